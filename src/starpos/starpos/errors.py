@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can go wrong. Every message is one sentence: what happened, where, and what to do about it."""
+
+
+class StarposError(Exception):
+    """The root of all errors starpos raises on purpose."""
+
+
+class FrameError(StarposError):
+    """A frame, or a list of stars, cannot be read or does not hold together."""
+
+
+class TiltError(StarposError):
+    """The inclinometer's readings are missing, broken or out of range."""
+
+
+class CatalogueError(StarposError):
+    """The star catalogue is missing or broken."""
+
+
+class TimeError(StarposError):
+    """A time is missing or outside the Earth-rotation tables."""
+
+
+class InstrumentError(StarposError):
+    """The instrument's description (camera, misalignment, mount) is missing or inconsistent."""

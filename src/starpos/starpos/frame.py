@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One exposure of a camera: its pixels and its time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.errors import FrameError
+from starpos.stars import check_focal, check_size, check_times
+
+PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The pixels of one exposure, row 0 on top.
+
+    pixels      (height, width) uint8 or uint16, monochrome or a colour mosaic; or (height, width, 3) uint8, BGR
+    pattern     the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
+    mid_unix_s  middle of the exposure, UTC as a Unix time; None: unknown
+    exposure_s  None: unknown
+    source      where it came from, for messages: a path or a topic
+    focal_px    focal length the file's header claims (FOCALLEN / XPIXSZ), px; a hint only; None: unknown
+
+    Raises FrameError on anything else.
+    """
+
+    pixels: np.ndarray
+    pattern: str = ""
+    mid_unix_s: float | None = None
+    exposure_s: float | None = None
+    source: str = ""
+    focal_px: float | None = None
+
+    def __post_init__(self):
+        place = self.source or "the frame"
+        pixels = self.pixels
+        if not isinstance(pixels, np.ndarray):
+            raise FrameError(f"{place}: the pixels are a {type(pixels).__name__}; give a numpy array.")
+        colour = pixels.ndim == 3 and pixels.shape[2] == 3
+        if not (pixels.ndim == 2 or colour):
+            raise FrameError(
+                f"{place}: the pixels have the shape {pixels.shape}; give rows by columns, or by 3 as BGR."
+            )
+        if pixels.dtype != np.uint8 and (colour or pixels.dtype != np.uint16):
+            depth = "uint8" if colour else "uint8 or uint16"
+            raise FrameError(f"{place}: the pixels are {pixels.dtype}; convert them to {depth}.")
+        check_size(pixels.shape[1], pixels.shape[0], place)
+        if self.pattern not in PATTERNS or (colour and self.pattern):
+            allowed = "''" if colour else ", ".join(map(repr, PATTERNS))
+            raise FrameError(f"{place}: the colour pattern is {self.pattern!r}; it must be {allowed}.")
+        check_times(self.mid_unix_s, self.exposure_s, place)
+        check_focal(self.focal_px, place)
+
+    @property
+    def width(self) -> int:
+        return self.pixels.shape[1]
+
+    @property
+    def height(self) -> int:
+        return self.pixels.shape[0]
