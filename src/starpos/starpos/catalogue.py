@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The star catalogue: a compact Tycho-2 in declination zones, its places at any date and their errors.
+
+The committed file holds every star with V < 11, which is what the instrument sees in half a second; half of the
+accuracy of the roll about the optical axis, and with it of the position, comes from the stars fainter than V = 9.5.
+"""
+
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from starpos.errors import CatalogueError
+
+EPOCH = 2000.0  # of ra, dec, Julian year
+FORMAT = 1
+ZONES = 180  # of one degree of declination each
+MAS = np.radians(1 / 3.6e6)
+SIGMA_UNIT_MAS, PM_SIGMA_UNIT, EPOCH_ZERO = 2.0, 0.2, 1900.0
+COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
+_COLUMNS = ("ra_mas", "dec_mas", "pm_ra", "pm_dec", "vmag_centi", "sigma_code", "pm_sigma_code", "epoch_code", "tyc")
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """Stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
+
+    ra_mas, dec_mas (N,) ICRS at J2000.0 in mas; pm_ra (times cos dec), pm_dec (N,) mas/yr; vmag_centi (N,) V in
+    0.01 mag; sigma_code, pm_sigma_code, epoch_code (N,): position error at the mean epoch, error of the motion, mean
+    epoch; tyc (N, 3); hip (N,) 0 where there is none; zone_start (181,).
+    """
+
+    ra_mas: np.ndarray
+    dec_mas: np.ndarray
+    pm_ra: np.ndarray
+    pm_dec: np.ndarray
+    vmag_centi: np.ndarray
+    sigma_code: np.ndarray
+    pm_sigma_code: np.ndarray
+    epoch_code: np.ndarray
+    tyc: np.ndarray
+    hip: np.ndarray
+    zone_start: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.ra_mas)
+
+    def vmag(self, index=slice(None)) -> np.ndarray:
+        """Johnson V."""
+        return self.vmag_centi[index] * 0.01
+
+    def directions(self, index, year: float = EPOCH) -> np.ndarray:
+        """ICRS unit vectors (n, 3), barycentric, at a Julian year: linear space motion without parallax."""
+        ra, dec = self.ra_mas[index] * MAS, self.dec_mas[index] * MAS
+        cr, sr, cd, sd = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
+        v = np.stack([cd * cr, cd * sr, sd], -1)
+        if year == EPOCH:
+            return v
+        east = np.stack([-sr, cr, np.zeros_like(sr)], -1) * (self.pm_ra[index] * (year - EPOCH) * MAS)[:, None]
+        north = np.stack([-sd * cr, -sd * sr, cd], -1) * (self.pm_dec[index] * (year - EPOCH) * MAS)[:, None]
+        v = v + east + north
+        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+    def sigma(self, index, year: float) -> np.ndarray:
+        """Error of a place at a Julian year, rad, one axis, 1 sigma (n,)."""
+        years = year - (EPOCH_ZERO + self.epoch_code[index])
+        motion = self.pm_sigma_code[index] * PM_SIGMA_UNIT * years
+        return np.hypot(self.sigma_code[index] * SIGMA_UNIT_MAS, motion) * MAS
+
+    def names(self, index) -> list[str]:
+        """Designations: 'HIP 1234' where there is one, else 'TYC 1-2-3'."""
+        return [
+            f"HIP {h}" if h else "TYC {}-{}-{}".format(*t)
+            for h, t in zip(self.hip[index].tolist(), self.tyc[index].tolist(), strict=True)
+        ]
+
+    def cone(self, centre, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
+        """Indices of the stars within radius_rad of the unit vector `centre` at J2000, brightest first."""
+        dec0, ra0 = np.arcsin(np.clip(centre[2], -1, 1)), np.arctan2(centre[1], centre[0]) % (2 * np.pi)
+        low, high = np.degrees([dec0 - radius_rad, dec0 + radius_rad])
+        zones = range(max(0, int(np.floor(low)) + 90), min(ZONES - 1, int(np.floor(high)) + 90) + 1)
+        if abs(dec0) + radius_rad >= np.pi / 2 - 1e-9:
+            half = np.pi
+        else:
+            half = np.arcsin(min(1.0, np.sin(radius_rad) / np.cos(dec0))) + 1e-9
+        spans = [(0.0, 2 * np.pi)] if half >= np.pi else _wrapped(ra0 - half, ra0 + half)
+        pieces = []
+        for z in zones:
+            first, last = self.zone_start[z], self.zone_start[z + 1]
+            ra = self.ra_mas[first:last]
+            for a, b in spans:
+                i, j = np.searchsorted(ra, (np.uint32(a / MAS), np.uint32(np.ceil(b / MAS))))
+                pieces.append(np.arange(first + i, first + j))
+        index = np.concatenate(pieces) if pieces else np.zeros(0, int)
+        if np.isfinite(limit_mag):
+            index = index[self.vmag_centi[index] < limit_mag * 100]
+        index = index[self.directions(index) @ centre >= np.cos(radius_rad)]
+        return index[np.argsort(self.vmag_centi[index], kind="stable")]
+
+
+def _wrapped(a: float, b: float) -> list[tuple[float, float]]:
+    turn = 2 * np.pi
+    if a < 0:
+        return [(a + turn, turn), (0.0, b)]
+    return [(a, turn), (0.0, b - turn)] if b > turn else [(a, b)]
+
+
+def pack(tyc, hip, vmag, ra_deg, dec_deg, pm_ra, pm_dec, sigma_mas, sigma_pm, epoch) -> Catalogue:
+    """A Catalogue from plain columns: deg, mas/yr (pm_ra times cos dec), mas, Julian year; errors round up."""
+    dec_mas = np.round(np.asarray(dec_deg) * 3.6e6).astype(np.int32)
+    ra_mas = (np.round(np.asarray(ra_deg) * 3.6e6) % 1_296_000_000).astype(np.uint32)
+    zone = np.clip(dec_mas // 3_600_000 + 90, 0, ZONES - 1)
+    order = np.lexsort((ra_mas, zone))
+
+    def column(values, dtype):
+        limits = np.iinfo(dtype)
+        return np.clip(np.round(values), limits.min, limits.max).astype(dtype)[order]
+
+    return Catalogue(
+        ra_mas[order],
+        dec_mas[order],
+        column(pm_ra, np.int16),
+        column(pm_dec, np.int16),
+        column(np.asarray(vmag) * 100, np.int16),
+        column(np.ceil(np.asarray(sigma_mas) / SIGMA_UNIT_MAS), np.uint8),
+        column(np.ceil(np.asarray(sigma_pm) / PM_SIGMA_UNIT), np.uint8),
+        column(np.asarray(epoch) - EPOCH_ZERO, np.uint8),
+        np.asarray(tyc, np.int16)[order],
+        np.asarray(hip, np.int32)[order],
+        np.searchsorted(zone[order], np.arange(ZONES + 1)),
+    )
+
+
+def save(catalogue: Catalogue, path) -> None:
+    """Write the compact file: differences along right ascension and split bytes, which deflate packs well."""
+    c = catalogue
+    step = np.diff(c.ra_mas.astype(np.int64), prepend=0).astype(np.uint32)
+    within = (c.dec_mas - (np.repeat(np.arange(ZONES), np.diff(c.zone_start)) - 90) * 3_600_000).astype(np.uint32)
+    named = np.flatnonzero(c.hip)
+    with open(path, "wb") as f:
+        np.savez_compressed(
+            f,
+            format=FORMAT,
+            zone_count=np.diff(c.zone_start).astype(np.int32),
+            ra_step=_split(step),
+            dec_within=_split(within),
+            pm_ra=_split(c.pm_ra),
+            pm_dec=_split(c.pm_dec),
+            vmag_centi=_split(c.vmag_centi),
+            sigma_code=c.sigma_code,
+            pm_sigma_code=c.pm_sigma_code,
+            epoch_code=c.epoch_code,
+            tyc1=_split(np.diff(c.tyc[:, 0], prepend=0).astype(np.int16)),
+            tyc2=_split(c.tyc[:, 1]),
+            tyc3=c.tyc[:, 2].astype(np.uint8),
+            hip_step=_split(np.diff(named, prepend=0).astype(np.uint16)),
+            hip=_split(c.hip[named]),
+        )
+
+
+def _split(column: np.ndarray) -> np.ndarray:
+    """Byte planes (bytes, N): the high bytes repeat and pack away."""
+    return np.ascontiguousarray(np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1).T)
+
+
+def _join(planes: np.ndarray, dtype) -> np.ndarray:
+    return np.ascontiguousarray(planes.T).view(dtype)[:, 0]
+
+
+def read(path) -> Catalogue:
+    """The catalogue of one compact file; CatalogueError with the cure where it is missing, broken or of another format."""
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as f:
+            if int(f["format"]) != FORMAT:
+                raise CatalogueError(f"{path}: format {int(f['format'])}, this program reads {FORMAT}: build it again")
+            zone_start = np.concatenate([[0], np.cumsum(f["zone_count"], dtype=np.int64)])
+            zone = np.repeat(np.arange(ZONES, dtype=np.int32), f["zone_count"])
+            hip = np.zeros(len(zone), np.int32)
+            hip[np.cumsum(_join(f["hip_step"], np.uint16), dtype=np.int64)] = _join(f["hip"], np.int32)
+            tyc1 = np.cumsum(_join(f["tyc1"], np.int16), dtype=np.int16)
+            return Catalogue(
+                np.cumsum(_join(f["ra_step"], np.uint32), dtype=np.uint32),
+                _join(f["dec_within"], np.uint32).astype(np.int32) + (zone - 90) * 3_600_000,
+                _join(f["pm_ra"], np.int16),
+                _join(f["pm_dec"], np.int16),
+                _join(f["vmag_centi"], np.int16),
+                f["sigma_code"],
+                f["pm_sigma_code"],
+                f["epoch_code"],
+                np.stack([tyc1, _join(f["tyc2"], np.int16), f["tyc3"].astype(np.int16)], -1),
+                hip,
+                zone_start,
+            )
+    except FileNotFoundError:
+        raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None
+    except CatalogueError:
+        raise
+    except Exception as e:  # a damaged zip raises many kinds
+        raise CatalogueError(f"{path}: not a readable catalogue ({e}): restore it or build it again") from None
+
+
+@lru_cache(maxsize=2)
+def load(path: str | None = None) -> Catalogue:
+    """The catalogue in use: `path`, else the file STARPOS_CATALOGUE names, else the committed one; read once."""
+    return read(path or os.environ.get("STARPOS_CATALOGUE") or COMMITTED)

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The inclinometer: its readings, its transfer function, and A2, which takes its frame S into the local level L."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starpos.errors import TiltError
+
+LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
+SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
+SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
+SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """Elevation of S's X' and Y' axes above the horizon, averaged over `samples` readings.
+
+    theta_x, theta_y: rad.  covariance: (2, 2) rad2 of the average.  utc_unix_s: the middle of the readings.
+    """
+
+    theta_x: float
+    theta_y: float
+    covariance: np.ndarray
+    utc_unix_s: float
+    samples: int = 1
+    temperature_c: float = float("nan")
+
+    def __post_init__(self):
+        object.__setattr__(self, "covariance", np.asarray(self.covariance, float))
+        if not np.isfinite([self.theta_x, self.theta_y, self.utc_unix_s]).all():
+            raise TiltError("a tilt reading is not a finite number: check the inclinometer")
+        if self.covariance.shape != (2, 2) or not np.isfinite(self.covariance).all():
+            raise TiltError("a tilt's covariance must be 2 x 2 finite numbers, rad2")
+        if max(abs(self.theta_x), abs(self.theta_y)) > LIMIT_RAD:
+            raise TiltError(
+                f"tilt ({np.degrees(self.theta_x):.3f}, {np.degrees(self.theta_y):.3f}) deg is beyond +-30 deg, "
+                "the inclinometer's range: set the instrument more upright"
+            )
+
+
+def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
+    """A2 = R2(b) R1(a) of the paper's equation 17 (3, 3): S into L, from the two elevations in rad.
+
+    b = -theta_x and a = asin(sin theta_y / cos b), so that the third row is up as S sees it.
+    """
+    b = -theta_x
+    s = np.sin(theta_y) / np.cos(b)
+    if not abs(s) < 1:
+        raise TiltError(f"tilts {np.degrees(theta_x):.3f}, {np.degrees(theta_y):.3f} deg cannot hold together")
+    a = np.arcsin(s)
+    ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
+
+
+def sca100t_angle(volts, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_SENSITIVITY_V_PER_G):
+    """Angle in rad from the SCA100T's output: asin((V - offset) / sensitivity); NaN beyond +-1 g (equation 14)."""
+    g = (np.asarray(volts, float) - offset_v) / sensitivity_v_per_g
+    return np.arcsin(np.where(np.abs(g) <= 1, g, np.nan))
+
+
+def sca100t_volts(angle, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_SENSITIVITY_V_PER_G):
+    """The inverse of `sca100t_angle`: output voltage at an angle in rad."""
+    return offset_v + sensitivity_v_per_g * np.sin(angle)
+
+
+@dataclass(frozen=True)
+class TiltLog:
+    """Readings in time order: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,)."""
+
+    utc_unix_s: np.ndarray
+    theta_x: np.ndarray
+    theta_y: np.ndarray
+    temperature_c: np.ndarray
+    noise_rad: float = SCA100T_NOISE_RAD
+
+    def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:
+        """The mean tilt over an exposure; where no reading falls into it, the nearest within one second.
+
+        A single wild reading does not move it: readings further than 6 sigma from the median are left out.
+        Raises TiltError with the distance in time where there is none.
+        """
+        apart = np.abs(self.utc_unix_s - mid_unix_s)
+        finite = np.isfinite(self.theta_x) & np.isfinite(self.theta_y)
+        half = max(exposure_s, 0.0) / 2 + 1e-6
+        use = finite & (apart <= half)
+        if not use.any():
+            nearest = apart[finite].min() if finite.any() else np.inf
+            if not nearest <= half + 1.0:
+                raise TiltError(
+                    f"no tilt reading within {half + 1:.2f} s of the middle of the exposure "
+                    f"(nearest {nearest:.1f} s off): check the clocks and the inclinometer"
+                )
+            use = finite & (apart <= nearest + 1e-6)
+        theta = np.stack([self.theta_x[use], self.theta_y[use]], -1)
+        centre = np.median(theta, axis=0)
+        sane = (np.abs(theta - centre) <= 6 * max(self.noise_rad, 1e-9)).all(1)
+        if 2 * sane.sum() < len(sane) or not sane.any():
+            raise TiltError(
+                f"the tilt moved by {np.degrees(np.ptp(theta, axis=0).max()):.3f} deg during the exposure: "
+                "the instrument was not at rest"
+            )
+        mean = theta[sane].mean(0)
+        n = int(sane.sum())
+        return Tilt(
+            float(mean[0]),
+            float(mean[1]),
+            np.eye(2) * self.noise_rad**2 / n,
+            float(self.utc_unix_s[use][sane].mean()),
+            n,
+            float(self.temperature_c[use][sane].mean()),
+        )
+
+
+def read_tilt_csv(path, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
+    """A TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if it is none."""
+    path = Path(path)
+    try:
+        with path.open() as f:
+            names = f.readline().strip().lstrip("# ").split(",")
+            rows = np.genfromtxt(f, delimiter=",", ndmin=2)
+    except (OSError, ValueError, UnicodeDecodeError) as e:
+        raise TiltError(f"{path}: not a readable table of tilts ({_first_line(e)})") from None
+    need = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
+    if not set(need) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(names):
+        raise TiltError(f"{path}: a tilt table needs the columns {', '.join(need)} and at least one row")
+    column = dict(zip(names, rows.T, strict=True))
+    order = np.argsort(column["utc_unix_s"], kind="stable")
+    order = order[np.isfinite(column["utc_unix_s"][order])]
+    temperature = column.get("temperature_c", np.full(len(rows), np.nan))
+    return TiltLog(
+        column["utc_unix_s"][order],
+        np.radians(column["theta_x_deg"][order]),
+        np.radians(column["theta_y_deg"][order]),
+        temperature[order],
+        noise_rad,
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Build the compact catalogue from the original Tycho-2 files (CDS I/259): tyc2.dat.* and suppl_1.dat.
+
+Tycho-2: Hog et al. 2000, A&A 355, L27.  Byte positions as in the catalogue's own ReadMe.
+"""
+
+import lzma
+import tarfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from starpos.catalogue import EPOCH, Catalogue, pack
+from starpos.errors import CatalogueError
+
+SUPPLEMENT_EPOCH = 1991.25
+UNKNOWN_MOTION_MAS_YEAR = 25.0  # 1 sigma of a star whose proper motion was never measured: the V ~ 10 stars' own spread
+MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
+
+_MAIN = {  # name: (first byte from 0, length)
+    "tyc1": (0, 4), "tyc2": (5, 5), "tyc3": (11, 1), "pflag": (13, 1), "ra_mean": (15, 12), "dec_mean": (28, 12),
+    "pm_ra": (41, 7), "pm_dec": (49, 7), "e_ra": (57, 3), "e_dec": (61, 3), "e_pm_ra": (65, 4), "e_pm_dec": (70, 4),
+    "epoch_ra": (75, 7), "epoch_dec": (83, 7), "bt": (110, 6), "vt": (123, 6), "hip": (142, 6),
+    "ra": (152, 12), "dec": (165, 12), "epoch": (178, 4), "e_ra_observed": (188, 5), "e_dec_observed": (194, 5),
+}  # fmt: skip
+_SUPPLEMENT = {
+    "tyc1": (0, 4), "tyc2": (5, 5), "tyc3": (11, 1), "flag": (13, 1), "ra": (15, 12), "dec": (28, 12),
+    "pm_ra": (41, 7), "pm_dec": (49, 7), "e_ra": (57, 5), "e_dec": (63, 5), "e_pm_ra": (69, 5), "e_pm_dec": (75, 5),
+    "bt": (83, 6), "vt": (96, 6), "hip": (115, 6),
+}  # fmt: skip
+
+
+def build(source, limit_mag: float, progress: Callable[[str, float], None] = lambda what, done: None) -> Catalogue:
+    """The catalogue of all stars with V < limit_mag from a folder (or Debian's tycho2_*.orig.tar.xz) of the originals.
+
+    Every star carries its own position error: mean position and motion where Tycho-2 has them, the observed place
+    with an unknown motion for pflag X, the photocentre once for each pflag P pair, epoch 1991.25 for supplement 1.
+    """
+    parts, seen = [], 0
+    for name, text in _originals(Path(source)):
+        supplement = name.startswith("suppl")
+        table = _read(text, _SUPPLEMENT if supplement else _MAIN, SUPPLEMENT_BYTES if supplement else MAIN_BYTES, name)
+        parts.append(_supplement_stars(table) if supplement else _main_stars(table))
+        parts[-1] = {k: v[parts[-1]["vmag"] < limit_mag + 1] for k, v in parts[-1].items()}
+        seen += 1
+        progress(name, seen / 21)
+    if seen < 21:
+        raise CatalogueError(f"{source}: {seen} of the 21 files tyc2.dat.00 .. 19 and suppl_1.dat are there")
+    stars = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+    stars = _merge_photocentres(stars)
+    return pack(**{k: v[stars["vmag"] < limit_mag] for k, v in stars.items() if k != "photocentre"})
+
+
+def _originals(source: Path) -> Iterator[tuple[str, bytes]]:
+    wanted = {f"tyc2.dat.{i:02d}" for i in range(20)} | {"suppl_1.dat"}
+    try:
+        if source.is_dir():
+            for path in sorted(p for p in source.rglob("*") if p.name in wanted):
+                yield path.name, path.read_bytes()
+            return
+        with tarfile.open(source) as archive:
+            for member in archive:
+                if Path(member.name).name in wanted and member.isfile():
+                    yield Path(member.name).name, archive.extractfile(member).read()
+    except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as e:
+        raise CatalogueError(f"{source}: not a folder or archive of Tycho-2's original files ({e})") from None
+
+
+def _read(text: bytes, columns: dict, record_bytes: int, name: str) -> dict[str, np.ndarray]:
+    if not text or len(text) % record_bytes:
+        raise CatalogueError(f"{name}: {len(text)} bytes are no whole number of {record_bytes}-byte records")
+    layout = np.dtype(
+        {
+            "names": list(columns),
+            "formats": [f"S{length}" for _, length in columns.values()],
+            "offsets": [first for first, _ in columns.values()],
+            "itemsize": record_bytes,
+        }
+    )
+    rows = np.frombuffer(text, layout)
+    return {c: rows[c] if c in ("pflag", "flag") else _numbers(rows[c]) for c in columns}
+
+
+def _numbers(column: np.ndarray) -> np.ndarray:
+    stripped = np.char.strip(column)
+    return np.where(stripped == b"", b"nan", stripped).astype(float)
+
+
+def johnson_v(bt: np.ndarray, vt: np.ndarray) -> np.ndarray:
+    """Johnson V from Tycho magnitudes: VT - 0.09 (BT - VT); a missing colour is taken as BT - VT = 0.7."""
+    colour = np.where(np.isfinite(bt) & np.isfinite(vt), bt - vt, 0.7)
+    return np.where(np.isfinite(vt), vt, bt - colour) - 0.09 * colour
+
+
+def _identity(t: dict) -> dict[str, np.ndarray]:
+    return {
+        "tyc": np.stack([t["tyc1"], t["tyc2"], t["tyc3"]], -1).astype(np.int32),
+        "hip": np.nan_to_num(t["hip"]).astype(np.int32),
+        "vmag": johnson_v(t["bt"], t["vt"]),
+    }
+
+
+def _main_stars(t: dict) -> dict[str, np.ndarray]:
+    mean = np.isfinite(t["ra_mean"])
+    return _identity(t) | {
+        "ra_deg": np.where(mean, t["ra_mean"], t["ra"]),
+        "dec_deg": np.where(mean, t["dec_mean"], t["dec"]),
+        "pm_ra": np.where(mean, t["pm_ra"], 0.0),
+        "pm_dec": np.where(mean, t["pm_dec"], 0.0),
+        "sigma_mas": np.where(
+            mean, np.hypot(t["e_ra"], t["e_dec"]), np.hypot(t["e_ra_observed"], t["e_dec_observed"])
+        )
+        / np.sqrt(2),
+        "sigma_pm": np.where(mean, np.hypot(t["e_pm_ra"], t["e_pm_dec"]) / np.sqrt(2), UNKNOWN_MOTION_MAS_YEAR),
+        "epoch": np.where(mean, (t["epoch_ra"] + t["epoch_dec"]) / 2, 1990 + t["epoch"]),
+        "photocentre": t["pflag"] == b"P",
+    }
+
+
+def _supplement_stars(t: dict) -> dict[str, np.ndarray]:
+    moving = np.isfinite(t["pm_ra"])
+    pm_ra, pm_dec = np.nan_to_num(t["pm_ra"]), np.nan_to_num(t["pm_dec"])
+    years, mas = EPOCH - SUPPLEMENT_EPOCH, 1 / 3.6e6
+    return _identity(t) | {
+        "ra_deg": (t["ra"] + years * pm_ra * mas / np.cos(np.radians(t["dec"]))) % 360,
+        "dec_deg": t["dec"] + years * pm_dec * mas,
+        "pm_ra": pm_ra,
+        "pm_dec": pm_dec,
+        "sigma_mas": np.hypot(t["e_ra"], t["e_dec"]) / np.sqrt(2),
+        "sigma_pm": np.where(
+            moving, np.nan_to_num(np.hypot(t["e_pm_ra"], t["e_pm_dec"])) / np.sqrt(2), UNKNOWN_MOTION_MAS_YEAR
+        ),
+        "epoch": np.full(len(moving), SUPPLEMENT_EPOCH),
+        "photocentre": np.zeros(len(moving), bool),
+    }
+
+
+def _merge_photocentres(stars: dict) -> dict[str, np.ndarray]:
+    """Each pflag P pair has one mean place in two rows: keep one row, with the light of both."""
+    pair = np.flatnonzero(stars["photocentre"])
+    place = np.stack([stars["ra_deg"][pair], stars["dec_deg"][pair]], -1)
+    _, first, group = np.unique(place, axis=0, return_index=True, return_inverse=True)
+    light = np.bincount(group.ravel(), 10 ** (-0.4 * stars["vmag"][pair]))
+    stars["vmag"][pair[first]] = -2.5 * np.log10(light)
+    keep = np.ones(len(stars["vmag"]), bool)
+    keep[np.setdiff1d(pair, pair[first])] = False
+    return {k: v[keep] for k, v in stars.items()}
