@@ -15,7 +15,7 @@ PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 class Frame:
     """The pixels of one exposure, row 0 on top.
 
-    pixels      (height, width) uint8 or uint16, monochrome or a colour mosaic; or (height, width, 3) uint8, BGR
+    pixels      (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
     pattern     the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
     mid_unix_s  middle of the exposure, UTC as a Unix time; None: unknown
     exposure_s  None: unknown
