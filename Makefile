@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+# make demo    the whole instrument on a simulated night      make test    linters, unit tests, whole-graph tests
+# make build   set-up (once) and build                        make lint    linters only
+# make clean   removes what was built                         make distclean   and the set-up
+# PYTHON=python3.12 chooses the interpreter of the set-up; ARGS goes to the demo or to pytest.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+export PYTHON
+
+# What a build copies or compiles. Python modules are links into the source tree: an edit needs no build.
+PACKAGES := $(patsubst %/package.xml,%,$(wildcard */package.xml src/*/package.xml))
+INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/package.xml $(p)/setup.* $(p)/CMakeLists.txt \
+  $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* $(p)/resource/*))
+
+.PHONY: build demo test lint clean distclean FORCE
+build: install/.built
+
+install/.built: .underlay/stamp $(INPUTS)
+	@tools/build
+
+.underlay/stamp: FORCE
+	@tools/underlay
+
+demo: build
+	@. tools/env.sh && python tools/demo.py $(ARGS)
+
+test: build
+	@. tools/env.sh && python tools/test.py $(ARGS)
+
+lint: build
+	@. tools/env.sh && python tools/test.py --lint
+
+clean:
+	rm -rf build install log demo .pytest_cache .ruff_cache
+
+distclean: clean
+	rm -rf .underlay

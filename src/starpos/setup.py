@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import find_packages, setup
+
+package = "starpos"
+
+setup(
+    name=package,
+    version="0.1.0",
+    description="Position and heading from stars and gravity",
+    maintainer="starpos maintainers",
+    maintainer_email="maintainers@starpos.invalid",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=find_packages(include=["starpos", "starpos.*"]),
+    package_data={package: ["data/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "astropy>=6.0",
+        "pyerfa>=2.0.1",
+        "opencv-python-headless>=4.6",
+        "PyYAML",
+    ],
+    extras_require={"picture": ["matplotlib"], "test": ["pytest"]},
+    entry_points={"console_scripts": ["starpos = starpos.cli:main"]},
+)

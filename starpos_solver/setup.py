@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package = "starpos_solver"
+
+setup(
+    name=package,
+    version="0.1.0",
+    description="Stars and tilt in, position and heading out",
+    maintainer="starpos maintainers",
+    maintainer_email="maintainers@starpos.invalid",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+        (f"share/{package}/launch", sorted(glob("launch/*.launch.py"))),
+        (f"share/{package}/config", sorted(glob("config/*.yaml"))),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    entry_points={"console_scripts": ["solver = starpos_solver.solver_node:main"]},
+)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stars and tilt in, position and heading out: node solver."""

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+# Enter the workspace (bash, zsh): `. tools/env.sh`. Afterwards python, starpos, ros2 run and colcon are the workspace's own.
+
+if [ -n "${ZSH_VERSION:-}" ]; then
+  eval '_starpos_env=${(%):-%x}' _starpos_shell=zsh
+else
+  _starpos_env=${BASH_SOURCE[0]} _starpos_shell=bash
+fi
+_starpos_root=$(cd "$(dirname "$_starpos_env")/.." >/dev/null && pwd)
+if [ ! -f "$_starpos_root/.underlay/stamp" ]; then
+  echo "starpos: nothing is set up in $_starpos_root yet: make -C $_starpos_root build" >&2
+  unset _starpos_env _starpos_shell _starpos_root
+  return 1
+fi
+
+# the set-up files of ROS and colcon are not written for `set -u` and `set -e`
+_starpos_flags=$-
+set +eu
+if [ -f "$_starpos_root/.underlay/venv/local_setup.$_starpos_shell" ]; then
+  . "$_starpos_root/.underlay/venv/local_setup.$_starpos_shell"
+else # over a ROS that is sourced already
+  case ":$PATH:" in
+    *":$_starpos_root/.underlay/venv/bin:"*) ;;
+    *) export PATH="$_starpos_root/.underlay/venv/bin:$PATH" ;;
+  esac
+fi
+if [ -f "$_starpos_root/install/local_setup.$_starpos_shell" ]; then
+  . "$_starpos_root/install/local_setup.$_starpos_shell"
+fi
+case $_starpos_flags in *u*) set -u ;; esac
+case $_starpos_flags in *e*) set -e ;; esac
+unset _starpos_env _starpos_shell _starpos_root _starpos_flags
