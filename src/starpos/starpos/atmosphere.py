@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Refraction in the local level L, where zenith distance is known from the tilt (ERRATA: it acts there, not after A2)."""
+
+from dataclasses import dataclass
+
+import erfa
+import numpy as np
+
+from starpos.errors import InstrumentError
+
+STANDARD_PRESSURE_PA = 101_325.0
+STANDARD_TEMPERATURE_C = 15.0
+MIN_COS_ZENITH = 0.05  # ERFA's own floor: below 3 deg of altitude the two-constant model has no meaning
+
+
+@dataclass(frozen=True)
+class Atmosphere:
+    """The air at the instrument and how well it is known (1 sigma)."""
+
+    pressure_pa: float = STANDARD_PRESSURE_PA
+    temperature_c: float = STANDARD_TEMPERATURE_C
+    humidity: float = 0.5  # 0..1
+    wavelength_um: float = 0.55
+    pressure_stddev_pa: float = 200.0
+    temperature_stddev_c: float = 2.0
+
+    def __post_init__(self):
+        checks = (
+            ("pressure", self.pressure_pa, 0.0, 1.2e5, "Pa"),
+            ("temperature", self.temperature_c, -100.0, 80.0, "deg C"),
+            ("humidity", self.humidity, 0.0, 1.0, ""),
+            ("wavelength", self.wavelength_um, 0.2, 10.0, "um"),
+        )
+        for name, value, low, high, unit in checks:
+            if not low <= value <= high:
+                raise InstrumentError(f"{name} {value} {unit}: must lie between {low:g} and {high:g} {unit}".rstrip())
+
+    @classmethod
+    def unknown(cls) -> "Atmosphere":
+        """Nothing was measured: sea level to 3000 m, frost to summer, and a sigma that says so."""
+        return cls(90_000.0, 10.0, pressure_stddev_pa=9_000.0, temperature_stddev_c=12.0)
+
+    @property
+    def relative_sigma(self) -> float:
+        """1 sigma of the refraction, as a fraction of it: it goes with pressure over absolute temperature."""
+        if self.pressure_pa == 0:
+            return 0.0
+        return float(
+            np.hypot(self.pressure_stddev_pa / self.pressure_pa, self.temperature_stddev_c / (self.temperature_c + 273.15))
+        )
+
+    def refraction(self, factor: float = 1.0) -> "Refraction":
+        """The model at `factor` times its strength (1, or a step for a derivative)."""
+        a, b = erfa.refco(self.pressure_pa / 100, self.temperature_c, self.humidity, self.wavelength_um)
+        return Refraction(float(a) * factor, float(b) * factor)
+
+
+@dataclass(frozen=True)
+class Refraction:
+    """Bending A tan z + B tan^3 z of the observed zenith distance z (ERFA's eraRefco); a, b in rad."""
+
+    a: float
+    b: float
+
+    def bend(self, v: np.ndarray) -> np.ndarray:
+        """Observed directions (N, 3) in L of unrefracted ones: raised toward +Z (ERFA's eraAtioq, one Newton step)."""
+        horizontal = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-12)
+        up = np.maximum(v[..., 2], MIN_COS_ZENITH)
+        tan = horizontal / up
+        w = self.b * tan * tan
+        angle = (self.a + w) * tan / (1 + (self.a + 3 * w) / (up * up))
+        return _raise(v, horizontal, angle)
+
+    def unbend(self, u: np.ndarray) -> np.ndarray:
+        """Unrefracted directions (N, 3) in L of observed ones."""
+        horizontal = np.maximum(np.hypot(u[..., 0], u[..., 1]), 1e-12)
+        tan = horizontal / np.maximum(u[..., 2], MIN_COS_ZENITH)
+        return _raise(u, horizontal, -(self.a + self.b * tan * tan) * tan)
+
+
+def _raise(v: np.ndarray, horizontal: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """v turned by `angle` toward +Z within its vertical plane."""
+    c, s = np.cos(angle), np.sin(angle)
+    shrink = c - s * v[..., 2] / horizontal
+    return np.stack([v[..., 0] * shrink, v[..., 1] * shrink, c * v[..., 2] + s * horizontal], -1)

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A1: from ICRS to the Earth's own frame ITRS, as the IERS Conventions (2010) have it, through ERFA.
+
+Places are geocentric apparent ones (light deflection and annual aberration in them); what depends on the site, the
+diurnal aberration, is `station_velocity`, which the fix applies.  Offline: the IERS table that astropy ships.
+"""
+
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+
+import erfa
+import numpy as np
+
+from starpos.errors import TimeError
+
+UNIX_EPOCH_JD = 2440587.5
+DAY_S = 86400.0
+SPEED_OF_LIGHT = erfa.CMPS
+ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
+EQUATOR_RADIUS_M, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3  # WGS 84
+FIRST_MJD = 41684.0  # 1973-01-02: the first day of the IERS table
+# Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
+# holding the pole (tools/ut1_extrapolation.py prints both).
+EXTRAPOLATION_DAYS = (0.0, 30.0, 90.0, 180.0, 365.0, 730.0, 1095.0)
+EXTRAPOLATION_SIGMA_S = (0.001, 0.013, 0.033, 0.053, 0.092, 0.25, 0.46)
+POLE_SIGMA_RAD = np.radians(0.2 / 3600)
+
+
+@dataclass(frozen=True)
+class EarthOrientation:
+    """UT1-UTC (s) and the pole (rad) at an instant, with 1 sigma each; `extrapolated_days` beyond the table's end."""
+
+    ut1_minus_utc_s: float
+    ut1_sigma_s: float
+    pole_x: float
+    pole_y: float
+    pole_sigma: float
+    extrapolated_days: float = 0.0
+
+
+@dataclass(frozen=True)
+class EarthState:
+    """All that A1 needs at one instant, computed once a frame.
+
+    astrom: ERFA's geocentric star-independent parameters; cirs_to_itrs (3, 3); year: Julian, TT.
+    """
+
+    utc_unix_s: float
+    year: float
+    orientation: EarthOrientation
+    astrom: np.ndarray
+    cirs_to_itrs: np.ndarray
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """The Earth's barycentric velocity in units of c (3,), ICRS axes."""
+        return np.array(self.astrom["v"], float)
+
+    def to_itrs(self, v: np.ndarray) -> np.ndarray:
+        """Geocentric apparent directions (N, 3) in ITRS of ICRS directions (N, 3) at this date (ERFA eraAtciqz)."""
+        ra, dec = erfa.c2s(v)
+        return erfa.s2c(*erfa.atciqz(ra, dec, self.astrom)) @ self.cirs_to_itrs.T
+
+
+def earth_state(utc_unix_s: float) -> EarthState:
+    """EarthState at UTC seconds since 1970; TimeError where no Earth orientation is known.
+
+    IERS Conventions (2010) chapter 5, equation 5.1 with the CIO; precession-nutation IAU 2006/2000A.
+    """
+    orientation = earth_orientation(utc_unix_s)
+    day = utc_unix_s / DAY_S
+    tai = erfa.utctai(UNIX_EPOCH_JD, day)
+    tt = erfa.taitt(*tai)
+    ut1 = erfa.utcut1(UNIX_EPOCH_JD, day, orientation.ut1_minus_utc_s)
+    astrom, _ = erfa.apci13(*tt)  # TT serves as TDB: they differ by 2 ms
+    pole = erfa.pom00(orientation.pole_x, orientation.pole_y, erfa.sp00(*tt))
+    spin = erfa.rz(erfa.era00(*ut1), np.eye(3))
+    year = 2000.0 + (tt[0] - erfa.DJ00 + tt[1]) / erfa.DJY
+    return EarthState(utc_unix_s, float(year), orientation, astrom, pole @ spin)
+
+
+def earth_orientation(utc_unix_s: float) -> EarthOrientation:
+    """UT1-UTC and the pole from the bundled IERS table; up to three years past its end carried on with a stated sigma.
+
+    Raises TimeError before 1973 and later than that.
+    """
+    if not np.isfinite(utc_unix_s):
+        raise TimeError("the time of the frame is not a finite number: check the clock that stamps it")
+    table = _table()
+    mjd = utc_unix_s / DAY_S + UNIX_EPOCH_JD - 2400000.5
+    beyond = mjd - table.mjd[-1]
+    if mjd < FIRST_MJD or beyond > EXTRAPOLATION_DAYS[-1]:
+        raise TimeError(
+            f"{utc_text(utc_unix_s)} lies outside the IERS tables (1973 to {_year(table.mjd[-1]):.1f}, and three years "
+            "of extrapolation): check the frame's clock, or upgrade astropy-iers-data"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)  # 'dubious year' is what the sigma is for
+        leap = float(erfa.utctai(2400000.5, mjd)[1] - mjd) * DAY_S
+    if beyond > 0:
+        ut1_minus_tai = table.ut1_minus_tai[-1] + beyond * table.slope
+        sigma = np.hypot(table.ut1_sigma[-1], np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S))
+        return EarthOrientation(
+            float(ut1_minus_tai + leap), float(sigma), table.pole_x[-1], table.pole_y[-1], POLE_SIGMA_RAD, float(beyond)
+        )
+    at = [float(np.interp(mjd, table.mjd, column)) for column in (table.ut1_minus_tai, table.ut1_sigma)]
+    pole = [float(np.interp(mjd, table.mjd, column)) for column in (table.pole_x, table.pole_y, table.pole_sigma)]
+    return EarthOrientation(at[0] + leap, at[1], *pole)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Daily values (N,): mjd, UT1-TAI (s; without leap seconds, so that it can be interpolated), pole (rad), sigmas."""
+
+    mjd: np.ndarray
+    ut1_minus_tai: np.ndarray
+    ut1_sigma: np.ndarray
+    pole_x: np.ndarray
+    pole_y: np.ndarray
+    pole_sigma: np.ndarray
+    slope: float  # of UT1-TAI over the last year, s per day
+
+
+@lru_cache(maxsize=1)
+def _table() -> _Table:
+    from astropy.utils import iers  # slow to import: only where a time is needed
+    from astropy_iers_data import IERS_A_FILE
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        t = iers.IERS_A.open(IERS_A_FILE)
+        mjd = np.asarray(t["MJD"].to_value("d"), float)
+        tai = erfa.utctai(2400000.5, mjd)
+        leap = np.round((tai[1] - mjd) * DAY_S)
+
+    def column(name, unit):
+        return np.nan_to_num(np.ma.filled(t[name], np.nan).to_value(unit).astype(float), nan=0.0)
+
+    known = np.flatnonzero(np.isfinite(np.ma.filled(t["UT1_UTC_A"], np.nan).to_value("s")))[-1] + 1
+    ut1 = column("UT1_UTC_A", "s") - leap
+    pole_sigma = np.hypot(column("e_PM_x_A", "rad"), column("e_PM_y_A", "rad"))
+    return _Table(
+        mjd[:known],
+        ut1[:known],
+        np.maximum(column("e_UT1_UTC_A", "s"), 1e-5)[:known],
+        column("PM_x_A", "rad")[:known],
+        column("PM_y_A", "rad")[:known],
+        np.maximum(pole_sigma, 1e-10)[:known],
+        float((ut1[known - 1] - ut1[known - 366]) / 365),
+    )
+
+
+def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
+    """Velocity of the turning ground in units of c (3,), ITRS, under the unit vector `zenith_itrs` (3,)."""
+    radius = EQUATOR_RADIUS_M / np.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
+    return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
+
+
+def curvature_radii_m(latitude: float) -> tuple[float, float]:
+    """Radii of curvature of WGS 84 (prime vertical, meridian) in m at a latitude in rad."""
+    w2 = 1 - ECCENTRICITY2 * np.sin(latitude) ** 2
+    return EQUATOR_RADIUS_M / np.sqrt(w2), EQUATOR_RADIUS_M * (1 - ECCENTRICITY2) / w2**1.5
+
+
+def utc_text(utc_unix_s: float) -> str:
+    """ISO 8601 with milliseconds, UTC."""
+    import datetime
+
+    try:
+        moment = datetime.datetime.fromtimestamp(utc_unix_s, datetime.timezone.utc)
+    except (OverflowError, ValueError, OSError):
+        return f"{utc_unix_s:g} s after 1970"
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
+
+
+def _year(mjd: float) -> float:
+    return 2000.0 + (mjd - 51544.5) / 365.25

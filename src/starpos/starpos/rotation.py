@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small tools for rotation matrices (3, 3); angles in rad, rotations active."""
+
+import numpy as np
+
+
+def about_axis(axis: int, angle: float) -> np.ndarray:
+    """Rotation about coordinate axis 0, 1 or 2."""
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = ((1, 2), (2, 0), (0, 1))[axis]
+    r = np.eye(3)
+    r[i, i] = r[j, j] = c
+    r[i, j], r[j, i] = -s, s
+    return r
+
+
+def from_vector(v) -> np.ndarray:
+    """Rotation by |v| rad about v (3,) (Rodrigues)."""
+    v = np.asarray(v, float)
+    angle = np.linalg.norm(v)
+    k = cross_matrix(v)
+    if angle < 1e-8:
+        return np.eye(3) + k + 0.5 * k @ k
+    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
+
+
+def to_small_vector(r: np.ndarray) -> np.ndarray:
+    """The rotation vector (3,) of a rotation by much less than 1 rad."""
+    return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+
+
+def cross_matrix(v) -> np.ndarray:
+    """[v]x, so that cross_matrix(v) @ w = v x w."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def best_rotation(source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+    """The proper rotation R (3, 3) that brings R source nearest to target, both (N, 3) unit vectors.
+
+    Wahba's problem by singular values (Markley 1988, J. Astronaut. Sci. 36, 245).
+    """
+    w = np.ones(len(source)) if weight is None else weight
+    u, _, vt = np.linalg.svd((target * w[:, None]).T @ source)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+
+
+def to_quaternion(r: np.ndarray) -> np.ndarray:
+    """Unit quaternion (x, y, z, w) of a rotation matrix, w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(r).as_quat()
+    return q if q[3] >= 0 else -q

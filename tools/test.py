@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run everything that can fail in this project: linters, each package's tests, the tests of the whole graph.
+
+`test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a linter counts as
+one test); the exit status is 0 only where nothing failed.
+"""
+
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from xml.etree import ElementTree
+
+ROOT = Path(__file__).resolve().parent.parent
+LINTERS = (["ruff", "check"], ["ruff", "format", "--check"])
+COLCON = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())", "--log-level", "error"]
+
+
+def run(command: list[str]) -> int:
+    """Run a command in the project's root with its output shown; its exit status."""
+    return subprocess.run(command, cwd=ROOT, check=False).returncode
+
+
+def lint() -> Counter:
+    """Run the linters."""
+    return Counter("failed" if run(linter) else "passed" for linter in LINTERS)
+
+
+def junit_counts(path: Path, since: float) -> Counter:
+    """Counts of a JUnit file written after `since` (Unix s); a file that is missing, stale or cut short is one failure."""
+    if not path.is_file() or path.stat().st_mtime < since:
+        print(f"{path}: the tests ended without a result")
+        return Counter(failed=1)
+    try:
+        suites = list(ElementTree.parse(path).getroot().iter("testsuite"))
+    except ElementTree.ParseError as error:
+        print(f"{path}: the tests ended with half a result ({error})")
+        return Counter(failed=1)
+    total = Counter()
+    for suite in suites:
+        tests, failures, errors, skipped = (int(suite.get(k, 0)) for k in ("tests", "failures", "errors", "skipped"))
+        total += Counter(passed=tests - failures - errors - skipped, failed=failures + errors, skipped=skipped)
+    return total
+
+
+def has_tests(folder: Path) -> bool:
+    return any(folder.glob("**/test_*.py"))
+
+
+def package_tests(pytest_args: list[str]) -> Counter:
+    """`colcon test`: the tests each package carries, in the environment it was built for."""
+    folders = [p.parent for pattern in ("*/package.xml", "src/*/package.xml") for p in ROOT.glob(pattern)]
+    packages = sorted(f.name for f in folders if has_tests(f / "test"))
+    if not packages:
+        return Counter()
+    since = time.time()
+    command = [*COLCON, "test", "--executor", "sequential", "--packages-select", *packages]
+    command += ["--event-handlers", "console_direct+", "console_stderr-", "status-", "summary-"]
+    broken = run(command + (["--pytest-args", *pytest_args] if pytest_args else []))
+    total = sum((junit_counts(ROOT / "build" / p / "pytest.xml", since) for p in packages), Counter())
+    return total + Counter(failed=int(broken != 0 and total["failed"] == 0))
+
+
+def graph_tests(pytest_args: list[str]) -> Counter:
+    """The tests of the whole graph."""
+    if not has_tests(ROOT / "test"):
+        return Counter()
+    since, report = time.time(), ROOT / "log" / "graph.xml"
+    status = run([sys.executable, "-m", "pytest", "test", f"--junit-xml={report}", *pytest_args])
+    total = junit_counts(report, since)
+    no_tests = 5  # pytest's exit status where a -k left none
+    return total + Counter(failed=int(status not in (0, no_tests) and total["failed"] == 0))
+
+
+def main(args: list[str]) -> int:
+    total = lint()
+    if "--lint" not in args:
+        total += package_tests(args)
+        total += graph_tests(args)
+    print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
+    return int(total["failed"] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
