@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print which of the named modules this interpreter cannot import, one a line.
 
-`lacking.py --have` prints instead, as pip's constraints, the versions of what apt has brought and pip must not replace.
+With --have, as pip's constraints, the versions of what apt has brought and pip must keep.
 """
 
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
-KEEP = ("numpy", "scipy", "astropy", "pyerfa", "opencv-python", "opencv-python-headless", "pyserial", "PyYAML")
+# fmt: off
+KEEP = [
+    "numpy", "scipy", "astropy", "pyerfa", "opencv-python", "opencv-python-headless", "pyserial", "PyYAML",
+]
+# fmt: on
 
 if sys.argv[1:] == ["--have"]:
     for name in KEEP:

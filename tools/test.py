@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run everything that can fail in this project: linters, each package's tests, the tests of the whole graph.
 
-`test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a linter counts as
-one test); the exit status is 0 only where nothing failed.
+`test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
+linter counts as one test); the exit status is 0 only where nothing failed.
 """
 
+import shlex
 import subprocess
 import sys
 import time
@@ -13,8 +14,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-LINTERS = (["ruff", "check"], ["ruff", "format", "--check"])
-COLCON = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())", "--log-level", "error"]
+LINTERS = [f"ruff {check} --output-format concise" for check in ("check", "format --check")]
+COLCON = (
+    "--log-level error test --executor sequential "
+    "--event-handlers console_direct+ console_stderr- status- summary- --packages-select"
+)
 
 
 def run(command: list[str]) -> int:
@@ -24,11 +28,11 @@ def run(command: list[str]) -> int:
 
 def lint() -> Counter:
     """Run the linters."""
-    return Counter("failed" if run(linter) else "passed" for linter in LINTERS)
+    return Counter("failed" if run(shlex.split(linter)) else "passed" for linter in LINTERS)
 
 
 def junit_counts(path: Path, since: float) -> Counter:
-    """Counts of a JUnit file written after `since` (Unix s); a file that is missing, stale or cut short is one failure."""
+    """Counts of a JUnit file written after `since` (Unix s); a missing, stale or broken one is a failure."""
     if not path.is_file() or path.stat().st_mtime < since:
         print(f"{path}: the tests ended without a result")
         return Counter(failed=1)
@@ -39,8 +43,9 @@ def junit_counts(path: Path, since: float) -> Counter:
         return Counter(failed=1)
     total = Counter()
     for suite in suites:
-        tests, failures, errors, skipped = (int(suite.get(k, 0)) for k in ("tests", "failures", "errors", "skipped"))
-        total += Counter(passed=tests - failures - errors - skipped, failed=failures + errors, skipped=skipped)
+        failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
+        skipped = int(suite.get("skipped", 0))
+        total += Counter(passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped)
     return total
 
 
@@ -55,8 +60,8 @@ def package_tests(pytest_args: list[str]) -> Counter:
     if not packages:
         return Counter()
     since = time.time()
-    command = [*COLCON, "test", "--executor", "sequential", "--packages-select", *packages]
-    command += ["--event-handlers", "console_direct+", "console_stderr-", "status-", "summary-"]
+    colcon = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())"]
+    command = [*colcon, *shlex.split(COLCON), *packages]
     broken = run(command + (["--pytest-args", *pytest_args] if pytest_args else []))
     total = sum((junit_counts(ROOT / "build" / p / "pytest.xml", since) for p in packages), Counter())
     return total + Counter(failed=int(broken != 0 and total["failed"] == 0))
