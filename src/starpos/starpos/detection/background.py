@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Background and noise of a frame: clipped means on a coarse mesh, from a sparse sample of the pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+QUANTISATION = 12**-0.5  # DN rms of rounding to whole numbers: no pixel is quieter
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """The sky's level and noise, DN, in cells spread evenly over a frame of width x height px.
+
+    level, noise  (P, rows, columns); P is 1, or 4 on a colour mosaic: the phases (0, 0), (0, 1), (1, 0), (1, 1)
+                  of (row, column) modulo 2, since each colour sees its own sky
+    """
+
+    level: np.ndarray
+    noise: np.ndarray
+    width: int
+    height: int
+
+    @property
+    def is_mosaic(self) -> bool:
+        return len(self.level) > 1
+
+    def at(self, x, y):
+        """level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
+        row = (np.asarray(y) + 0.5) * self.level.shape[1] / self.height - 0.5
+        column = (np.asarray(x) + 0.5) * self.level.shape[2] / self.width - 0.5
+        place = np.stack([row, column])
+        return tuple(
+            np.stack([ndimage.map_coordinates(m, place, order=1, mode="nearest") for m in mesh], -1)
+            for mesh in (self.level, self.noise)
+        )
+
+
+def measure_background(plane, cell_px=64, mosaic=None) -> Background:
+    """The Background of plane (h, w; h, w >= 2). mosaic None: decided by whether the four phases differ."""
+    rows, columns = (_sample(n, cell_px) for n in plane.shape)
+    sample = plane[rows.ravel()][:, columns.ravel()].astype(np.float32)
+    (ny, sy), (nx, sx) = rows.shape, columns.shape
+    # (cell row, block row, 2, cell column, block column, 2) -> (phase, cell row, cell column, samples)
+    sample = sample.reshape(ny, sy // 2, 2, nx, sx // 2, 2).transpose(2, 5, 0, 3, 1, 4).reshape(4, ny, nx, -1)
+    level, noise = _clipped(sample)
+    if mosaic is None:
+        mosaic = _phases_differ(level, noise, sample.shape[-1])
+    if not mosaic:
+        level, noise = _clipped(np.moveaxis(sample, 0, 2).reshape(1, ny, nx, -1))
+    level, noise = (np.stack([_smooth(m) for m in mesh]) for mesh in (level, noise))
+    return Background(level, np.maximum(noise, QUANTISATION), plane.shape[1], plane.shape[0])
+
+
+def _sample(length, cell_px):
+    """(cells, samples) row numbers: in each of the cells pairs of neighbours, the first of a pair even."""
+    cells = max(1, round(length / cell_px))
+    size = min(cell_px, length) // 2 * 2
+    starts = np.round(np.linspace(0, length - size, cells)).astype(int) // 2 * 2
+    pairs = np.arange(0, size, 8 if size >= 32 else 2)
+    inside = (pairs[:, None] + np.arange(2)).ravel()
+    return starts[:, None] + inside
+
+
+def _clipped(sample):
+    """Mean and rms over the last axis of what lies within 3 sigma of the median; stars and defects do not."""
+    middle = sample.shape[-1] // 2
+    median = np.partition(sample, middle, axis=-1)[..., middle, None]
+    deviation = sample - median
+    spread = np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
+    limit = np.maximum(3 * 1.4826 * spread, 1.0)
+    for _ in range(2):
+        inside = np.abs(deviation) <= limit
+        count = inside.sum(-1, keepdims=True)
+        kept = np.where(inside, deviation, 0)
+        mean = kept.sum(-1, keepdims=True) / count
+        rms = np.sqrt(np.maximum((kept**2).sum(-1, keepdims=True) / count - mean**2, 0)) / 0.9867
+        limit = np.maximum(np.minimum(limit, 3 * rms + np.abs(mean)), 1.0)
+    return (median + mean)[..., 0], rms[..., 0]
+
+
+def _phases_differ(level, noise, samples):
+    """Whether the 2 x 2 phases see different skies, as behind a colour mosaic that nobody declared."""
+    means, error = np.median(level, axis=(1, 2)), np.median(noise) / np.sqrt(samples * level[0].size)
+    return bool(np.ptp(means) > max(0.03 * np.median(noise), 6 * error, 0.1))
+
+
+def _smooth(mesh):
+    """A cell mostly covered by something bright takes its neighbours' value; then the cells' noise evens out."""
+    return ndimage.uniform_filter(ndimage.median_filter(mesh, 3, mode="nearest"), 3, mode="nearest")

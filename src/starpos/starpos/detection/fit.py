@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weighted least-squares fit of position and flux of many stars at once, with the frame's PSF."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+FIT_WIDTHS = 4.0  # fit what lies within so many widths of the star: beyond is only noise and neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """How light becomes DN, and noise.
+
+    gain           (P,) what each phase of the colour mosaic passes, mean 1; (1,) without a mosaic
+    colour_spread  how far a star's own gains scatter about these, relative, 1 sigma: stars have colours
+    dn_per_photon  the variance of a signal of s DN is dn_per_photon * s DN2
+    """
+
+    gain: np.ndarray
+    colour_spread: float
+    dn_per_photon: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """N fitted stars: x, y px; flux DN and its sigma; covariance (N, 2, 2) px2 of x, y; chi2 per degree of freedom.
+
+    residual, model, used (N, S, S): signal minus model, the model (DN) and which pixels took part.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+    flux_sigma: np.ndarray
+    covariance: np.ndarray
+    chi2: np.ndarray
+    residual: np.ndarray
+    model: np.ndarray
+    used: np.ndarray
+
+
+def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
+    """Gauss-Newton from the points x, y (N,).
+
+    On a mosaic nothing is interpolated: each pixel is compared with the PSF at its own place, times the gain of its
+    colour, and each star's four gains are fitted along, held near the frame's by colour_spread. So a position owes
+    nothing to the mosaic's phase nor to the star's colour. The weights come from the model, not from the pixels,
+    whose noise would otherwise pull the fit.
+    """
+    x, y = x.copy(), y.copy()
+    n, phases = len(x), len(response.gain)
+    gain = response.gain.astype(np.float32)[stamps.phase]
+    inverse_noise2 = stamps.good / stamps.noise**2
+    extra = 0 if phases == 1 else phases
+    colour = np.zeros((n, phases))  # each star's gains over the frame's, minus 1
+    flux = np.full(n, np.nan)
+    each = np.arange(n)[:, None, None]
+    for last in [False] * (rounds - 1) + [True]:
+        dx, dy = stamps.offsets(x, y)
+        value, by_x, by_y = psf.evaluate(dx, dy)
+        local = gain * (1 + colour.astype(np.float32)[each, stamps.phase]) if extra else gain
+        u, v = (a[0] * dx + a[1] * dy for a in psf.axes.astype(np.float32))
+        inside = u * u + v * v < FIT_WIDTHS**2
+        unit = value * local
+        if not np.isfinite(flux).all():
+            weight = inverse_noise2 * inside
+            with np.errstate(divide="ignore", invalid="ignore"):
+                flux = (weight * unit * stamps.signal).sum((1, 2)) / (weight * unit * unit).sum((1, 2))
+            flux = np.nan_to_num(flux)
+        amount = flux.astype(np.float32)[:, None, None]
+        variance = stamps.noise**2 + np.float32(response.dn_per_photon) * np.maximum(amount * unit, 0)
+        root = np.sqrt(stamps.good * inside / variance)
+        columns = [amount * by_x * local, amount * by_y * local, unit]
+        columns += [amount * value * gain * (stamps.phase == p) for p in range(extra)]
+        design = np.stack([(c * root).reshape(n, -1) for c in columns], 2)
+        residual = stamps.signal - amount * unit
+        normal = (design.transpose(0, 2, 1) @ design).astype(np.float64)
+        right = (design.transpose(0, 2, 1) @ (residual * root).reshape(n, -1, 1))[..., 0].astype(np.float64)
+        for p in range(extra):
+            normal[:, 3 + p, 3 + p] += response.colour_spread**-2
+            right[:, 3 + p] -= colour[:, p] * response.colour_spread**-2
+        covariance = _inverse(normal)
+        if last:
+            break
+        step = (covariance @ right[..., None])[..., 0]
+        x += np.clip(step[:, 0], -1, 1)
+        y += np.clip(step[:, 1], -1, 1)
+        flux += step[:, 2]
+        if extra:
+            colour = np.clip(colour + step[:, 3:], -0.9, 3.0)
+    used = root > 0
+    freedom = np.maximum(used.sum((1, 2)) - 3, 1)
+    chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
+    return Fit(
+        x, y, flux, np.sqrt(covariance[:, 2, 2]), covariance[:, :2, :2], chi2, residual, amount * unit, used
+    )
+
+
+def _inverse(normal):
+    """Inverses of (N, K, K), NaN where singular; scaled first, since fluxes and pixels differ by a millionfold."""
+    scale = np.sqrt(np.einsum("nii->ni", normal))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = normal / (scale[:, :, None] * scale[:, None, :])
+    sound = np.isfinite(scaled).all((1, 2))
+    sound[sound] = np.linalg.cond(scaled[sound]) < 1e10
+    out = np.full(normal.shape, np.nan)
+    out[sound] = np.linalg.inv(scaled[sound]) / (scale[:, :, None] * scale[:, None, :])[sound]
+    return out

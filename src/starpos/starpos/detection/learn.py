@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame's own bright stars teach: its PSF, its colour gains and its photon noise."""
+
+import numpy as np
+from scipy import ndimage, spatial
+
+from starpos.detection.fit import Response, fit_stars
+from starpos.detection.psf import MAX_ORDER, gaussian, refine
+from starpos.detection.shape import frame_shape, moments, relative_widths
+from starpos.detection.stamps import cut
+
+DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
+BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
+TEACHERS = 250
+MAX_REACH = 20
+SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
+SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
+
+
+def learn(plane, background, x, y, height, saturation):
+    """(Psf, Response, reach) from the peaks x, y of that height (N,), highest first.
+
+    reach px: how far from a star its light is worth using.
+    """
+    fallback = gaussian(np.eye(2) * DEFAULT_SIGMA**2)
+    plain = Response(np.ones(len(background.level)), 0.3, 0.0)
+    bright = np.flatnonzero(height > BRIGHT)
+    if len(bright) == 0:
+        bright = np.arange(min(len(x), TEACHERS))
+    bright = bright[_isolated(x, y, height, bright)][:TEACHERS]
+    stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
+    stamps = stamps.take(~_is_dot(stamps) & ~stamps.full.any((1, 2)))
+    if len(stamps.x) == 0:
+        return fallback, plain, reach_of(fallback)
+    shape = frame_shape(*grey(stamps, background))
+    if shape is None:
+        return fallback, plain, reach_of(fallback)
+    psf = gaussian(shape)
+    stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
+    window = shape
+    smooth, blur = grey(stamps, background)
+    x, y = centroid(smooth, shape)
+    _, _, seen = moments(smooth, x, y, window)
+    widths = relative_widths(seen, shape + blur * np.eye(2), window)
+    alike = (widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)
+    if not alike.any():
+        return psf, plain, reach_of(psf)
+    stamps, x, y = stamps.take(alike), x[alike], y[alike]
+    response = plain
+    order = min(MAX_ORDER, 2 * int(np.log2(len(x)) / 1.2))
+    for _ in range(3):
+        fit = fit_stars(stamps, psf, x, y, response, rounds=3)
+        sound = np.isfinite(fit.chi2) & (fit.flux > 0) & np.isfinite(fit.covariance).all((1, 2))
+        sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
+        if sound.sum() < 1:
+            return psf, response, reach_of(psf)
+        sound &= fit.chi2 < 6 * np.median(fit.chi2[sound]) + 1
+        stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
+        response = _respond(stamps, psf, x, y, fit, sound, response)
+        if order > 0:
+            psf = _shape_up(stamps, psf, x, y, fit.flux[sound], response, order)
+    return psf, response, reach_of(psf)
+
+
+def reach_of(psf) -> int:
+    """px from the centre at which a stamp may end: 3.5 widths along the longer axis."""
+    return int(np.clip(np.ceil(3.5 * np.sqrt(np.linalg.eigvalsh(psf.shape)[1])) + 1, 4, MAX_REACH))
+
+
+def grey(stamps, background):
+    """Stamps without the mosaic's pattern, and how much wider (px2) that made the images."""
+    if not background.is_mosaic:
+        return stamps, 0.0
+    signal = ndimage.convolve1d(stamps.signal, SMOOTHING, axis=1, mode="nearest")
+    signal = ndimage.convolve1d(signal, SMOOTHING, axis=2, mode="nearest")
+    return type(stamps)(
+        stamps.x, stamps.y, signal, stamps.noise, stamps.good, stamps.full, stamps.phase
+    ), SMOOTHING_WIDTH
+
+
+def centroid(stamps, window, rounds=3):
+    """x, y (N,) px: the windowed centroids, never further than 2 px from the peak. window (2, 2) px2: the star's."""
+    x, y = stamps.x.astype(float), stamps.y.astype(float)
+    for _ in range(rounds):
+        _, step, _ = moments(stamps, x, y, window)
+        step = np.clip(np.nan_to_num(2 * step), -1, 1)  # a matched window sees half of a displacement
+        x = np.clip(x + step[:, 0], stamps.x - 2, stamps.x + 2)
+        y = np.clip(y + step[:, 1], stamps.y - 2, stamps.y + 2)
+    return x, y
+
+
+def _isolated(x, y, height, index):
+    """Which of the peaks `index` have no neighbour within 12 px of more than a fiftieth of their height."""
+    points = np.stack([x, y], 1)
+    pairs = spatial.cKDTree(points).query_pairs(12, output_type="ndarray")
+    crowded = np.zeros(len(x), bool)
+    for a, b in (pairs.T, pairs.T[::-1]):
+        crowded[a[height[b] > 0.02 * height[a]]] = True
+    return ~crowded[index]
+
+
+def _is_dot(stamps):
+    """Hot pixels: less light in the eight neighbours together than in half the brightest pixel."""
+    c = stamps.reach
+    core = stamps.signal[:, c - 1 : c + 2, c - 1 : c + 2].reshape(-1, 9)
+    peak = core.max(1)
+    return core.sum(1) - peak < 0.5 * peak
+
+
+def _respond(stamps, psf, x, y, fit, sound, before):
+    """The Response the fitted stars show: gains of the phases, their scatter, and the noise that grows with light."""
+    flux, model, residual, used = fit.flux[sound], fit.model[sound], fit.residual[sound], fit.used[sound]
+    gain, spread = before.gain, before.colour_spread
+    if len(gain) > 1:
+        value = psf.evaluate(*stamps.offsets(x, y))[0]
+        weight = stamps.good / stamps.noise**2
+        own = np.stack(
+            [
+                (weight * value * stamps.signal * (stamps.phase == p)).sum((1, 2))
+                / np.maximum((weight * value * value * (stamps.phase == p)).sum((1, 2)), 1e-12)
+                for p in range(len(gain))
+            ],
+            1,
+        )
+        own = own / np.maximum(own.mean(1, keepdims=True), 1e-12)
+        gain = np.clip(np.median(own, 0), 0.02, None)
+        gain = gain / gain.mean()
+        spread = float(np.clip(1.4826 * np.median(np.abs(own / gain - 1)), 0.01, 0.5))
+    noise2 = (stamps.noise**2)[used]
+    light, square = np.maximum(model[used], 0), residual[used] ** 2
+    photon = before.dn_per_photon
+    for _ in range(4):
+        variance = noise2 + photon * light
+        keep = square < 16 * variance if photon > 0 else slice(None)
+        w = (light / variance**2)[keep]
+        total = (w * light[keep]).sum()
+        photon = max(0.0, float((w * (square - noise2)[keep]).sum() / total)) if total > 0 else 0.0
+    return Response(gain, spread, photon)
+
+
+def _shape_up(stamps, psf, x, y, flux, response, order):
+    """One refinement of the PSF by these stars."""
+    dx, dy = np.broadcast_arrays(*stamps.offsets(x, y))
+    gain = response.gain.astype(np.float32)[stamps.phase]
+    scale = gain * flux.astype(np.float32)[:, None, None]
+    value = psf.evaluate(dx, dy)[0]
+    # 2 % of the model as extra noise: the brightest star must not be the only teacher
+    variance = (
+        stamps.noise**2 + response.dn_per_photon * np.maximum(scale * value, 0) + (0.02 * scale * value) ** 2
+    )
+    weight = np.where(stamps.good, scale**2 / variance, 0)
+    return refine(psf, dx.ravel(), dy.ravel(), (stamps.signal / scale).ravel(), weight.ravel(), order)

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussian-windowed moments: where a star is and how wide, for any symmetric image, without a model of it.
+
+The moments of a star seen through an elliptical Gaussian window of covariance W are those of a Gaussian of
+covariance V = (C^-1 + W^-1)^-1, if the star is one of covariance C (Bernstein & Jarvis 2002, AJ 123, 583).
+"""
+
+import numpy as np
+
+
+def moments(stamps, x, y, window):
+    """One look through the window (2, 2) px2 at the points x, y (N,).
+
+    Returns mass (N,), the mean offset (N, 2) px from x, y and the covariance (N, 2, 2) px2 of the windowed image;
+    NaN where there is nothing. Pixels off the frame or saturated hold what they hold: without them the moments
+    would lean away from the edge.
+    """
+    dx, dy = stamps.offsets(x, y)
+    inverse = np.linalg.inv(window)
+    exponent = inverse[0, 0] * dx * dx + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy * dy
+    weighted = np.exp(-0.5 * exponent) * stamps.signal
+    rows, columns = weighted.sum(2), weighted.sum(1)  # the separable sums, over (N, S) from here on
+    dx, dy = dx[:, 0, :], dy[:, :, 0]
+    mass = columns.sum(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(mass > 0, 1 / mass, np.nan)
+    mx, my = (columns * dx).sum(1) * scale, (rows * dy).sum(1) * scale
+    xx, yy = (columns * dx * dx).sum(1) * scale - mx * mx, (rows * dy * dy).sum(1) * scale - my * my
+    xy = np.einsum("nij,ni,nj->n", weighted, dy, dx) * scale - mx * my
+    return mass, np.stack([mx, my], 1), np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
+
+
+def frame_shape(stamps, blur=0.0, rounds=12):
+    """The typical covariance C (2, 2) px2 of the stars in stamps, their own measurement through a matched window.
+
+    blur px2: how much wider smoothing has made the stamps' images. Returns None if they agree on nothing.
+    """
+    window = np.eye(2) * max(1.5, stamps.reach / 4) ** 2
+    x, y = stamps.x.astype(float), stamps.y.astype(float)
+    shape = None
+    for _ in range(rounds):
+        _, step, seen = moments(stamps, x, y, window)
+        with np.errstate(invalid="ignore"):
+            usable = (np.abs(step).max(1) < 1.5) & (np.linalg.det(seen) > 0.01)
+        if not usable.any():
+            return shape
+        seen = np.median(seen[usable], axis=0)
+        narrower = np.linalg.inv(seen) - np.linalg.inv(window)
+        values, vectors = np.linalg.eigh(narrower)
+        limit = (stamps.reach / 2.0) ** 2  # wider than this the stamp does not hold the star
+        own = vectors @ np.diag(1 / np.clip(values, 1 / limit, 1 / 0.05)) @ vectors.T
+        gain = np.eye(2) + own @ np.linalg.inv(window)
+        step = np.where(usable[:, None], step @ gain.T, 0)
+        x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
+        change = np.inf if shape is None else np.abs(own - window).max() / own.max()
+        shape = window = own
+        if change < 1e-3:
+            break
+    return shape - blur * np.eye(2) if np.linalg.eigvalsh(shape)[0] > blur + 0.1 else shape
+
+
+def relative_widths(seen, shape, window):
+    """(N, 2): the smaller and the larger squared width of windowed images over that of a star of `shape`.
+
+    1 for a star like the frame's, towards 0 across a hot pixel; along a streak it reaches 2 if window = shape.
+    NaN counts as 0.
+    """
+    expected = np.linalg.inv(np.linalg.inv(shape) + np.linalg.inv(window))
+    root = np.linalg.inv(np.linalg.cholesky(expected))
+    with np.errstate(invalid="ignore"):
+        return np.linalg.eigvalsh(np.nan_to_num(root @ seen @ root.T))
