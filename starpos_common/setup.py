@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+package = "starpos_common"
+
+setup(
+    name=package,
+    version="0.1.0",
+    packages=[package],
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="starpos developers",
+    maintainer_email="starpos@users.noreply.github.com",
+    description="What every starpos node shares.",
+    license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
+)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""/diagnostics once a second, in diagnostic_updater's conventions (which PyPI's ROS does not carry)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+PERIOD_S = 1.0
+
+
+class Level(IntEnum):
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a task has to say: a level, a sentence, and named values (numbers, strings, booleans)."""
+
+    level: Level
+    message: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+class Diagnostics:
+    """Publishes one DiagnosticStatus `node: Task` for every task, at 1 Hz of real time.
+
+    Real time, because a health report must not stop with a paused simulation or flood a fast replay; the
+    stamp is the node's own time. `hardware_id` may be changed at any time.
+    """
+
+    def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Status]], hardware_id: str = "none"):
+        self.hardware_id = hardware_id
+        self._node = node
+        self._tasks = dict(tasks)
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(PERIOD_S, self.publish, clock=self._steady)
+
+    def publish(self):
+        """Publish now, besides the 1 Hz; for changes that should not wait."""
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [self._status(name, task) for name, task in self._tasks.items()]
+        self._publisher.publish(message)
+
+    def _status(self, name: str, task: Callable[[], Status]) -> DiagnosticStatus:
+        try:
+            status = task()
+        except Exception as error:
+            # A health report that fails must say so instead of taking the instrument down.
+            status = Status(Level.ERROR, f"this diagnostic failed: {type(error).__name__}: {error}")
+        return DiagnosticStatus(
+            level=bytes([status.level]),
+            name=f"{self._node.get_name()}: {name}",
+            message=status.message,
+            hardware_id=self.hardware_id,
+            values=[KeyValue(key=key, value=_text(value)) for key, value in status.values.items()],
+        )
+
+
+def _text(value: object) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else str(value)

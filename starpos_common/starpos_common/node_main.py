@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.
+
+Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up is a clean
+exit too; an executable's module therefore imports its node inside `make_node`.
+"""
+
+import signal
+import sys
+from pathlib import Path
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def run(make_node, args=None) -> int:
+    """Run the node that `make_node()` returns until it is told to stop; the process's exit status.
+
+    make_node: called without arguments after rclpy.init; may raise StarposError or one of rclpy's parameter
+    errors to refuse to start.  args: the command line, by default sys.argv.
+
+    0 after SIGINT (once or twice) or SIGTERM; 1 with one line on standard error when the start is refused.
+    Anything else a callback raises is a defect and leaves with its traceback.
+    """
+    stopped = []
+    for number in SIGNALS:
+        # rclpy's own handlers, which wake the executor, call these in turn.
+        signal.signal(number, lambda signum, frame: stopped.append(signum))
+    try:
+        return _run(make_node, args, stopped)
+    finally:
+        # launch sends a second SIGINT: it must not meet the default handler while the interpreter ends.
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
+
+def _run(make_node, args, stopped) -> int:
+    import rclpy
+    from rclpy.exceptions import ParameterException
+    from rclpy.executors import ExternalShutdownException
+    from starpos.errors import StarposError
+
+    if stopped:
+        return 0
+    try:
+        rclpy.init(args=args)
+    except Exception as error:
+        # A bad command line or parameter file; rcl has an error class for each.
+        return 0 if stopped else _refuse(error)
+    node = None
+    try:
+        node = make_node()
+        if not stopped:
+            rclpy.spin(node)
+    except ExternalShutdownException:
+        pass
+    except (StarposError, ParameterException) as error:
+        if node is None and not stopped:
+            return _refuse(error)
+        if not stopped and rclpy.ok():
+            raise
+    except Exception:
+        # With the context gone, whatever a callback was about to do fails: that is part of stopping.
+        if not stopped and rclpy.ok():
+            raise
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _refuse(error: Exception) -> int:
+    sentence = " ".join(str(error).split()) or type(error).__name__
+    print(f"{Path(sys.argv[0]).name}: {sentence}", file=sys.stderr, flush=True)
+    return 1

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters from one table: declared with descriptors, validated in sentences, applied once they are set."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from starpos.errors import StarposError
+
+INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+
+
+class ParameterError(StarposError):
+    """A parameter has a value that is not allowed."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    default      bool, int, float, str, or a tuple of one of these; it fixes the type, and a tuple its length.
+                 NaN: the parameter may be NaN, which means unset. Else NaN is refused; infinity always is.
+    description  what it is, and what goes wrong when it is wrong
+    unit         '' for a bare number or a text
+    minimum, maximum   inclusive, of numbers (of each number of a tuple); None: unbounded
+    choices      the allowed values; () for any
+    read_only    cannot be changed while the node runs
+    """
+
+    name: str
+    default: Any
+    description: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple = ()
+    read_only: bool = False
+
+    @property
+    def items(self) -> tuple:
+        """The default as a tuple, of one for a scalar."""
+        return self.default if isinstance(self.default, tuple) else (self.default,)
+
+    @property
+    def may_be_nan(self) -> bool:
+        return any(isinstance(item, float) and math.isnan(item) for item in self.items)
+
+    @property
+    def constraint(self) -> str:
+        """The rest of the sentence 'NAME must be ...'."""
+        kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+        text = kinds[type(self.items[0])]
+        unit = f" {self.unit}" if self.unit else ""
+        if self.choices:
+            text = "one of " + ", ".join(map(str, self.choices))
+        elif self.minimum is not None and self.maximum is not None:
+            text += f" from {self.minimum:g} to {self.maximum:g}{unit}"
+        elif self.minimum is not None:
+            text += f" of at least {self.minimum:g}{unit}"
+        elif self.maximum is not None:
+            text += f" of at most {self.maximum:g}{unit}"
+        elif unit:
+            text += f" in{unit}"
+        if isinstance(self.default, tuple):
+            text = f"{len(self.default)} values, each {text}"
+        return text + (", or nan for unset" if self.may_be_nan else "")
+
+    def convert(self, value):
+        """`value` as this parameter's type (whole numbers become floats where floats are meant).
+
+        Raises ParameterError with the constraint where it is not allowed.
+        """
+        if isinstance(self.default, tuple):
+            sequence = not isinstance(value, (str, bytes)) and isinstance(value, (Sequence, memoryview))
+            values = tuple(value) if sequence or hasattr(value, "tolist") else None
+            if values is None or len(values) != len(self.default):
+                raise self._error(value)
+            return tuple(self._convert_item(item, value) for item in values)
+        return self._convert_item(value, value)
+
+    def _convert_item(self, item, whole):
+        kind = type(self.items[0])
+        if kind is float and type(item) is int:
+            item = float(item)
+        if type(item) is not kind or (self.choices and item not in self.choices):
+            raise self._error(whole)
+        if kind is float and not math.isfinite(item):
+            if math.isnan(item) and self.may_be_nan:
+                return item
+            raise self._error(whole)
+        below = self.minimum is not None and item < self.minimum
+        above = self.maximum is not None and item > self.maximum
+        if kind in (int, float) and (below or above):
+            raise self._error(whole)
+        return item
+
+    def _error(self, value) -> ParameterError:
+        shown = value.tolist() if hasattr(value, "tolist") else value
+        return ParameterError(f"parameter {self.name} must be {self.constraint}; {shown!r} was given.")
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Its descriptor. With a NaN default it leaves out the native range, which would refuse NaN."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        descriptor = ParameterDescriptor(
+            name=self.name,
+            type=RosParameter.Type.from_parameter_value(self.ros_value(self.default)).value,
+            description=self.description + unit,
+            additional_constraints=f"must be {self.constraint}",
+            read_only=self.read_only,
+        )
+        bounded = self.minimum is not None or self.maximum is not None
+        kind = type(self.default)
+        if bounded and kind is int:
+            low = INT64_MIN if self.minimum is None else int(self.minimum)
+            high = INT64_MAX if self.maximum is None else int(self.maximum)
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=0)]
+        elif bounded and kind is float and not self.may_be_nan:
+            low = -math.inf if self.minimum is None else float(self.minimum)
+            high = math.inf if self.maximum is None else float(self.maximum)
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
+        return descriptor
+
+    def ros_value(self, value):
+        """`value` as rclpy wants it: lists for tuples."""
+        return list(value) if isinstance(value, tuple) else value
+
+
+class Values(Mapping):
+    """The parameters' present values by name; tuples for lists."""
+
+    def __init__(self, node: Node, table: Mapping[str, Parameter]):
+        self._node = node
+        self._table = table
+
+    def __getitem__(self, name: str):
+        return self._table[name].convert(self._node.get_parameter(name).value)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._table)
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+
+def declare(
+    node: Node,
+    parameters: Sequence[Parameter],
+    apply: Callable[[frozenset[str]], None] | None = None,
+    check: Callable[[Mapping[str, Any]], str | None] | None = None,
+) -> Values:
+    """Declare a node's parameters; a live view of their values.
+
+    apply: called with the names that were set, after a successful change at run time (not here).
+    check: called with all values as they would be; a sentence where they do not fit together, or None.
+    Raises ParameterError where a value given at start-up (command line, YAML) is not allowed.
+    """
+    table = {p.name: p for p in parameters}
+    values = Values(node, table)
+    for p in parameters:
+        # Any type is taken first: rclpy would refuse `5` for a float, and its errors name no constraint.
+        node.declare_parameter(p.name, p.ros_value(p.default), ParameterDescriptor(dynamic_typing=True))
+        value = p.convert(node.get_parameter(p.name).value)
+        node.set_parameters([RosParameter(p.name, value=p.ros_value(value))])
+        node.set_descriptor(p.name, p.descriptor())
+    complaint = check(values) if check else None
+    if complaint:
+        raise ParameterError(complaint)
+
+    def widen(changes: list[RosParameter]) -> list[RosParameter]:
+        return [_widened(table[c.name], c) if c.name in table else c for c in changes]
+
+    def validate(changes: list[RosParameter]) -> SetParametersResult:
+        try:
+            wanted = {c.name: table[c.name].convert(c.value) for c in changes if c.name in table}
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        reason = check({**values, **wanted}) if check and wanted else None
+        return SetParametersResult(successful=not reason, reason=reason or "")
+
+    def applied(changes: list[RosParameter]):
+        names = frozenset(c.name for c in changes if c.name in table)
+        if names:
+            apply(names)
+
+    node.add_pre_set_parameters_callback(widen)
+    node.add_on_set_parameters_callback(validate)
+    if apply:
+        node.add_post_set_parameters_callback(applied)
+    return values
+
+
+def _widened(parameter: Parameter, change: RosParameter) -> RosParameter:
+    """Whole numbers as floats where floats are meant, so that `ros2 param set ... 5` works."""
+    try:
+        value = parameter.ros_value(parameter.convert(change.value))
+    except ParameterError:
+        return change
+    return RosParameter(change.name, value=value)
+
+
+def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
+    """A parameter file with every default, each under a comment with its meaning, unit and constraint."""
+    lines = ["# SPDX-License-Identifier: Apache-2.0", f"/**/{node_name}:", "  ros__parameters:"]
+    for p in parameters:
+        fixed = "; fixed while the node runs" if p.read_only else ""
+        lines += [f"    # {p.description}", f"    # {p.name} must be {p.constraint}{fixed}."]
+        lines.append(f"    {p.name}: {_yaml(p.default)}")
+    return "\n".join(lines) + "\n"
+
+
+def _yaml(value) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_yaml, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, float):
+        # rcl's YAML reads 1e5 as a text without the point.
+        return (
+            ".nan"
+            if math.isnan(value)
+            else repr(value)
+            if "e" not in repr(value)
+            else f"{value:.17f}".rstrip("0")
+        )
+    return str(value)

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+package = "starpos_inclinometer"
+
+setup(
+    name=package,
+    version="0.1.0",
+    packages=[package],
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml", "README.md", "PROTOCOL.md"]),
+    ],
+    install_requires=["setuptools", "numpy", "pyserial"],
+    zip_safe=True,
+    maintainer="starpos developers",
+    maintainer_email="starpos@users.noreply.github.com",
+    description="The starpos inclinometer: serial protocol, driver, node and emulator.",
+    license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
+    entry_points={
+        "console_scripts": [
+            "inclinometer = starpos_inclinometer.main:inclinometer",
+            "emulator = starpos_inclinometer.main:emulator",
+        ],
+    },
+)

@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An emulated inclinometer: the microcontroller's side of the protocol, byte for byte, on a pseudo-terminal.
+
+`Mcu` is the device without any I/O, its time given from outside; `Pty` is the cable; `Emulator` runs one
+on the other in real time.
+"""
+
+import argparse
+import contextlib
+import errno
+import math
+import os
+import random
+import select
+import sys
+import time
+import tty
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+from starpos.inclinometer import sca100t_volts
+
+from starpos_inclinometer import protocol, sensor
+
+FIRMWARE = 0x0100
+UNIT = 0x53494D00
+DEFAULT_RATE_HZ = 10
+DELAY_MS = 20  # what the two conversions and the reading take
+ADC_NOISE_CODES = 27.0  # 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV a code
+LINE_S = protocol.SAMPLE_LINE * 10 / protocol.BAUD
+POLL_S = 0.2  # how soon a stop is noticed while nothing is due
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Probabilities a line, but flip: a bit."""
+
+    garbage: float = 0.0  # random bytes before the line
+    drop: float = 0.0  # the line is lost
+    truncate: float = 0.0  # the line ends early
+    double: float = 0.0  # the line comes twice
+    flip: float = 0.0
+
+    def apply(self, line: bytes, rng: random.Random) -> bytes:
+        """The bytes that arrive for a line that is sent."""
+        if not any((self.garbage, self.drop, self.truncate, self.double, self.flip)):
+            return line
+        if rng.random() < self.drop:
+            line = b""
+        if rng.random() < self.truncate:
+            line = line[: rng.randrange(len(line) + 1)]
+        if rng.random() < self.double:
+            line += line
+        if self.flip:
+            flips = (sum((rng.random() < self.flip) << bit for bit in range(8)) for _ in line)
+            line = bytes(byte ^ flip for byte, flip in zip(line, flips, strict=True))
+        if rng.random() < self.garbage:
+            line = rng.randbytes(rng.randrange(1, 64)) + line
+        return line
+
+
+class Mcu:
+    """The device: tilts in, bytes out. Times are seconds of one clock that does not step.
+
+    tilt: called with a sample's time, returns (x, y) rad.  noise_rad: white, on each axis.
+    """
+
+    def __init__(
+        self,
+        tilt: Callable[[float], tuple[float, float]] = lambda now: (0.0, 0.0),
+        noise_rad: float = math.radians(0.0035),
+        temperature_c: float = 20.0,
+        rate_hz: int = DEFAULT_RATE_HZ,
+        drift_ppm: float = 0.0,
+        seed: int | None = None,
+        calibration: sensor.Calibration | None = None,
+    ):
+        self.tilt = tilt
+        self.noise_rad = noise_rad
+        self.temperature_c = temperature_c
+        self.frozen = False  # the ADC repeats its last codes
+        self._power_up_rate = rate_hz
+        self._tick = 1.0 + drift_ppm * 1e-6
+        self._rng = random.Random(seed)
+        self._calibration = calibration or sensor.Calibration()
+        self._commands = protocol.LineSplitter()
+        self._codes = (sensor.CODE_ZERO, sensor.CODE_ZERO)
+        self.reset(0.0)
+
+    def reset(self, now: float) -> bytes:
+        """Power up; what it sends first."""
+        self._boot = now
+        self._rate_hz = self._power_up_rate
+        self._sequence = 0
+        self._status = protocol.Status.FIRST
+        self._next = now + 1 / self._rate_hz
+        return self._identify()
+
+    @property
+    def due(self) -> float:
+        """When the next line has been sent."""
+        return self._next + DELAY_MS * 1e-3 + LINE_S
+
+    def sample(self) -> bytes:
+        """The next line."""
+        at = self._next
+        self._next = at + 1 / self._rate_hz
+        if not self.frozen:
+            x, y = self.tilt(at)
+            self._codes = (self._code(0, x), self._code(1, y))
+        counts = sensor.temperature_counts(self.temperature_c)
+        ms = int((at - self._boot) * self._tick * 1e3)
+        line = protocol.sample_line(self._sequence, ms, *self._codes, counts, self._status)
+        self._sequence += 1
+        self._status = protocol.Status(0)
+        return line
+
+    def skip_to(self, now: float):
+        """Forget what was due before `now`: the host was asleep, or nobody ran this."""
+        if self.due < now - 1.0:
+            missed = int((now - self.due) * self._rate_hz)
+            self._sequence += missed
+            self._next += missed / self._rate_hz
+
+    def receive(self, data: bytes) -> bytes:
+        """The answers to what the host sends."""
+        return b"".join(self._answer(body, right) for body, right in self._commands.feed(data))
+
+    def _answer(self, body: bytes, right: bool) -> bytes:
+        command = protocol.parse_command(body) if right else protocol.Reason.CHECKSUM
+        if isinstance(command, protocol.Reason):
+            return protocol.refusal_line(command)
+        name, rate = command
+        if name == "R" and rate != self._rate_hz:
+            self._next += 1 / rate - 1 / self._rate_hz
+            self._rate_hz = rate
+        return self._identify()
+
+    def _identify(self) -> bytes:
+        return protocol.identity_line(
+            protocol.Identity(protocol.VERSION, FIRMWARE, UNIT, self._rate_hz, DELAY_MS)
+        )
+
+    def _code(self, axis: int, angle: float) -> int:
+        c = self._calibration
+        angle += self._rng.gauss(0.0, self.noise_rad) if self.noise_rad else 0.0
+        volts = float(sca100t_volts(angle, c.offset_volts[axis], c.sensitivity_volts_per_g[axis]))
+        # The sensor's output ends at the rails.
+        code = c.code(min(max(volts, 0.0), c.reference_volts))
+        noisy = code + round(self._rng.gauss(0.0, ADC_NOISE_CODES))
+        return min(max(noisy, 0), sensor.CODE_MAX) if 0 < code < sensor.CODE_MAX else code
+
+
+class Pty:
+    """A pseudo-terminal, the host's end under `path` (and under the symbolic link, if one is asked for)."""
+
+    def __init__(self, link: str | None = None):
+        self._link = link
+        self.fd, host = os.openpty()
+        tty.setraw(host)
+        self.path = os.ttyname(host)
+        # With the host's end closed, poll tells whether anyone listens: a cable keeps nothing for later.
+        os.close(host)
+        os.set_blocking(self.fd, False)
+        if link:
+            self._make_link(link)
+
+    def _make_link(self, link: str):
+        if os.path.lexists(link) and not os.path.islink(link):
+            os.close(self.fd)
+            raise FileExistsError(errno.EEXIST, "exists and is no symbolic link", link)
+        temporary = f"{link}.{os.getpid()}"
+        os.symlink(self.path, temporary)
+        os.replace(temporary, link)
+
+    @property
+    def connected(self) -> bool:
+        poll = select.poll()
+        poll.register(self.fd, select.POLLIN)
+        return not any(event & select.POLLHUP for _, event in poll.poll(0))
+
+    def write(self, data: bytes):
+        """Send; what nobody reads is lost."""
+        if data and self.connected:
+            with contextlib.suppress(BlockingIOError):
+                os.write(self.fd, data)
+
+    def read(self) -> bytes:
+        """What the host has sent; empty where there is nothing, or nobody."""
+        try:
+            return os.read(self.fd, 4096)
+        except OSError:
+            return b""
+
+    def close(self):
+        """Pull the cable."""
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+        if self._link and os.path.islink(self._link) and os.readlink(self._link) == self.path:
+            os.unlink(self._link)
+
+
+class Emulator:
+    """An Mcu on a Pty in real time."""
+
+    def __init__(
+        self, mcu: Mcu, link: str | None = None, faults: Faults = Faults(), reset_every_s: float = 0.0
+    ):
+        self._mcu = mcu
+        self._faults = faults
+        self._reset_every_s = reset_every_s
+        self._rng = random.Random(0)
+        self.pty = Pty(link)
+
+    def run(self, stopped: Callable[[], bool]):
+        """Until stopped() is true, which is asked at least every POLL_S; leaves the cable pulled."""
+        mcu, pty = self._mcu, self.pty
+        try:
+            pty.write(mcu.reset(time.monotonic()))
+            next_reset = time.monotonic() + (self._reset_every_s or math.inf)
+            while not stopped():
+                now = time.monotonic()
+                if now >= next_reset:
+                    next_reset = now + self._reset_every_s
+                    pty.write(mcu.reset(now))
+                mcu.skip_to(now)
+                while mcu.due <= now:
+                    pty.write(self._faults.apply(mcu.sample(), self._rng))
+                self._wait(min(mcu.due - time.monotonic(), POLL_S))
+                pty.write(mcu.receive(pty.read()))
+        finally:
+            pty.close()
+
+    def _wait(self, seconds: float):
+        """Until the time has come or the host has sent something."""
+        # Without a host the master is readable (hung up) all the time, so there only the time is waited for.
+        watched = [self.pty.fd] if self.pty.connected else []
+        select.select(watched, [], [], max(seconds, 0.0))
+
+
+def main(arguments: list[str], stopped: list) -> int:
+    """The command `emulator`; ends when `stopped`, filled by a signal handler, is not empty."""
+    options = _parser().parse_args(arguments)
+    tilt = (math.radians(options.tilt_x), math.radians(options.tilt_y))
+    mcu = Mcu(
+        lambda now: tilt,
+        math.radians(options.noise),
+        options.temperature,
+        options.rate,
+        options.drift_ppm,
+        options.seed,
+    )
+    mcu.frozen = options.freeze
+    faults = Faults(**{f.name: getattr(options, f.name) for f in fields(Faults)})
+    try:
+        emulator = Emulator(mcu, options.link, faults, options.reset_every)
+    except OSError as error:
+        print(f"emulator: {options.link}: {error.strerror}; choose another --link.", file=sys.stderr)
+        return 1
+    print(f"emulated inclinometer on {options.link or emulator.pty.path}", flush=True)
+    emulator.run(lambda: bool(stopped))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="emulator", description="An emulated inclinometer on a pseudo-terminal, until it is interrupted."
+    )
+    number = _number
+    add = parser.add_argument
+    add("--link", metavar="PATH", help="make the serial port appear under this stable path (a symbolic link)")
+    add("--tilt-x", type=number(-90, 90), default=0.0, metavar="DEG")
+    add("--tilt-y", type=number(-90, 90), default=0.0, metavar="DEG")
+    add(
+        "--noise",
+        type=number(0, 10),
+        default=0.0035,
+        metavar="DEG",
+        help="white noise of a sample (%(default)s)",
+    )
+    add("--temperature", type=number(-40, 125), default=20.0, metavar="C")
+    add("--rate", type=int, choices=range(1, protocol.MAX_RATE_HZ + 1), default=DEFAULT_RATE_HZ, metavar="HZ")
+    add(
+        "--drift-ppm",
+        type=number(-5e4, 5e4),
+        default=0.0,
+        metavar="PPM",
+        help="of the microcontroller's clock",
+    )
+    add("--seed", type=int, help="of the noise, for the same samples every time")
+    faults = parser.add_argument_group("faults", "probabilities a line, but --flip: a bit")
+    for fault in fields(Faults):
+        faults.add_argument(f"--{fault.name}", type=number(0, 1), default=0.0, metavar="P")
+    faults.add_argument("--reset-every", type=number(0, 1e9), default=0.0, metavar="S", help="reset the MCU")
+    faults.add_argument("--freeze", action="store_true", help="the ADC repeats one code")
+    return parser
+
+
+def _number(low: float, high: float) -> Callable[[str], float]:
+    def convert(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text} is not from {low:g} to {high:g}")
+        return value
+
+    convert.__name__ = "number"
+    return convert

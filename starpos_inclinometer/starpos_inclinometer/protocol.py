@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The serial line's protocol, as PROTOCOL.md defines it: framing, parsing, counting. No I/O, no clock."""
+
+import re
+from binascii import crc_hqx
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+VERSION = 1
+BAUD = 38400
+MIN_RATE_HZ, MAX_RATE_HZ = 1, 50
+MAX_LINE = 48  # bytes with '$' and CR LF, in both directions
+SAMPLE_LINE = 43  # bytes of a `$T` line
+
+_LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
+_SAMPLE = re.compile(
+    rb"T,([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{6}),([0-9A-F]{6}),([0-9A-F]{2}),([0-9A-F]{2})"
+)
+_IDENTITY = re.compile(rb"I,([0-9A-F]{2}),([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{2}),([0-9A-F]{4})")
+_REFUSAL = re.compile(rb"N,([0-9A-F]{2})")
+_RATE = re.compile(rb"R,([0-9A-F]{2})")
+
+
+class Status(IntFlag):
+    """Status bits of a sample; unknown bits are for later versions and ignored."""
+
+    ADC_TIMEOUT = 0x01  # a channel did not convert in time: its code is the one before
+    NO_REFERENCE = 0x02  # the AD7730's NOREF bit: codes mean nothing
+    NO_TEMPERATURE = 0x04
+    FIRST = 0x08  # the first sample since the reset
+    WATCHDOG = 0x10  # that reset was the watchdog's
+    OVERRUN = 0x20  # at least one sample before this one was not sent
+
+
+class Reason(IntEnum):
+    """Why a command was refused."""
+
+    CHECKSUM = 1
+    UNKNOWN = 2
+    OUT_OF_RANGE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One `$T` line, and what the parser knows of the lines before it."""
+
+    sequence: int  # counts on over 16-bit wraps and resets of the MCU: a jump of n + 1 is n samples lost
+    milliseconds: int  # the MCU's clock at the middle of the conversions, 32 bits
+    x: int  # AD7730 codes, 24-bit offset binary: 0x800000 is no input
+    y: int
+    temperature: int  # the SCA100T's temperature counts, 8 bits
+    status: int  # of Status
+    lost: int = 0  # samples lost just before this one
+    restarted: bool = False  # the MCU was reset since the sample before
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """The answer to both commands."""
+
+    version: int  # of the protocol
+    firmware: int  # 0x0102 is 1.2
+    unit: int  # serial number, 0 for none
+    rate_hz: int
+    delay_ms: int  # from a sample's milliseconds to the first byte of its line
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    reason: int  # of Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What has come in since the parser was made."""
+
+    good: int = 0  # lines with the right checksum and form
+    crc_errors: int = 0  # framed lines with the wrong checksum
+    malformed: int = 0  # right checksum, but no line this version knows
+    garbage_bytes: int = 0  # bytes outside of framed lines
+    lost: int = 0  # samples missing in the sequence
+    duplicates: int = 0  # samples that came twice; dropped
+    restarts: int = 0  # resets of the MCU
+
+
+def checksum(body: bytes) -> int:
+    """CRC-16/XMODEM (polynomial 0x1021, start 0) of the bytes between '$' and '*'."""
+    return crc_hqx(body, 0)
+
+
+def frame(body: bytes) -> bytes:
+    """The line of a body: `$body*CRC` CR LF."""
+    return b"$%s*%04X\r\n" % (body, checksum(body))
+
+
+def identify_command() -> bytes:
+    return frame(b"Q")
+
+
+def rate_command(rate_hz: int) -> bytes:
+    """Ask for rate_hz samples a second, MIN_RATE_HZ to MAX_RATE_HZ."""
+    return frame(b"R,%02X" % rate_hz)
+
+
+def sample_line(sequence: int, milliseconds: int, x: int, y: int, temperature: int, status: int) -> bytes:
+    """A `$T` line; sequence and milliseconds wrap at 16 and 32 bits."""
+    numbers = (sequence & 0xFFFF, milliseconds & 0xFFFFFFFF, x, y, temperature, status)
+    return frame(b"T,%04X,%08X,%06X,%06X,%02X,%02X" % numbers)
+
+
+def identity_line(identity: Identity) -> bytes:
+    i = identity
+    return frame(b"I,%02X,%04X,%08X,%02X,%04X" % (i.version, i.firmware, i.unit, i.rate_hz, i.delay_ms))
+
+
+def refusal_line(reason: Reason) -> bytes:
+    return frame(b"N,%02X" % reason)
+
+
+class LineSplitter:
+    """Framed lines out of arbitrary chunks of bytes; keeps at most one line; nothing that comes in raises."""
+
+    def __init__(self):
+        self.garbage_bytes = 0
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[tuple[bytes, bool]]:
+        """The bodies of the lines that end in `data`, each with whether its checksum is right."""
+        buffer = self._rest + data
+        lines = []
+        end = 0
+        for match in _LINE.finditer(buffer):
+            self.garbage_bytes += match.start() - end
+            end = match.end()
+            lines.append((match[1], checksum(match[1]) == int(match[2], 16)))
+        # A '$' can only be the first byte of a line: nothing before the last one becomes a line any more.
+        start = buffer.rfind(b"$", end)
+        if start < 0 or len(buffer) - start >= MAX_LINE:
+            start = len(buffer)
+        self.garbage_bytes += start - end
+        self._rest = buffer[start:]
+        return lines
+
+    def forget(self):
+        """Drop a half-received line: what follows comes from another connection."""
+        self.garbage_bytes += len(self._rest)
+        self._rest = b""
+
+
+class Parser:
+    """What the MCU sends, out of arbitrary chunks of bytes, counted."""
+
+    def __init__(self):
+        self._splitter = LineSplitter()
+        self._last: Sample | None = None
+        self._last_raw_sequence = 0
+        self._good = self._crc_errors = self._malformed = 0
+        self._lost = self._duplicates = self._restarts = 0
+
+    @property
+    def counts(self) -> Counts:
+        return Counts(
+            self._good,
+            self._crc_errors,
+            self._malformed,
+            self._splitter.garbage_bytes,
+            self._lost,
+            self._duplicates,
+            self._restarts,
+        )
+
+    def feed(self, data: bytes) -> list[Sample | Identity | Refusal]:
+        """The messages completed by `data`, in order; corrupted and doubled ones never."""
+        messages = []
+        for body, right in self._splitter.feed(data):
+            if not right:
+                self._crc_errors += 1
+                continue
+            message = self._parse(body)
+            if message is None:
+                continue
+            self._good += 1
+            messages.append(message)
+        return messages
+
+    def forget_line(self):
+        """Drop a half-received line: the connection was opened anew."""
+        self._splitter.forget()
+
+    def _parse(self, body: bytes) -> Sample | Identity | Refusal | None:
+        if match := _SAMPLE.fullmatch(body):
+            return self._sample(*(int(group, 16) for group in match.groups()))
+        if match := _IDENTITY.fullmatch(body):
+            return Identity(*(int(group, 16) for group in match.groups()))
+        if match := _REFUSAL.fullmatch(body):
+            return Refusal(int(match[1], 16))
+        self._malformed += 1
+        return None
+
+    def _sample(self, raw_sequence, milliseconds, x, y, temperature, status) -> Sample | None:
+        last = self._last
+        lost, restarted, step = 0, False, 1
+        if last is not None:
+            elapsed = (milliseconds - last.milliseconds) & 0xFFFFFFFF
+            ahead = (raw_sequence - self._last_raw_sequence) & 0xFFFF
+            if ahead == 0 and elapsed == 0:
+                self._duplicates += 1
+                return None
+            # A serial line does not reorder: a clock that went back, or a first sample, is a reset.
+            restarted = bool(status & Status.FIRST) or elapsed >= 1 << 31
+            if restarted:
+                self._restarts += 1
+            else:
+                step = ahead or 1 << 16
+                lost = step - 1
+                self._lost += lost
+        sequence = raw_sequence if last is None else (last.sequence + step) & 0xFFFFFFFF
+        self._last_raw_sequence = raw_sequence
+        self._last = Sample(sequence, milliseconds, x, y, temperature, status, lost, restarted)
+        return self._last
+
+
+def parse_command(body: bytes) -> tuple[str, int] | Reason:
+    """The MCU's side of a command: ('Q', 0), ('R', rate in Hz), or why it is refused."""
+    if body == b"Q":
+        return "Q", 0
+    if match := _RATE.fullmatch(body):
+        rate = int(match[1], 16)
+        return ("R", rate) if MIN_RATE_HZ <= rate <= MAX_RATE_HZ else Reason.OUT_OF_RANGE
+    return Reason.UNKNOWN
