@@ -48,7 +48,7 @@ def measure_background(plane, cell_px=64, mosaic=None) -> Background:
     if mosaic is None:
         mosaic = _phases_differ(level, noise, sample.shape[-1])
     if not mosaic:
-        level, noise = _clipped(np.moveaxis(sample, 0, 2).reshape(1, ny, nx, -1))
+        level, noise = level.mean(0, keepdims=True), np.sqrt((noise**2).mean(0, keepdims=True))
     level, noise = (np.stack([_smooth(m) for m in mesh]) for mesh in (level, noise))
     return Background(level, np.maximum(noise, QUANTISATION), plane.shape[1], plane.shape[0])
 
@@ -70,13 +70,12 @@ def _clipped(sample):
     deviation = sample - median
     spread = np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
     limit = np.maximum(3 * 1.4826 * spread, 1.0)
-    for _ in range(2):
-        inside = np.abs(deviation) <= limit
-        count = inside.sum(-1, keepdims=True)
-        kept = np.where(inside, deviation, 0)
-        mean = kept.sum(-1, keepdims=True) / count
-        rms = np.sqrt(np.maximum((kept**2).sum(-1, keepdims=True) / count - mean**2, 0)) / 0.9867
-        limit = np.maximum(np.minimum(limit, 3 * rms + np.abs(mean)), 1.0)
+    inside = np.abs(deviation) <= limit
+    count = inside.sum(-1, keepdims=True)
+    deviation *= inside
+    mean = deviation.sum(-1, keepdims=True) / count
+    square = np.einsum("...i,...i->...", deviation, deviation)[..., None] / count
+    rms = np.sqrt(np.maximum(square - mean**2, 0)) / 0.9867  # what clipping at 3 sigma leaves of a Gaussian's
     return (median + mean)[..., 0], rms[..., 0]
 
 

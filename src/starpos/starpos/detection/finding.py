@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
-STRIP = 128  # rows: small enough to stay in the processor's cache
+STRIP = 64  # rows: small enough to stay in the processor's cache
 SIGMA = 1.2  # px of the smoothing Gaussian: near the best for FWHM 1.2 to 5 px, within 40 % of it at 8 px
 REACH = 3  # px: half the kernel
 FLAT = 2  # px: a peak is the highest within this
@@ -33,7 +33,8 @@ def find_peaks(plane, background, threshold, limit):
         if not above.any():
             continue
         above &= smooth == cv2.dilate(smooth, np.ones((2 * FLAT + 1, 2 * FLAT + 1), np.uint8))
-        y, x = np.nonzero(above[offset : offset + bottom - top])
+        place = np.flatnonzero(above[offset : offset + bottom - top])  # faster than nonzero in two dimensions
+        y, x = np.divmod(place, plane.shape[1])
         found.append(np.stack([x, y + top, smooth[y + offset, x]]))
     if not found:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)

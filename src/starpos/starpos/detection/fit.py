@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+OUTLIER = 6.0  # sigma
 FIT_WIDTHS = 4.0  # fit what lies within so many widths of the star: beyond is only noise and neighbours
 
 
@@ -26,7 +27,9 @@ class Response:
 class Fit:
     """N fitted stars: x, y px; flux DN and its sigma; covariance (N, 2, 2) px2 of x, y; chi2 per degree of freedom.
 
-    residual, model, used (N, S, S): signal minus model, the model (DN) and which pixels took part.
+    residual, model (N, S, S): signal minus model, and the model, DN; used (N, S, S): which pixels took part;
+    leverage (N, S, S): how much of its own noise each pixel explains, 0..1, so a residual's variance is 1 - leverage
+    of the noise's.
     """
 
     x: np.ndarray
@@ -38,6 +41,7 @@ class Fit:
     residual: np.ndarray
     model: np.ndarray
     used: np.ndarray
+    leverage: np.ndarray
 
 
 def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
@@ -56,12 +60,13 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     colour = np.zeros((n, phases))  # each star's gains over the frame's, minus 1
     flux = np.full(n, np.nan)
     each = np.arange(n)[:, None, None]
-    for last in [False] * (rounds - 1) + [True]:
+    outlier = np.zeros(stamps.signal.shape, bool)
+    for round_ in range(rounds):
+        last = round_ == rounds - 1
         dx, dy = stamps.offsets(x, y)
         value, by_x, by_y = psf.evaluate(dx, dy)
         local = gain * (1 + colour.astype(np.float32)[each, stamps.phase]) if extra else gain
-        u, v = (a[0] * dx + a[1] * dy for a in psf.axes.astype(np.float32))
-        inside = u * u + v * v < FIT_WIDTHS**2
+        inside = psf.within(dx, dy, FIT_WIDTHS)
         unit = value * local
         if not np.isfinite(flux).all():
             weight = inverse_noise2 * inside
@@ -70,7 +75,8 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
             flux = np.nan_to_num(flux)
         amount = flux.astype(np.float32)[:, None, None]
         variance = stamps.noise**2 + np.float32(response.dn_per_photon) * np.maximum(amount * unit, 0)
-        root = np.sqrt(stamps.good * inside / variance)
+        used = stamps.good & inside & ~outlier
+        root = np.sqrt(used / variance)
         columns = [amount * by_x * local, amount * by_y * local, unit]
         columns += [amount * value * gain * (stamps.phase == p) for p in range(extra)]
         design = np.stack([(c * root).reshape(n, -1) for c in columns], 2)
@@ -83,18 +89,25 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         covariance = _inverse(normal)
         if last:
             break
+        if round_ >= 1:
+            # a hot pixel or a neighbour's light: much too bright for the noise and for an imperfect PSF
+            outlier = (residual > OUTLIER * np.sqrt(variance)) & (
+                residual > 0.15 * amount * unit.max((1, 2), keepdims=True)
+            )
         step = (covariance @ right[..., None])[..., 0]
         x += np.clip(step[:, 0], -1, 1)
         y += np.clip(step[:, 1], -1, 1)
         flux += step[:, 2]
         if extra:
             colour = np.clip(colour + step[:, 3:], -0.9, 3.0)
-    used = root > 0
     freedom = np.maximum(used.sum((1, 2)) - 3, 1)
     chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
-    return Fit(
-        x, y, flux, np.sqrt(covariance[:, 2, 2]), covariance[:, :2, :2], chi2, residual, amount * unit, used
-    )
+    leverage = ((design @ np.nan_to_num(covariance).astype(np.float32)) * design).sum(2).reshape(used.shape)
+    with np.errstate(divide="ignore"):
+        flux_sigma = (
+            normal[:, 2, 2] ** -0.5
+        )  # at known place and colour, of which the star's detection owes nothing
+    return Fit(x, y, flux, flux_sigma, covariance[:, :2, :2], chi2, residual, amount * unit, used, leverage)
 
 
 def _inverse(normal):
@@ -103,7 +116,7 @@ def _inverse(normal):
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = normal / (scale[:, :, None] * scale[:, None, :])
     sound = np.isfinite(scaled).all((1, 2))
-    sound[sound] = np.linalg.cond(scaled[sound]) < 1e10
+    sound[sound] = np.linalg.det(scaled[sound]) > 1e-9
     out = np.full(normal.shape, np.nan)
     out[sound] = np.linalg.inv(scaled[sound]) / (scale[:, :, None] * scale[:, None, :])[sound]
     return out

@@ -4,14 +4,14 @@
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection.fit import Response, fit_stars
+from starpos.detection.fit import FIT_WIDTHS, Response, fit_stars
 from starpos.detection.psf import MAX_ORDER, gaussian, refine
 from starpos.detection.shape import frame_shape, moments, relative_widths
 from starpos.detection.stamps import cut
 
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
-TEACHERS = 250
+TEACHERS = 100
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
 SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
@@ -48,7 +48,7 @@ def learn(plane, background, x, y, height, saturation):
     stamps, x, y = stamps.take(alike), x[alike], y[alike]
     response = plain
     order = min(MAX_ORDER, 2 * int(np.log2(len(x)) / 1.2))
-    for _ in range(3):
+    for _ in range(2):
         fit = fit_stars(stamps, psf, x, y, response, rounds=3)
         sound = np.isfinite(fit.chi2) & (fit.flux > 0) & np.isfinite(fit.covariance).all((1, 2))
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
@@ -109,33 +109,42 @@ def _is_dot(stamps):
 
 def _respond(stamps, psf, x, y, fit, sound, before):
     """The Response the fitted stars show: gains of the phases, their scatter, and the noise that grows with light."""
-    flux, model, residual, used = fit.flux[sound], fit.model[sound], fit.residual[sound], fit.used[sound]
+    used = fit.used[sound]
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
-        value = psf.evaluate(*stamps.offsets(x, y))[0]
-        weight = stamps.good / stamps.noise**2
-        own = np.stack(
-            [
-                (weight * value * stamps.signal * (stamps.phase == p)).sum((1, 2))
-                / np.maximum((weight * value * value * (stamps.phase == p)).sum((1, 2)), 1e-12)
-                for p in range(len(gain))
-            ],
-            1,
-        )
-        own = own / np.maximum(own.mean(1, keepdims=True), 1e-12)
-        gain = np.clip(np.median(own, 0), 0.02, None)
-        gain = gain / gain.mean()
-        spread = float(np.clip(1.4826 * np.median(np.abs(own / gain - 1)), 0.01, 0.5))
+        gain, spread = _gains(stamps, psf.evaluate(*stamps.offsets(x, y))[0], before)
     noise2 = (stamps.noise**2)[used]
-    light, square = np.maximum(model[used], 0), residual[used] ** 2
+    light, square = np.maximum(fit.model[sound][used], 0), fit.residual[sound][used] ** 2
+    square = square / np.maximum(1 - fit.leverage[sound][used], 0.1)
     photon = before.dn_per_photon
     for _ in range(4):
         variance = noise2 + photon * light
-        keep = square < 16 * variance if photon > 0 else slice(None)
+        keep = square < 25 * variance if photon > 0 else slice(None)
         w = (light / variance**2)[keep]
         total = (w * light[keep]).sum()
         photon = max(0.0, float((w * (square - noise2)[keep]).sum() / total)) if total > 0 else 0.0
     return Response(gain, spread, photon)
+
+
+def _gains(stamps, value, before):
+    """The gains of the mosaic's phases (P,), mean 1, and how far a star's own scatter about them beyond noise."""
+    phases = stamps.phase[..., None] == np.arange(len(before.gain))
+    light = np.maximum(stamps.signal, 0) * before.dn_per_photon
+    weight = (stamps.good / (stamps.noise**2 + light))[..., None] * phases
+    information = (weight * (value * value)[..., None]).sum((1, 2))
+    own = (weight * (value * stamps.signal)[..., None]).sum((1, 2)) / np.maximum(information, 1e-12)
+    mean = np.maximum(own.mean(1, keepdims=True), 1e-12)
+    own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
+    gain, spread2 = np.median(own, 0), 0.0
+    for _ in range(4):
+        weight = 1 / (error2 + spread2 + 1e-6)
+        weight = weight * ((own - gain) ** 2 * weight < 16)
+        gain = np.clip((weight * own).sum(0) / np.maximum(weight.sum(0), 1e-12), 0.02, None)
+        gain = gain / gain.mean()
+        spread2 = max(
+            0.0, float((weight * ((own / gain - 1) ** 2 - error2)).sum() / max(weight.sum(), 1e-12))
+        )
+    return gain, float(np.clip(np.sqrt(spread2), 0.01, 0.5))
 
 
 def _shape_up(stamps, psf, x, y, flux, response, order):
@@ -148,5 +157,5 @@ def _shape_up(stamps, psf, x, y, flux, response, order):
     variance = (
         stamps.noise**2 + response.dn_per_photon * np.maximum(scale * value, 0) + (0.02 * scale * value) ** 2
     )
-    weight = np.where(stamps.good, scale**2 / variance, 0)
-    return refine(psf, dx.ravel(), dy.ravel(), (stamps.signal / scale).ravel(), weight.ravel(), order)
+    use = stamps.good & psf.within(dx, dy, FIT_WIDTHS)
+    return refine(psf, dx[use], dy[use], (stamps.signal[use] / scale[use]), (scale**2 / variance)[use], order)

@@ -126,20 +126,18 @@ def _measure(plane, background, x, y, psf, response, reach, saturation, settings
             (fit.x >= 0) & (fit.x <= background.width - 1) & (fit.y >= 0) & (fit.y <= background.height - 1)
         )
         slack = 3 / snr
-        full = (stamps.full & fit_core(stamps, fit, psf, 2)).any((1, 2))
+        full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
         sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
-        edge = (~stamps.good & ~stamps.full & fit_core(stamps, fit, psf, 3)).any((1, 2))
+        edge = (~stamps.good & ~stamps.full & _core(stamps, fit, psf, 3)).any((1, 2))
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.25 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated
     columns = dict(x=fit.x, y=fit.y, flux=fit.flux, snr=snr, covariance=c, flags=flags)
     return {name: column[sound] for name, column in columns.items()}
 
 
-def fit_core(stamps, fit, psf, widths):
+def _core(stamps, fit, psf, widths):
     """(N, S, S) bool: the pixels within so many widths of the star's centre."""
-    dx, dy = stamps.offsets(np.nan_to_num(fit.x), np.nan_to_num(fit.y))
-    u, v = (a[0] * dx + a[1] * dy for a in psf.axes.astype(np.float32))
-    return u * u + v * v < widths**2
+    return psf.within(*stamps.offsets(fit.x, fit.y), widths)
 
 
 def _is_dot(stamps, fit, psf):

@@ -8,6 +8,7 @@ Only even terms are kept, so the centre is the centre of symmetry whatever the f
 """
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 
@@ -31,6 +32,11 @@ class Psf:
     def fwhm_px(self) -> float:
         """Geometric mean over the two axes of that Gaussian's full width at half maximum."""
         return float(np.sqrt(8 * np.log(2)) * np.linalg.det(self.axes) ** -0.5)
+
+    def within(self, dx, dy, widths):
+        """Whether pixels dx, dy px off a star's centre lie within so many widths of it."""
+        u, v = (a[0] * dx + a[1] * dy for a in self.axes.astype(np.float32))
+        return u * u + v * v < widths**2
 
     def evaluate(self, dx, dy):
         """value, d/dx0 and d/dy0 (N, S, S): the PSF at pixels dx, dy off a star's centre, and how moving it acts."""
@@ -71,16 +77,17 @@ def refine(psf, dx, dy, brightness, weight, order) -> Psf:
     brightness  (M,) values of those pixels over their stars' fluxes
     weight      (M,) inverse variances of brightness
     """
-    u, v = psf.axes @ np.stack([dx, dy])
-    gauss = np.exp(-0.5 * (u * u + v * v)) * abs(np.linalg.det(psf.axes)) / (2 * np.pi)
+    u, v = psf.axes.astype(np.float32) @ np.stack([dx, dy])
+    gauss = np.exp(-0.5 * (u * u + v * v)) * np.float32(abs(np.linalg.det(psf.axes)) / (2 * np.pi))
     fu, fv = _hermites(u, order), _hermites(v, order)
     terms = [(i, j) for i in range(order + 1) for j in range(order + 1 - i) if (i + j) % 2 == 0]
-    size = np.array([float(np.sqrt(_factorial(i) * _factorial(j))) for i, j in terms])
-    design = np.stack([fu[i] * fv[j] * gauss for i, j in terms], 1) / size
-    normal = (design * weight[:, None]).T @ design
-    # a weak pull to zero of the corrections (0.3 of the Gaussian, in orthonormal units) keeps thin data sound
+    size = np.sqrt([float(factorial(i) * factorial(j)) for i, j in terms])
+    design = np.stack([fu[i] * fv[j] * gauss / np.float32(s) for (i, j), s in zip(terms, size, strict=True)])
+    weighted = design * weight.astype(np.float32)
+    normal = (weighted @ design.T).astype(np.float64)
+    # a weak pull of the corrections to zero keeps thin data sound
     pull = np.array([0.0] + [1.0] * (len(terms) - 1)) * np.trace(normal) / len(terms) * 1e-4
-    found = np.linalg.solve(normal + np.diag(pull), (design * weight[:, None]).T @ brightness) / size
+    found = np.linalg.solve(normal + np.diag(pull), weighted @ brightness) / size
     series = np.zeros((order + 1, order + 1))
     for (i, j), c in zip(terms, found, strict=True):
         series[i, j] = c
@@ -95,7 +102,3 @@ def _hermites(u, order):
     for n in range(1, order):
         values.append(u * values[n] - n * values[n - 1])
     return values[: order + 1]
-
-
-def _factorial(n):
-    return float(np.prod(np.arange(1, n + 1)))
