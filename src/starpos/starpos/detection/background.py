@@ -15,12 +15,14 @@ class Background:
 
     level, noise  (P, rows, columns); P is 1, or 4 on a colour mosaic: the phases (0, 0), (0, 1), (1, 0), (1, 1)
                   of (row, column) modulo 2, since each colour sees its own sky
+    correlation   how many times noisier than independent pixels a smoothed frame is, 1 or more
     """
 
     level: np.ndarray
     noise: np.ndarray
     width: int
     height: int
+    correlation: float = 1.0
 
     @property
     def is_mosaic(self) -> bool:

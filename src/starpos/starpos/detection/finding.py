@@ -8,6 +8,7 @@ from scipy import ndimage, sparse, spatial
 STRIP = 64  # rows: small enough to stay in the processor's cache
 SIGMA = 1.2  # px of the smoothing Gaussian: near the best for FWHM 1.2 to 5 px, within 40 % of it at 8 px
 REACH = 3  # px: half the kernel
+KERNEL_NORM = 1 / (4 * np.pi * SIGMA**2) ** 0.5  # what smoothing leaves of white noise
 FLAT = 2  # px: a peak is the highest within this
 
 
@@ -18,7 +19,7 @@ def find_peaks(plane, background, threshold, limit):
     frequency, leaves no trace in the smoothed frame; being odd it is centred on its pixel.
     """
     level, noise = background.level.mean(0), np.sqrt((background.noise**2).mean(0))
-    noise = noise * _smoothed_noise(plane, background)
+    noise = noise * KERNEL_NORM * background.correlation
     wanted = (level + threshold * noise).astype(np.float32)
     lowest = _columns(wanted, background.width)
     found = []
@@ -57,10 +58,12 @@ def _smooth(plane, top, bottom):
     return smooth[start - first : min(last, bottom + FLAT) - first], top - start
 
 
-def _smoothed_noise(plane, background):
-    """What smoothing leaves of the noise: of white noise the kernel's norm; more where neighbours correlate."""
-    kernel = cv2.getGaussianKernel(2 * REACH + 1, SIGMA)
-    norm = float((kernel**2).sum())
+def noise_correlation(plane, background):
+    """How many times more noise a smoothed frame has than if its pixels' noise were independent, 1 or more.
+
+    Demosaicing, resampling and lossy compression tie neighbours together; a star then has less SNR than its pixels
+    claim.
+    """
     height = plane.shape[0]
     ratios = []
     for top in np.linspace(0, max(0, height - 16), 8).astype(int):
@@ -69,7 +72,8 @@ def _smoothed_noise(plane, background):
         level, noise = background.at(x.ravel(), y.ravel() - offset + top)
         score = (smooth[y, x].ravel() - level.mean(1)) / np.sqrt((noise**2).mean(1))
         ratios.append(1.4826 * np.median(np.abs(score - np.median(score))))
-    return max(norm, float(np.median(ratios)))
+    ratio = float(np.median(ratios)) / KERNEL_NORM
+    return ratio if ratio > 1.1 else 1.0
 
 
 def _columns(mesh, width):

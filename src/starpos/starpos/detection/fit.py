@@ -28,6 +28,7 @@ class Fit:
     """N fitted stars: x, y px; flux DN and its sigma; covariance (N, 2, 2) px2 of x, y; chi2 per degree of freedom.
 
     residual, model (N, S, S): signal minus model, and the model, DN; used (N, S, S): which pixels took part;
+    outlier (N, S, S): which did not, much too bright for this star;
     leverage (N, S, S): how much of its own noise each pixel explains, 0..1, so a residual's variance is 1 - leverage
     of the noise's.
     """
@@ -41,6 +42,7 @@ class Fit:
     residual: np.ndarray
     model: np.ndarray
     used: np.ndarray
+    outlier: np.ndarray
     leverage: np.ndarray
 
 
@@ -107,7 +109,19 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         flux_sigma = (
             normal[:, 2, 2] ** -0.5
         )  # at known place and colour, of which the star's detection owes nothing
-    return Fit(x, y, flux, flux_sigma, covariance[:, :2, :2], chi2, residual, amount * unit, used, leverage)
+    return Fit(
+        x,
+        y,
+        flux,
+        flux_sigma,
+        covariance[:, :2, :2],
+        chi2,
+        residual,
+        amount * unit,
+        used,
+        outlier & stamps.good & inside,
+        leverage,
+    )
 
 
 def _inverse(normal):

@@ -1,65 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a frame's own bright stars teach: its PSF, its colour gains and its photon noise."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import ndimage, spatial
 
 from starpos.detection.fit import FIT_WIDTHS, Response, fit_stars
-from starpos.detection.psf import MAX_ORDER, gaussian, refine
+from starpos.detection.psf import MAX_ORDER, Psf, gaussian, refine
 from starpos.detection.shape import frame_shape, moments, relative_widths
 from starpos.detection.stamps import cut
 
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
 TEACHERS = 100
+ROUNDS = 2
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
 SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
 
 
-def learn(plane, background, x, y, height, saturation):
-    """(Psf, Response, reach) from the peaks x, y of that height (N,), highest first.
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """A frame's PSF and response, and how far from a star (px) its light is worth using."""
 
-    reach px: how far from a star its light is worth using.
-    """
-    fallback = gaussian(np.eye(2) * DEFAULT_SIGMA**2)
-    plain = Response(np.ones(len(background.level)), 0.3, 0.0)
+    psf: Psf
+    response: Response
+    reach: int
+
+
+def learn(plane, background, x, y, height, saturation) -> Lesson:
+    """What the peaks x, y (N,) of that height, highest first, teach; defaults where they teach nothing."""
+    psf = gaussian(np.eye(2) * DEFAULT_SIGMA**2)
+    response = Response(np.ones(len(background.level)), 0.3, 0.0)
     bright = np.flatnonzero(height > BRIGHT)
     if len(bright) == 0:
         bright = np.arange(min(len(x), TEACHERS))
     bright = bright[_isolated(x, y, height, bright)][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(~_is_dot(stamps) & ~stamps.full.any((1, 2)))
-    if len(stamps.x) == 0:
-        return fallback, plain, reach_of(fallback)
-    shape = frame_shape(*grey(stamps, background))
+    shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     if shape is None:
-        return fallback, plain, reach_of(fallback)
+        return Lesson(psf, response, reach_of(psf))
     psf = gaussian(shape)
     stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
-    window = shape
     smooth, blur = grey(stamps, background)
     x, y = centroid(smooth, shape)
-    _, _, seen = moments(smooth, x, y, window)
-    widths = relative_widths(seen, shape + blur * np.eye(2), window)
+    _, _, seen = moments(smooth, x, y, shape)
+    widths = relative_widths(seen, shape + blur * np.eye(2), shape)
     alike = (widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)
-    if not alike.any():
-        return psf, plain, reach_of(psf)
     stamps, x, y = stamps.take(alike), x[alike], y[alike]
-    response = plain
-    order = min(MAX_ORDER, 2 * int(np.log2(len(x)) / 1.2))
-    for _ in range(2):
+    for _ in range(ROUNDS if len(x) else 0):
         fit = fit_stars(stamps, psf, x, y, response, rounds=3)
         sound = np.isfinite(fit.chi2) & (fit.flux > 0) & np.isfinite(fit.covariance).all((1, 2))
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
-        if sound.sum() < 1:
-            return psf, response, reach_of(psf)
+        if not sound.any():
+            break
         sound &= fit.chi2 < 6 * np.median(fit.chi2[sound]) + 1
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = _respond(stamps, psf, x, y, fit, sound, response)
+        order = min(MAX_ORDER, 2 * int(np.log2(len(x)) / 1.2))  # 4 from 6 stars, 6 from 13, 8 from 28
         if order > 0:
             psf = _shape_up(stamps, psf, x, y, fit.flux[sound], response, order)
-    return psf, response, reach_of(psf)
+    return Lesson(psf, response, reach_of(psf))
 
 
 def reach_of(psf) -> int:

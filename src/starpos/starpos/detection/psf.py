@@ -31,7 +31,7 @@ class Psf:
     @property
     def fwhm_px(self) -> float:
         """Geometric mean over the two axes of that Gaussian's full width at half maximum."""
-        return float(np.sqrt(8 * np.log(2)) * np.linalg.det(self.axes) ** -0.5)
+        return float(np.sqrt(8 * np.log(2)) * abs(np.linalg.det(self.axes)) ** -0.5)
 
     def within(self, dx, dy, widths):
         """Whether pixels dx, dy px off a star's centre lie within so many widths of it."""

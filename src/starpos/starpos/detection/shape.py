@@ -7,6 +7,15 @@ covariance V = (C^-1 + W^-1)^-1, if the star is one of covariance C (Bernstein &
 
 import numpy as np
 
+NARROWEST = 0.2  # px2: a pixel alone has 1/12, and starlight never falls on one alone
+NARROWEST_WINDOW = 0.7  # px2: under narrower ones a sum over pixels is no integral
+
+
+def at_least(shape, floor):
+    """The covariance shape (2, 2) px2 with no principal axis below floor px2."""
+    values, vectors = np.linalg.eigh(shape)
+    return vectors @ np.diag(np.maximum(values, floor)) @ vectors.T
+
 
 def moments(stamps, x, y, window):
     """One look through the window (2, 2) px2 at the points x, y (N,).
@@ -48,15 +57,16 @@ def frame_shape(stamps, blur=0.0, rounds=12):
         narrower = np.linalg.inv(seen) - np.linalg.inv(window)
         values, vectors = np.linalg.eigh(narrower)
         limit = (stamps.reach / 2.0) ** 2  # wider than this the stamp does not hold the star
-        own = vectors @ np.diag(1 / np.clip(values, 1 / limit, 1 / 0.05)) @ vectors.T
+        own = vectors @ np.diag(1 / np.clip(values, 1 / limit, 1 / NARROWEST)) @ vectors.T
         gain = np.eye(2) + own @ np.linalg.inv(window)
         step = np.where(usable[:, None], step @ gain.T, 0)
         x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
-        change = np.inf if shape is None else np.abs(own - window).max() / own.max()
-        shape = window = own
+        change = np.inf if shape is None else np.abs(own - shape).max() / own.max()
+        shape = own
+        window = at_least(own, NARROWEST_WINDOW)
         if change < 1e-3:
             break
-    return shape - blur * np.eye(2) if np.linalg.eigvalsh(shape)[0] > blur + 0.1 else shape
+    return at_least(shape - blur * np.eye(2), NARROWEST)
 
 
 def relative_widths(seen, shape, window):

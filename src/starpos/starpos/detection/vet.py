@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Peaks to measured stars: fit each, leave out what is no star, flag what is not a good one."""
+
+import numpy as np
+from scipy import spatial
+
+from starpos.detection.fit import fit_stars
+from starpos.detection.learn import centroid, grey
+from starpos.detection.shape import moments, relative_widths
+from starpos.detection.stamps import cut
+from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
+
+
+def measure(plane, background, x, y, lesson, saturation, min_snr):
+    """Columns x, y, flux, snr, covariance, flags of the stars among the peaks x, y (N,) int, in no order."""
+    psf = lesson.psf
+    stamps = cut(plane, background, x, y, lesson.reach, saturation)
+    smooth, blur = grey(stamps, background)
+    shape = psf.shape
+    x, y = centroid(smooth, shape)
+    fit = fit_stars(stamps, psf, x, y, lesson.response)
+    _, _, seen = moments(smooth, fit.x, fit.y, shape)
+    widths = relative_widths(seen, shape + blur * np.eye(2), shape)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        snr = fit.flux / (fit.flux_sigma * background.correlation)
+        c = fit.covariance * (_misfit(fit) * background.correlation**2)[:, None, None]
+        sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
+        sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 4
+        sound &= (snr >= min_snr) & ~_is_dot(stamps, fit, psf)
+        sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
+        sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
+        slack = 3 / snr
+        full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
+        sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
+        edge = (~stamps.good & ~stamps.full & _core(stamps, fit, psf, 3)).any((1, 2))
+        foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux
+        elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.25 + slack) & ~full & ~edge
+    flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
+    columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
+    return {name: column[sound] for name, column in columns.items()}
+
+
+def _misfit(fit):
+    """(N,) factors on the covariance: chi2 where it is above what chance allows, else 1."""
+    freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
+    return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
+
+
+def _core(stamps, fit, psf, widths):
+    """(N, S, S) bool: the pixels within so many widths of the star's centre."""
+    return psf.within(*stamps.offsets(fit.x, fit.y), widths)
+
+
+def _is_dot(stamps, fit, psf):
+    """Hot pixels and sharp cosmic rays: one pixel alone explains more than the PSF does (likelihood ratio)."""
+    c = stamps.reach
+    score = (stamps.signal * stamps.good / stamps.noise)[:, c - 2 : c + 3, c - 2 : c + 3].reshape(
+        len(stamps.x), -1
+    )
+    matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))
+    return score.max(1) > matched
+
+
+def resolve(columns, psf):
+    """Sort by flux, keep one of each set of fits that ran into the same star, and flag neighbours as BLENDED."""
+    order = np.argsort(-columns["flux"], kind="stable")
+    columns = {name: column[order] for name, column in columns.items()}
+    n = len(order)
+    if n == 0:
+        return columns
+    points = np.stack([columns["x"], columns["y"]], 1) @ psf.axes.T  # in widths of the PSF
+    pairs = spatial.cKDTree(points).query_pairs(6.0, output_type="ndarray")
+    pairs = np.sort(pairs, axis=1)  # the brighter first
+    apart = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
+    ratio = columns["flux"][pairs[:, 1]] / columns["flux"][pairs[:, 0]]
+    keep = np.ones(n, bool)
+    keep[pairs[(apart < 1.5) | (ratio < 0.01), 1]] = False
+    real = keep[pairs].all(1)
+    flags = columns["flags"].copy()
+    flags[pairs[real, 1]] |= BLENDED
+    flags[pairs[real & (ratio > 0.03), 0]] |= BLENDED
+    columns["flags"] = flags.astype(np.uint8)
+    return {name: column[keep] for name, column in columns.items()}
