@@ -2,8 +2,8 @@
 """The MCU's milliseconds to the time of a sample, without the jitter of the serial line and of the scheduler.
 
 A line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the
-two clocks, and what lies above it is delay. The envelope is a line, because the clocks' rates differ: the lower
-convex hull's edge over the window's middle, the linear-programming fit of Moon, Skelly and Towsley (1999).
+two clocks, and what lies above it is delay. The envelope is a line, because the clocks' rates differ: the
+lower hull's edge over the window's middle, which is the linear-programming fit of Moon, Skelly and Towsley (1999).
 """
 
 from collections import deque
@@ -32,6 +32,10 @@ class ArrivalFilter:
     def rate_ppm(self) -> float:
         """How much the MCU's clock is slow against the host's, 1e-6; 0 until it is known."""
         return self._slope * 1e6
+
+    def restart(self):
+        """Forget the MCU's clock: it was reset, or may have been while nobody listened."""
+        self._points.clear()
 
     def delay(self, milliseconds: int, arrival_s: float) -> float:
         """Seconds (>= 0) by which this sample arrived later than the line is quick.

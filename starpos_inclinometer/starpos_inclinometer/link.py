@@ -100,6 +100,7 @@ class SerialLink:
         self._sentence = LinkState.sentence
         self._identity: Identity | None = None
         self._connections = self._dropped = 0
+        self._next_command = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="serial link", daemon=True)
 
@@ -166,9 +167,9 @@ class SerialLink:
             self._connections += 1
             self._identity = None
             self._refused_rate = None
-            self._parser.forget_line()
+            self._parser.resume()
         last_sample = last_byte = time.monotonic()
-        next_command = 0.0
+        self._next_command = 0.0
         while not self._stop.is_set():
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))
             now = time.monotonic()
@@ -176,9 +177,9 @@ class SerialLink:
                 last_byte = now
                 if self._receive(data, now):
                     last_sample = now
-            if now >= next_command and (command := self._command()):
+            if now >= self._next_command and (command := self._command()):
                 device.write(command)
-                next_command = now + COMMAND_RETRY_S
+                self._next_command = now + COMMAND_RETRY_S
             if now - last_sample > self._patience():
                 if now - last_byte > self._patience():
                     self._enter(
@@ -211,7 +212,9 @@ class SerialLink:
                     if message.restarted:
                         # After a reset it is at the default rate, perhaps with another firmware.
                         self._identity = None
-                elif isinstance(message, Identity):
+                    continue
+                self._next_command = 0.0  # it has answered
+                if isinstance(message, Identity):
                     self._identity = message
                 elif isinstance(message, Refusal) and message.reason == Reason.OUT_OF_RANGE:
                     self._refused_rate = self._wanted_rate

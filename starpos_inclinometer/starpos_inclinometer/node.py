@@ -157,8 +157,11 @@ class InclinometerNode(Node):
             self._publish(arrival, latency)
         if (state.phase, state.sentence) != self._logged:
             self._logged = (state.phase, state.sentence)
-            log = self.get_logger().info if state.phase is Phase.RECEIVING else self.get_logger().warning
-            log(state.sentence)
+            # rclpy ties a severity to the line it is called from, so each has its own.
+            if state.phase is Phase.RECEIVING:
+                self.get_logger().info(state.sentence)
+            else:
+                self.get_logger().warning(state.sentence)
 
     def _latency(self, state: LinkState) -> float:
         """Seconds from a sample to the end of its line, at the quickest."""
@@ -169,6 +172,8 @@ class InclinometerNode(Node):
 
     def _publish(self, arrival: Arrival, latency: float):
         sample = arrival.sample
+        if sample.restarted or sample.resumed:
+            self._arrivals.restart()
         late = self._arrivals.delay(sample.milliseconds, arrival.monotonic_s)
         reading = self._sensor.measure(sample)
         self._flags |= reading.flags

@@ -52,6 +52,7 @@ class Sample:
     status: int  # of Status
     lost: int = 0  # samples lost just before this one
     restarted: bool = False  # the MCU was reset since the sample before
+    resumed: bool = False  # the first one after the connection was opened anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +155,7 @@ class Parser:
         self._splitter = LineSplitter()
         self._last: Sample | None = None
         self._last_raw_sequence = 0
+        self._resumed = False
         self._good = self._crc_errors = self._malformed = 0
         self._lost = self._duplicates = self._restarts = 0
 
@@ -183,9 +185,10 @@ class Parser:
             messages.append(message)
         return messages
 
-    def forget_line(self):
-        """Drop a half-received line: the connection was opened anew."""
+    def resume(self):
+        """Start on a connection that was opened anew: drop a half-received line, trust no continuity."""
         self._splitter.forget()
+        self._resumed = self._last is not None
 
     def _parse(self, body: bytes) -> Sample | Identity | Refusal | None:
         if match := _SAMPLE.fullmatch(body):
@@ -203,7 +206,7 @@ class Parser:
         if last is not None:
             elapsed = (milliseconds - last.milliseconds) & 0xFFFFFFFF
             ahead = (raw_sequence - self._last_raw_sequence) & 0xFFFF
-            if ahead == 0 and elapsed == 0:
+            if ahead == 0 and elapsed == 0 and not self._resumed:
                 self._duplicates += 1
                 return None
             # A serial line does not reorder: a clock that went back, or a first sample, is a reset.
@@ -211,12 +214,13 @@ class Parser:
             if restarted:
                 self._restarts += 1
             else:
-                step = ahead or 1 << 16
+                step = ahead or (1 if self._resumed else 1 << 16)
                 lost = step - 1
                 self._lost += lost
         sequence = raw_sequence if last is None else (last.sequence + step) & 0xFFFFFFFF
         self._last_raw_sequence = raw_sequence
-        self._last = Sample(sequence, milliseconds, x, y, temperature, status, lost, restarted)
+        self._last = Sample(sequence, milliseconds, x, y, temperature, status, lost, restarted, self._resumed)
+        self._resumed = False
         return self._last
 
 

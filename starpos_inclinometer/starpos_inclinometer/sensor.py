@@ -101,7 +101,7 @@ class Sensor:
 
     def measure(self, sample: Sample) -> Reading:
         codes = (sample.x, sample.y)
-        flags = GAP if sample.lost or sample.restarted else 0
+        flags = GAP if sample.lost or sample.restarted or sample.resumed else 0
         for axis in range(2):
             self._run[axis] = self._run[axis] + 1 if codes[axis] == self._last[axis] else 1
         self._last = codes

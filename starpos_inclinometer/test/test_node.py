@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node as a process of its own, with the emulated device behind a real port."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from starpos_inclinometer.emulator import Mcu
+
+from starpos_inclinometer import sensor
+from starpos_interfaces.msg import Tilt
+
+NODE = [
+    sys.executable,
+    "-c",
+    "import sys; from starpos_inclinometer.main import inclinometer; sys.exit(inclinometer())",
+]
+WAIT_S = 20.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain():
+    os.environ["ROS_DOMAIN_ID"] = str(100 + os.getpid() % 100)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+@pytest.fixture
+def listener():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    listener = Listener(context)
+    yield listener
+    listener.node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+class Listener:
+    def __init__(self, context):
+        self.node = rclpy.create_node("listener", context=context)
+        self.tilts, self.links = [], []
+        self.node.create_subscription(Tilt, "tilt", self.tilts.append, 100)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, 10)
+        self._executor = rclpy.executors.SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+
+    def _diagnostics(self, message):
+        self.links += [s for s in message.status if s.name == "inclinometer: Link"]
+
+    def wait(self, condition):
+        end = time.monotonic() + WAIT_S
+        while not condition():
+            assert time.monotonic() < end, (len(self.tilts), self.links[-1:])
+            self._executor.spin_once(timeout_sec=0.5)
+
+    def call(self, kind, name, request):
+        client = self.node.create_client(kind, name)
+        self.wait(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait(future.done)
+        return future.result()
+
+    def set(self, name, value):
+        request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=value)])
+        return self.call(SetParameters, "/inclinometer/set_parameters", request).results[0]
+
+
+class Process:
+    def __init__(self, *parameters):
+        options = [word for p in parameters for word in ("-p", p)]
+        self.process = subprocess.Popen(
+            [*NODE, "--ros-args", *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+
+    def end(self, *signals):
+        """Send the signals; the exit status and all output."""
+        for number in signals:
+            self.process.send_signal(number)
+        out, _ = self.process.communicate(timeout=WAIT_S)
+        return self.process.returncode, out
+
+
+@pytest.fixture
+def start():
+    processes = []
+
+    def start(*parameters):
+        processes.append(Process(*parameters))
+        return processes[-1]
+
+    yield start
+    for p in processes:
+        if p.process.poll() is None:
+            p.process.kill()
+            p.process.communicate()
+
+
+def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listener):
+    tilt = (math.radians(3.0), math.radians(-1.0))
+    times = []
+
+    def when(now):
+        times.append(time.time())
+        return tilt
+
+    bench.plug(Mcu(when, seed=1))
+    node = start(f"port:={bench.path}", "noise_stddev:=0.004", "rate:=20")
+    listener.wait(lambda: len(listener.tilts) >= 40)
+    first = listener.tilts[0]
+    assert first.header.frame_id == "starpos_inclinometer_frame"
+    mean = [sum(getattr(t, axis) for t in listener.tilts) / len(listener.tilts) for axis in "xy"]
+    assert mean == pytest.approx(tilt, abs=4 * math.radians(0.0035) / math.sqrt(len(listener.tilts)))
+    assert list(first.covariance) == pytest.approx(
+        [math.radians(0.004) ** 2, 0, 0, math.radians(0.004) ** 2], rel=1e-3
+    )
+    assert first.temperature == pytest.approx(20, abs=0.5)
+    assert all(t.flags == 0 for t in listener.tilts[1:])
+    stamps = [t.header.stamp.sec + t.header.stamp.nanosec * 1e-9 for t in listener.tilts]
+    assert stamps == sorted(stamps)
+    # The emulator asks for the tilt when the line is due: 20 ms of conversion and 11 ms of line later.
+    assert min(abs(stamps[20] - t + 0.031) for t in times) < 0.02
+    assert [b.sequence - a.sequence for a, b in zip(listener.tilts, listener.tilts[1:], strict=False)] == [
+        1
+    ] * (len(listener.tilts) - 1)
+    listener.wait(lambda: listener.links)
+    listener.wait(lambda: listener.links[-1].level == b"\x00")
+    assert listener.links[-1].hardware_id == bench.path
+
+    integer = ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=50)
+    assert listener.set("rate", integer).successful
+    listener.wait(
+        lambda: any(v.key == "rate (Hz)" and float(v.value) > 40 for v in listener.links[-1].values)
+    )
+    integer.integer_value = 51
+    refusal = listener.set("rate", integer)
+    assert not refusal.successful and "50" in refusal.reason
+    assert not listener.set(
+        "baud", ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=9600)
+    ).successful
+    request = DescribeParameters.Request(names=["rate", "noise_stddev"])
+    rate, noise = listener.call(DescribeParameters, "/inclinometer/describe_parameters", request).descriptors
+    assert (rate.integer_range[0].from_value, rate.integer_range[0].to_value) == (1, 50)
+    assert noise.description.endswith("[deg]") and noise.floating_point_range
+    assert node.end(signal.SIGINT, signal.SIGINT)[0] == 0
+
+
+def test_missing_port_keeps_the_node_alive_with_one_sentence_until_it_comes(bench, start, listener):
+    node = start(f"port:={bench.path}")
+    listener.wait(lambda: len(listener.links) >= 3)
+    assert listener.links[-1].level == b"\x02" and "is not there" in listener.links[-1].message
+    bench.plug()
+    listener.wait(lambda: len(listener.tilts) >= 3)
+    bench.unplug()
+    listener.wait(lambda: listener.links[-1].level == b"\x02")
+    bench.plug(Mcu(seed=2))
+    n = len(listener.tilts)
+    listener.wait(lambda: len(listener.tilts) >= n + 3)
+    assert listener.tilts[n].flags & Tilt.GAP
+    status, out = node.end(signal.SIGTERM)
+    assert status == 0
+    assert 2 <= out.count("is not there") + out.count("went away") <= 3
+    assert len(out.splitlines()) <= 5 and "Traceback" not in out
+
+
+def test_frozen_converter_and_steep_tilt_are_flagged_and_reported(bench, start, listener):
+    mcu = Mcu(lambda now: (0.55, 0.0), seed=1)
+    bench.plug(mcu)
+    node = start(f"port:={bench.path}", "rate:=50")
+    listener.wait(lambda: listener.tilts and listener.links and listener.links[-1].level == b"\x01")
+    assert listener.tilts[-1].flags == Tilt.OUT_OF_RANGE and "30 deg" in listener.links[-1].message
+    mcu.frozen = True
+    listener.wait(lambda: listener.links[-1].level == b"\x02")
+    assert listener.tilts[-1].flags & Tilt.STUCK and "stuck" in listener.links[-1].message
+    assert node.end(signal.SIGINT)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("parameter", "sentence"),
+    [
+        ("rate:=0", "rate must be a whole number from 1 to 50 Hz; 0 was given"),
+        ("noise_stddev:=.nan", "noise_stddev must be a number from 1e-06 to 10 deg"),
+        ("offset_volts:=[2.5]", "offset_volts must be 2 values"),
+        ("port:=7", "port must be a text"),
+    ],
+)
+def test_bad_parameter_ends_with_one_line(start, parameter, sentence):
+    status, out = start(parameter).end()
+    assert status == 1
+    assert sentence in out and len(out.splitlines()) == 1
+
+
+def test_flags_are_those_of_the_message():
+    for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "GAP"):
+        assert getattr(sensor, name) == getattr(Tilt, name)

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The protocol against published check values, and the parser against everything a line can do to it."""
+
+import re
+from binascii import crc_hqx
+from pathlib import Path
+
+import numpy as np
+import pytest
+from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Sample, Status
+
+from starpos_inclinometer import protocol
+
+PROTOCOL = Path(__file__).parent.parent / "PROTOCOL.md"
+
+
+def lines(n, start=0):
+    return [
+        protocol.sample_line(start + i, 100 * (start + i), 0x800000 + 37 * i, 0x7F0000 + i, 0xAF, 0)
+        for i in range(n)
+    ]
+
+
+def crc_as_avr_libc_documents_it(data, crc=0):
+    """The C of _crc_xmodem_update's documentation, in Python."""
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+    return crc
+
+
+def test_checksum_gives_the_published_check_values():
+    assert protocol.checksum(b"123456789") == 0x31C3  # CRC-16/XMODEM
+    assert (
+        crc_hqx(b"123456789", 0xFFFF) == 0x29B1
+    )  # CRC-16/CCITT-FALSE (IBM-3740): same polynomial, other start
+    for text in (b"", b"T", b"T,0012,0000070A,800000,A8C9C5,AF,00", bytes(range(256))):
+        assert protocol.checksum(text) == crc_as_avr_libc_documents_it(text)
+
+
+def test_the_documents_example_is_a_line_of_this_protocol():
+    example = re.search(r"\$T,[0-9A-F,]+\*[0-9A-F]{4}", PROTOCOL.read_text())[0].encode() + b"\r\n"
+    (sample,) = Parser().feed(example)
+    assert sample == Sample(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
+    assert example == protocol.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
+    assert len(example) == protocol.SAMPLE_LINE
+
+
+def test_messages_round_trip():
+    identity = Identity(1, 0x0102, 0xDEADBEEF, 10, 20)
+    stream = protocol.identity_line(identity) + lines(1)[0] + protocol.refusal_line(Reason.UNKNOWN)
+    messages = Parser().feed(stream)
+    assert messages == [identity, Sample(0, 0, 0x800000, 0x7F0000, 0xAF, 0), Refusal(Reason.UNKNOWN)]
+    assert max(map(len, stream.splitlines(keepends=True))) <= protocol.MAX_LINE
+
+
+def test_chunks_of_any_size_give_the_same_samples():
+    stream = b"".join(lines(50))
+    whole = Parser().feed(stream)
+    assert len(whole) == 50
+    for size in (1, 2, 7, 42, 43, 44, 1000):
+        parser = Parser()
+        pieces = [m for i in range(0, len(stream), size) for m in parser.feed(stream[i : i + size])]
+        assert pieces == whole
+        assert parser.counts == protocol.Counts(good=50)
+
+
+def test_resynchronises_after_garbage_and_counts_it():
+    parser = Parser()
+    a, b, c = lines(3)
+    garbage = b"\x00\xff$T,00*\r\n$$$*"
+    assert [m.sequence for m in parser.feed(garbage + a + garbage + b[:20] + c)] == [0, 2]
+    assert parser.counts == protocol.Counts(good=2, lost=1, garbage_bytes=2 * len(garbage) + 20)
+
+
+def test_memory_stays_bounded_whatever_comes():
+    parser = Parser()
+    for chunk in (b"$" * 10_000, b"$" + b"A" * 10_000, b"x" * 10_000, b"$T,"):
+        assert parser.feed(chunk) == []
+        assert len(parser._splitter._rest) < protocol.MAX_LINE
+    assert [m.sequence for m in parser.feed(lines(1)[0])] == [0]
+
+
+def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
+    parser = Parser()
+    line = lines(1)[0]
+    assert parser.feed(line.replace(b"800000", b"800001")) == []
+    assert parser.feed(protocol.frame(b"Z,01") + protocol.frame(b"T,1,2,3")) == []
+    assert parser.counts == protocol.Counts(crc_errors=1, malformed=2)
+
+
+def test_lost_doubled_and_wrapped_sequence():
+    parser = Parser()
+    sent = lines(8, start=0xFFFC)
+    del sent[2:4]
+    sent.insert(1, sent[0])
+    samples = parser.feed(b"".join(sent))
+    assert [s.lost for s in samples] == [0, 0, 2, 0, 0, 0]
+    assert np.diff([s.sequence for s in samples]).tolist() == [1, 3, 1, 1, 1]
+    assert (parser.counts.lost, parser.counts.duplicates) == (2, 1)
+
+
+def test_millisecond_wrap_is_no_reset_but_going_back_is():
+    parser = Parser()
+    first = protocol.sample_line(7, 0xFFFFFFF0, 1, 1, 1, 0)
+    wrapped = protocol.sample_line(8, 84, 1, 1, 1, 0)
+    reset = protocol.sample_line(0, 10, 1, 1, 1, Status.FIRST | Status.WATCHDOG)
+    unannounced = protocol.sample_line(0, 5, 1, 1, 1, 0)
+    samples = parser.feed(first + wrapped + reset + unannounced)
+    assert [s.restarted for s in samples] == [False, False, True, True]
+    assert np.diff([s.sequence for s in samples]).tolist() == [1, 1, 1]
+    assert parser.counts.restarts == 2 and parser.counts.lost == 0
+
+
+def test_the_first_sample_of_a_new_connection_claims_no_continuity():
+    """The MCU may have been reset while nobody listened, and by chance go on where it was."""
+    parser = Parser()
+    a, b, c = lines(3)
+    parser.resume()
+    samples = parser.feed(a + b[:9])
+    parser.resume()
+    samples += parser.feed(b + c)
+    assert [s.resumed for s in samples] == [False, True, False]
+    assert [s.sequence for s in samples] == [0, 1, 2]
+    assert parser.counts == protocol.Counts(good=3, garbage_bytes=9)
+    parser.resume()
+    assert parser.feed(c)[0].resumed
+
+
+def test_random_bytes_never_raise_and_give_nothing():
+    rng = np.random.default_rng(1)
+    parser = Parser()
+    alphabet = np.frombuffer(b"$*,\r\nTINR0123456789ABCDEF", np.uint8)
+    for data in (rng.integers(0, 256, 100_000, np.uint8), rng.choice(alphabet, 100_000)):
+        for chunk in np.array_split(data, 777):
+            assert parser.feed(chunk.tobytes()) == []
+    assert parser.counts.garbage_bytes > 190_000
+
+
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.05])
+def test_flipped_bits_never_make_a_wrong_sample(share):
+    rng = np.random.default_rng(2)
+    sent = lines(10_000)
+    truth = dict(enumerate(sent))
+    data = np.frombuffer(b"".join(sent), np.uint8)
+    flips = np.packbits(rng.random((len(data), 8)) < share, axis=1)[:, 0]
+    parser = Parser()
+    samples = parser.feed((data ^ flips).tobytes())
+    for s in samples:
+        line = protocol.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
+        assert line == truth[s.sequence]
+    clean = sum(not line.any() for line in flips.reshape(len(sent), -1))
+    assert clean <= len(samples) <= clean + 3
+    assert parser.counts.crc_errors > 0
+
+
+def test_every_single_and_double_bit_error_in_a_line_is_found():
+    line = lines(1, start=1234)[0]
+    bits = range(8 * len(line))
+    for i in bits:
+        for j in (*bits[:i:17], None):
+            bad = bytearray(line)
+            bad[i // 8] ^= 1 << i % 8
+            if j is not None:
+                bad[j // 8] ^= 1 << j % 8
+            assert Parser().feed(bytes(bad)) == []
+
+
+def test_commands():
+    assert protocol.parse_command(b"Q") == ("Q", 0)
+    assert protocol.parse_command(b"R,0A") == ("R", 10)
+    assert protocol.parse_command(b"R,00") is Reason.OUT_OF_RANGE
+    assert protocol.parse_command(b"R,33") is Reason.OUT_OF_RANGE
+    assert protocol.parse_command(b"R,A") is Reason.UNKNOWN
+    assert protocol.rate_command(50) == protocol.frame(b"R,32")
