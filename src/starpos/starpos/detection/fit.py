@@ -15,12 +15,19 @@ class Response:
 
     gain           (P,) what each phase of the colour mosaic passes, mean 1; (1,) without a mosaic
     colour_spread  how far a star's own gains scatter about these, relative, 1 sigma: stars have colours
-    dn_per_photon  the variance of a signal of s DN is dn_per_photon * s DN2
+    dn_per_photon  a signal of s DN has the variance dn_per_photon * s + (misfit * s)^2 DN2 on top of the sky's:
+    misfit         photons, and what the frame's one PSF fails to describe
     """
 
     gain: np.ndarray
     colour_spread: float
     dn_per_photon: float
+    misfit: float
+
+    def variance(self, noise, light):
+        """DN2 of pixels with the sky's noise (DN) and light DN of a star on them."""
+        light = np.maximum(light, 0)
+        return noise**2 + np.float32(self.dn_per_photon) * light + np.float32(self.misfit**2) * light**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +83,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
                 flux = (weight * unit * stamps.signal).sum((1, 2)) / (weight * unit * unit).sum((1, 2))
             flux = np.nan_to_num(flux)
         amount = flux.astype(np.float32)[:, None, None]
-        variance = stamps.noise**2 + np.float32(response.dn_per_photon) * np.maximum(amount * unit, 0)
+        variance = response.variance(stamps.noise, amount * unit)
         used = stamps.good & inside & ~outlier
         root = np.sqrt(used / variance)
         columns = [amount * by_x * local, amount * by_y * local, unit]

@@ -32,7 +32,7 @@ class Lesson:
 def learn(plane, background, x, y, height, saturation) -> Lesson:
     """What the peaks x, y (N,) of that height, highest first, teach; defaults where they teach nothing."""
     psf = gaussian(np.eye(2) * DEFAULT_SIGMA**2)
-    response = Response(np.ones(len(background.level)), 0.3, 0.0)
+    response = Response(np.ones(len(background.level)), 0.3, 0.0, 0.0)
     bright = np.flatnonzero(height > BRIGHT)
     if len(bright) == 0:
         bright = np.arange(min(len(x), TEACHERS))
@@ -119,21 +119,32 @@ def _respond(stamps, psf, x, y, fit, sound, before):
     noise2 = (stamps.noise**2)[used]
     light, square = np.maximum(fit.model[sound][used], 0), fit.residual[sound][used] ** 2
     square = square / np.maximum(1 - fit.leverage[sound][used], 0.1)
-    photon = before.dn_per_photon
+    photon, misfit2 = before.dn_per_photon, before.misfit**2
     for _ in range(4):
-        variance = noise2 + photon * light
-        keep = square < 25 * variance if photon > 0 else slice(None)
-        w = (light / variance**2)[keep]
-        total = (w * light[keep]).sum()
-        photon = max(0.0, float((w * (square - noise2)[keep]).sum() / total)) if total > 0 else 0.0
-    return Response(gain, spread, photon)
+        variance = noise2 + photon * light + misfit2 * light**2
+        keep = square < 25 * variance if photon + misfit2 > 0 else slice(None)
+        photon, misfit2 = _two_terms(light[keep], (square - noise2)[keep], variance[keep])
+    return Response(gain, spread, photon, float(np.sqrt(misfit2)))
+
+
+def _two_terms(light, excess, variance):
+    """a, b >= 0 for which a * light + b * light^2 is the least-squares fit of excess, of that variance."""
+    terms = np.stack([light, light * light]).astype(np.float64) / variance
+    normal, right = terms @ terms.T, terms @ (excess / variance)
+    if normal[0, 0] <= 0:
+        return 0.0, 0.0
+    both = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+    if both.min() >= 0:
+        return float(both[0]), float(both[1])
+    alone = np.maximum(right / np.diag(normal), 0)
+    best = int(np.argmax(right * alone))  # the one that takes more off the sum of squares
+    return (float(alone[0]), 0.0) if best == 0 else (0.0, float(alone[1]))
 
 
 def _gains(stamps, value, before):
     """The gains of the mosaic's phases (P,), mean 1, and how far a star's own scatter about them beyond noise."""
     phases = stamps.phase[..., None] == np.arange(len(before.gain))
-    light = np.maximum(stamps.signal, 0) * before.dn_per_photon
-    weight = (stamps.good / (stamps.noise**2 + light))[..., None] * phases
+    weight = (stamps.good / before.variance(stamps.noise, stamps.signal))[..., None] * phases
     information = (weight * (value * value)[..., None]).sum((1, 2))
     own = (weight * (value * stamps.signal)[..., None]).sum((1, 2)) / np.maximum(information, 1e-12)
     mean = np.maximum(own.mean(1, keepdims=True), 1e-12)
@@ -157,8 +168,6 @@ def _shape_up(stamps, psf, x, y, flux, response, order):
     scale = gain * flux.astype(np.float32)[:, None, None]
     value = psf.evaluate(dx, dy)[0]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
-    variance = (
-        stamps.noise**2 + response.dn_per_photon * np.maximum(scale * value, 0) + (0.02 * scale * value) ** 2
-    )
+    variance = response.variance(stamps.noise, scale * value) + (0.02 * scale * value) ** 2
     use = stamps.good & psf.within(dx, dy, FIT_WIDTHS)
     return refine(psf, dx[use], dy[use], (stamps.signal[use] / scale[use]), (scale**2 / variance)[use], order)

@@ -12,7 +12,7 @@ class Stamps:
 
     x, y    (N,) int: the central pixel of each
     signal  (N, S, S) float32, DN above the background
-    noise   (N, S, S) float32, DN rms of the background
+    noise   (N, S, S) float32, DN rms of the background, as large as sums over neighbouring pixels show it
     good    (N, S, S) bool: on the frame and not saturated
     full    (N, S, S) bool: saturated
     phase   (N, S, S) int: which of the colour mosaic's 2 x 2 pixels, 0..3; 0 everywhere without a mosaic
@@ -49,6 +49,7 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     on = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
     pixels = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
     level, noise = (v.astype(np.float32) for v in background.at(x, y))
+    noise *= np.float32(background.correlation)
     if background.is_mosaic:
         phase = 2 * (rows & 1)[:, :, None] + (columns & 1)[:, None, :]
         each = np.arange(len(x))[:, None, None]

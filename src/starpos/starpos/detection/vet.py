@@ -22,14 +22,18 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
     _, _, seen = moments(smooth, fit.x, fit.y, shape)
     widths = relative_widths(seen, shape + blur * np.eye(2), shape)
     with np.errstate(invalid="ignore", divide="ignore"):
-        snr = fit.flux / (fit.flux_sigma * background.correlation)
-        c = fit.covariance * (_misfit(fit) * background.correlation**2)[:, None, None]
+        snr = fit.flux / fit.flux_sigma
+        c = fit.covariance * _misfit(fit)[:, None, None]
+        score = (stamps.signal * stamps.good / stamps.noise)[:, 1:-1, 1:-1].max((1, 2))
+        matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))  # SNR in the sky's noise
         sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 4
-        sound &= (snr >= min_snr) & ~_is_dot(stamps, fit, psf)
+        sound &= (fit.flux > 0) & (matched >= min_snr)
+        # a hot pixel or a sharp cosmic ray: one pixel alone explains more than the PSF (likelihood ratio)
+        sound &= score < matched
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
-        slack = 3 / snr
+        slack = 3 / matched
         full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
         sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
         edge = (~stamps.good & ~stamps.full & _core(stamps, fit, psf, 3)).any((1, 2))
@@ -49,16 +53,6 @@ def _misfit(fit):
 def _core(stamps, fit, psf, widths):
     """(N, S, S) bool: the pixels within so many widths of the star's centre."""
     return psf.within(*stamps.offsets(fit.x, fit.y), widths)
-
-
-def _is_dot(stamps, fit, psf):
-    """Hot pixels and sharp cosmic rays: one pixel alone explains more than the PSF does (likelihood ratio)."""
-    c = stamps.reach
-    score = (stamps.signal * stamps.good / stamps.noise)[:, c - 2 : c + 3, c - 2 : c + 3].reshape(
-        len(stamps.x), -1
-    )
-    matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))
-    return score.max(1) > matched
 
 
 def resolve(columns, psf):
