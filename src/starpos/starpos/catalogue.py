@@ -5,9 +5,10 @@ The committed file holds every star with V < 11, which is what the instrument se
 accuracy of the roll about the optical axis, and with it of the position, comes from the stars fainter than V = 9.5.
 """
 
+import hashlib
 import os
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,9 @@ ZONES = 180  # of one degree of declination each
 MAS = np.radians(1 / 3.6e6)
 SIGMA_UNIT_MAS, PM_SIGMA_UNIT, EPOCH_ZERO = 2.0, 0.2, 1900.0
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
-_COLUMNS = ("ra_mas", "dec_mas", "pm_ra", "pm_dec", "vmag_centi", "sigma_code", "pm_sigma_code", "epoch_code", "tyc")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Catalogue:
     """Stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
 
@@ -46,6 +46,14 @@ class Catalogue:
 
     def __len__(self) -> int:
         return len(self.ra_mas)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Equal for equal stars: what a table made from this catalogue is known by."""
+        digest = hashlib.sha256()
+        for column in (self.ra_mas, self.dec_mas, self.vmag_centi):
+            digest.update(np.ascontiguousarray(column))
+        return digest.hexdigest()[:16]
 
     def vmag(self, index=slice(None)) -> np.ndarray:
         """Johnson V."""

@@ -14,6 +14,10 @@ class TiltError(StarposError):
     """The inclinometer's readings are missing, broken or out of range."""
 
 
+class TiltRangeError(TiltError):
+    """The instrument leans further than the inclinometer can measure."""
+
+
 class CatalogueError(StarposError):
     """The star catalogue is missing or broken."""
 
@@ -24,3 +28,7 @@ class TimeError(StarposError):
 
 class InstrumentError(StarposError):
     """The instrument's description (camera, misalignment, mount) is missing or inconsistent."""
+
+
+class FixError(StarposError):
+    """The stars do not support a fix."""

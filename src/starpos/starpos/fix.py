@@ -14,17 +14,13 @@ from starpos import rotation
 from starpos.atmosphere import Atmosphere, Refraction
 from starpos.camera import Camera
 from starpos.earth import ROTATION_RAD_S, EarthState, curvature_radii_m, station_velocity
-from starpos.errors import StarposError
+from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
 
 OUTLIER_SIGMA = 5.0
 MAX_ROUNDS = 6
 MIN_STARS = 3
 STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
-
-
-class FixError(StarposError):
-    """The stars do not support a fix."""
 
 
 @dataclass(frozen=True)
@@ -236,8 +232,8 @@ def _report(problem, state, keep, centroid_px2, catalogue_px2, jitter2, tilt, mo
     terms = (
         ErrorTerm("centroids", _compact(per_star(centroid_px2[keep] + np.eye(2) * jitter2)), False),
         ErrorTerm("catalogue", _compact(per_star(catalogue_px2[keep])), True),
-        ErrorTerm("tilt", level_moves @ _numerical(tilted, 2) @ _root(tilt.covariance), False),
-        ErrorTerm("calibration", level_moves @ a2 @ _root(mounting.calibration_covariance), True),
+        ErrorTerm("tilt", level_moves @ _numerical(tilted, 2) @ symmetric_root(tilt.covariance), False),
+        ErrorTerm("calibration", level_moves @ a2 @ symmetric_root(mounting.calibration_covariance), True),
         ErrorTerm("refraction", (stars_move @ pull * atmosphere.relative_sigma)[:, None], True),
         ErrorTerm("clock", time_east * clock_s, True),
         ErrorTerm("ut1", time_east * earth.orientation.ut1_sigma_s, True),
@@ -320,12 +316,14 @@ def _difference(plus, minus) -> np.ndarray:
     return np.array([moved @ east * prime, moved @ north * meridian, turned, *spin])
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """A square root F with F F^T = covariance, also of a singular one."""
+def symmetric_root(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric F with F F = covariance, also of a singular one; it keeps its signs from frame to frame."""
     values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0))
+    return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
 
 
 def _compact(factor: np.ndarray) -> np.ndarray:
-    """The same covariance with at most six columns."""
-    return _root(factor @ factor.T)
+    """The same covariance with six columns."""
+    scale = np.array([1.0, 1.0, 1e-6, 1e-6, 1e-6, 1e-6])  # m and rad, brought to like sizes
+    root = symmetric_root(factor @ factor.T / np.outer(scale, scale))
+    return root * scale[:, None]

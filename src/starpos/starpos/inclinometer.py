@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.errors import TiltError
+from starpos.errors import TiltError, TiltRangeError
 
 LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
@@ -35,7 +35,7 @@ class Tilt:
         if self.covariance.shape != (2, 2) or not np.isfinite(self.covariance).all():
             raise TiltError("a tilt's covariance must be 2 x 2 finite numbers, rad2")
         if max(abs(self.theta_x), abs(self.theta_y)) > LIMIT_RAD:
-            raise TiltError(
+            raise TiltRangeError(
                 f"tilt ({np.degrees(self.theta_x):.3f}, {np.degrees(self.theta_y):.3f}) deg is beyond +-30 deg, "
                 "the inclinometer's range: set the instrument more upright"
             )

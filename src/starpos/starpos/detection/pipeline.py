@@ -22,7 +22,7 @@ class DetectionSettings:
     """What may be chosen.
 
     threshold       sigma of the smoothed noise a peak must stand out by
-    min_snr         flux over its sigma a star must have
+    min_snr         flux over its sigma in the sky's noise a star must have
     max_stars       the brightest so many are kept
     mesh_px         size of the background's cells
     saturation_dn   DN from which a pixel is full; None: the type's largest value, or the frame's largest if several
@@ -30,7 +30,7 @@ class DetectionSettings:
     """
 
     threshold: float = 5.0
-    min_snr: float = 6.0
+    min_snr: float = 6.5
     max_stars: int = 10000
     mesh_px: int = 64
     saturation_dn: float | None = None

@@ -38,7 +38,7 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
         edge = (~stamps.good & ~stamps.full & _core(stamps, fit, psf, 3)).any((1, 2))
         foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux
-        elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.25 + slack) & ~full & ~edge
+        elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
     columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
     return {name: column[sound] for name, column in columns.items()}

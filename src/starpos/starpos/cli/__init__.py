@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos`: the instrument without ROS, so that a night can be worked off a disk.  One file a command."""
+
+import argparse
+import os
+import sys
+from importlib import import_module
+
+from starpos.errors import StarposError
+
+COMMANDS = {
+    "solve": "position and heading of frames with their tilts",
+    "detect": "the stars of frames",
+    "identify": "where frames look, lost in space",
+    "simulate": "write a night of frames and tilts from a place you choose",
+    "catalogue": "build the star catalogue, or say what it holds",
+}
+BAD_CALL = 2
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
+    parser = argparse.ArgumentParser(prog="starpos", description="Position and heading from the stars.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    given = sys.argv[1:] if argv is None else argv
+    for name, text in COMMANDS.items():
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if given and given[0] == name:  # only the command in use is imported: --help stays quick
+            import_module(f"starpos.cli.{name}").define(sub)
+    args = parser.parse_args(given)
+    try:
+        return args.run(args)
+    except StarposError as e:
+        print(f"starpos {args.command}: {e}", file=sys.stderr)
+        return BAD_CALL
+    except BrokenPipeError:  # the reader of our output has gone, as in `starpos ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except KeyboardInterrupt:
+        return 130

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands share: the instrument's and the air's options, reading frames, JSON without NaN, progress."""
+
+import argparse
+import json
+import math
+import sys
+import time
+
+import numpy as np
+
+from starpos import instrument
+from starpos.atmosphere import Atmosphere
+from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.frame import Frame
+from starpos.reading import read_frame
+from starpos.stars import Stars
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids")
+    parser.add_argument("--json", action="store_true", help="one JSON object a frame instead of a table")
+
+
+def add_optics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--focal-mm", type=float, metavar="MM", help="focal length; within 3 %%")
+    parser.add_argument("--pixel-um", type=float, metavar="UM", help="pixel size")
+
+
+def add_air(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--pressure-hpa", type=float, metavar="HPA", help="air pressure at the instrument, not reduced")
+    parser.add_argument("--temperature-c", type=float, metavar="C", help="air temperature")
+    parser.add_argument("--humidity", type=float, default=0.3, metavar="0..1", help="relative humidity (0.3)")
+
+
+def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
+    """The air as far as it was given; what was not given is wide."""
+    unknown = Atmosphere.unknown()
+    pressure, temperature = args.pressure_hpa, args.temperature_c
+    return Atmosphere(
+        unknown.pressure_pa if pressure is None else pressure * 100,
+        unknown.temperature_c if temperature is None else temperature,
+        args.humidity,
+        pressure_stddev_pa=unknown.pressure_stddev_pa if pressure is None else 200.0,
+        temperature_stddev_c=unknown.temperature_stddev_c if temperature is None else 2.0,
+    )
+
+
+def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> instrument.Instrument:
+    """From --instrument, or --focal-mm and --pixel-um, or what the first frame's header says."""
+    path = getattr(args, "instrument", None)
+    misalignment = getattr(args, "misalignment", None)
+    flat = args.focal_mm is not None or args.pixel_um is not None or misalignment is not None
+    if path is not None:
+        if flat:
+            raise InstrumentError("--instrument holds focal length and misalignment: give either it or the options")
+        return instrument.read(path)
+    if (args.focal_mm is None) != (args.pixel_um is None):
+        raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
+    if args.focal_mm is not None:
+        focal_px = instrument.focal_px_of(args.focal_mm, args.pixel_um)
+    elif first is not None and first.focal_px is not None:
+        focal_px = first.focal_px
+    else:
+        raise InstrumentError("no focal length: give --focal-mm and --pixel-um, or frames whose header has them")
+    return instrument.Instrument(focal_px, misalignment_deg=tuple(misalignment or (0.0, 0.0, 0.0)))
+
+
+def frames_of(paths: list[str]):
+    """(path, Frame or Stars or FrameError) of each, read one at a time."""
+    for path in paths:
+        try:
+            yield path, read_frame(path)
+        except FrameError as e:
+            yield path, e
+
+
+def stars_of(item: Frame | Stars) -> Stars:
+    """Detected stars, or the given ones."""
+    if isinstance(item, Stars):
+        return item
+    from starpos.detection import detect
+
+    return detect(item).stars
+
+
+def print_json(value: dict) -> None:
+    """One line; numbers that are none become null."""
+    print(json.dumps(_plain(value)), flush=True)
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+def complain(command: str, error: StarposError | str) -> None:
+    print(f"starpos {command}: {error}", file=sys.stderr)
+
+
+UNREADABLE = 2  # exit status
+
+
+class ProgressBar:
+    """A bar on standard error for work of more than half a second; silent where that is no terminal."""
+
+    def __init__(self):
+        self.begin = time.monotonic()
+        self.shown = False
+
+    def __call__(self, what: str, done: float) -> None:
+        if not sys.stderr.isatty() or (time.monotonic() - self.begin < 0.5 and not self.shown):
+            return
+        self.shown = True
+        filled = int(30 * min(done, 1.0))
+        end = "\n" if done >= 1 else ""
+        print(f"\r{what:>20} [{'#' * filled}{'.' * (30 - filled)}] {100 * done:3.0f} %", end=end, file=sys.stderr, flush=True)

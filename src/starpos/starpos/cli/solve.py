@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos solve`: position and heading of frames with their tilts, each and all together."""
+
+import numpy as np
+
+from starpos import catalogue
+from starpos.average import Average, average
+from starpos.cli import common
+from starpos.earth import utc_text
+from starpos.errors import FrameError
+from starpos.fix import Fix
+from starpos.inclinometer import read_tilt_csv
+from starpos.solve import Solution, Solver, Status
+from starpos.vertical import Deflection, geodetic
+
+NO_FIX = 1
+
+
+def define(parser) -> None:
+    common.add_frames(parser)
+    parser.add_argument("--tilt", required=True, metavar="CSV", help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]")
+    parser.add_argument("--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below")
+    common.add_optics(parser)
+    parser.add_argument("--misalignment", type=float, nargs=3, metavar=("RX", "RY", "RZ"), help="A3 in deg: camera to inclinometer")
+    common.add_air(parser)
+    parser.add_argument("--xi", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, north")
+    parser.add_argument("--eta", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, east")
+    parser.add_argument("--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)")
+    parser.set_defaults(run=run)
+
+
+def run(args) -> int:
+    deflection = _deflection(args)
+    tilts, solver, fixes, unreadable = None, None, [], False
+    for path, item in common.frames_of(args.frames):
+        if isinstance(item, FrameError):
+            common.complain("solve", item)
+            unreadable = True
+            answer = Solution(Status.BAD_INPUT, str(item), path, None, 0)
+        else:
+            if solver is None:
+                instrument = common.instrument_of(args, item)
+                tilts = read_tilt_csv(args.tilt, instrument.tilt_noise_rad)
+                solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar())
+            answer = solver.solve(common.stars_of(item), tilts.average)
+            if answer.fix:
+                fixes.append(answer.fix)
+            else:
+                common.complain("solve", answer.message)
+        if args.json:
+            common.print_json({"file": path} | _json_of(answer.fix, deflection) | _json_about(answer))
+        else:
+            print(_line(path, answer))
+    if fixes:
+        _print_combined(average(fixes), fixes, args, deflection)
+    return common.UNREADABLE if unreadable else 0 if fixes else NO_FIX
+
+
+def _deflection(args) -> Deflection:
+    if args.deflection_stddev is not None:
+        return Deflection(args.xi, args.eta, args.deflection_stddev)
+    return Deflection(args.xi, args.eta, 1.0) if args.xi or args.eta else Deflection()
+
+
+def _json_of(fix: Fix | Average | None, deflection: Deflection) -> dict:
+    """The keys of the contract that a fix fills; without one they are null."""
+    keys = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
+            "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "budget")  # fmt: skip
+    if fix is None:
+        return dict.fromkeys(keys)
+    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, deflection)
+    covariance = _in_degrees(fix.covariance)
+    sigma = np.sqrt(np.diag(covariance))
+    values = (
+        utc_text(fix.utc_unix_s),
+        np.degrees(fix.latitude),
+        np.degrees(fix.longitude),
+        np.degrees(fix.heading),
+        np.degrees(ground.latitude),
+        np.degrees(ground.longitude),
+        *sigma,
+        covariance,
+        _in_degrees(ground.covariance),
+        budget_of(fix, deflection),
+    )
+    return dict(zip(keys, values, strict=True))
+
+
+def _in_degrees(covariance: np.ndarray) -> np.ndarray:
+    """(east m, north m, heading deg) from (east m, north m, heading rad)."""
+    unit = np.array([1.0, 1.0, np.degrees(1.0)])
+    return covariance * np.outer(unit, unit)
+
+
+def budget_of(fix: Fix | Average, deflection: Deflection) -> dict:
+    """1 sigma of each source: east m, north m, heading deg; the deflection only concerns the geodetic position."""
+    terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
+    extra = geodetic(fix.latitude, fix.longitude, 0.0, np.zeros((3, 3)), deflection).covariance
+    terms["deflection (geodetic only)"] = np.sqrt(np.diag(extra)) * [1, 1, np.degrees(1)]
+    return terms
+
+
+def _json_about(s: Solution) -> dict:
+    a = s.attitude
+    return {
+        "stars_detected": s.stars_detected,
+        "stars_matched": len(s.names),
+        "residual_arcsec": s.fix.residual_arcsec if s.fix else None,
+        "log_odds": a.log_odds if a else None,
+        "status": s.status.value,
+    }
+
+
+def _line(path: str, s: Solution) -> str:
+    if s.fix is None:
+        return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
+    return f"{path}: {_where(s.fix)}, {len(s.names)} of {s.stars_detected} stars"
+
+
+def _where(fix: Fix | Average) -> str:
+    east, north, heading = np.sqrt(np.diag(_in_degrees(fix.covariance)))
+    turned = np.isnan(fix.heading)
+    facing = "turned between frames" if turned else f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
+    return (
+        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
+    )
+
+
+def _print_combined(all_together: Average, fixes: list[Fix], args, deflection: Deflection) -> None:
+    if args.json:
+        about = {"combined": True, "frames": len(fixes), "status": Status.OK.value}
+        about["stars_matched"] = int(sum(len(f.used) for f in fixes))
+        about["residual_arcsec"] = float(np.sqrt(np.mean([f.residual_arcsec**2 for f in fixes])))
+        common.print_json(about | _json_of(all_together, deflection))
+        return
+    ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, deflection)
+    print(f"{len(fixes)} frames together: {_where(all_together)} (astronomic)")
+    sigma = np.sqrt(np.diag(ground.covariance))
+    print(
+        f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
+        f"+- {sigma[1]:.0f} m N {sigma[0]:.0f} m E (the deflection of the vertical included)"
+    )
+    for name, (east, north, heading) in budget_of(all_together, deflection).items():
+        print(f"  {name:<28} {east:8.2f} m E {north:8.2f} m N {heading * 3600:8.2f} arcsec")

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the instrument is: optics, how its parts are fixed to each other, and how well that is known; its YAML file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starpos import rotation
+from starpos.camera import Camera
+from starpos.errors import InstrumentError
+from starpos.fix import Mounting
+from starpos.inclinometer import SCA100T_NOISE_RAD
+
+FORMAT = 1
+# x of the base link is the top of the frame (-y of C), z the optical axis (DESIGN section 2)
+TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+UNSTATED_CALIBRATION_ARCSEC = 5.0  # 1 sigma a axis of an A3 given without its error
+SIZE_LIMIT = 1 << 20
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """The paper's instrument, or another.
+
+    focal_px: focal length; camera: full intrinsics, None for an ideal camera of any size; misalignment_deg: A3 =
+    R3(rz) R2(ry) R1(rx), active, C into S; calibration_stddev_arcsec (3,): its errors about S's axes, the
+    inclinometer's zero included; link_to_camera (3, 3): the base link's axes as C sees them.
+    """
+
+    focal_px: float
+    camera: Camera | None = None
+    misalignment_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    calibration_stddev_arcsec: tuple[float, float, float] = (UNSTATED_CALIBRATION_ARCSEC,) * 3
+    link_to_camera: tuple = TOP_OF_FRAME
+    tilt_noise_rad: float = SCA100T_NOISE_RAD
+    clock_stddev_s: float = 0.01
+
+    def __post_init__(self):
+        for name, numbers in (
+            ("focal length", [self.focal_px]),
+            ("misalignment", self.misalignment_deg),
+            ("calibration_stddev_arcsec", self.calibration_stddev_arcsec),
+            ("link_to_camera", np.ravel(self.link_to_camera)),
+            ("tilt noise", [self.tilt_noise_rad]),
+            ("clock_stddev", [self.clock_stddev_s]),
+        ):
+            if not np.isfinite(np.asarray(numbers, float)).all():
+                raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
+        if self.focal_px <= 0:
+            raise InstrumentError(f"focal length {self.focal_px:g} px: must be positive (focal_mm * 1000 / pixel_um)")
+        if len(self.misalignment_deg) != 3 or len(self.calibration_stddev_arcsec) != 3:
+            raise InstrumentError("misalignment_deg and calibration_stddev_arcsec are three numbers each")
+        if min(*self.calibration_stddev_arcsec, self.tilt_noise_rad, self.clock_stddev_s) < 0:
+            raise InstrumentError("a standard deviation of the instrument is negative: it must be 0 or more")
+        link = np.asarray(self.link_to_camera, float)
+        if link.shape != (3, 3) or not np.allclose(link @ link.T, np.eye(3), atol=1e-6) or np.linalg.det(link) < 0:
+            raise InstrumentError("link_to_camera must be a 3 x 3 rotation matrix")
+
+    def camera_for(self, width: int, height: int) -> Camera:
+        """The camera of a frame of this size; InstrumentError where the intrinsics are of another size."""
+        if self.camera is None:
+            return Camera.from_focal(width, height, self.focal_px)
+        if (self.camera.width, self.camera.height) != (width, height):
+            raise InstrumentError(
+                f"the frame is {width} x {height} px but the camera's intrinsics are of {self.camera.width} x "
+                f"{self.camera.height} px: use those of this frame size"
+            )
+        return self.camera
+
+    @property
+    def mounting(self) -> Mounting:
+        """A3 and the base link as matrices."""
+        rx, ry, rz = np.radians(self.misalignment_deg)
+        a3 = rotation.about_axis(2, rz) @ rotation.about_axis(1, ry) @ rotation.about_axis(0, rx)
+        sigma = np.radians(np.asarray(self.calibration_stddev_arcsec) / 3600)
+        return Mounting(a3, np.asarray(self.link_to_camera, float), np.diag(sigma**2))
+
+
+def focal_px_of(focal_mm: float, pixel_um: float) -> float:
+    """Focal length in px; InstrumentError unless both are positive."""
+    if not (focal_mm > 0 and pixel_um > 0 and np.isfinite([focal_mm, pixel_um]).all()):
+        raise InstrumentError(f"focal length {focal_mm:g} mm with {pixel_um:g} um pixels: both must be positive")
+    return focal_mm * 1000 / pixel_um
+
+
+def read(path) -> Instrument:
+    """An Instrument from its YAML file (format below); InstrumentError with the reason where it is none.
+
+    starpos_instrument: 1
+    camera: {focal_mm, pixel_um} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
+    misalignment_deg: [rx, ry, rz]
+    calibration_stddev_arcsec: [x, y, z]
+    link_to_camera: [[..], [..], [..]]
+    tilt_noise_deg: 0.0035
+    clock_stddev_s: 0.01
+    """
+    import yaml
+
+    path = Path(path)
+    try:
+        if path.stat().st_size > SIZE_LIMIT:
+            raise InstrumentError(f"{path}: over 1 MiB, no instrument file")
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
+        raise InstrumentError(f"{path}: not a readable instrument file ({' '.join(str(e).split())[:120]})") from None
+    if not isinstance(content, dict) or content.pop("starpos_instrument", None) != FORMAT:
+        raise InstrumentError(f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`")
+    try:
+        return _from_mapping(content)
+    except InstrumentError as e:
+        raise InstrumentError(f"{path}: {e}") from None
+    except (KeyError, TypeError, ValueError) as e:
+        raise InstrumentError(f"{path}: a key is missing or of the wrong kind ({e})") from None
+
+
+def _from_mapping(content: dict) -> Instrument:
+    known = {"camera", "misalignment_deg", "calibration_stddev_arcsec", "link_to_camera", "tilt_noise_deg", "clock_stddev_s"}
+    if unknown := sorted(set(content) - known):
+        raise InstrumentError(f"unknown key {unknown[0]!r}: the keys are {', '.join(sorted(known))}")
+    camera = dict(content["camera"])
+    given = {}
+    if "focal_mm" in camera:
+        focal_px = focal_px_of(float(camera["focal_mm"]), float(camera["pixel_um"]))
+    else:
+        sizes = (int(camera["width"]), int(camera["height"]))
+        numbers = (float(camera[k]) for k in ("fx", "fy", "cx", "cy"))
+        given["camera"] = Camera(*sizes, *numbers, tuple(float(d) for d in camera.get("distortion", [0.0] * 5)))
+        focal_px = given["camera"].fx
+    for key in ("misalignment_deg", "calibration_stddev_arcsec"):
+        if key in content:
+            given[key] = tuple(float(v) for v in content[key])
+    if "link_to_camera" in content:
+        given["link_to_camera"] = tuple(tuple(float(v) for v in row) for row in content["link_to_camera"])
+    if "tilt_noise_deg" in content:
+        given["tilt_noise_rad"] = float(np.radians(float(content["tilt_noise_deg"])))
+    if "clock_stddev_s" in content:
+        given["clock_stddev_s"] = float(content["clock_stddev_s"])
+    return Instrument(focal_px, **given)

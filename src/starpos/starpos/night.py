@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated night on disk: frames (FITS) or star lists (CSV), tilt.csv, and truth.json to hold a solution against."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from starpos.catalogue import Catalogue
+from starpos.errors import FrameError, TimeError
+from starpos.frame import Frame
+from starpos.simulate import Scene, detected, expose, read_tilt, render
+from starpos.stars import Stars
+
+TILT_RATE_HZ = 10.0
+
+
+def write_night(
+    folder,
+    scene: Scene,
+    catalogue: Catalogue,
+    start_utc: str,
+    frames: int,
+    cadence_s: float,
+    exposure_s: float,
+    turn_deg: float,
+    stars_only: bool,
+    rng: np.random.Generator,
+    progress: Callable[[str, float], None] = lambda what, done: None,
+) -> None:
+    """Write `frames` exposures of a scene that turns by turn_deg of azimuth from one to the next."""
+    begin = unix_of(start_utc)
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        truth, tilts = [], []
+        for k in range(frames):
+            now = replace(scene, azimuth_deg=scene.azimuth_deg + k * turn_deg)
+            start = begin + k * cadence_s
+            stars = expose(now, catalogue, start, exposure_s, rng)
+            if stars_only:
+                listed = detected(now, stars, start + exposure_s / 2, exposure_s, rng)
+                write_stars(folder / f"stars_{k:04d}.csv", listed, _text(start))
+            else:
+                write_fits(folder / f"frame_{k:04d}.fits", render(now, stars, start, exposure_s, rng), _text(start))
+            samples = max(1, round(exposure_s * TILT_RATE_HZ))
+            for j in range(samples):
+                moment = start + (j + 0.5) * exposure_s / samples
+                tilts.append((moment, *np.degrees(read_tilt(now, (moment - begin) / 3600, rng)), 15.0))
+            truth.append({"start_utc": _text(start), "mid_unix_s": start + exposure_s / 2,
+                          "heading_deg": float(np.degrees(now.heading)), "stars": len(stars.electrons)})  # fmt: skip
+            progress("frames", (k + 1) / frames)
+        rows = "".join("{:.6f},{:.7f},{:.7f},{:.2f}\n".format(*row) for row in tilts)
+        (folder / "tilt.csv").write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n" + rows)
+        place = {"latitude_deg": scene.site.latitude_deg, "longitude_deg": scene.site.longitude_deg}
+        (folder / "truth.json").write_text(json.dumps(place | {"frames": truth}, indent=1))
+    except OSError as e:
+        raise FrameError(f"{folder}: the night cannot be written there ({e.strerror})") from None
+
+
+def unix_of(utc: str) -> float:
+    """Unix seconds of an ISO 8601 time, UTC unless it says otherwise; TimeError if it is none."""
+    import datetime
+
+    try:
+        moment = datetime.datetime.fromisoformat(utc.replace("Z", "+00:00"))
+    except ValueError:
+        raise TimeError(f"{utc!r} is no time: write it like 2026-11-02T18:00:00") from None
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.timezone.utc)
+    return moment.timestamp()
+
+
+def _text(unix_s: float) -> str:
+    import datetime
+
+    moment = datetime.datetime.fromtimestamp(round(unix_s, 6), datetime.timezone.utc)
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")
+
+
+def write_fits(path, frame: Frame, start_utc: str) -> None:
+    """A frame as FITS with DATE-OBS (start of exposure, UTC) and EXPTIME."""
+    from astropy.io import fits
+
+    header = fits.Header()
+    header["DATE-OBS"] = (start_utc, "start of exposure, UTC")
+    header["EXPTIME"] = (frame.exposure_s, "s")
+    header["FOCALLEN"] = (frame.focal_px / 1000, "mm, at 1 um pixels")
+    header["XPIXSZ"] = (1.0, "um")
+    fits.PrimaryHDU(frame.pixels, header).writeto(path, overwrite=True)
+
+
+def write_stars(path, stars: Stars, start_utc: str) -> None:
+    """A list of stars as CSV, in the form `read_frame` reads."""
+    about = {"DATE-OBS": start_utc, "EXPTIME": stars.exposure_s, "NAXIS1": stars.width, "NAXIS2": stars.height}
+    sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
+    rows = "".join(f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n" for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True))
+    Path(path).write_text(f"# {json.dumps(about)}\nx,y,flux,sigma\n{rows}")

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated instrument under a simulated sky: frames and tilts with their errors, from a known place.
+
+It uses this package's own apparent places, so it tests everything after them; the places themselves are held against
+ERFA's and astropy's numbers in the tests.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import erf
+
+from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
+from starpos.catalogue import Catalogue
+from starpos.earth import earth_state
+from starpos.frame import Frame
+from starpos.instrument import Instrument
+from starpos.sky import Site, camera_to_enu
+from starpos.stars import Stars
+
+FWHM_PER_SIGMA = 2.354820045
+STAMP_SIGMAS = 5.0
+CENTROID_FLOOR_PX, DETECTED_SNR = 0.02, 6.0
+TILT_QUANTUM_RAD = np.radians(0.0035 / 8)
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What reaches the pixels: the paper's telescope and camera by default."""
+
+    fwhm_px: float = 2.4
+    zero_point_e_s: float = 3.0e7  # electrons per second of a star of V = 0
+    sky_mag_arcsec2: float = 18.0
+    read_noise_e: float = 6.0
+    gain_e_dn: float = 1.0
+    bias_dn: float = 512.0
+    full_well_dn: float = 16383.0
+    seeing_arcsec: float = 0.2  # each star's own motion, 1 sigma
+    limit_mag: float = 11.0
+
+
+@dataclass(frozen=True)
+class TiltErrors:
+    """Errors of one inclinometer reading: white noise, zero of the two axes, drift of the zero per hour; rad."""
+
+    noise: float = np.radians(0.0035)
+    zero: tuple[float, float] = (0.0, 0.0)
+    drift_hour: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An instrument standing at a site and looking somewhere."""
+
+    camera: Camera
+    instrument: Instrument
+    site: Site
+    azimuth_deg: float = 40.0
+    altitude_deg: float = 78.0
+    roll_deg: float = 15.0
+    optics: Optics = field(default_factory=Optics)
+    tilt_errors: TiltErrors = field(default_factory=TiltErrors)
+
+    @property
+    def attitude(self) -> np.ndarray:
+        """C into ENU (3, 3)."""
+        return camera_to_enu(self.azimuth_deg, self.altitude_deg, self.roll_deg)
+
+    @property
+    def heading(self) -> float:
+        """Azimuth in rad of the base link's x axis."""
+        forward = self.attitude @ np.asarray(self.instrument.link_to_camera)[:, 0]
+        return float(np.arctan2(forward[0], forward[1]) % (2 * np.pi))
+
+    @property
+    def tilt(self) -> tuple[float, float]:
+        """theta_x, theta_y in rad without errors."""
+        up = self.instrument.mounting.a3 @ self.attitude[2]
+        return float(np.arcsin(up[0])), float(np.arcsin(up[1]))
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """Stars on a frame: pixels (n, 2) at start, middle and end of the exposure; electrons (n,); catalogue index (n,)."""
+
+    start: np.ndarray
+    middle: np.ndarray
+    end: np.ndarray
+    electrons: np.ndarray
+    catalogue: np.ndarray
+
+
+def expose(scene: Scene, catalogue: Catalogue, start_unix_s: float, exposure_s: float, rng) -> Exposed:
+    """Where each star's light falls while the sky turns over the standing camera."""
+    camera, optics = scene.camera, scene.optics
+    reach = camera.half_diagonal_rad * 1.02
+    middle_state = earth_state(start_unix_s + exposure_s / 2)
+    index = scene.site.overhead(catalogue, middle_state, scene.attitude[:, 2], reach, optics.limit_mag)
+    px = []
+    for t in (start_unix_s, start_unix_s + exposure_s / 2, start_unix_s + exposure_s):
+        state = middle_state if t == middle_state.utc_unix_s else earth_state(t)
+        px.append(camera.project(scene.site.observed(catalogue, index, state) @ scene.attitude))
+    px = np.stack(px) + rng.normal(0, optics.seeing_arcsec / camera.scale_arcsec, (len(index), 2))
+    on = np.isfinite(px).all((0, 2)) & (px[1] > -6).all(1) & (px[1] < [camera.width + 5, camera.height + 5]).all(1)
+    electrons = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * catalogue.vmag(index))
+    return Exposed(*(p[on] for p in px), electrons[on], index[on])
+
+
+def render(scene: Scene, stars: Exposed, start_unix_s: float, exposure_s: float, rng, source: str = "simulated") -> Frame:
+    """A 16-bit frame: trailed Gaussian images integrated over pixels, sky, photon and read noise, clipping."""
+    camera, optics = scene.camera, scene.optics
+    sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2
+    light = np.full(camera.height * camera.width, sky, np.float32)
+    place, amount = _star_light(camera, optics, stars)
+    np.add.at(light, place, amount)
+    light += rng.standard_normal(len(light), dtype=np.float32) * np.sqrt(light + np.float32(optics.read_noise_e**2))
+    light *= np.float32(1 / optics.gain_e_dn)
+    light += np.float32(optics.bias_dn + 0.5)
+    np.clip(light, 0, optics.full_well_dn, out=light)
+    pixels = light.astype(np.uint16).reshape(camera.height, camera.width)
+    return Frame(pixels, "", start_unix_s + exposure_s / 2, exposure_s, source, camera.fx)
+
+
+def _star_light(camera: Camera, optics: Optics, stars: Exposed) -> tuple[np.ndarray, np.ndarray]:
+    """Flat pixel indices and electrons of all stars' trailed images."""
+    sigma = optics.fwhm_px / FWHM_PER_SIGMA
+    trail = stars.end - stars.start
+    longest = np.hypot(*trail.T).max(initial=0.0)
+    steps = max(1, int(np.ceil(4 * longest)))
+    reach = int(np.ceil(STAMP_SIGMAS * sigma + longest / 2)) + 1
+    offset = np.arange(-reach, reach + 1)
+    corner = np.round(stars.middle).astype(int)
+    moments = (np.arange(steps) + 0.5) / steps
+    along = stars.start[:, None] + moments[None, :, None] * trail[:, None]  # (n, steps, 2)
+    profile = []
+    for k in range(2):
+        d = corner[:, k, None, None] + offset - along[:, :, k, None]  # (n, steps, size)
+        profile.append(0.5 * (erf((d + 0.5) / (sigma * np.sqrt(2))) - erf((d - 0.5) / (sigma * np.sqrt(2)))))
+    image = np.einsum("nsx,nsy->nyx", *profile) * (stars.electrons / steps)[:, None, None]
+    x = corner[:, 0, None, None] + offset[None, None, :]
+    y = corner[:, 1, None, None] + offset[None, :, None]
+    on = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return (y * camera.width + x)[on], image[on].astype(np.float32)
+
+
+def read_tilt(scene: Scene, hours: float, rng) -> tuple[float, float]:
+    """One inclinometer reading (rad), `hours` after its zero was true."""
+    e = scene.tilt_errors
+    theta = np.array(scene.tilt) + e.zero + hours * np.asarray(e.drift_hour) + rng.normal(0, 1, 2) * e.noise
+    if e.noise:
+        theta = np.round(theta / TILT_QUANTUM_RAD) * TILT_QUANTUM_RAD
+    return float(theta[0]), float(theta[1])
+
+
+def scene_of(
+    size: tuple[int, int] = (5616, 3744),
+    focal_px: float = 93750.0,
+    latitude_deg: float = 35.7046,
+    longitude_deg: float = 51.4106,
+    atmosphere: Atmosphere = Atmosphere(),
+    pointing_deg: tuple[float, float, float] = (40.0, 78.0, 15.0),
+    misalignment_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    tilt_noise_deg: float = 0.0035,
+    tilt_zero_deg: tuple[float, float] = (0.0, 0.0),
+) -> Scene:
+    """The paper's instrument at a place, with what is usually varied as plain numbers."""
+    return Scene(
+        Camera.from_focal(*size, focal_px),
+        Instrument(focal_px, misalignment_deg=misalignment_deg),
+        Site(latitude_deg, longitude_deg, atmosphere),
+        *pointing_deg,
+        tilt_errors=TiltErrors(np.radians(tilt_noise_deg), tuple(np.radians(tilt_zero_deg))),
+    )
+
+
+def detected(scene: Scene, stars: Exposed, mid_unix_s: float, exposure_s: float, rng, source: str = "simulated") -> Stars:
+    """The stars as a good detector would list them: errors by photon noise, with a floor of 0.02 px; SNR above 6."""
+    optics, camera = scene.optics, scene.camera
+    sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2
+    area = np.pi * optics.fwhm_px**2
+    snr = stars.electrons / np.sqrt(stars.electrons + area * (sky + optics.read_noise_e**2))
+    sigma = np.hypot(optics.fwhm_px / FWHM_PER_SIGMA / snr, CENTROID_FLOOR_PX)
+    xy = stars.middle + rng.normal(0, 1, stars.middle.shape) * sigma[:, None]
+    seen = (snr > DETECTED_SNR) & (xy >= 0).all(1) & (xy <= [camera.width - 1, camera.height - 1]).all(1)
+    order = np.flatnonzero(seen)[np.argsort(-stars.electrons[seen], kind="stable")]
+    return Stars(
+        *xy[order].T,
+        stars.electrons[order],
+        snr[order],
+        np.eye(2) * (sigma[order] ** 2)[:, None, None],
+        np.zeros(len(order), np.uint8),
+        camera.width,
+        camera.height,
+        mid_unix_s,
+        exposure_s,
+        source,
+        camera.fx,
+    )

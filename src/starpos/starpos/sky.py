@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sky seen from a known place: the forward direction of what the fix inverts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos import rotation
+from starpos.atmosphere import Atmosphere
+from starpos.catalogue import Catalogue
+from starpos.earth import EarthState, station_velocity
+
+
+@dataclass(frozen=True)
+class Site:
+    """A place by gravity: astronomic latitude, longitude in deg; and its air."""
+
+    latitude_deg: float
+    longitude_deg: float
+    atmosphere: Atmosphere = Atmosphere()
+
+    @property
+    def enu(self) -> np.ndarray:
+        """(3, 3): ITRS into east, north, up."""
+        phi, lam = np.radians([self.latitude_deg, self.longitude_deg])
+        return np.array(
+            [
+                [-np.sin(lam), np.cos(lam), 0.0],
+                [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
+                [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+            ]
+        )
+
+    def observed(self, catalogue: Catalogue, index: np.ndarray, state: EarthState) -> np.ndarray:
+        """Refracted directions (n, 3) in ENU of catalogue stars."""
+        v = state.to_itrs(catalogue.directions(index, state.year)) + station_velocity(self.enu[2])
+        return self.atmosphere.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ self.enu.T)
+
+    def overhead(self, catalogue: Catalogue, state: EarthState, toward: np.ndarray, radius: float, limit_mag: float):
+        """Catalogue indices within `radius` rad of an observed ENU direction (3,), brightest first."""
+        itrs = self.atmosphere.refraction().unbend(toward) @ self.enu
+        # aberration and precession of the direction itself are far below the margin
+        ra, dec = np.arctan2(itrs[1], itrs[0]), np.arcsin(np.clip(itrs[2], -1, 1))
+        cirs = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]) @ state.cirs_to_itrs
+        icrs = cirs @ np.asarray(state.astrom["bpn"]).reshape(3, 3)
+        return catalogue.cone(icrs, radius + np.radians(0.05), limit_mag)
+
+
+def camera_to_enu(azimuth_deg: float, altitude_deg: float, roll_deg: float) -> np.ndarray:
+    """Attitude (3, 3) of a camera that looks at azimuth, altitude; at roll 0 its x axis is level, to the right."""
+    a, h = np.radians([azimuth_deg, altitude_deg])
+    z = np.array([np.sin(a) * np.cos(h), np.cos(a) * np.cos(h), np.sin(h)])
+    x = np.array([np.cos(a), -np.sin(a), 0.0])
+    return np.stack([x, np.cross(z, x), z], 1) @ rotation.about_axis(2, -np.radians(roll_deg))

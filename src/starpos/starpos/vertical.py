@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From astronomic to geodetic: the deflection of the vertical (DESIGN section 2)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.earth import curvature_radii_m
+from starpos.errors import InstrumentError
+
+ARCSEC = np.radians(1 / 3600)
+UNKNOWN_STDDEV_ARCSEC = 6.0  # of each component where nothing is known: the root mean square over the continents
+
+
+@dataclass(frozen=True)
+class Deflection:
+    """xi (north) and eta (east) in arcsec, with the 1 sigma of each."""
+
+    xi_arcsec: float = 0.0
+    eta_arcsec: float = 0.0
+    stddev_arcsec: float = UNKNOWN_STDDEV_ARCSEC
+
+    def __post_init__(self):
+        if not np.isfinite([self.xi_arcsec, self.eta_arcsec, self.stddev_arcsec]).all() or self.stddev_arcsec < 0:
+            raise InstrumentError("deflection of the vertical: xi and eta must be finite, their stddev 0 or more")
+
+
+@dataclass(frozen=True)
+class Geodetic:
+    """Latitude, longitude, heading (rad) on WGS 84; covariance (3, 3) of east m, north m, heading rad."""
+
+    latitude: float
+    longitude: float
+    heading: float
+    covariance: np.ndarray
+
+
+def geodetic(latitude: float, longitude: float, heading: float, covariance: np.ndarray, d: Deflection) -> Geodetic:
+    """phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); its unknown part widens all three."""
+    phi = latitude - d.xi_arcsec * ARCSEC
+    eta = d.eta_arcsec * ARCSEC
+    cos_phi = max(np.cos(phi), 1e-9)
+    lam = (longitude - eta / cos_phi + np.pi) % (2 * np.pi) - np.pi
+    azimuth = (heading - eta * np.tan(phi)) % (2 * np.pi)
+    prime, meridian = curvature_radii_m(phi)
+    xi_moves = np.array([0.0, meridian, 0.0])
+    eta_moves = np.array([prime, 0.0, np.sin(phi) / cos_phi])
+    sigma = d.stddev_arcsec * ARCSEC
+    extra = (np.outer(xi_moves, xi_moves) + np.outer(eta_moves, eta_moves)) * sigma**2
+    return Geodetic(float(phi), float(lam), float(azimuth), covariance + extra)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small star fields for the tests of detection, and the Cramer-Rao bound of what is in them.
+
+A star is a Gaussian drawn along a straight trail and integrated over each pixel; 1 DN is one electron.
+"""
+
+import numpy as np
+from scipy.special import erf
+
+SKY, READ_NOISE, BIAS = 20.0, 5.0, 300.0
+
+
+def star(size, x, y, fwhm, trail=(0.0, 0.0)):
+    """A star of unit flux at (x, y) on size (height, width) px, float64."""
+    scale = fwhm / 2.3548 * np.sqrt(2)
+    columns, rows = np.arange(size[1]), np.arange(size[0])
+    steps = int(np.ceil(6 * np.hypot(*trail))) + 1
+    image = np.zeros(size)
+    for t in (np.arange(steps) + 0.5) / steps - 0.5:
+        u, v = columns - x - t * trail[0], rows - y - t * trail[1]
+        across = 0.5 * (erf((u + 0.5) / scale) - erf((u - 0.5) / scale))
+        down = 0.5 * (erf((v + 0.5) / scale) - erf((v - 0.5) / scale))
+        image += np.outer(down, across) / steps
+    return image
+
+
+def field(size, stars, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gains=None):
+    """Noiseless electrons (float64) of stars (N, 3): x, y, electrons; gains (N + 1, 2, 2): each star's mosaic and
+    last the sky's."""
+    image = np.zeros(size)
+    reach = int(4 * fwhm + np.hypot(*trail)) + 3
+
+    def through(gain, light, row=0, column=0):
+        rows, columns = np.indices(light.shape)
+        return light if gains is None else light * gain[(rows + row) % 2, (columns + column) % 2]
+
+    for i, (x, y, electrons) in enumerate(stars):
+        r0, c0 = max(0, int(y) - reach), max(0, int(x) - reach)
+        r1, c1 = min(size[0], int(y) + reach + 1), min(size[1], int(x) + reach + 1)
+        if r1 > r0 and c1 > c0:
+            light = electrons * star((r1 - r0, c1 - c0), x - c0, y - r0, fwhm, trail)
+            image[r0:r1, c0:c1] += through(None if gains is None else gains[i], light, r0, c0)
+    return image + through(None if gains is None else gains[-1], np.full(size, float(sky)))
+
+
+def noisy(image, rng, top=65535, dtype=np.uint16):
+    """What a camera writes of these electrons."""
+    counts = rng.poisson(image) + rng.normal(0, READ_NOISE, image.shape) + BIAS
+    return np.clip(np.rint(counts), 0, top).astype(dtype)
+
+
+def bound(electrons, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gain=None):
+    """Cramer-Rao bound (sigma_x, sigma_y) px of one star; gain (2, 2): behind a mosaic of known colours."""
+    size, x, y, h = (41, 41), 20.2, 19.9, 1e-3
+    mosaic = np.ones(size) if gain is None else np.tile(gain, (21, 21))[:41, :41]
+    value = star(size, x, y, fwhm, trail)
+    by_x = (star(size, x + h, y, fwhm, trail) - star(size, x - h, y, fwhm, trail)) / (2 * h)
+    by_y = (star(size, x, y + h, fwhm, trail) - star(size, x, y - h, fwhm, trail)) / (2 * h)
+    design = np.stack([electrons * by_x, electrons * by_y, value], -1).reshape(-1, 3) * mosaic.reshape(-1, 1)
+    variance = (mosaic * (electrons * value + sky)).ravel() + READ_NOISE**2 + 1 / 12
+    return np.sqrt(np.diag(np.linalg.inv((design / variance[:, None]).T @ design)))[:2]
+
+
+def grid(size, spacing, electrons, rng):
+    """Stars (N, 3) about `spacing` px apart, each somewhere in its pixel, away from the edges."""
+    y, x = np.meshgrid(*(np.arange(spacing, n - spacing + 1, spacing) for n in size), indexing="ij")
+    x, y = (v.ravel() + rng.uniform(-2, 2, v.size) for v in (x, y))
+    return np.stack(
+        [x, y, np.broadcast_to(electrons, x.shape) if np.ndim(electrons) == 0 else electrons(x.size)], 1
+    )
+
+
+def match(found, stars, within=2.0):
+    """For every true star the index of the nearest found one, -1 where none lies within so many px."""
+    if len(found) == 0:
+        return np.full(len(stars), -1)
+    apart = np.hypot(stars[:, None, 0] - found.x, stars[:, None, 1] - found.y)
+    return np.where(apart.min(1) < within, apart.argmin(1), -1)

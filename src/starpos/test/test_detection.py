@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from rendered import BIAS, bound, field, grid, match, noisy
+
+from starpos.detection import DetectionSettings, detect
+from starpos.errors import FrameError
+from starpos.frame import Frame
+from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
+
+TRAIL = (2.6, -2.2)  # px: half a second of the sky
+
+
+def errors(size, frames, electrons, seed, pattern="", gains=None, **shape):
+    """Errors (M, 2) px, errors over their claimed sigmas, and how many stars were missed or invented."""
+    rng = np.random.default_rng(seed)
+    error, pull, missed, invented = [], [], 0, 0
+    for _ in range(frames):
+        stars = grid(size, 30, electrons, rng)
+        pixels = noisy(field(size, stars, gains=gains and gains(len(stars), rng), **shape), rng)
+        found = detect(Frame(pixels, pattern)).stars
+        index = match(found, stars)
+        missed += np.count_nonzero(index < 0)
+        invented += len(found) - len(set(index[index >= 0]))
+        hit = index[index >= 0]
+        d = np.stack([found.x[hit], found.y[hit]], 1) - stars[index >= 0, :2]
+        error.append(d)
+        pull.append(d / np.sqrt(np.einsum("nii->ni", found.covariance[hit])))
+    return np.concatenate(error), np.concatenate(pull), missed, invented
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values), axis=0))
+
+
+@pytest.mark.parametrize("electrons", [1500, 8000, 80000])
+def test_trailed_stars_are_measured_at_the_cramer_rao_bound(electrons):
+    error, pull, missed, invented = errors((520, 520), 3, electrons, seed=1, trail=TRAIL)
+    assert (missed, invented) == (0, 0)
+    assert np.all(rms(error) < 1.08 * bound(electrons, trail=TRAIL))
+    assert 0.92 < rms(pull.ravel()) < 1.08
+    assert np.all(np.abs(error.mean(0)) < 4 * bound(electrons, trail=TRAIL) / np.sqrt(len(error)))
+
+
+@pytest.mark.parametrize(("fwhm", "electrons"), [(1.2, 4000), (8.0, 30000)])
+def test_undersampled_and_defocused_stars_keep_near_the_bound(fwhm, electrons):
+    error, pull, missed, invented = errors((520, 520), 2, electrons, seed=2, fwhm=fwhm)
+    assert (missed, invented) == (0, 0)
+    assert np.all(rms(error) < 1.12 * bound(electrons, fwhm))
+    assert 0.9 < rms(pull.ravel()) < 1.1
+
+
+def test_error_does_not_depend_on_where_in_a_pixel_a_star_falls():
+    rng = np.random.default_rng(3)
+    stars = grid((700, 700), 28, 60000, rng)
+    found = detect(Frame(noisy(field((700, 700), stars, fwhm=1.3), rng))).stars
+    index = match(found, stars)
+    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
+    phase = 2 * np.pi * stars[:, :2]
+    for wave in (np.sin(phase), np.cos(phase), np.sin(2 * phase)):
+        amplitude = 2 * np.mean(error * wave, axis=0)
+        assert np.all(np.abs(amplitude) < 0.005)
+
+
+@pytest.mark.parametrize("pattern", ["rggb", ""])
+def test_a_mosaic_declared_or_not_shifts_no_star_whatever_its_colour(pattern):
+    sky = np.array([[0.5, 1.0], [1.0, 0.6]])
+
+    def coloured(count, rng):
+        red, blue = rng.uniform(0.3, 1.0, (2, count))
+        own = np.stack([np.stack([red, np.ones(count)], 1), np.stack([np.ones(count), blue], 1)], 1)
+        return np.concatenate([own, sky[None]])
+
+    error, pull, missed, invented = errors(
+        (520, 520), 3, 20000, seed=4, pattern=pattern, gains=coloured, trail=TRAIL
+    )
+    assert (missed, invented) == (0, 0)
+    assert np.all(rms(error) < 1.3 * bound(20000, trail=TRAIL, gain=np.array([[0.65, 1], [1, 0.65]])))
+    assert 0.9 < rms(pull.ravel()) < 1.1
+    assert np.all(np.abs(error.mean(0)) < 0.004)
+
+
+def test_colours_of_a_bgr_frame_are_added():
+    rng = np.random.default_rng(5)
+    stars = grid((300, 300), 50, 6000, rng)
+    light = field((300, 300), stars, sky=40) / 30
+    channels = [
+        np.clip(np.rint(light * g + rng.normal(8, 1.5, light.shape)), 0, 255) for g in (0.6, 1.0, 0.8)
+    ]
+    found = detect(Frame(np.stack(channels, 2).astype(np.uint8))).stars
+    index = match(found, stars)
+    assert len(found) == len(stars) and np.all(index >= 0)
+    assert np.all(rms(np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]) < 0.05)
+
+
+def test_nothing_is_invented_from_noise():
+    rng = np.random.default_rng(6)
+    for _ in range(2):
+        pixels = np.rint(rng.normal(500, 7, (1500, 1500))).astype(np.uint16)
+        detection = detect(Frame(pixels))
+        assert len(detection.stars) == 0
+        assert detection.background == pytest.approx(500, abs=0.1)
+        assert detection.noise == pytest.approx(np.hypot(7, 12**-0.5), rel=0.02)
+
+
+def test_faint_stars_down_to_snr_8_are_found():
+    # matched SNR of a star of E electrons in this sky is E / sqrt(4 pi s^2 (sky + read^2)), s^2 = 1.04 + 1/12
+    noise = np.sqrt(4 * np.pi * (1.04 + 1 / 12) * (20 + 25))
+    _, _, missed, invented = errors((520, 520), 2, 9 * noise, seed=7)
+    assert missed <= 4 and invented == 0
+
+
+def test_moonlit_gradient_hot_pixels_and_cosmic_rays_add_no_star():
+    rng = np.random.default_rng(8)
+    size = (600, 600)
+    stars = grid(size, 50, 12000, rng)
+    moon = np.add.outer(np.linspace(0, 1500, 600), np.linspace(200, 900, 600))
+    pixels = noisy(field(size, stars, trail=TRAIL, sky=0) + moon, rng).astype(np.int64)
+    bad = rng.integers(4, 596, (2, 150))
+    bad = bad[:, np.hypot(*(bad[::-1, :, None] - stars.T[:2, None])).min(1) > 14]
+    pixels[bad[0], bad[1]] += rng.integers(400, 30000, bad.shape[1])
+    rays = bad[:, :40]
+    pixels[rays[0] + 1, rays[1]] += 800
+    found = detect(Frame(np.clip(pixels, 0, 65535).astype(np.uint16))).stars
+    index = match(found, stars)
+    assert np.all(index >= 0)
+    assert len(found) == len(stars)
+
+
+def test_a_satellite_trail_is_left_out():
+    rng = np.random.default_rng(9)
+    size = (600, 600)
+    stars = grid(size, 60, 9000, rng)
+    light = field(size, stars, trail=TRAIL)
+    columns = np.arange(600)
+    rows = np.rint(40 + 0.83 * columns).astype(int)
+    for dy in (-1, 0, 1):
+        on = rows + dy < 600
+        light[rows[on] + dy, columns[on]] += 400
+    found = detect(Frame(noisy(light, rng))).stars
+    near_streak = np.abs(stars[:, 1] - 40 - 0.83 * stars[:, 0]) < 12
+    index = match(found, stars)
+    assert np.all(index[~near_streak] >= 0)
+    assert len(found) <= len(stars)
+    assert np.hypot(found.x[:, None] - stars[:, 0], found.y[:, None] - stars[:, 1]).min(1).max() < 3
+
+
+def test_saturated_edge_blended_and_elongated_stars_are_flagged_and_others_not():
+    rng = np.random.default_rng(10)
+    size = (400, 400)
+    stars = grid(size, 80, 15000, rng)
+    special = np.array(
+        [
+            [120.3, 120.4, 9e5],  # far over the full well
+            [1.2, 200.4, 15000],  # half outside
+            [280.2, 120.1, 15000],
+            [285.1, 120.3, 12000],  # its neighbour 4.9 px off
+            [120.2, 279.0, 9000],
+            [120.2, 282.2, 9000],  # a pair closer than the resolution: one long image
+        ]
+    )
+    light = field(size, np.concatenate([stars, special]))
+    found = detect(Frame(noisy(light, rng, top=16383))).stars
+    flags = np.where((index := match(found, special, 2.0)) >= 0, found.flags[index], 0)
+    assert flags[0] & SATURATED
+    assert np.hypot(found.x[index[0]] - 120.3, found.y[index[0]] - 120.4) < 0.1
+    assert flags[1] & EDGE
+    assert flags[2] & BLENDED and flags[3] & BLENDED
+    assert flags[4] & ELONGATED or flags[5] & ELONGATED or flags[4] & BLENDED
+    assert np.all(found.flags[match(found, stars)] == 0)
+
+
+def test_a_hot_pixel_on_a_star_costs_little():
+    rng = np.random.default_rng(11)
+    stars = grid((400, 400), 40, 15000, rng)
+    pixels = noisy(field((400, 400), stars, trail=TRAIL), rng)
+    pixels[np.rint(stars[:, 1]).astype(int) + 3, np.rint(stars[:, 0]).astype(int) + 1] = 9000
+    found = detect(Frame(pixels)).stars
+    index = match(found, stars)
+    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
+    assert np.mean(index >= 0) > 0.95
+    assert np.median(np.abs(error)) < 0.03
+
+
+def test_eight_bits_are_enough():
+    rng = np.random.default_rng(12)
+    stars = grid((400, 400), 40, 10000, rng)
+    light = field((400, 400), stars)
+    pixels = np.clip(np.rint((rng.poisson(light) + rng.normal(0, 5, light.shape)) / 12 + 6), 0, 255)
+    found = detect(Frame(pixels.astype(np.uint8))).stars
+    index = match(found, stars)
+    assert len(found) == len(stars) and np.all(index >= 0)
+    assert np.all(rms(np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]) < 1.2 * bound(10000))
+
+
+def test_time_size_and_source_reach_the_stars_brightest_first():
+    rng = np.random.default_rng(13)
+    stars = grid((200, 300), 50, lambda n: np.geomspace(2000, 50000, n), rng)
+    found = detect(Frame(noisy(field((200, 300), stars), rng), "", 1.75e9, 0.5, "night 1", 1000.0)).stars
+    assert (found.width, found.height, found.mid_unix_s, found.exposure_s) == (300, 200, 1.75e9, 0.5)
+    assert (found.source, found.focal_px) == ("night 1", 1000.0)
+    assert np.all(np.diff(found.flux) <= 0)
+    assert found.flux == pytest.approx(np.sort(stars[:, 2])[::-1], rel=0.1)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (2, 2), (3, 5), (7, 7), (40, 3), (64, 64), (65, 130)])
+@pytest.mark.parametrize("value", [0, 1, 65535])
+def test_a_frame_of_one_value_has_no_stars(shape, value):
+    assert len(detect(Frame(np.full(shape, value, np.uint16))).stars) == 0
+    assert len(detect(Frame(np.full((*shape, 3), min(value, 255), np.uint8))).stars) == 0
+
+
+def test_no_frame_of_random_content_raises():
+    rng = np.random.default_rng(14)
+    for _ in range(150):
+        shape = tuple(rng.integers(1, 90, 2)) + ((3,) if rng.random() < 0.2 else ())
+        kind = np.uint8 if len(shape) == 3 or rng.random() < 0.5 else np.uint16
+        top = np.iinfo(kind).max
+        pixels = [
+            lambda: rng.integers(0, top + 1, shape),
+            lambda: rng.choice([0, top], shape),
+            lambda: np.where(rng.random(shape) < 0.02, top, 0),
+            lambda: np.clip(np.cumsum(rng.integers(-3, 4, shape), axis=1) + 100, 0, top),
+        ][rng.integers(4)]().astype(kind)
+        pattern = "" if len(shape) == 3 else str(rng.choice(["", "rggb", "gbrg"]))
+        detection = detect(Frame(pixels, pattern))
+        assert np.all(detection.stars.snr > 0)
+
+
+def test_settings_that_make_no_sense_are_refused():
+    for wrong in ({"threshold": 0}, {"max_stars": 0}, {"mesh_px": float("nan")}, {"saturation_dn": -1}):
+        with pytest.raises(FrameError, match="detection setting"):
+            DetectionSettings(**wrong)
+    rng = np.random.default_rng(15)
+    stars = grid((300, 300), 50, 12000, rng)
+    pixels = noisy(field((300, 300), stars), rng)
+    assert len(detect(Frame(pixels), DetectionSettings(max_stars=5)).stars) <= 5
+    full = detect(Frame(pixels), DetectionSettings(saturation_dn=BIAS + 800)).stars
+    assert np.all(full.flags & SATURATED)
