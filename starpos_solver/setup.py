@@ -21,5 +21,5 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
-    entry_points={"console_scripts": ["solver = starpos_solver.solver_node:main"]},
+    entry_points={"console_scripts": ["solver = starpos_solver.main:solver"]},
 )

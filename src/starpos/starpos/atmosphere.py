@@ -36,9 +36,16 @@ class Atmosphere:
                 raise InstrumentError(f"{name} {value} {unit}: must lie between {low:g} and {high:g} {unit}".rstrip())
 
     @classmethod
-    def unknown(cls) -> "Atmosphere":
-        """Nothing was measured: sea level to 3000 m, frost to summer, and a sigma that says so."""
-        return cls(90_000.0, 10.0, pressure_stddev_pa=9_000.0, temperature_stddev_c=12.0)
+    def measured(cls, pressure_pa: float | None, temperature_c: float | None, humidity: float = 0.3) -> "Atmosphere":
+        """The air as far as it was measured; None takes a middle of sea level to 3000 m, or of frost to summer, and a
+        sigma that covers them."""
+        return cls(
+            90_000.0 if pressure_pa is None else pressure_pa,
+            10.0 if temperature_c is None else temperature_c,
+            humidity,
+            pressure_stddev_pa=9_000.0 if pressure_pa is None else 200.0,
+            temperature_stddev_c=12.0 if temperature_c is None else 2.0,
+        )
 
     @property
     def relative_sigma(self) -> float:

@@ -79,7 +79,7 @@ class Solver:
 
     instrument: Instrument
     catalogue: Catalogue
-    atmosphere: Atmosphere = Atmosphere.unknown()
+    atmosphere: Atmosphere = Atmosphere.measured(None, None)
     min_stars: int = 5
     progress: Callable[[str, float], None] = lambda what, done: None
 

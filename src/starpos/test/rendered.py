@@ -66,7 +66,7 @@ def grid(size, spacing, electrons, rng):
     y, x = np.meshgrid(*(np.arange(spacing, n - spacing + 1, spacing) for n in size), indexing="ij")
     x, y = (v.ravel() + rng.uniform(-2, 2, v.size) for v in (x, y))
     return np.stack(
-        [x, y, np.broadcast_to(electrons, x.shape) if np.ndim(electrons) == 0 else electrons(x.size)], 1
+        [x, y, electrons(x.size) if callable(electrons) else np.full(x.size, float(electrons))], 1
     )
 
 

@@ -155,8 +155,8 @@ def test_saturated_edge_blended_and_elongated_stars_are_flagged_and_others_not()
             [1.2, 200.4, 15000],  # half outside
             [280.2, 120.1, 15000],
             [285.1, 120.3, 12000],  # its neighbour 4.9 px off
-            [120.2, 279.0, 9000],
-            [120.2, 282.2, 9000],  # a pair closer than the resolution: one long image
+            [120.2, 280.0, 9000],
+            [120.2, 282.1, 9000],  # a pair closer than the resolution: one long image
         ]
     )
     light = field(size, np.concatenate([stars, special]))
@@ -166,7 +166,7 @@ def test_saturated_edge_blended_and_elongated_stars_are_flagged_and_others_not()
     assert np.hypot(found.x[index[0]] - 120.3, found.y[index[0]] - 120.4) < 0.1
     assert flags[1] & EDGE
     assert flags[2] & BLENDED and flags[3] & BLENDED
-    assert flags[4] & ELONGATED or flags[5] & ELONGATED or flags[4] & BLENDED
+    assert flags[4] & ELONGATED
     assert np.all(found.flags[match(found, stars)] == 0)
 
 
@@ -174,12 +174,13 @@ def test_a_hot_pixel_on_a_star_costs_little():
     rng = np.random.default_rng(11)
     stars = grid((400, 400), 40, 15000, rng)
     pixels = noisy(field((400, 400), stars, trail=TRAIL), rng)
-    pixels[np.rint(stars[:, 1]).astype(int) + 3, np.rint(stars[:, 0]).astype(int) + 1] = 9000
+    hit = stars[::3]
+    pixels[np.rint(hit[:, 1]).astype(int) + 3, np.rint(hit[:, 0]).astype(int) + 1] += 1500
     found = detect(Frame(pixels)).stars
     index = match(found, stars)
     error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
-    assert np.mean(index >= 0) > 0.95
-    assert np.median(np.abs(error)) < 0.03
+    assert np.all(index >= 0) and len(found) == len(stars)
+    assert np.all(rms(error[::3]) < 1.5 * bound(15000, trail=TRAIL))
 
 
 def test_eight_bits_are_enough():

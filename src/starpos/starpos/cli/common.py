@@ -34,16 +34,9 @@ def add_air(parser: argparse.ArgumentParser) -> None:
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
-    """The air as far as it was given; what was not given is wide."""
-    unknown = Atmosphere.unknown()
-    pressure, temperature = args.pressure_hpa, args.temperature_c
-    return Atmosphere(
-        unknown.pressure_pa if pressure is None else pressure * 100,
-        unknown.temperature_c if temperature is None else temperature,
-        args.humidity,
-        pressure_stddev_pa=unknown.pressure_stddev_pa if pressure is None else 200.0,
-        temperature_stddev_c=unknown.temperature_stddev_c if temperature is None else 2.0,
-    )
+    """The air as far as it was given."""
+    pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100
+    return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity)
 
 
 def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> instrument.Instrument:

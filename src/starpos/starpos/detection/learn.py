@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a frame's own bright stars teach: its PSF, its colour gains and its photon noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, spatial
 
 from starpos.detection.fit import FIT_WIDTHS, Response, fit_stars
 from starpos.detection.psf import MAX_ORDER, Psf, gaussian, refine
-from starpos.detection.shape import frame_shape, moments, relative_widths
+from starpos.detection.shape import frame_shape, moments, relative_widths, window_for
 from starpos.detection.stamps import cut
 
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
-TEACHERS = 100
+TEACHERS = 250
+TEACHING_PIXELS = 17000  # of wide stars fewer are enough
 ROUNDS = 2
+UNDERSAMPLED = 0.6  # px2: narrower stars show their PSF and their places only together, in more rounds
+UNDERSAMPLED_ROUNDS = 8
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
 SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
@@ -46,11 +49,16 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
     stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
     smooth, blur = grey(stamps, background)
     x, y = centroid(smooth, shape)
-    _, _, seen = moments(smooth, x, y, shape)
-    widths = relative_widths(seen, shape + blur * np.eye(2), shape)
+    window = window_for(shape)
+    _, _, seen = moments(smooth, x, y, window)
+    widths = relative_widths(seen, shape + blur * np.eye(2), window)
     alike = (widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)
     stamps, x, y = stamps.take(alike), x[alike], y[alike]
-    for _ in range(ROUNDS if len(x) else 0):
+    most = max(TEACHING_PIXELS // stamps.signal[0].size, 40) if len(x) else 0
+    stamps, x, y = stamps.take(slice(most)), x[:most], y[:most]
+    for _ in range(ROUNDS if np.linalg.eigvalsh(shape)[0] > UNDERSAMPLED else UNDERSAMPLED_ROUNDS):
+        if len(x) == 0:
+            break
         fit = fit_stars(stamps, psf, x, y, response, rounds=3)
         sound = np.isfinite(fit.chi2) & (fit.flux > 0) & np.isfinite(fit.covariance).all((1, 2))
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
@@ -76,17 +84,17 @@ def grey(stamps, background):
         return stamps, 0.0
     signal = ndimage.convolve1d(stamps.signal, SMOOTHING, axis=1, mode="nearest")
     signal = ndimage.convolve1d(signal, SMOOTHING, axis=2, mode="nearest")
-    return type(stamps)(
-        stamps.x, stamps.y, signal, stamps.noise, stamps.good, stamps.full, stamps.phase
-    ), SMOOTHING_WIDTH
+    return replace(stamps, signal=signal), SMOOTHING_WIDTH
 
 
-def centroid(stamps, window, rounds=3):
-    """x, y (N,) px: the windowed centroids, never further than 2 px from the peak. window (2, 2) px2: the star's."""
+def centroid(stamps, shape, rounds=3):
+    """x, y (N,) px: the windowed centroids of stars of covariance shape, never further than 2 px from the peak."""
     x, y = stamps.x.astype(float), stamps.y.astype(float)
+    window = window_for(shape)
+    gain = (np.eye(2) + shape @ np.linalg.inv(window)).T  # of a displacement the window shows only a part
     for _ in range(rounds):
         _, step, _ = moments(stamps, x, y, window)
-        step = np.clip(np.nan_to_num(2 * step), -1, 1)  # a matched window sees half of a displacement
+        step = np.clip(np.nan_to_num(step @ gain), -1, 1)
         x = np.clip(x + step[:, 0], stamps.x - 2, stamps.x + 2)
         y = np.clip(y + step[:, 1], stamps.y - 2, stamps.y + 2)
     return x, y

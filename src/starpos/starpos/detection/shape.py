@@ -8,7 +8,7 @@ covariance V = (C^-1 + W^-1)^-1, if the star is one of covariance C (Bernstein &
 import numpy as np
 
 NARROWEST = 0.2  # px2: a pixel alone has 1/12, and starlight never falls on one alone
-NARROWEST_WINDOW = 0.7  # px2: under narrower ones a sum over pixels is no integral
+NARROWEST_WINDOW = 1.2  # px2: under narrower ones a sum over pixels is no integral
 
 
 def at_least(shape, floor):
@@ -39,6 +39,11 @@ def moments(stamps, x, y, window):
     return mass, np.stack([mx, my], 1), np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
 
 
+def window_for(shape):
+    """The window (2, 2) px2 that suits stars of covariance shape: the same, unless too narrow for sums."""
+    return at_least(shape, NARROWEST_WINDOW)
+
+
 def frame_shape(stamps, blur=0.0, rounds=12):
     """The typical covariance C (2, 2) px2 of the stars in stamps, their own measurement through a matched window.
 
@@ -63,7 +68,7 @@ def frame_shape(stamps, blur=0.0, rounds=12):
         x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
         change = np.inf if shape is None else np.abs(own - shape).max() / own.max()
         shape = own
-        window = at_least(own, NARROWEST_WINDOW)
+        window = window_for(own)
         if change < 1e-3:
             break
     return at_least(shape - blur * np.eye(2), NARROWEST)

@@ -1,36 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peaks to measured stars: fit each, leave out what is no star, flag what is not a good one."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import spatial
 
 from starpos.detection.fit import fit_stars
 from starpos.detection.learn import centroid, grey
-from starpos.detection.shape import moments, relative_widths
+from starpos.detection.shape import moments, relative_widths, window_for
 from starpos.detection.stamps import cut
 from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
+
+SPECK = 3  # pixels
 
 
 def measure(plane, background, x, y, lesson, saturation, min_snr):
     """Columns x, y, flux, snr, covariance, flags of the stars among the peaks x, y (N,) int, in no order."""
     psf = lesson.psf
     stamps = cut(plane, background, x, y, lesson.reach, saturation)
-    smooth, blur = grey(stamps, background)
     shape = psf.shape
-    x, y = centroid(smooth, shape)
+    x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
-    _, _, seen = moments(smooth, fit.x, fit.y, shape)
-    widths = relative_widths(seen, shape + blur * np.eye(2), shape)
+    smooth, blur = grey(_without_specks(stamps, fit), background)
+    window = window_for(shape)
+    _, _, seen = moments(smooth, fit.x, fit.y, window)
+    widths = relative_widths(seen, shape + blur * np.eye(2), window)
     with np.errstate(invalid="ignore", divide="ignore"):
         snr = fit.flux / fit.flux_sigma
         c = fit.covariance * _misfit(fit)[:, None, None]
-        score = (stamps.signal * stamps.good / stamps.noise)[:, 1:-1, 1:-1].max((1, 2))
         matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))  # SNR in the sky's noise
         sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 4
         sound &= (fit.flux > 0) & (matched >= min_snr)
-        # a hot pixel or a sharp cosmic ray: one pixel alone explains more than the PSF (likelihood ratio)
-        sound &= score < matched
+        sound &= ~_is_dot(stamps, fit, lesson.response)
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
         slack = 3 / matched
@@ -50,9 +53,26 @@ def _misfit(fit):
     return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
 
 
+def _without_specks(stamps, fit):
+    """Stamps whose stars have lost a hot pixel or a cosmic ray on them; more than a speck stays, to be judged."""
+    speck = fit.outlier & (fit.outlier.sum((1, 2)) <= SPECK)[:, None, None]
+    return replace(stamps, signal=np.where(speck, fit.model, stamps.signal))
+
+
 def _core(stamps, fit, psf, widths):
     """(N, S, S) bool: the pixels within so many widths of the star's centre."""
     return psf.within(*stamps.offsets(fit.x, fit.y), widths)
+
+
+def _is_dot(stamps, fit, response):
+    """Hot pixels and sharp cosmic rays: what one pixel leaves unexplained is less than what the PSF does."""
+    c = slice(stamps.reach - 2, stamps.reach + 3)
+    signal, noise, residual, model, good = (
+        a[:, c, c] for a in (stamps.signal, stamps.noise, fit.residual, fit.model, stamps.good)
+    )
+    score = good * (signal / noise) ** 2
+    one_pixel = score.sum((1, 2)) - (score * (signal > 0)).max((1, 2))
+    return one_pixel < (good * residual**2 / response.variance(noise, model)).sum((1, 2))
 
 
 def resolve(columns, psf):

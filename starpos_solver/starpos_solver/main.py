@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The executable. The imports inside are heavy; they come after the signal handlers (see starpos_common)."""
+
+
+def solver() -> int:
+    """The node."""
+    from starpos_common.node_main import run
+
+    def make_node():
+        from starpos_solver.node import SolverNode
+
+        return SolverNode()
+
+    return run(make_node)

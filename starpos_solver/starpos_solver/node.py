@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `solver`: stars and tilts in, `fix`, `heading/imu` and `solver/solution` out."""
+
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
+from starpos import catalogue
+from starpos.camera import Camera
+from starpos.errors import StarposError
+from starpos.solve import Solution as Answer
+from starpos.solve import Solver, Status
+from starpos.stars import Stars
+from starpos_common.diagnostics import Diagnostics, Level
+from starpos_common.diagnostics import Status as Report
+from starpos_common.messages import message_to_camera, message_to_stars
+from starpos_common.parameters import declare
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from starpos_interfaces.msg import Solution, StarArray, Tilt
+from starpos_interfaces.srv import Solve
+from starpos_solver import outputs, parameters
+from starpos_solver.tilts import TiltBuffer
+
+WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
+POLL_S = 0.02
+STALE_S = 5.0
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame's stars, as they came and as they are; `since` in ns of the steady clock."""
+
+    message: StarArray
+    stars: Stars
+    since_ns: int
+
+
+class SolverNode(Node):
+    """See README.md."""
+
+    def __init__(self):
+        super().__init__("solver")
+        self._values = declare(self, parameters.PARAMETERS, apply=self._apply, check=self._check)
+        self._catalogue = catalogue.load()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._tilts = TiltBuffer()
+        self._waiting: deque[Waiting] = deque()
+        self._camera: Camera | None = None
+        self._solver: Solver | None = None
+        self._preparing: threading.Thread | None = None
+        self._trouble = ""  # why there is no solver
+        self._latest: Waiting | None = None
+        self._answer: Answer | None = None
+        self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0, "broken messages": 0}
+        self._last_seen_ns: dict[str, int] = {}
+        self._logged: object = None
+        self._connect()
+
+    def _connect(self):
+        qos = QoSProfile(depth=10)
+        override = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
+        self._fix = self.create_publisher(NavSatFix, "fix", qos, **override)
+        self._imu = self.create_publisher(Imu, "heading/imu", qos, **override)
+        self._solution = self.create_publisher(Solution, "solver/solution", qos, **override)
+        self.create_subscription(CameraInfo, "camera/camera_info", self._on_camera, qos, **override)
+        self.create_subscription(Tilt, "tilt", self._on_tilt, QoSProfile(depth=1000), **override)
+        self.create_subscription(StarArray, "stars", self._on_stars, qos, **override)
+        self.create_service(Solve, "solver/solve", self._on_solve)
+        self.create_service(Trigger, "solver/reset", self._on_reset)
+        self._prepared = self.create_guard_condition(self._on_prepared)
+        group = MutuallyExclusiveCallbackGroup()
+        self._poll = self.create_timer(POLL_S, self._work, callback_group=group, clock=self._steady, autostart=False)
+        self._diagnostics = Diagnostics(
+            self, {"Solution": self._report_solution, "Inputs": self._report_inputs}, self._values["frame_id"]
+        )
+
+    # parameters ------------------------------------------------------------------------------------------------------
+
+    def _check(self, values) -> str | None:
+        """Values that are each allowed but make no instrument together, such as a broken calibration file."""
+        try:
+            parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0))
+            parameters.atmosphere_of(values)
+            parameters.deflection_of(values)
+        except StarposError as e:
+            return str(e)
+        return None
+
+    def _apply(self, names: frozenset[str]):
+        if self._solver is not None and self._camera is not None:
+            self._solver = self._make_solver(self._camera)
+
+    def _make_solver(self, camera: Camera) -> Solver:
+        return Solver(
+            parameters.instrument_of(self._values, camera),
+            self._catalogue,
+            parameters.atmosphere_of(self._values),
+            self._values["min_stars"],
+        )
+
+    # inputs ----------------------------------------------------------------------------------------------------------
+
+    def _seen(self, what: str):
+        self._last_seen_ns[what] = self._steady.now().nanoseconds
+
+    def _on_camera(self, message: CameraInfo):
+        self._seen("camera_info")
+        try:
+            camera = message_to_camera(message)
+        except StarposError as e:
+            self._reject(str(e))
+            return
+        if camera == self._camera:
+            return
+        self._camera, self._solver = camera, None
+        if self._preparing is None:
+            self._prepare(camera)
+
+    def _prepare(self, camera: Camera):
+        """Have the triangles of this field ready; they may have to be built, which must not hold up the node."""
+
+        def work():
+            try:
+                self._make_solver(camera).prepare(camera.width, camera.height)
+                self._trouble = ""
+            except StarposError as e:
+                self._trouble = str(e)
+            self._prepared.trigger()
+
+        self._preparing = threading.Thread(target=work, daemon=True)
+        self._preparing.start()
+
+    def _on_prepared(self):
+        self._preparing = None
+        if self._trouble:
+            self._log_change(self._trouble, good=False)
+        elif self._camera is not None:
+            self._solver = self._make_solver(self._camera)
+        self._work()
+
+    def _on_tilt(self, message: Tilt):
+        self._seen("tilt")
+        try:
+            self._tilts.add(message, float(self._values["tilt_stddev"]) * 0.017453292519943295)
+        except StarposError as e:
+            self._reject(str(e))
+        if self._waiting:
+            self._work()
+
+    def _on_stars(self, message: StarArray):
+        self._seen("stars")
+        try:
+            stars = message_to_stars(message)
+        except StarposError as e:
+            self._publish(message.header, Answer(Status.BAD_INPUT, str(e), "stars", None, len(message.stars)))
+            return
+        self._waiting.append(Waiting(message, stars, self._steady.now().nanoseconds))
+        while len(self._waiting) > WAITING:
+            self._waiting.popleft()
+            self._counts["dropped frames"] += 1
+        self._work()
+
+    def _reject(self, sentence: str):
+        self._counts["broken messages"] += 1
+        self.get_logger().warning(sentence, throttle_duration_sec=10.0)
+
+    # work ------------------------------------------------------------------------------------------------------------
+
+    def _work(self):
+        """Solve what has all it needs; poll only while something waits."""
+        while self._waiting and self._ready(self._waiting[0]):
+            self._solve(self._waiting.popleft())
+        if self._waiting and self._poll.is_canceled():
+            self._poll.reset()
+        elif not self._waiting and not self._poll.is_canceled():
+            self._poll.cancel()
+
+    def _ready(self, frame: Waiting) -> bool:
+        waited_s = (self._steady.now().nanoseconds - frame.since_ns) * 1e-9
+        if self._preparing is not None:
+            return False
+        if self._solver is None or frame.stars.mid_unix_s is None:
+            return waited_s > self._values["tilt_timeout"] or frame.stars.mid_unix_s is None or bool(self._trouble)
+        return waited_s > self._values["tilt_timeout"] or self._tilts.complete(
+            frame.stars.mid_unix_s, self._span(frame.stars)
+        )
+
+    def _span(self, stars: Stars) -> float:
+        return stars.exposure_s or self._values["tilt_window"]
+
+    def _solve(self, frame: Waiting):
+        self._latest = frame
+        self._publish(frame.message.header, self._answer_to(frame))
+
+    def _answer_to(self, frame: Waiting) -> Answer:
+        stars = frame.stars
+        if self._solver is None:
+            reason = self._trouble or (
+                f"{self.resolve_topic_name('camera/camera_info')}: no camera calibration has arrived: start the camera"
+            )
+            return Answer(Status.BAD_INPUT, reason, "stars", stars.mid_unix_s, len(stars))
+        solver = self._solver
+        stamp_stddev = frame.message.stamp_stddev
+        if stamp_stddev > 0:
+            clock = (solver.instrument.clock_stddev_s**2 + stamp_stddev**2) ** 0.5
+            solver = replace(solver, instrument=replace(solver.instrument, clock_stddev_s=clock))
+        return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)))
+
+    # outputs ---------------------------------------------------------------------------------------------------------
+
+    def _publish(self, about: Header, answer: Answer):
+        self._answer = answer
+        self._counts["frames"] += 1
+        self._counts["fixes"] += answer.ok
+        header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
+        message, fix, imu = self._messages(header, answer)
+        self._fix.publish(fix)
+        if imu is not None:
+            self._imu.publish(imu)
+        self._solution.publish(message)
+        self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
+
+    def _messages(self, header: Header, answer: Answer):
+        deflection = parameters.deflection_of(self._values)
+        ground = outputs.on_ground(answer, deflection)
+        message = outputs.solution(header, answer, ground, deflection)
+        if self._solver is None and self._camera is None:
+            message.status = Solution.NO_CAMERA
+        fix = outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
+        return message, fix, outputs.imu(header, answer, ground, deflection) if ground else None
+
+    def _log_change(self, sentence: str, good: bool, state: object = None):
+        state = state or sentence
+        if state == self._logged:
+            return
+        self._logged = state
+        # rclpy ties a severity to the line it is called from, so each has its own
+        if good:
+            self.get_logger().info(sentence)
+        else:
+            self.get_logger().warning(sentence)
+
+    def _on_solve(self, request, response):
+        if self._latest is None:
+            response.message = "no frame has arrived yet: start the camera and the detector"
+            response.solution = Solution(status=Solution.BAD_INPUT, status_text=response.message)
+            return response
+        answer = self._answer_to(self._latest)
+        header = Header(stamp=self._latest.message.header.stamp, frame_id=self._values["frame_id"])
+        response.solution = self._messages(header, answer)[0]
+        response.success, response.message = answer.ok, answer.message
+        return response
+
+    def _on_reset(self, request, response):
+        self._tilts.clear()
+        self._waiting.clear()
+        self._latest = self._answer = None
+        response.success, response.message = True, "tilts and frames that wait are forgotten"
+        return response
+
+    # diagnostics -----------------------------------------------------------------------------------------------------
+
+    def _report_solution(self) -> Report:
+        a = self._answer
+        if a is None:
+            waiting = "building the triangles of this field" if self._preparing else "no frame yet"
+            return Report(Level.WARN, self._trouble or waiting, self._counts)
+        values = self._counts | {"status": a.status.value, "stars detected": a.stars_detected}
+        values |= {"stars matched": len(a.names), "identify (s)": a.identify_s, "fit (s)": a.fix_s}
+        if a.fix:
+            east, north, _ = a.fix.covariance.diagonal() ** 0.5
+            values |= {"sigma east (m)": float(east), "sigma north (m)": float(north), "residual (arcsec)": a.fix.residual_arcsec}
+        return Report(Level.OK if a.ok else Level.WARN, a.message, values)
+
+    def _report_inputs(self) -> Report:
+        now = self._steady.now().nanoseconds
+        ages = {name: (now - seen) * 1e-9 for name, seen in self._last_seen_ns.items()}
+        missing = [name for name in ("camera_info", "stars", "tilt") if ages.get(name, 1e9) > STALE_S]
+        values = {f"{name} age (s)": age for name, age in ages.items()} | {"tilts kept": len(self._tilts)}
+        if missing:
+            return Report(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
+        return Report(Level.OK, "all inputs arrive", values)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a solution becomes on the wire: NavSatFix, Imu, Solution."""
+
+import math
+
+import numpy as np
+from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
+from starpos import rotation
+from starpos.solve import Solution as Answer
+from starpos.solve import Status
+from starpos.vertical import ARCSEC, Deflection, Geodetic, geodetic
+from starpos_common.messages import tilt_to_message
+from std_msgs.msg import Header
+
+from starpos_interfaces.msg import ErrorTerm, Solution
+
+NO_CAMERA = "no camera"
+STATUS = {
+    Status.OK: Solution.OK,
+    Status.TOO_FEW_STARS: Solution.TOO_FEW_STARS,
+    Status.NOT_IDENTIFIED: Solution.NOT_IDENTIFIED,
+    Status.NO_TILT: Solution.NO_TILT,
+    Status.TILT_OUT_OF_RANGE: Solution.TILT_OUT_OF_RANGE,
+    Status.TIME_OUTSIDE_TABLES: Solution.TIME_OUTSIDE_TABLES,
+    Status.BAD_INPUT: Solution.BAD_INPUT,
+    Status.POOR_FIT: Solution.POOR_FIT,
+}
+UNKNOWN_ALTITUDE_VARIANCE = 1e8  # m2; a NaN would make consumers drop the whole matrix
+NAN = math.nan
+
+
+def on_ground(answer: Answer, deflection: Deflection) -> Geodetic | None:
+    """The geodetic position of an answer; None without a fix."""
+    fix = answer.fix
+    return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, deflection) if fix else None
+
+
+def nav_sat_fix(header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float) -> NavSatFix:
+    """The position on WGS 84; without one a NO_FIX with NaN, so that a consumer sees that the instrument lives."""
+    message = NavSatFix(header=header)
+    message.status.service = NavSatStatus.SERVICE_UNKNOWN if hasattr(NavSatStatus, "SERVICE_UNKNOWN") else 0
+    if ground is None:
+        message.status.status = NavSatStatus.STATUS_NO_FIX
+        message.latitude = message.longitude = message.altitude = NAN
+        message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_UNKNOWN
+        return message
+    message.status.status = NavSatStatus.STATUS_FIX
+    message.latitude, message.longitude = math.degrees(ground.latitude), math.degrees(ground.longitude)
+    message.altitude = altitude
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = ground.covariance[:2, :2]
+    covariance[2, 2] = UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else altitude_stddev**2
+    message.position_covariance = covariance.ravel()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
+    return message
+
+
+def imu(header: Header, answer: Answer, ground: Geodetic, deflection: Deflection) -> Imu:
+    """The attitude of the base link in true-north ENU; rates and accelerations are not measured."""
+    fix = answer.fix
+    to_geodetic_north = rotation.about_axis(2, deflection.eta_arcsec * ARCSEC * math.tan(ground.latitude))
+    x, y, z, w = rotation.to_quaternion(to_geodetic_north @ fix.link_to_enu).tolist()
+    message = Imu(header=header)
+    message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w = x, y, z, w
+    covariance = fix.attitude_covariance.copy()
+    covariance[2, 2] += ground.covariance[2, 2] - fix.covariance[2, 2]  # the deflection's share of the azimuth
+    message.orientation_covariance = covariance.ravel()
+    message.angular_velocity_covariance[0] = -1.0
+    message.linear_acceleration_covariance[0] = -1.0
+    return message
+
+
+def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection: Deflection) -> Solution:
+    """All there is to say about one frame."""
+    message = Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
+    message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
+    message.ids = list(answer.names)
+    message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
+    message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
+    a, fix = answer.attitude, answer.fix
+    message.right_ascension, message.declination, message.roll = (
+        (math.degrees(v) for v in (a.ra, a.dec, a.roll)) if a else (NAN,) * 3
+    )
+    message.focal_px, message.log_odds = (a.focal_px, a.log_odds) if a else (NAN, NAN)
+    message.mirrored = bool(a and a.mirrored)
+    message.residual = fix.residual_arcsec if fix else a.residual_arcsec if a else NAN
+    if answer.tilt:
+        message.tilt = tilt_to_message(answer.tilt, "")
+        message.tilt_samples = answer.tilt.samples
+    if fix is None:
+        for name in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading", "heading_stddev",
+                     "refraction", "diurnal_aberration", "ut1_minus_utc"):  # fmt: skip
+            setattr(message, name, NAN)
+        message.covariance = message.covariance_geodetic = [NAN] * 9
+        return message
+    degrees = np.array([1.0, 1.0, np.degrees(1.0)])
+    message.latitude, message.longitude = math.degrees(fix.latitude), math.degrees(fix.longitude)
+    message.latitude_geodetic, message.longitude_geodetic = math.degrees(ground.latitude), math.degrees(ground.longitude)
+    message.heading = math.degrees(ground.heading)
+    message.covariance = (fix.covariance * np.outer(degrees, degrees)).ravel()
+    message.covariance_geodetic = (ground.covariance * np.outer(degrees, degrees)).ravel()
+    message.heading_stddev = math.sqrt(message.covariance_geodetic[8])
+    for term in fix.terms:
+        east, north, heading = (np.sqrt(np.diag(term.covariance)[:3]) * degrees).tolist()
+        message.budget.append(ErrorTerm(name=term.name, east=east, north=north, heading=heading))
+    message.refraction = fix.refraction_arcsec
+    message.diurnal_aberration = fix.diurnal_aberration_arcsec
+    message.ut1_minus_utc = fix.ut1_minus_utc_s
+    return message

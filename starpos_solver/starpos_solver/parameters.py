@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solver's parameters, and what they mean to starpos."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from starpos import instrument
+from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
+from starpos.instrument import Instrument
+from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection
+from starpos_common.parameters import Parameter
+
+NAN = math.nan
+
+PARAMETERS = (
+    Parameter("frame_id", "starpos_link", "Frame of fix and heading: x forward, y left, z up."),
+    Parameter(
+        "calibration_url",
+        "",
+        "Instrument file (YAML): misalignment and its error, mount, tilt noise, clock; '' uses the parameters below. "
+        "A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km.",
+    ),
+    Parameter(
+        "misalignment",
+        (0.0, 0.0, 0.0),
+        "A3 = R3(rz) R2(ry) R1(rx), camera into inclinometer; used without calibration_url.",
+        "deg",
+        -360.0,
+        360.0,
+    ),
+    Parameter(
+        "misalignment_stddev",
+        instrument.UNSTATED_CALIBRATION_ARCSEC,
+        "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. Too small "
+        "makes fixes claim more than they hold.",
+        "arcsec",
+        0.0,
+        36000.0,
+    ),
+    Parameter("refraction.pressure", NAN, "Air pressure at the instrument, not reduced to sea level; unset widens the fix.",
+              "Pa", 0.0, 120000.0),  # fmt: skip
+    Parameter("refraction.temperature", NAN, "Air temperature; unset widens the fix.", "deg C", -100.0, 80.0),
+    Parameter("refraction.humidity", 0.3, "Relative humidity; it hardly matters in visible light.", "", 0.0, 1.0),
+    Parameter("altitude", NAN, "Altitude put into fix, which the stars cannot tell; unset leaves NaN, and some consumers "
+              "drop such a fix.", "m", -1000.0, 100000.0),  # fmt: skip
+    Parameter("altitude_stddev", 100.0, "Its error.", "m", 0.0, 100000.0),
+    Parameter("clock_stddev", 0.01, "Error of the frames' time stamps against UTC; 1 s is 464 m at the equator.", "s",
+              0.0, 3600.0),  # fmt: skip
+    Parameter("deflection.xi", 0.0, "Deflection of the vertical to the north; 1 arcsec is 31 m of the geodetic latitude.",
+              "arcsec", -120.0, 120.0),  # fmt: skip
+    Parameter("deflection.eta", 0.0, "Deflection of the vertical to the east.", "arcsec", -120.0, 120.0),
+    Parameter("deflection.stddev", UNKNOWN_STDDEV_ARCSEC, "Error of each component; the default is that of knowing "
+              "nothing.", "arcsec", 0.0, 120.0),  # fmt: skip
+    Parameter("min_stars", 5, "Fewest identified stars that make a fix.", "", 4, 1000),
+    Parameter("tilt_window", 0.5, "Span of tilts averaged where the exposure is unknown.", "s", 0.01, 60.0),
+    Parameter("tilt_timeout", 0.5, "How long a frame waits for the tilts of its exposure; later ones come too late.", "s",
+              0.0, 60.0),  # fmt: skip
+    Parameter("tilt_stddev", 0.0035, "Error of a tilt sample whose message states none.", "deg", 1e-7, 10.0),
+)
+
+
+def instrument_of(values: Mapping, camera: Camera) -> Instrument:
+    """The Instrument the parameters describe, with the camera of camera_info; InstrumentError for a bad file."""
+    url = values["calibration_url"]
+    if url:
+        known = instrument.read(url.removeprefix("file://"))
+        return replace(known, camera=camera, focal_px=camera.fx)
+    return Instrument(
+        camera.fx,
+        camera,
+        values["misalignment"],
+        (values["misalignment_stddev"],) * 3,
+        tilt_noise_rad=math.radians(values["tilt_stddev"]),
+        clock_stddev_s=values["clock_stddev"],
+    )
+
+
+def atmosphere_of(values: Mapping) -> Atmosphere:
+    """The air as far as it is set."""
+    pressure, temperature = (values[f"refraction.{name}"] for name in ("pressure", "temperature"))
+    return Atmosphere.measured(
+        None if math.isnan(pressure) else pressure,
+        None if math.isnan(temperature) else temperature,
+        values["refraction.humidity"],
+    )
+
+
+def deflection_of(values: Mapping) -> Deflection:
+    return Deflection(values["deflection.xi"], values["deflection.eta"], values["deflection.stddev"])

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tilts that have arrived, and their average over an exposure."""
+
+from collections import deque
+
+import numpy as np
+from starpos.errors import TiltError, TiltRangeError
+from starpos.inclinometer import Tilt, TiltLog
+from starpos_common.messages import message_to_tilt, stamp_to_unix
+
+from starpos_interfaces.msg import Tilt as TiltMessage
+
+CAPACITY = 6000  # ten minutes at 10 Hz
+UNUSABLE = TiltMessage.OUT_OF_RANGE | TiltMessage.STUCK | TiltMessage.SATURATED
+NEAR_S = 1.0  # how far from an exposure a flagged sample still explains why there is no good one
+
+
+class TiltBuffer:
+    """The latest samples in any order, bounded; unusable ones are remembered only to say so."""
+
+    def __init__(self):
+        self._good: deque[Tilt] = deque(maxlen=CAPACITY)
+        self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
+
+    def __len__(self) -> int:
+        return len(self._good)
+
+    def clear(self) -> None:
+        self._good.clear()
+        self._flagged.clear()
+
+    def add(self, message: TiltMessage, unknown_stddev_rad: float) -> None:
+        """Keep a sample; TiltError where the message is broken."""
+        if message.flags & UNUSABLE:
+            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
+            return
+        try:
+            self._good.append(message_to_tilt(message, unknown_stddev_rad))
+        except TiltRangeError:
+            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, TiltMessage.OUT_OF_RANGE))
+            raise
+
+    def complete(self, mid_unix_s: float, span_s: float) -> bool:
+        """Whether no further sample of this exposure is to come: one from its end, or after it, is here."""
+        times = [t.utc_unix_s for t in self._good]
+        if not times:
+            return False
+        period = 0.1 if len(times) < 3 else float(np.median(np.abs(np.diff(times[-20:]))))
+        return max(times) >= mid_unix_s + span_s / 2 - 1.5 * period
+
+    def average(self, mid_unix_s: float, span_s: float) -> Tilt:
+        """The mean over an exposure; TiltRangeError or TiltError with the reason where there is none."""
+        near = [s for s in self._good if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + NEAR_S]
+        if not near:
+            self._explain(mid_unix_s, span_s)
+        noise = np.sqrt(np.mean([np.trace(s.covariance) / 2 for s in near]))
+        log = TiltLog(
+            np.array([s.utc_unix_s for s in near]),
+            np.array([s.theta_x for s in near]),
+            np.array([s.theta_y for s in near]),
+            np.array([s.temperature_c for s in near]),
+            float(noise),
+        )
+        return log.average(mid_unix_s, span_s)
+
+    def _explain(self, mid_unix_s: float, span_s: float) -> None:
+        flags = 0
+        for moment, flag in self._flagged:
+            if abs(moment - mid_unix_s) <= span_s / 2 + NEAR_S:
+                flags |= flag
+        if flags & (TiltMessage.OUT_OF_RANGE | TiltMessage.SATURATED):
+            raise TiltRangeError("tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright")
+        if flags:
+            raise TiltError("tilt: the inclinometer repeats the same value: check its converter's wiring")
+        nearest = min((abs(s.utc_unix_s - mid_unix_s) for s in self._good), default=None)
+        known = "none has arrived at all" if nearest is None else f"the nearest is {nearest:.1f} s off"
+        raise TiltError(f"tilt: no sample near the exposure ({known}): check the inclinometer and the clocks")
