@@ -12,7 +12,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
-from starpos import catalogue
 from starpos.camera import Camera
 from starpos.errors import StarposError
 from starpos.solve import Solution as Answer
@@ -25,6 +24,7 @@ from starpos_common.parameters import declare
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+from starpos import catalogue
 from starpos_interfaces.msg import Solution, StarArray, Tilt
 from starpos_interfaces.srv import Solve
 from starpos_solver import outputs, parameters
@@ -78,7 +78,9 @@ class SolverNode(Node):
         self.create_service(Trigger, "solver/reset", self._on_reset)
         self._prepared = self.create_guard_condition(self._on_prepared)
         group = MutuallyExclusiveCallbackGroup()
-        self._poll = self.create_timer(POLL_S, self._work, callback_group=group, clock=self._steady, autostart=False)
+        self._poll = self.create_timer(
+            POLL_S, self._work, callback_group=group, clock=self._steady, autostart=False
+        )
         self._diagnostics = Diagnostics(
             self, {"Solution": self._report_solution, "Inputs": self._report_inputs}, self._values["frame_id"]
         )
@@ -189,7 +191,11 @@ class SolverNode(Node):
         if self._preparing is not None:
             return False
         if self._solver is None or frame.stars.mid_unix_s is None:
-            return waited_s > self._values["tilt_timeout"] or frame.stars.mid_unix_s is None or bool(self._trouble)
+            return (
+                waited_s > self._values["tilt_timeout"]
+                or frame.stars.mid_unix_s is None
+                or bool(self._trouble)
+            )
         return waited_s > self._values["tilt_timeout"] or self._tilts.complete(
             frame.stars.mid_unix_s, self._span(frame.stars)
         )
@@ -278,7 +284,11 @@ class SolverNode(Node):
         values |= {"stars matched": len(a.names), "identify (s)": a.identify_s, "fit (s)": a.fix_s}
         if a.fix:
             east, north, _ = a.fix.covariance.diagonal() ** 0.5
-            values |= {"sigma east (m)": float(east), "sigma north (m)": float(north), "residual (arcsec)": a.fix.residual_arcsec}
+            values |= {
+                "sigma east (m)": float(east),
+                "sigma north (m)": float(north),
+                "residual (arcsec)": a.fix.residual_arcsec,
+            }
         return Report(Level.OK if a.ok else Level.WARN, a.message, values)
 
     def _report_inputs(self) -> Report:

@@ -5,13 +5,13 @@ import math
 
 import numpy as np
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
-from starpos import rotation
 from starpos.solve import Solution as Answer
 from starpos.solve import Status
 from starpos.vertical import ARCSEC, Deflection, Geodetic, geodetic
 from starpos_common.messages import tilt_to_message
 from std_msgs.msg import Header
 
+from starpos import rotation
 from starpos_interfaces.msg import ErrorTerm, Solution
 
 NO_CAMERA = "no camera"
@@ -35,7 +35,9 @@ def on_ground(answer: Answer, deflection: Deflection) -> Geodetic | None:
     return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, deflection) if fix else None
 
 
-def nav_sat_fix(header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float) -> NavSatFix:
+def nav_sat_fix(
+    header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float
+) -> NavSatFix:
     """The position on WGS 84; without one a NO_FIX with NaN, so that a consumer sees that the instrument lives."""
     message = NavSatFix(header=header)
     message.status.service = NavSatStatus.SERVICE_UNKNOWN if hasattr(NavSatStatus, "SERVICE_UNKNOWN") else 0
@@ -63,7 +65,9 @@ def imu(header: Header, answer: Answer, ground: Geodetic, deflection: Deflection
     message = Imu(header=header)
     message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w = x, y, z, w
     covariance = fix.attitude_covariance.copy()
-    covariance[2, 2] += ground.covariance[2, 2] - fix.covariance[2, 2]  # the deflection's share of the azimuth
+    covariance[2, 2] += (
+        ground.covariance[2, 2] - fix.covariance[2, 2]
+    )  # the deflection's share of the azimuth
     message.orientation_covariance = covariance.ravel()
     message.angular_velocity_covariance[0] = -1.0
     message.linear_acceleration_covariance[0] = -1.0
@@ -95,7 +99,10 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
         return message
     degrees = np.array([1.0, 1.0, np.degrees(1.0)])
     message.latitude, message.longitude = math.degrees(fix.latitude), math.degrees(fix.longitude)
-    message.latitude_geodetic, message.longitude_geodetic = math.degrees(ground.latitude), math.degrees(ground.longitude)
+    message.latitude_geodetic, message.longitude_geodetic = (
+        math.degrees(ground.latitude),
+        math.degrees(ground.longitude),
+    )
     message.heading = math.degrees(ground.heading)
     message.covariance = (fix.covariance * np.outer(degrees, degrees)).ravel()
     message.covariance_geodetic = (ground.covariance * np.outer(degrees, degrees)).ravel()

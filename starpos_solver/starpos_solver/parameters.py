@@ -5,12 +5,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from starpos import instrument
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.instrument import Instrument
 from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection
 from starpos_common.parameters import Parameter
+
+from starpos import instrument
 
 NAN = math.nan
 
@@ -39,24 +40,63 @@ PARAMETERS = (
         0.0,
         36000.0,
     ),
-    Parameter("refraction.pressure", NAN, "Air pressure at the instrument, not reduced to sea level; unset widens the fix.",
-              "Pa", 0.0, 120000.0),  # fmt: skip
+    Parameter(
+        "refraction.pressure",
+        NAN,
+        "Air pressure at the instrument, not reduced to sea level; unset widens the fix.",
+        "Pa",
+        0.0,
+        120000.0,
+    ),
     Parameter("refraction.temperature", NAN, "Air temperature; unset widens the fix.", "deg C", -100.0, 80.0),
-    Parameter("refraction.humidity", 0.3, "Relative humidity; it hardly matters in visible light.", "", 0.0, 1.0),
-    Parameter("altitude", NAN, "Altitude put into fix, which the stars cannot tell; unset leaves NaN, and some consumers "
-              "drop such a fix.", "m", -1000.0, 100000.0),  # fmt: skip
+    Parameter(
+        "refraction.humidity", 0.3, "Relative humidity; it hardly matters in visible light.", "", 0.0, 1.0
+    ),
+    Parameter(
+        "altitude",
+        NAN,
+        "Altitude put into fix, which the stars cannot tell; unset leaves NaN, and some consumers "
+        "drop such a fix.",
+        "m",
+        -1000.0,
+        100000.0,
+    ),
     Parameter("altitude_stddev", 100.0, "Its error.", "m", 0.0, 100000.0),
-    Parameter("clock_stddev", 0.01, "Error of the frames' time stamps against UTC; 1 s is 464 m at the equator.", "s",
-              0.0, 3600.0),  # fmt: skip
-    Parameter("deflection.xi", 0.0, "Deflection of the vertical to the north; 1 arcsec is 31 m of the geodetic latitude.",
-              "arcsec", -120.0, 120.0),  # fmt: skip
+    Parameter(
+        "clock_stddev",
+        0.01,
+        "Error of the frames' time stamps against UTC; 1 s is 464 m at the equator.",
+        "s",
+        0.0,
+        3600.0,
+    ),
+    Parameter(
+        "deflection.xi",
+        0.0,
+        "Deflection of the vertical to the north; 1 arcsec is 31 m of the geodetic latitude.",
+        "arcsec",
+        -120.0,
+        120.0,
+    ),
     Parameter("deflection.eta", 0.0, "Deflection of the vertical to the east.", "arcsec", -120.0, 120.0),
-    Parameter("deflection.stddev", UNKNOWN_STDDEV_ARCSEC, "Error of each component; the default is that of knowing "
-              "nothing.", "arcsec", 0.0, 120.0),  # fmt: skip
+    Parameter(
+        "deflection.stddev",
+        UNKNOWN_STDDEV_ARCSEC,
+        "Error of each component; the default is that of knowing nothing.",
+        "arcsec",
+        0.0,
+        120.0,
+    ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", "", 4, 1000),
     Parameter("tilt_window", 0.5, "Span of tilts averaged where the exposure is unknown.", "s", 0.01, 60.0),
-    Parameter("tilt_timeout", 0.5, "How long a frame waits for the tilts of its exposure; later ones come too late.", "s",
-              0.0, 60.0),  # fmt: skip
+    Parameter(
+        "tilt_timeout",
+        0.5,
+        "How long a frame waits for the tilts of its exposure; later ones come too late.",
+        "s",
+        0.0,
+        60.0,
+    ),
     Parameter("tilt_stddev", 0.0035, "Error of a tilt sample whose message states none.", "deg", 1e-7, 10.0),
 )
 

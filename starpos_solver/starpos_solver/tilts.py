@@ -69,7 +69,9 @@ class TiltBuffer:
             if abs(moment - mid_unix_s) <= span_s / 2 + NEAR_S:
                 flags |= flag
         if flags & (TiltMessage.OUT_OF_RANGE | TiltMessage.SATURATED):
-            raise TiltRangeError("tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright")
+            raise TiltRangeError(
+                "tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright"
+            )
         if flags:
             raise TiltError("tilt: the inclinometer repeats the same value: check its converter's wiring")
         nearest = min((abs(s.utc_unix_s - mid_unix_s) for s in self._good), default=None)

@@ -33,10 +33,14 @@ class Atmosphere:
         )
         for name, value, low, high, unit in checks:
             if not low <= value <= high:
-                raise InstrumentError(f"{name} {value} {unit}: must lie between {low:g} and {high:g} {unit}".rstrip())
+                raise InstrumentError(
+                    f"{name} {value} {unit}: must lie between {low:g} and {high:g} {unit}".rstrip()
+                )
 
     @classmethod
-    def measured(cls, pressure_pa: float | None, temperature_c: float | None, humidity: float = 0.3) -> "Atmosphere":
+    def measured(
+        cls, pressure_pa: float | None, temperature_c: float | None, humidity: float = 0.3
+    ) -> "Atmosphere":
         """The air as far as it was measured; None takes a middle of sea level to 3000 m, or of frost to summer, and a
         sigma that covers them."""
         return cls(
@@ -53,7 +57,10 @@ class Atmosphere:
         if self.pressure_pa == 0:
             return 0.0
         return float(
-            np.hypot(self.pressure_stddev_pa / self.pressure_pa, self.temperature_stddev_c / (self.temperature_c + 273.15))
+            np.hypot(
+                self.pressure_stddev_pa / self.pressure_pa,
+                self.temperature_stddev_c / (self.temperature_c + 273.15),
+            )
         )
 
     def refraction(self, factor: float = 1.0) -> "Refraction":

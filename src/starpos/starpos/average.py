@@ -43,7 +43,9 @@ def average(fixes: Sequence[Fix]) -> Average:
     own = np.array([sum(t.covariance for t in f.terms if not t.common)[:3, :3] for f in fixes])
     own[:, 2, 2] += 1e-24
     weight = np.linalg.inv(own[:, :2, :2])
-    weight = np.linalg.solve(weight.sum(0), weight.swapaxes(0, 1).reshape(2, -1)).reshape(2, -1, 2).swapaxes(0, 1)
+    weight = (
+        np.linalg.solve(weight.sum(0), weight.swapaxes(0, 1).reshape(2, -1)).reshape(2, -1, 2).swapaxes(0, 1)
+    )
     east, north = np.einsum("kij,kj->i", weight, moved)
     heading_weight = 1 / own[:, 2, 2]
     heading_weight /= heading_weight.sum()

@@ -30,7 +30,9 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise InstrumentError(f"camera size {self.width} x {self.height} px: both must be at least 1")
         if not np.all(np.isfinite(numbers)):
-            raise InstrumentError("camera intrinsics hold a number that is not finite: calibrate the camera again")
+            raise InstrumentError(
+                "camera intrinsics hold a number that is not finite: calibrate the camera again"
+            )
         if self.fx <= 0 or self.fy <= 0:
             raise InstrumentError(f"focal length {self.fx} x {self.fy} px: must be positive")
         if len(self.distortion) != 5:
@@ -65,9 +67,11 @@ class Camera:
 
         Raises InstrumentError where the distortion cannot be inverted.
         """
-        target = np.stack([(np.asarray(x, float) - self.cx) / self.fx, (np.asarray(y, float) - self.cy) / self.fy], -1)
+        target = np.stack(
+            [(np.asarray(x, float) - self.cx) / self.fx, (np.asarray(y, float) - self.cy) / self.fy], -1
+        )
         plane = self._undistort(target) if any(self.distortion) else target
-        v = np.concatenate([plane, np.ones(plane.shape[:-1] + (1,))], -1)
+        v = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], -1)
         return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
     def project(self, v) -> np.ndarray:

@@ -66,7 +66,9 @@ class Catalogue:
         v = np.stack([cd * cr, cd * sr, sd], -1)
         if year == EPOCH:
             return v
-        east = np.stack([-sr, cr, np.zeros_like(sr)], -1) * (self.pm_ra[index] * (year - EPOCH) * MAS)[:, None]
+        east = (
+            np.stack([-sr, cr, np.zeros_like(sr)], -1) * (self.pm_ra[index] * (year - EPOCH) * MAS)[:, None]
+        )
         north = np.stack([-sd * cr, -sd * sr, cd], -1) * (self.pm_dec[index] * (year - EPOCH) * MAS)[:, None]
         v = v + east + north
         return v / np.linalg.norm(v, axis=-1, keepdims=True)
@@ -145,7 +147,9 @@ def save(catalogue: Catalogue, path) -> None:
     """Write the compact file: differences along right ascension and split bytes, which deflate packs well."""
     c = catalogue
     step = np.diff(c.ra_mas.astype(np.int64), prepend=0).astype(np.uint32)
-    within = (c.dec_mas - (np.repeat(np.arange(ZONES), np.diff(c.zone_start)) - 90) * 3_600_000).astype(np.uint32)
+    within = (c.dec_mas - (np.repeat(np.arange(ZONES), np.diff(c.zone_start)) - 90) * 3_600_000).astype(
+        np.uint32
+    )
     named = np.flatnonzero(c.hip)
     with open(path, "wb") as f:
         np.savez_compressed(
@@ -178,12 +182,14 @@ def _join(planes: np.ndarray, dtype) -> np.ndarray:
 
 
 def read(path) -> Catalogue:
-    """The catalogue of one compact file; CatalogueError with the cure where it is missing, broken or of another format."""
+    """The catalogue of one compact file; CatalogueError where it is missing, broken or of another format."""
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as f:
             if int(f["format"]) != FORMAT:
-                raise CatalogueError(f"{path}: format {int(f['format'])}, this program reads {FORMAT}: build it again")
+                raise CatalogueError(
+                    f"{path}: format {int(f['format'])}, this program reads {FORMAT}: build it again"
+                )
             zone_start = np.concatenate([[0], np.cumsum(f["zone_count"], dtype=np.int64)])
             zone = np.repeat(np.arange(ZONES, dtype=np.int32), f["zone_count"])
             hip = np.zeros(len(zone), np.int32)
@@ -207,7 +213,9 @@ def read(path) -> Catalogue:
     except CatalogueError:
         raise
     except Exception as e:  # a damaged zip raises many kinds
-        raise CatalogueError(f"{path}: not a readable catalogue ({e}): restore it or build it again") from None
+        raise CatalogueError(
+            f"{path}: not a readable catalogue ({e}): restore it or build it again"
+        ) from None
 
 
 @lru_cache(maxsize=2)

@@ -102,10 +102,17 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
         ut1_minus_tai = table.ut1_minus_tai[-1] + beyond * table.slope
         sigma = np.hypot(table.ut1_sigma[-1], np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S))
         return EarthOrientation(
-            float(ut1_minus_tai + leap), float(sigma), table.pole_x[-1], table.pole_y[-1], POLE_SIGMA_RAD, float(beyond)
+            float(ut1_minus_tai + leap),
+            float(sigma),
+            table.pole_x[-1],
+            table.pole_y[-1],
+            POLE_SIGMA_RAD,
+            float(beyond),
         )
     at = [float(np.interp(mjd, table.mjd, column)) for column in (table.ut1_minus_tai, table.ut1_sigma)]
-    pole = [float(np.interp(mjd, table.mjd, column)) for column in (table.pole_x, table.pole_y, table.pole_sigma)]
+    pole = [
+        float(np.interp(mjd, table.mjd, column)) for column in (table.pole_x, table.pole_y, table.pole_sigma)
+    ]
     return EarthOrientation(at[0] + leap, at[1], *pole)
 
 

@@ -107,7 +107,11 @@ def solve_fix(
     Raises FixError where the stars are too few or do not agree.
     """
     problem = _Problem(
-        xy, camera, a2_matrix(tilt.theta_x, tilt.theta_y) @ mounting.a3, earth.to_itrs(places), atmosphere.refraction()
+        xy,
+        camera,
+        a2_matrix(tilt.theta_x, tilt.theta_y) @ mounting.a3,
+        earth.to_itrs(places),
+        atmosphere.refraction(),
     )
     catalogue_px2 = np.eye(2) * ((place_sigma * camera.fx) ** 2)[:, None, None]
     keep, jitter2 = np.ones(len(xy), bool), 0.0
@@ -127,7 +131,9 @@ def solve_fix(
         if settled:
             break
     if keep.sum() < max(MIN_STARS, 0.5 * len(xy)):
-        raise FixError(f"only {int(keep.sum())} of {len(xy)} identified stars agree on one attitude: no fix from them")
+        raise FixError(
+            f"only {int(keep.sum())} of {len(xy)} identified stars agree on one attitude: no fix from them"
+        )
     return _report(problem, state, keep, covariance_px2, catalogue_px2, jitter2, tilt, mounting, atmosphere, earth,
                    clock_stddev_s)  # fmt: skip
 
@@ -167,7 +173,9 @@ class _Problem:
             a4 = rotation.best_rotation(self.itrs + station_velocity(a4[2]), local)
         return _State(a4, 1.0)
 
-    def predict(self, state: _State, refraction: Refraction | None = None, g: np.ndarray | None = None) -> np.ndarray:
+    def predict(
+        self, state: _State, refraction: Refraction | None = None, g: np.ndarray | None = None
+    ) -> np.ndarray:
         """Pixels (N, 2) where the stars should be."""
         v = self.itrs + station_velocity(state.a4[2])
         v = v / np.linalg.norm(v, axis=1, keepdims=True)
@@ -189,7 +197,9 @@ class _Problem:
             return np.einsum("nji,nj->ni", whiten[keep], r).ravel()
 
         if np.isnan(whitened(np.zeros(4))).any():
-            raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
+            raise FixError(
+                "the identified stars do not fit into the camera's field: check focal length and tilt"
+            )
         found = least_squares(whitened, np.zeros(4), method="lm", xtol=1e-12, ftol=1e-12)
         return self.moved(state, found.x)
 
@@ -199,32 +209,41 @@ class _Problem:
         for i in range(4):
             p = np.zeros(4)
             p[i] = STEP_RAD
-            columns.append((self.predict(self.moved(state, p)) - self.predict(self.moved(state, -p))) / (2 * STEP_RAD))
+            columns.append(
+                (self.predict(self.moved(state, p)) - self.predict(self.moved(state, -p))) / (2 * STEP_RAD)
+            )
         return np.stack(columns, -1)
 
 
-def _report(problem, state, keep, centroid_px2, catalogue_px2, jitter2, tilt, mounting, atmosphere, earth, clock_s) -> Fix:
+def _report(
+    problem, state, keep, centroid_px2, catalogue_px2, jitter2, tilt, mounting, atmosphere, earth, clock_s
+) -> Fix:
     total = (centroid_px2 + catalogue_px2 + np.eye(2) * jitter2)[keep]
     j = problem.jacobian(state)[keep]
     wj = np.linalg.solve(total, j)  # (M, 2, 4): weight times jacobian
     normal = np.einsum("nki,nkj->ij", j, wj)
-    gain = np.linalg.solve(normal, wj.reshape(-1, 4).T).reshape(4, -1, 2)[:3]  # rotation of A4 per pixel of star
+    gain = np.linalg.solve(normal, wj.reshape(-1, 4).T).reshape(4, -1, 2)[
+        :3
+    ]  # rotation of A4 per pixel of star
     stars_move = _numerical(lambda d: _outcome(rotation.from_vector(d) @ state.a4, problem.g, mounting), 3)
     level_moves = _numerical(
-        lambda d: _outcome(rotation.from_vector(d) @ state.a4, rotation.from_vector(d) @ problem.g, mounting), 3
+        lambda d: _outcome(rotation.from_vector(d) @ state.a4, rotation.from_vector(d) @ problem.g, mounting),
+        3,
     )
 
     def per_star(covariance):
         root = np.linalg.cholesky(covariance + np.eye(2) * 1e-18)
         return stars_move @ np.einsum("anj,njk->ank", gain, root).reshape(3, -1)
 
-    def tilted(theta):
-        return rotation.to_small_vector(a2_matrix(*(theta + [tilt.theta_x, tilt.theta_y])) @ mounting.a3 @ problem.g.T)
+    def tilted(d):
+        return rotation.to_small_vector(
+            a2_matrix(tilt.theta_x + d[0], tilt.theta_y + d[1]) @ mounting.a3 @ problem.g.T
+        )
 
     a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
     weaker, stronger = (problem.predict(state, atmosphere.refraction(f))[keep] for f in (0.99, 1.01))
     pull = -np.einsum("anj,nj->a", gain, (stronger - weaker) / 0.02)
-    latitude, longitude, east, north = _place(state.a4)
+    latitude, longitude, *_ = _place(state.a4)
     prime, _ = curvature_radii_m(latitude)
     metres_a_second = ROTATION_RAD_S * prime * np.cos(latitude)
     pole = earth.orientation.pole_sigma * prime * np.eye(6)[:, :2]
@@ -282,7 +301,12 @@ def _place(a4: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
     length = np.linalg.norm(north)
     north = north / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
     east = np.cross(north, [0.0, 0.0, 1.0])
-    return float(np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1]))), float(np.arctan2(zenith[1], zenith[0])), east, north
+    return (
+        float(np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1]))),
+        float(np.arctan2(zenith[1], zenith[0])),
+        east,
+        north,
+    )
 
 
 def _outcome(a4: np.ndarray, g: np.ndarray, mounting: Mounting):

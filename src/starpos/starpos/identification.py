@@ -22,7 +22,14 @@ ACCEPT_LOG_ODDS = np.log(1e9)  # a wrong match among all hypotheses of a frame a
 FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
 TEST_STARS = 50  # the brightest of a frame, which decide
 SCALE_TOLERANCE = 0.03  # of the focal length
-STAGES = ((5, 0.35), (7, 0.35), (10, 0.35), (14, 0.35), (8, 2.5), (12, 6.0))  # (brightest stars, their error in px)
+STAGES = (
+    (5, 0.35),
+    (7, 0.35),
+    (10, 0.35),
+    (14, 0.35),
+    (8, 2.5),
+    (12, 6.0),
+)  # (brightest stars, their error in px)
 TRIANGLE_SIGMA = 3.0
 MAX_VERIFIED = 60  # candidates a stage
 FAINTEST_FIT = 400  # stars
@@ -230,7 +237,12 @@ class _Search:
         offset = xy[test] - predicted[nearest]
         distance2 = np.sum(offset**2, 1)
         variance = sigma**2
-        likelihood = (1 - FALSE_FRACTION) / len(index) * np.exp(self.log_area - 0.5 * distance2 / variance) / (2 * np.pi * variance)
+        likelihood = (
+            (1 - FALSE_FRACTION)
+            / len(index)
+            * np.exp(self.log_area - 0.5 * distance2 / variance)
+            / (2 * np.pi * variance)
+        )
         odds = np.log(FALSE_FRACTION + np.where(hit, likelihood, 0.0))
         return _Match(attitude, scale, h.mirrored, float(odds[~own].sum()), test[hit], index[nearest[hit]])
 
@@ -251,7 +263,9 @@ class _Search:
         xy = (self.flipped if match.mirrored else self.xy)[:FAINTEST_FIT]
         attitude, scale = match.attitude, match.scale
         index, w = self._in_field(attitude, scale, 3 * len(xy) + 50)
-        residual = xy[match.star] - self.camera.scaled(scale).project(self.sky.directions(match.catalogue) @ attitude.T)
+        residual = xy[match.star] - self.camera.scaled(scale).project(
+            self.sky.directions(match.catalogue) @ attitude.T
+        )
         spread = max(float(np.sqrt(np.mean(residual**2))), 0.1)
         star, near = match.star, None
         for _ in range(3):
@@ -310,7 +324,9 @@ def _fit(xy, w, attitude, scale, camera: Camera, rounds: int = 2):
         # d plane for a rotation by d about the camera's axes, and for a relative change of the focal length
         jx = np.stack([-x * y, 1 + x * x, -y, x], -1)
         jy = np.stack([-(1 + y * y), x * y, x, y], -1)
-        d = np.linalg.lstsq(np.concatenate([jx, jy]), np.concatenate([residual[:, 0], residual[:, 1]]), rcond=None)[0]
+        d = np.linalg.lstsq(
+            np.concatenate([jx, jy]), np.concatenate([residual[:, 0], residual[:, 1]]), rcond=None
+        )[0]
         attitude = rotation.from_vector(d[:3]) @ attitude
         scale = scale * (1 + d[3])
     return attitude, scale

@@ -49,7 +49,9 @@ def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
     b = -theta_x
     s = np.sin(theta_y) / np.cos(b)
     if not abs(s) < 1:
-        raise TiltError(f"tilts {np.degrees(theta_x):.3f}, {np.degrees(theta_y):.3f} deg cannot hold together")
+        raise TiltError(
+            f"tilts {np.degrees(theta_x):.3f}, {np.degrees(theta_y):.3f} deg cannot hold together"
+        )
     a = np.arcsin(s)
     ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])

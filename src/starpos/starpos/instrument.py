@@ -48,13 +48,19 @@ class Instrument:
             if not np.isfinite(np.asarray(numbers, float)).all():
                 raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
         if self.focal_px <= 0:
-            raise InstrumentError(f"focal length {self.focal_px:g} px: must be positive (focal_mm * 1000 / pixel_um)")
+            raise InstrumentError(
+                f"focal length {self.focal_px:g} px: must be positive (focal_mm * 1000 / pixel_um)"
+            )
         if len(self.misalignment_deg) != 3 or len(self.calibration_stddev_arcsec) != 3:
             raise InstrumentError("misalignment_deg and calibration_stddev_arcsec are three numbers each")
         if min(*self.calibration_stddev_arcsec, self.tilt_noise_rad, self.clock_stddev_s) < 0:
             raise InstrumentError("a standard deviation of the instrument is negative: it must be 0 or more")
         link = np.asarray(self.link_to_camera, float)
-        if link.shape != (3, 3) or not np.allclose(link @ link.T, np.eye(3), atol=1e-6) or np.linalg.det(link) < 0:
+        if (
+            link.shape != (3, 3)
+            or not np.allclose(link @ link.T, np.eye(3), atol=1e-6)
+            or np.linalg.det(link) < 0
+        ):
             raise InstrumentError("link_to_camera must be a 3 x 3 rotation matrix")
 
     def camera_for(self, width: int, height: int) -> Camera:
@@ -80,7 +86,9 @@ class Instrument:
 def focal_px_of(focal_mm: float, pixel_um: float) -> float:
     """Focal length in px; InstrumentError unless both are positive."""
     if not (focal_mm > 0 and pixel_um > 0 and np.isfinite([focal_mm, pixel_um]).all()):
-        raise InstrumentError(f"focal length {focal_mm:g} mm with {pixel_um:g} um pixels: both must be positive")
+        raise InstrumentError(
+            f"focal length {focal_mm:g} mm with {pixel_um:g} um pixels: both must be positive"
+        )
     return focal_mm * 1000 / pixel_um
 
 
@@ -103,9 +111,13 @@ def read(path) -> Instrument:
             raise InstrumentError(f"{path}: over 1 MiB, no instrument file")
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
-        raise InstrumentError(f"{path}: not a readable instrument file ({' '.join(str(e).split())[:120]})") from None
+        raise InstrumentError(
+            f"{path}: not a readable instrument file ({' '.join(str(e).split())[:120]})"
+        ) from None
     if not isinstance(content, dict) or content.pop("starpos_instrument", None) != FORMAT:
-        raise InstrumentError(f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`")
+        raise InstrumentError(
+            f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`"
+        )
     try:
         return _from_mapping(content)
     except InstrumentError as e:
@@ -115,7 +127,14 @@ def read(path) -> Instrument:
 
 
 def _from_mapping(content: dict) -> Instrument:
-    known = {"camera", "misalignment_deg", "calibration_stddev_arcsec", "link_to_camera", "tilt_noise_deg", "clock_stddev_s"}
+    known = {
+        "camera",
+        "misalignment_deg",
+        "calibration_stddev_arcsec",
+        "link_to_camera",
+        "tilt_noise_deg",
+        "clock_stddev_s",
+    }
     if unknown := sorted(set(content) - known):
         raise InstrumentError(f"unknown key {unknown[0]!r}: the keys are {', '.join(sorted(known))}")
     camera = dict(content["camera"])
@@ -125,7 +144,9 @@ def _from_mapping(content: dict) -> Instrument:
     else:
         sizes = (int(camera["width"]), int(camera["height"]))
         numbers = (float(camera[k]) for k in ("fx", "fy", "cx", "cy"))
-        given["camera"] = Camera(*sizes, *numbers, tuple(float(d) for d in camera.get("distortion", [0.0] * 5)))
+        given["camera"] = Camera(
+            *sizes, *numbers, tuple(float(d) for d in camera.get("distortion", [0.0] * 5))
+        )
         focal_px = given["camera"].fx
     for key in ("misalignment_deg", "calibration_stddev_arcsec"):
         if key in content:

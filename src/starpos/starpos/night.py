@@ -44,7 +44,9 @@ def write_night(
                 listed = detected(now, stars, start + exposure_s / 2, exposure_s, rng)
                 write_stars(folder / f"stars_{k:04d}.csv", listed, _text(start))
             else:
-                write_fits(folder / f"frame_{k:04d}.fits", render(now, stars, start, exposure_s, rng), _text(start))
+                write_fits(
+                    folder / f"frame_{k:04d}.fits", render(now, stars, start, exposure_s, rng), _text(start)
+                )
             samples = max(1, round(exposure_s * TILT_RATE_HZ))
             for j in range(samples):
                 moment = start + (j + 0.5) * exposure_s / samples
@@ -94,7 +96,15 @@ def write_fits(path, frame: Frame, start_utc: str) -> None:
 
 def write_stars(path, stars: Stars, start_utc: str) -> None:
     """A list of stars as CSV, in the form `read_frame` reads."""
-    about = {"DATE-OBS": start_utc, "EXPTIME": stars.exposure_s, "NAXIS1": stars.width, "NAXIS2": stars.height}
+    about = {
+        "DATE-OBS": start_utc,
+        "EXPTIME": stars.exposure_s,
+        "NAXIS1": stars.width,
+        "NAXIS2": stars.height,
+    }
     sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
-    rows = "".join(f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n" for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True))
+    rows = "".join(
+        f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n"
+        for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True)
+    )
     Path(path).write_text(f"# {json.dumps(about)}\nx,y,flux,sigma\n{rows}")

@@ -102,19 +102,27 @@ def expose(scene: Scene, catalogue: Catalogue, start_unix_s: float, exposure_s: 
         state = middle_state if t == middle_state.utc_unix_s else earth_state(t)
         px.append(camera.project(scene.site.observed(catalogue, index, state) @ scene.attitude))
     px = np.stack(px) + rng.normal(0, optics.seeing_arcsec / camera.scale_arcsec, (len(index), 2))
-    on = np.isfinite(px).all((0, 2)) & (px[1] > -6).all(1) & (px[1] < [camera.width + 5, camera.height + 5]).all(1)
+    on = (
+        np.isfinite(px).all((0, 2))
+        & (px[1] > -6).all(1)
+        & (px[1] < [camera.width + 5, camera.height + 5]).all(1)
+    )
     electrons = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * catalogue.vmag(index))
     return Exposed(*(p[on] for p in px), electrons[on], index[on])
 
 
-def render(scene: Scene, stars: Exposed, start_unix_s: float, exposure_s: float, rng, source: str = "simulated") -> Frame:
+def render(
+    scene: Scene, stars: Exposed, start_unix_s: float, exposure_s: float, rng, source: str = "simulated"
+) -> Frame:
     """A 16-bit frame: trailed Gaussian images integrated over pixels, sky, photon and read noise, clipping."""
     camera, optics = scene.camera, scene.optics
     sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2
     light = np.full(camera.height * camera.width, sky, np.float32)
     place, amount = _star_light(camera, optics, stars)
     np.add.at(light, place, amount)
-    light += rng.standard_normal(len(light), dtype=np.float32) * np.sqrt(light + np.float32(optics.read_noise_e**2))
+    light += rng.standard_normal(len(light), dtype=np.float32) * np.sqrt(
+        light + np.float32(optics.read_noise_e**2)
+    )
     light *= np.float32(1 / optics.gain_e_dn)
     light += np.float32(optics.bias_dn + 0.5)
     np.clip(light, 0, optics.full_well_dn, out=light)
@@ -174,7 +182,9 @@ def scene_of(
     )
 
 
-def detected(scene: Scene, stars: Exposed, mid_unix_s: float, exposure_s: float, rng, source: str = "simulated") -> Stars:
+def detected(
+    scene: Scene, stars: Exposed, mid_unix_s: float, exposure_s: float, rng, source: str = "simulated"
+) -> Stars:
     """The stars as a good detector would list them: errors by photon noise, with a floor of 0.02 px; SNR above 6."""
     optics, camera = scene.optics, scene.camera
     sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2

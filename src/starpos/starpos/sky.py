@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sky seen from a known place: the forward direction of what the fix inverts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,7 +17,7 @@ class Site:
 
     latitude_deg: float
     longitude_deg: float
-    atmosphere: Atmosphere = Atmosphere()
+    atmosphere: Atmosphere = field(default_factory=Atmosphere)
 
     @property
     def enu(self) -> np.ndarray:
@@ -36,12 +36,16 @@ class Site:
         v = state.to_itrs(catalogue.directions(index, state.year)) + station_velocity(self.enu[2])
         return self.atmosphere.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ self.enu.T)
 
-    def overhead(self, catalogue: Catalogue, state: EarthState, toward: np.ndarray, radius: float, limit_mag: float):
+    def overhead(
+        self, catalogue: Catalogue, state: EarthState, toward: np.ndarray, radius: float, limit_mag: float
+    ):
         """Catalogue indices within `radius` rad of an observed ENU direction (3,), brightest first."""
         itrs = self.atmosphere.refraction().unbend(toward) @ self.enu
         # aberration and precession of the direction itself are far below the margin
         ra, dec = np.arctan2(itrs[1], itrs[0]), np.arcsin(np.clip(itrs[2], -1, 1))
-        cirs = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]) @ state.cirs_to_itrs
+        cirs = (
+            np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]) @ state.cirs_to_itrs
+        )
         icrs = cirs @ np.asarray(state.astrom["bpn"]).reshape(3, 3)
         return catalogue.cone(icrs, radius + np.radians(0.05), limit_mag)
 

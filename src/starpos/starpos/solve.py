@@ -3,7 +3,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import erfa
@@ -40,7 +40,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Attitude:
-    """Where the camera looks: ICRS of the frame's centre pixel and the position angle, east of north, of its top (rad)."""
+    """Where the camera looks: ICRS of the frame's centre pixel, and the position angle of its top (rad)."""
 
     ra: float
     dec: float
@@ -79,7 +79,7 @@ class Solver:
 
     instrument: Instrument
     catalogue: Catalogue
-    atmosphere: Atmosphere = Atmosphere.measured(None, None)
+    atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
     min_stars: int = 5
     progress: Callable[[str, float], None] = lambda what, done: None
 
@@ -121,7 +121,9 @@ class Solver:
         """
         try:
             if stars.mid_unix_s is None:
-                raise TimeError(f"{stars.source}: no time of exposure (DATE-OBS): a position needs it to a millisecond")
+                raise TimeError(
+                    f"{stars.source}: no time of exposure (DATE-OBS): a position needs it to a millisecond"
+                )
             state = earth_state(stars.mid_unix_s)
             if callable(tilt):
                 tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0)
@@ -138,7 +140,9 @@ class Solver:
         attitude = _attitude(found, sky, camera)
         try:
             if len(found.star) < self.min_stars:
-                raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
+                raise FixError(
+                    f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix"
+                )
             if found.mirrored:
                 raise InstrumentError(
                     "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
@@ -199,14 +203,18 @@ class Solver:
             saturated = int(np.sum((stars.flags & SATURATED) != 0))
             hint = f" ({saturated} saturated)" if saturated else ""
             message = (
-                f"{place}: {len(stars)} stars detected{hint}, at least 4 are needed: check cap, clouds, focus and exposure"
+                f"{place}: {len(stars)} stars detected{hint}, at least 4 are needed: check clouds and focus"
             )
-            return Solution(Status.TOO_FEW_STARS, message, stars.source, stars.mid_unix_s, len(stars), identify_s=spent)
+            return Solution(
+                Status.TOO_FEW_STARS, message, stars.source, stars.mid_unix_s, len(stars), identify_s=spent
+            )
         message = (
             f"{place}: none of the sky fits its {len(stars)} stars: check the focal length "
             f"({self.instrument.focal_px:.0f} px given, 3 % is allowed), clouds and exposure"
         )
-        return Solution(Status.NOT_IDENTIFIED, message, stars.source, stars.mid_unix_s, len(stars), identify_s=spent)
+        return Solution(
+            Status.NOT_IDENTIFIED, message, stars.source, stars.mid_unix_s, len(stars), identify_s=spent
+        )
 
     def _failure(self, stars: Stars, error: StarposError) -> Solution:
         kinds = (

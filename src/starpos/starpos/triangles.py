@@ -87,7 +87,9 @@ class TriangleCatalogue:
 
 
 def _bin_largest(angle):
-    return np.clip(((angle - np.pi / 3) * (LARGEST_BINS / (2 * np.pi / 3))).astype(np.int64), 0, LARGEST_BINS - 1)
+    return np.clip(
+        ((angle - np.pi / 3) * (LARGEST_BINS / (2 * np.pi / 3))).astype(np.int64), 0, LARGEST_BINS - 1
+    )
 
 
 def _bin_smallest(angle):
@@ -97,7 +99,9 @@ def _bin_smallest(angle):
 Progress = Callable[[str, float], None]
 
 
-def build(catalogue: Catalogue, longest_side: float, progress: Progress = lambda what, done: None) -> TriangleCatalogue:
+def build(
+    catalogue: Catalogue, longest_side: float, progress: Progress = lambda what, done: None
+) -> TriangleCatalogue:
     """Triangles with every side below `longest_side` rad, the diagonal of the field.
 
     Each star makes triangles with the pairs of its brighter neighbours within half of that, so that each triangle is
@@ -129,7 +133,9 @@ def _with_brighter_pairs(tree: cKDTree, own: np.ndarray, chord: float, brighter:
     The tree's rows are in order of brightness, so a smaller row is a brighter star.
     """
     by_rank: dict[int, list] = {}
-    for star, near in zip(own.tolist(), tree.query_ball_point(tree.data[own], chord, return_sorted=True), strict=True):
+    for star, near in zip(
+        own.tolist(), tree.query_ball_point(tree.data[own], chord, return_sorted=True), strict=True
+    ):
         rank = int(np.searchsorted(near, star))
         if 2 <= rank < brighter:
             by_rank.setdefault(rank, []).append([star, *near[:rank]])
@@ -181,7 +187,8 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
 
 @lru_cache(maxsize=4)
 def _cached(catalogue: Catalogue, longest_side: float, progress: Progress) -> TriangleCatalogue:
-    settings = f"{FORMAT} {catalogue.fingerprint} {longest_side:.6f} {BRIGHTER_NEIGHBOURS} {MAX_TRIANGLES} {SHORTEST_SIDE}"
+    limits = (BRIGHTER_NEIGHBOURS, MAX_TRIANGLES, SHORTEST_SIDE)
+    settings = f"{FORMAT} {catalogue.fingerprint} {longest_side:.6f} {limits}"
     digest = hashlib.sha256(settings.encode()).hexdigest()[:16]
     folder = cache_folder() / f"triangles-{np.degrees(longest_side):.2f}deg-{digest}"
     if not folder.is_dir():
@@ -218,4 +225,6 @@ def _map(folder: Path) -> TriangleCatalogue:
             raise ValueError("bins do not fit")
         return TriangleCatalogue(**{k: np.asarray(v) for k, v in columns.items()})
     except (OSError, ValueError, EOFError) as e:
-        raise CatalogueError(f"{folder}: a broken triangle catalogue ({e}): remove the folder, it is built anew") from None
+        raise CatalogueError(
+            f"{folder}: a broken triangle catalogue ({e}): remove the folder, it is built anew"
+        ) from None

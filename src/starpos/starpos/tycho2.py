@@ -15,7 +15,9 @@ from starpos.catalogue import EPOCH, Catalogue, pack
 from starpos.errors import CatalogueError
 
 SUPPLEMENT_EPOCH = 1991.25
-UNKNOWN_MOTION_MAS_YEAR = 25.0  # 1 sigma of a star whose proper motion was never measured: the V ~ 10 stars' own spread
+UNKNOWN_MOTION_MAS_YEAR = (
+    25.0  # 1 sigma of a star whose proper motion was never measured: the V ~ 10 stars' own spread
+)
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
 
 _MAIN = {  # name: (first byte from 0, length)
@@ -31,7 +33,9 @@ _SUPPLEMENT = {
 }  # fmt: skip
 
 
-def build(source, limit_mag: float, progress: Callable[[str, float], None] = lambda what, done: None) -> Catalogue:
+def build(
+    source, limit_mag: float, progress: Callable[[str, float], None] = lambda what, done: None
+) -> Catalogue:
     """The catalogue of all stars with V < limit_mag from a folder (or Debian's tycho2_*.orig.tar.xz) of the originals.
 
     Every star carries its own position error: mean position and motion where Tycho-2 has them, the observed place
@@ -40,7 +44,9 @@ def build(source, limit_mag: float, progress: Callable[[str, float], None] = lam
     parts, seen = [], 0
     for name, text in _originals(Path(source)):
         supplement = name.startswith("suppl")
-        table = _read(text, _SUPPLEMENT if supplement else _MAIN, SUPPLEMENT_BYTES if supplement else MAIN_BYTES, name)
+        table = _read(
+            text, _SUPPLEMENT if supplement else _MAIN, SUPPLEMENT_BYTES if supplement else MAIN_BYTES, name
+        )
         parts.append(_supplement_stars(table) if supplement else _main_stars(table))
         parts[-1] = {k: v[parts[-1]["vmag"] < limit_mag + 1] for k, v in parts[-1].items()}
         seen += 1
@@ -112,7 +118,9 @@ def _main_stars(t: dict) -> dict[str, np.ndarray]:
             mean, np.hypot(t["e_ra"], t["e_dec"]), np.hypot(t["e_ra_observed"], t["e_dec_observed"])
         )
         / np.sqrt(2),
-        "sigma_pm": np.where(mean, np.hypot(t["e_pm_ra"], t["e_pm_dec"]) / np.sqrt(2), UNKNOWN_MOTION_MAS_YEAR),
+        "sigma_pm": np.where(
+            mean, np.hypot(t["e_pm_ra"], t["e_pm_dec"]) / np.sqrt(2), UNKNOWN_MOTION_MAS_YEAR
+        ),
         "epoch": np.where(mean, (t["epoch_ra"] + t["epoch_dec"]) / 2, 1990 + t["epoch"]),
         "photocentre": t["pflag"] == b"P",
     }

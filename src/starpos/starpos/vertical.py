@@ -9,7 +9,9 @@ from starpos.earth import curvature_radii_m
 from starpos.errors import InstrumentError
 
 ARCSEC = np.radians(1 / 3600)
-UNKNOWN_STDDEV_ARCSEC = 6.0  # of each component where nothing is known: the root mean square over the continents
+UNKNOWN_STDDEV_ARCSEC = (
+    6.0  # of each component where nothing is known: the root mean square over the continents
+)
 
 
 @dataclass(frozen=True)
@@ -21,8 +23,13 @@ class Deflection:
     stddev_arcsec: float = UNKNOWN_STDDEV_ARCSEC
 
     def __post_init__(self):
-        if not np.isfinite([self.xi_arcsec, self.eta_arcsec, self.stddev_arcsec]).all() or self.stddev_arcsec < 0:
-            raise InstrumentError("deflection of the vertical: xi and eta must be finite, their stddev 0 or more")
+        if (
+            not np.isfinite([self.xi_arcsec, self.eta_arcsec, self.stddev_arcsec]).all()
+            or self.stddev_arcsec < 0
+        ):
+            raise InstrumentError(
+                "deflection of the vertical: xi and eta must be finite, their stddev 0 or more"
+            )
 
 
 @dataclass(frozen=True)
@@ -35,7 +42,9 @@ class Geodetic:
     covariance: np.ndarray
 
 
-def geodetic(latitude: float, longitude: float, heading: float, covariance: np.ndarray, d: Deflection) -> Geodetic:
+def geodetic(
+    latitude: float, longitude: float, heading: float, covariance: np.ndarray, d: Deflection
+) -> Geodetic:
     """phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); its unknown part widens all three."""
     phi = latitude - d.xi_arcsec * ARCSEC
     eta = d.eta_arcsec * ARCSEC

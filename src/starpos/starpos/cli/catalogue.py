@@ -21,11 +21,15 @@ def define(parser) -> None:
     info.add_argument("path", nargs="?", metavar="FILE", help="another file than the one in use")
     info.add_argument("--year", type=float, default=2026.0, help="for the errors of places (2026)")
     info.set_defaults(run=show)
-    build = kinds.add_parser("build", help="make the compact file from Tycho-2's original files", epilog=ORIGINALS)
+    build = kinds.add_parser(
+        "build", help="make the compact file from Tycho-2's original files", epilog=ORIGINALS
+    )
     build.formatter_class = argparse.RawDescriptionHelpFormatter
     build.add_argument("originals", metavar="ORIGINALS", help="folder or archive of the original files")
     build.add_argument("--limit-mag", type=float, default=11.0, metavar="V", help="faintest V kept (11.0)")
-    build.add_argument("--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it")
+    build.add_argument(
+        "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
+    )
     build.set_defaults(run=build_file)
 
 
@@ -33,7 +37,9 @@ def show(args) -> int:
     c = catalogue.load(args.path)
     v = c.vmag()
     sigma_mas = c.sigma(slice(None), args.year) / catalogue.MAS
-    print(f"{len(c)} stars of Tycho-2, V {v.min():.2f} to {v.max():.2f}, {np.count_nonzero(c.hip)} with a HIP number")
+    print(
+        f"{len(c)} stars of Tycho-2, V {v.min():.2f} to {v.max():.2f}, {np.count_nonzero(c.hip)} with a HIP number"
+    )
     print("   V up to     stars   median error of a place in", args.year)
     for limit in (2, 4, 6, 7, 8, 9, 9.5, 10, 10.5, 11, 12, 13):
         if limit > v.max() + 1:

@@ -18,7 +18,9 @@ from starpos.stars import Stars
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids")
+    parser.add_argument(
+        "frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object a frame instead of a table")
 
 
@@ -28,7 +30,9 @@ def add_optics(parser: argparse.ArgumentParser) -> None:
 
 
 def add_air(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--pressure-hpa", type=float, metavar="HPA", help="air pressure at the instrument, not reduced")
+    parser.add_argument(
+        "--pressure-hpa", type=float, metavar="HPA", help="air pressure at the instrument, not reduced"
+    )
     parser.add_argument("--temperature-c", type=float, metavar="C", help="air temperature")
     parser.add_argument("--humidity", type=float, default=0.3, metavar="0..1", help="relative humidity (0.3)")
 
@@ -46,7 +50,9 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
     flat = args.focal_mm is not None or args.pixel_um is not None or misalignment is not None
     if path is not None:
         if flat:
-            raise InstrumentError("--instrument holds focal length and misalignment: give either it or the options")
+            raise InstrumentError(
+                "--instrument holds focal length and misalignment: give either it or the options"
+            )
         return instrument.read(path)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
@@ -55,7 +61,9 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
     elif first is not None and first.focal_px is not None:
         focal_px = first.focal_px
     else:
-        raise InstrumentError("no focal length: give --focal-mm and --pixel-um, or frames whose header has them")
+        raise InstrumentError(
+            "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
+        )
     return instrument.Instrument(focal_px, misalignment_deg=tuple(misalignment or (0.0, 0.0, 0.0)))
 
 
@@ -114,4 +122,9 @@ class ProgressBar:
         self.shown = True
         filled = int(30 * min(done, 1.0))
         end = "\n" if done >= 1 else ""
-        print(f"\r{what:>20} [{'#' * filled}{'.' * (30 - filled)}] {100 * done:3.0f} %", end=end, file=sys.stderr, flush=True)
+        print(
+            f"\r{what:>20} [{'#' * filled}{'.' * (30 - filled)}] {100 * done:3.0f} %",
+            end=end,
+            file=sys.stderr,
+            flush=True,
+        )

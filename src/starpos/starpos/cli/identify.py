@@ -27,7 +27,9 @@ def run(args) -> int:
             cpu_ms = 0.0
         else:
             if solver is None:
-                solver = Solver(common.instrument_of(args, item), catalogue.load(), progress=common.ProgressBar())
+                solver = Solver(
+                    common.instrument_of(args, item), catalogue.load(), progress=common.ProgressBar()
+                )
             solver.prepare(*_size(item))
             begin = time.process_time()
             answer = solver.identify(common.stars_of(item))

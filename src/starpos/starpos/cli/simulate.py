@@ -15,7 +15,9 @@ def define(parser) -> None:
     parser.add_argument("-n", "--frames", type=int, default=5, help="how many (5)")
     parser.add_argument("--latitude", type=float, default=35.7046, help="deg, astronomic")
     parser.add_argument("--longitude", type=float, default=51.4106, help="deg, east positive")
-    parser.add_argument("--start", default="2026-11-02T18:00:00", metavar="UTC", help="start of the first exposure")
+    parser.add_argument(
+        "--start", default="2026-11-02T18:00:00", metavar="UTC", help="start of the first exposure"
+    )
     parser.add_argument("--cadence", type=float, default=5.0, help="s between frames (5)")
     parser.add_argument("--exposure", type=float, default=0.5, help="s (0.5)")
     parser.add_argument("--azimuth", type=float, default=40.0, help="deg, of the optical axis")
@@ -24,11 +26,21 @@ def define(parser) -> None:
     parser.add_argument("--turn", type=float, default=0.0, help="deg of azimuth between frames")
     parser.add_argument("--focal-mm", type=float, default=600.0)
     parser.add_argument("--pixel-um", type=float, default=6.4)
-    parser.add_argument("--size", type=int, nargs=2, default=(5616, 3744), metavar=("WIDTH", "HEIGHT"), help="px")
-    parser.add_argument("--misalignment", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("RX", "RY", "RZ"))
-    parser.add_argument("--tilt-noise", type=float, default=0.0035, help="deg, of one reading (0.0035, the SCA100T's)")
-    parser.add_argument("--tilt-zero", type=float, nargs=2, default=(0.0, 0.0), metavar=("X", "Y"), help="deg")
-    parser.add_argument("--stars-only", action="store_true", help="lists of detected stars (CSV) instead of frames")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(5616, 3744), metavar=("WIDTH", "HEIGHT"), help="px"
+    )
+    parser.add_argument(
+        "--misalignment", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("RX", "RY", "RZ")
+    )
+    parser.add_argument(
+        "--tilt-noise", type=float, default=0.0035, help="deg, of one reading (0.0035, the SCA100T's)"
+    )
+    parser.add_argument(
+        "--tilt-zero", type=float, nargs=2, default=(0.0, 0.0), metavar=("X", "Y"), help="deg"
+    )
+    parser.add_argument(
+        "--stars-only", action="store_true", help="lists of detected stars (CSV) instead of frames"
+    )
     parser.add_argument("--seed", type=int, default=1)
     common.add_air(parser)
     parser.set_defaults(run=run)

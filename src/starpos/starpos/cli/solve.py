@@ -18,14 +18,30 @@ NO_FIX = 1
 
 def define(parser) -> None:
     common.add_frames(parser)
-    parser.add_argument("--tilt", required=True, metavar="CSV", help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]")
-    parser.add_argument("--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below")
+    parser.add_argument(
+        "--tilt", required=True, metavar="CSV", help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]"
+    )
+    parser.add_argument(
+        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
+    )
     common.add_optics(parser)
-    parser.add_argument("--misalignment", type=float, nargs=3, metavar=("RX", "RY", "RZ"), help="A3 in deg: camera to inclinometer")
+    parser.add_argument(
+        "--misalignment",
+        type=float,
+        nargs=3,
+        metavar=("RX", "RY", "RZ"),
+        help="A3 in deg: camera to inclinometer",
+    )
     common.add_air(parser)
-    parser.add_argument("--xi", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, north")
-    parser.add_argument("--eta", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, east")
-    parser.add_argument("--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)")
+    parser.add_argument(
+        "--xi", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, north"
+    )
+    parser.add_argument(
+        "--eta", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, east"
+    )
+    parser.add_argument(
+        "--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)"
+    )
     parser.set_defaults(run=run)
 
 
@@ -41,7 +57,9 @@ def run(args) -> int:
             if solver is None:
                 instrument = common.instrument_of(args, item)
                 tilts = read_tilt_csv(args.tilt, instrument.tilt_noise_rad)
-                solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar())
+                solver = Solver(
+                    instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar()
+                )
             answer = solver.solve(common.stars_of(item), tilts.average)
             if answer.fix:
                 fixes.append(answer.fix)
@@ -120,10 +138,10 @@ def _line(path: str, s: Solution) -> str:
 def _where(fix: Fix | Average) -> str:
     east, north, heading = np.sqrt(np.diag(_in_degrees(fix.covariance)))
     turned = np.isnan(fix.heading)
-    facing = "turned between frames" if turned else f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
-    return (
-        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
+    facing = (
+        "turned between frames" if turned else f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
     )
+    return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
 def _print_combined(all_together: Average, fixes: list[Fix], args, deflection: Deflection) -> None:

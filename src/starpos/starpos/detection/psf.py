@@ -8,7 +8,6 @@ Only even terms are kept, so the centre is the centre of symmetry whatever the f
 """
 
 from dataclasses import dataclass
-from math import factorial
 
 import numpy as np
 
@@ -17,7 +16,8 @@ MAX_ORDER = 8
 
 @dataclass(frozen=True, eq=False)
 class Psf:
-    """axes (2, 2): rows turn an offset (dx, dy) px into (u, v); series (K, K): coefficient of He_i(u) He_j(v)."""
+    """axes (2, 2): rows turn an offset (dx, dy) px into (u, v); series (I, J): coefficient of h_i(u) h_j(v),
+    Hermite polynomials."""
 
     axes: np.ndarray
     series: np.ndarray
@@ -41,23 +41,19 @@ class Psf:
     def evaluate(self, dx, dy):
         """value, d/dx0 and d/dy0 (N, S, S): the PSF at pixels dx, dy off a star's centre, and how moving it acts."""
         u, v = (a[0] * dx + a[1] * dy for a in self.axes.astype(np.float32))
-        order = len(self.series) - 1
-        fu, fv = _hermites(u, order + 1), _hermites(v, order + 1)
+        fu, fv = (_hermites(w, n) for w, n in zip((u, v), self.series.shape, strict=True))
         norm = np.float32(abs(np.linalg.det(self.axes)) / (2 * np.pi))
         gauss = np.exp(-0.5 * (u * u + v * v)) * norm
-        value, du, dv = (np.zeros_like(u) for _ in range(3))
-        for i in range(order + 1):
-            along = along_dv = None
-            for j in range(order + 1 - i):
-                c = np.float32(self.series[i, j])
-                if c == 0:
-                    continue
-                along = c * fv[j] if along is None else along + c * fv[j]
-                along_dv = c * fv[j + 1] if along_dv is None else along_dv + c * fv[j + 1]
-            if along is not None:
-                value += fu[i] * along
-                du += fu[i + 1] * along  # -d/du He_i exp(-u^2/2) = He_i+1 exp(-u^2/2)
-                dv += fu[i] * along_dv
+        value, du, dv = (np.zeros_like(gauss) for _ in range(3))
+        for i, row in enumerate(self.series.astype(np.float32)):
+            terms = np.flatnonzero(row)
+            if len(terms) == 0:
+                continue
+            across = sum(row[j] * fv[j] for j in terms)
+            value += fu[i] * across
+            # -d/du of h_i exp(-u^2 / 2) is sqrt(i + 1) h_i+1 exp(-u^2 / 2)
+            du += np.float32((i + 1) ** 0.5) * fu[i + 1] * across
+            dv += fu[i] * sum(row[j] * np.float32((j + 1) ** 0.5) * fv[j + 1] for j in terms)
         (ax, ay), (bx, by) = self.axes.astype(np.float32)
         du, dv = du * gauss, dv * gauss
         return value * gauss, ax * du + bx * dv, ay * du + by * dv
@@ -71,34 +67,41 @@ def gaussian(shape) -> Psf:
 
 
 def refine(psf, dx, dy, brightness, weight, order) -> Psf:
-    """The Psf whose even series up to `order` fits stars best, by weighted linear least squares.
+    """The Psf whose even series fits stars best, by weighted linear least squares.
 
     dx, dy      (M,) px: offsets of M pixels from their stars' centres
     brightness  (M,) values of those pixels over their stars' fluxes
     weight      (M,) inverse variances of brightness
+    order       of the terms across the trail; along it more, up to twice as many, as the star is longer
     """
     u, v = psf.axes.astype(np.float32) @ np.stack([dx, dy])
     gauss = np.exp(-0.5 * (u * u + v * v)) * np.float32(abs(np.linalg.det(psf.axes)) / (2 * np.pi))
-    fu, fv = _hermites(u, order), _hermites(v, order)
-    terms = [(i, j) for i in range(order + 1) for j in range(order + 1 - i) if (i + j) % 2 == 0]
-    size = np.sqrt([float(factorial(i) * factorial(j)) for i, j in terms])
-    design = np.stack([fu[i] * fv[j] * gauss / np.float32(s) for (i, j), s in zip(terms, size, strict=True)])
+    long, short = 1 / np.linalg.norm(psf.axes, axis=1)
+    stretch = float(np.clip(long / short, 1, 2))
+    along = int(order * stretch) // 2 * 2
+    fu, fv = _hermites(u, along), _hermites(v, order)
+    terms = [
+        (i, j)
+        for i in range(along + 1)
+        for j in range(order + 1)
+        if (i + j) % 2 == 0 and i / stretch + j <= order
+    ]
+    design = np.stack([fu[i] * fv[j] * gauss for i, j in terms])
     weighted = design * weight.astype(np.float32)
     normal = (weighted @ design.T).astype(np.float64)
     # a weak pull of the corrections to zero keeps thin data sound
     pull = np.array([0.0] + [1.0] * (len(terms) - 1)) * np.trace(normal) / len(terms) * 1e-4
-    found = np.linalg.solve(normal + np.diag(pull), weighted @ brightness) / size
-    series = np.zeros((order + 1, order + 1))
-    for (i, j), c in zip(terms, found, strict=True):
-        series[i, j] = c
+    found = np.linalg.solve(normal + np.diag(pull), weighted @ brightness)
+    series = np.zeros((along + 1, order + 1))
+    series[tuple(np.transpose(terms))] = found
     if not np.all(np.isfinite(series)) or series[0, 0] <= 0:
         return psf
     return Psf(psf.axes, series / series[0, 0])  # unit flux: the other terms integrate to zero
 
 
 def _hermites(u, order):
-    """He_0(u) .. He_order(u), the probabilists' Hermite polynomials."""
+    """h_0(u) .. h_order+1(u): the probabilists' Hermite polynomials over sqrt(n!), which keeps them of order 1."""
     values = [np.ones_like(u), u]
-    for n in range(1, order):
-        values.append(u * values[n] - n * values[n - 1])
-    return values[: order + 1]
+    for n in range(1, order + 1):
+        values.append((u * values[n] - np.float32(n**0.5) * values[n - 1]) * np.float32((n + 1) ** -0.5))
+    return values
