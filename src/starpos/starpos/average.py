@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.budget import ErrorTerm, symmetric_root
 from starpos.earth import curvature_radii_m
-from starpos.fix import ErrorTerm, Fix, symmetric_root
+from starpos.fix import Fix
 
 SAME_HEADING_SIGMA = 5.0
 

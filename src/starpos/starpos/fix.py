@@ -12,8 +12,9 @@ from scipy.optimize import brentq, least_squares
 
 from starpos import rotation
 from starpos.atmosphere import Atmosphere, Refraction
+from starpos.budget import ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
 from starpos.camera import Camera
-from starpos.earth import ROTATION_RAD_S, EarthState, curvature_radii_m, station_velocity
+from starpos.earth import EarthState, station_velocity
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
 
@@ -21,6 +22,7 @@ OUTLIER_SIGMA = 5.0
 MAX_ROUNDS = 6
 MIN_STARS = 3
 STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
+STEP_REFRACTION = 0.01
 
 
 @dataclass(frozen=True)
@@ -34,24 +36,6 @@ class Mounting:
     a3: np.ndarray
     link_to_camera: np.ndarray
     calibration_covariance: np.ndarray
-
-
-@dataclass(frozen=True)
-class ErrorTerm:
-    """One source of error: factor (6, m) of the covariance factor @ factor.T.
-
-    Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  A common term
-    keeps its sign from frame to frame (a calibration, a clock); the others are new in every frame.
-    """
-
-    name: str
-    factor: np.ndarray
-    common: bool
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(6, 6)."""
-        return self.factor @ self.factor.T
 
 
 @dataclass(frozen=True)
@@ -216,138 +200,53 @@ class _Problem:
 
 
 def _report(
-    problem, state, keep, centroid_px2, catalogue_px2, jitter2, tilt, mounting, atmosphere, earth, clock_s
+    problem,
+    state,
+    keep,
+    centroid_px2,
+    catalogue_px2,
+    jitter2,
+    tilt,
+    mounting,
+    atmosphere,
+    earth,
+    clock_stddev_s,
 ) -> Fix:
-    total = (centroid_px2 + catalogue_px2 + np.eye(2) * jitter2)[keep]
+    centroid_px2 = centroid_px2[keep] + np.eye(2) * jitter2
+    catalogue_px2 = catalogue_px2[keep]
+    place = place_of(state.a4)
+    link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
     j = problem.jacobian(state)[keep]
-    wj = np.linalg.solve(total, j)  # (M, 2, 4): weight times jacobian
-    normal = np.einsum("nki,nkj->ij", j, wj)
-    gain = np.linalg.solve(normal, wj.reshape(-1, 4).T).reshape(4, -1, 2)[
-        :3
-    ]  # rotation of A4 per pixel of star
-    stars_move = _numerical(lambda d: _outcome(rotation.from_vector(d) @ state.a4, problem.g, mounting), 3)
-    level_moves = _numerical(
-        lambda d: _outcome(rotation.from_vector(d) @ state.a4, rotation.from_vector(d) @ problem.g, mounting),
-        3,
+    weighted = np.linalg.solve(centroid_px2 + catalogue_px2, j)
+    normal = np.einsum("nki,nkj->ij", j, weighted)
+    gain = np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3]
+    stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
+    bending = -np.einsum("ank,nk->a", gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
+    terms = error_terms(
+        Sensitivity.of(state.a4, link_to_enu),
+        StarErrors(gain, centroid_px2, catalogue_px2),
+        tilt,
+        mounting.calibration_covariance,
+        bending,
+        place.latitude,
+        earth,
+        clock_stddev_s,
     )
-
-    def per_star(covariance):
-        root = np.linalg.cholesky(covariance + np.eye(2) * 1e-18)
-        return stars_move @ np.einsum("anj,njk->ank", gain, root).reshape(3, -1)
-
-    def tilted(d):
-        return rotation.to_small_vector(
-            a2_matrix(tilt.theta_x + d[0], tilt.theta_y + d[1]) @ mounting.a3 @ problem.g.T
-        )
-
-    a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
-    weaker, stronger = (problem.predict(state, atmosphere.refraction(f))[keep] for f in (0.99, 1.01))
-    pull = -np.einsum("anj,nj->a", gain, (stronger - weaker) / 0.02)
-    latitude, longitude, *_ = _place(state.a4)
-    prime, _ = curvature_radii_m(latitude)
-    metres_a_second = ROTATION_RAD_S * prime * np.cos(latitude)
-    pole = earth.orientation.pole_sigma * prime * np.eye(6)[:, :2]
-    time_east = np.eye(6)[:, :1] * metres_a_second
-    terms = (
-        ErrorTerm("centroids", _compact(per_star(centroid_px2[keep] + np.eye(2) * jitter2)), False),
-        ErrorTerm("catalogue", _compact(per_star(catalogue_px2[keep])), True),
-        ErrorTerm("tilt", level_moves @ _numerical(tilted, 2) @ symmetric_root(tilt.covariance), False),
-        ErrorTerm("calibration", level_moves @ a2 @ symmetric_root(mounting.calibration_covariance), True),
-        ErrorTerm("refraction", (stars_move @ pull * atmosphere.relative_sigma)[:, None], True),
-        ErrorTerm("clock", time_east * clock_s, True),
-        ErrorTerm("ut1", time_east * earth.orientation.ut1_sigma_s, True),
-        ErrorTerm("pole", pole, True),
-    )
-    outcome = _Outcome.of(state.a4, problem.g, mounting)
-    observed = problem.camera.directions(*np.array(problem.camera.centre_px)[:, None]) @ problem.g.T
-    bent = problem.refraction.unbend(observed)
-    residual_px = problem.residual(state)[keep]
+    axis = problem.camera.directions(*np.array(problem.camera.centre_px)[:, None]) @ problem.g.T
+    bent = np.linalg.norm(np.cross(axis, problem.refraction.unbend(axis)))
     return Fix(
         earth.utc_unix_s,
-        latitude,
-        longitude,
-        outcome.heading,
-        outcome.link_to_enu,
+        place.latitude,
+        place.longitude,
+        heading_of(link_to_enu),
+        link_to_enu,
         terms,
         np.flatnonzero(keep),
-        float(np.sqrt(np.mean(residual_px**2)) * problem.camera.scale_arcsec),
+        float(np.sqrt(np.mean(problem.residual(state)[keep] ** 2)) * problem.camera.scale_arcsec),
         float(np.sqrt(jitter2)),
         state.scale,
-        float(np.arccos(np.clip(observed[0, 2], -1, 1))),
-        float(np.degrees(np.arccos(np.clip(np.sum(observed * bent), -1, 1))) * 3600),
+        float(np.arccos(np.clip(axis[0, 2], -1, 1))),
+        float(np.degrees(bent) * 3600),
         float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
         earth.orientation.ut1_minus_utc_s,
     )
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    heading: float
-    link_to_enu: np.ndarray
-
-    @classmethod
-    def of(cls, a4: np.ndarray, g: np.ndarray, mounting: Mounting) -> "_Outcome":
-        _, _, east, north = _place(a4)
-        local_to_enu = np.stack([east, north, [0.0, 0.0, 1.0]])
-        link_to_enu = local_to_enu @ g @ mounting.link_to_camera
-        forward = link_to_enu[:, 0]
-        return cls(float(np.arctan2(forward[0], forward[1]) % (2 * np.pi)), link_to_enu)
-
-
-def _place(a4: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Latitude, longitude (rad), and east and north as unit vectors in L, of A4 (ITRS into L)."""
-    zenith, pole = a4[2], a4[:, 2]
-    north = np.array([pole[0], pole[1], 0.0])
-    length = np.linalg.norm(north)
-    north = north / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
-    east = np.cross(north, [0.0, 0.0, 1.0])
-    return (
-        float(np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1]))),
-        float(np.arctan2(zenith[1], zenith[0])),
-        east,
-        north,
-    )
-
-
-def _outcome(a4: np.ndarray, g: np.ndarray, mounting: Mounting):
-    """What a fix says, for differences: zenith in ITRS, latitude, heading, attitude."""
-    return a4[2], _Outcome.of(a4, g, mounting)
-
-
-def _numerical(function, n: int) -> np.ndarray:
-    """Central differences of a vector or of an outcome with respect to n small angles: (rows, n)."""
-    columns = []
-    for i in range(n):
-        d = np.zeros(n)
-        d[i] = STEP_RAD
-        plus, minus = function(d), function(-d)
-        columns.append(_difference(plus, minus) / (2 * STEP_RAD))
-    return np.stack(columns, -1)
-
-
-def _difference(plus, minus) -> np.ndarray:
-    if isinstance(plus, np.ndarray):
-        return plus - minus
-    (zenith_plus, a), (zenith_minus, b) = plus, minus
-    zenith = (zenith_plus + zenith_minus) / 2
-    latitude, longitude = np.arcsin(np.clip(zenith[2], -1, 1)), np.arctan2(zenith[1], zenith[0])
-    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
-    north = np.cross(zenith / np.linalg.norm(zenith), east)
-    prime, meridian = curvature_radii_m(latitude)
-    moved = zenith_plus - zenith_minus
-    turned = (a.heading - b.heading + np.pi) % (2 * np.pi) - np.pi
-    spin = rotation.to_small_vector(a.link_to_enu @ b.link_to_enu.T)
-    return np.array([moved @ east * prime, moved @ north * meridian, turned, *spin])
-
-
-def symmetric_root(covariance: np.ndarray) -> np.ndarray:
-    """The symmetric F with F F = covariance, also of a singular one; it keeps its signs from frame to frame."""
-    values, vectors = np.linalg.eigh(covariance)
-    return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
-
-
-def _compact(factor: np.ndarray) -> np.ndarray:
-    """The same covariance with six columns."""
-    scale = np.array([1.0, 1.0, 1e-6, 1e-6, 1e-6, 1e-6])  # m and rad, brought to like sizes
-    root = symmetric_root(factor @ factor.T / np.outer(scale, scale))
-    return root * scale[:, None]

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The error budget of a fix: each source of error as what it does to place, heading and attitude."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos import rotation
+from starpos.earth import ROTATION_RAD_S, EarthState, curvature_radii_m
+from starpos.inclinometer import Tilt, a2_matrix
+
+STEP_RAD = 1e-6
+
+
+@dataclass(frozen=True)
+class ErrorTerm:
+    """One source of error: factor (6, m) of the covariance factor @ factor.T.
+
+    Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  A common term
+    keeps its sign from frame to frame (a calibration, a clock); the others are new in every frame.
+    """
+
+    name: str
+    factor: np.ndarray
+    common: bool
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(6, 6)."""
+        return self.factor @ self.factor.T
+
+
+@dataclass(frozen=True)
+class Place:
+    """What A4 says: latitude, longitude (rad); east and north as unit vectors (3,) of L."""
+
+    latitude: float
+    longitude: float
+    east: np.ndarray
+    north: np.ndarray
+
+    @property
+    def local_to_enu(self) -> np.ndarray:
+        """(3, 3)."""
+        return np.stack([self.east, self.north, [0.0, 0.0, 1.0]])
+
+
+def place_of(a4: np.ndarray) -> Place:
+    """Zenith and pole of A4 (3, 3), ITRS into L; at a pole, where north is any direction, L's X is taken."""
+    zenith, pole = a4[2], a4[:, 2]
+    north = np.array([pole[0], pole[1], 0.0])
+    length = np.linalg.norm(north)
+    north = north / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
+    latitude = np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1]))
+    return Place(
+        float(latitude), float(np.arctan2(zenith[1], zenith[0])), np.cross(north, [0.0, 0.0, 1.0]), north
+    )
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How the rows of an ErrorTerm answer to small rotations (6, 3) about L's axes.
+
+    stars: of the sky against L (A4 alone); level: of L against sky and instrument (A4 and the attitude together).
+    """
+
+    stars: np.ndarray
+    level: np.ndarray
+
+    @classmethod
+    def of(cls, a4: np.ndarray, link_to_enu: np.ndarray) -> "Sensitivity":
+        p = place_of(a4)
+        prime, meridian = curvature_radii_m(p.latitude)
+        # the zenith among the stars moves by (-dy, dx) in L
+        moved = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        ground = np.stack([p.east @ moved * prime, p.north @ moved * meridian])
+        # north turns in L with the pole, and the attitude against it
+        px, py, pz = a4[:, 2]
+        flat = max(px * px + py * py, 1e-12)
+        north_turns = np.array([-px * pz, -py * pz, flat]) / flat
+        about_up = np.stack([np.zeros(3), np.zeros(3), -north_turns])
+        return cls(
+            *(
+                np.vstack([ground, _heading_row(spin, link_to_enu), spin])
+                for spin in (about_up, about_up + p.local_to_enu)
+            )
+        )
+
+
+def heading_of(link_to_enu: np.ndarray) -> float:
+    """Azimuth (rad, 0 to 2 pi) of the base link's x axis."""
+    return float(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]) % (2 * np.pi))
+
+
+def _heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:
+    """(1, 3): the heading's answer to rotations that spin (3, 3) the attitude about east, north, up."""
+    east, north, up = link_to_enu[:, 0]
+    level = max(east * east + north * north, 1e-12)
+    # d azimuth = (north d_east - east d_north) / level, with d(forward) = spin x forward
+    return np.array([[east * up / level, north * up / level, -1.0]]) @ spin
+
+
+def symmetric_root(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric F with F F = covariance, also of a singular one; it keeps its signs from frame to frame."""
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+
+
+@dataclass(frozen=True)
+class StarErrors:
+    """Errors of a fix's stars: gain (3, N, 2), rad of A4 for a pixel of each star; covariances (N, 2, 2) in px2."""
+
+    gain: np.ndarray
+    centroids: np.ndarray
+    catalogue: np.ndarray
+
+    def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
+        """(3, 3) rad2 of A4 from independent covariances (N, 2, 2)."""
+        return np.einsum("anj,njk,bnk->ab", self.gain, covariance, self.gain)
+
+
+def error_terms(
+    sensitivity: Sensitivity,
+    stars: StarErrors,
+    tilt: Tilt,
+    calibration_covariance: np.ndarray,
+    refraction_rotation: np.ndarray,
+    latitude: float,
+    earth: EarthState,
+    clock_stddev_s: float,
+) -> tuple[ErrorTerm, ...]:
+    """All sources that are known.
+
+    calibration_covariance (3, 3) rad2 about S's axes; refraction_rotation (3,) rad: of A4 for 1 sigma of refraction.
+    """
+
+    def of_stars(covariance):
+        return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
+
+    a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
+    steps = (np.array([STEP_RAD, 0.0]), np.array([0.0, STEP_RAD]))
+    levelling = [a2_matrix(tilt.theta_x + dx, tilt.theta_y + dy) @ a2.T for dx, dy in steps]
+    levelling = np.stack([rotation.to_small_vector(r) / STEP_RAD for r in levelling], -1)
+    prime, _ = curvature_radii_m(latitude)
+    east, north = np.eye(6)[:, :1], np.eye(6)[:, 1:2]
+    second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
+    pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
+    return (
+        ErrorTerm("centroids", of_stars(stars.centroids), False),
+        ErrorTerm("catalogue", of_stars(stars.catalogue), True),
+        ErrorTerm("tilt", sensitivity.level @ levelling @ symmetric_root(tilt.covariance), False),
+        ErrorTerm("calibration", sensitivity.level @ a2 @ symmetric_root(calibration_covariance), True),
+        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], True),
+        ErrorTerm("clock", second_of_time * clock_stddev_s, True),
+        ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, True),
+        ErrorTerm("pole", pole, True),
+    )
