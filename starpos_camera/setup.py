@@ -6,21 +6,22 @@ package = "starpos_camera"
 setup(
     name=package,
     version="0.1.0",
-    description="Frames of the sky from a camera, files or a simulation, and the stars in them",
-    maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
-    license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
-        (f"share/{package}", ["package.xml"]),
+        (f"share/{package}", ["package.xml", "README.md"]),
     ],
-    install_requires=["setuptools"],
+    install_requires=["setuptools", "numpy", "pyyaml"],
+    zip_safe=True,
+    maintainer="starpos developers",
+    maintainer_email="starpos@users.noreply.github.com",
+    description="The starpos camera: frames from files or a simulated sky, and the stars in them.",
+    license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     entry_points={
         "console_scripts": [
-            "camera = starpos_camera.camera_node:main",
-            "detector = starpos_camera.detector_node:main",
+            "camera = starpos_camera.main:camera",
+            "detector = starpos_camera.main:detector",
         ],
     },
 )

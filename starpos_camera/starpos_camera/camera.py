@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `camera`: frames from a source to `~/image_raw`, each with its intrinsics and how it was taken."""
+
+import math
+import time
+from dataclasses import dataclass
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.srv import SetCameraInfo
+from starpos.camera import Camera
+from starpos.errors import InstrumentError, StarposError
+from starpos.instrument import focal_px_of
+from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera
+from starpos_common.parameters import declare
+
+from starpos_camera import calibration
+from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.sources import Settings, Source, SourceEnded, source_class
+from starpos_camera.worker import Worker
+from starpos_interfaces.msg import Capture
+from starpos_interfaces.srv import SetCapture
+
+IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
+STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated")
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """A frame as messages, the intrinsics its source vouches for, and how long it took."""
+
+    image: Image
+    capture: Capture
+    camera: Camera | None
+    seconds: float
+
+
+class CameraNode(Node):
+    """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
+
+    def __init__(self, **options):
+        """options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
+        super().__init__("camera", **options)
+        self._values = declare(self, PARAMETERS, apply=self._apply, check=_complaint)
+        self._calibration_path = None
+        self._calibration: Camera | None = None
+        if self._values["calibration_url"]:
+            self._calibration_path = calibration.path_of(self._values["calibration_url"])
+            if self._calibration_path.exists():
+                self._calibration = calibration.read(self._calibration_path)
+            else:
+                self.get_logger().warning(
+                    f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
+                    "and pixel_um, until ~/set_camera_info is called."
+                )
+        self._source: Source = source_class(self._values["source"])(self._values, self._now_s)
+
+        self._frames = self._failed = self._skipped = 0
+        self._skipped_before = 0  # at the last report
+        self._last: Taken | None = None  # without its image
+        self._ended = False
+        self._state = (Level.WARN, "no frame has been taken yet.")
+        self._logged = ""
+        overriding = QoSOverridingOptions.with_default_policies()
+        self._images = self.create_publisher(
+            Image, "~/image_raw", QoSProfile(depth=IMAGE_DEPTH), qos_overriding_options=overriding
+        )
+        self._infos = self.create_publisher(
+            CameraInfo, "~/camera_info", QoSProfile(depth=10), qos_overriding_options=overriding
+        )
+        self._captures = self.create_publisher(
+            Capture, "~/capture", QoSProfile(depth=10), qos_overriding_options=overriding
+        )
+        self.create_service(SetCameraInfo, "~/set_camera_info", self._on_set_camera_info)
+        self.create_service(SetCapture, "~/set_capture", self._on_set_capture)
+        self._wake = self.create_guard_condition(self._on_wake)
+        self._worker = Worker(self._take, self._wake.trigger, "capture")
+        self._diagnostics = Diagnostics(self, {"Capture": self._report}, self._source.hardware_id)
+        self._timer = None
+        self._start_timer()
+        self._worker.start()
+
+    def destroy_node(self):
+        self._worker.stop()
+        self._source.close()
+        super().destroy_node()
+
+    def _now_s(self) -> float:
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _start_timer(self):
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+        # The system's clock may be stepped, and a timer on it would wait; a simulated one is what we play by.
+        clock = self.get_clock()
+        if not clock.ros_time_is_active:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
+
+    def _apply(self, names: frozenset[str]):
+        if "cadence" in names:
+            self._start_timer()
+        self._source.update(self._values)
+
+    def _tick(self):
+        if self._ended:
+            return
+        if not self._worker.idle:
+            self._skipped += 1
+        elif (
+            self._source.waits_for_listener and not self._frames and not self._images.get_subscription_count()
+        ):
+            self._say(Level.OK, f"waiting for a subscriber of {self._images.topic_name}.")
+        else:
+            self._worker.offer(_settings(self._values))
+
+    def _take(self, settings: Settings) -> Taken:
+        """In the worker's thread: a frame, ready to be published."""
+        begin = time.monotonic()
+        exposure = self._source.capture(settings)
+        image = frame_to_message(exposure.frame, self._values["frame_id"])
+        capture = Capture(
+            header=image.header,
+            exposure=float(exposure.frame.exposure_s or 0.0),
+            stamp_stddev=float(exposure.stamp_stddev_s),
+            stamp_source=exposure.stamp_source,
+        )
+        return Taken(image, capture, exposure.camera, time.monotonic() - begin)
+
+    def _on_wake(self):
+        for result in self._worker.fetch():
+            if isinstance(result, SourceEnded):
+                self._ended = True
+                self._say(Level.OK, str(result))
+            elif isinstance(result, StarposError):
+                self._failed += 1
+                self._say(Level.ERROR, str(result))
+            elif isinstance(result, Exception):
+                raise result
+            else:
+                self._publish(result)
+
+    def _publish(self, taken: Taken):
+        image, camera = taken.image, self._camera(taken)
+        info = camera_to_message(camera, image.header.frame_id)
+        info.header = image.header
+        self._captures.publish(taken.capture)
+        self._infos.publish(info)
+        self._images.publish(image)
+        self._frames += 1
+        self._last = Taken(Image(width=image.width, height=image.height), taken.capture, None, taken.seconds)
+        if (camera.width, camera.height) != (image.width, image.height):
+            self._say(
+                Level.ERROR,
+                f"the calibration is of {camera.width} x {camera.height} px but the frames have {image.width} x "
+                f"{image.height} px: calibrate the camera as it is used.",
+            )
+        else:
+            self._say(Level.OK, f"taking frames of {image.width} x {image.height} px.")
+
+    def _camera(self, taken: Taken) -> Camera:
+        if self._calibration or taken.camera:
+            return self._calibration or taken.camera
+        focal_px = focal_px_of(self._values["focal_mm"], self._values["pixel_um"])
+        return Camera.from_focal(taken.image.width, taken.image.height, focal_px)
+
+    def _say(self, level: Level, sentence: str):
+        """The state from now on; logged where it is another than before."""
+        self._state = (level, sentence)
+        if sentence == self._logged:
+            return
+        self._logged = sentence
+        # rclpy ties a severity to the line it is called from, so each has its own.
+        if level is Level.OK:
+            self.get_logger().info(sentence)
+        else:
+            self.get_logger().warning(sentence)
+
+    def _on_set_camera_info(self, request, response):
+        try:
+            camera = message_to_camera(request.camera_info, "set_camera_info")
+            if self._last and (camera.width, camera.height) != (
+                self._last.image.width,
+                self._last.image.height,
+            ):
+                raise InstrumentError(
+                    f"set_camera_info: the calibration is of {camera.width} x {camera.height} px but the frames "
+                    f"have {self._last.image.width} x {self._last.image.height} px: calibrate with whole frames."
+                )
+            # What cannot be kept is still right: it holds for this session, and the answer says so.
+            self._calibration = camera
+            if self._calibration_path is not None:
+                calibration.write(self._calibration_path, camera, self.get_name())
+                response.status_message = f"written to {self._calibration_path}."
+            else:
+                response.status_message = "holds for this session; set calibration_url to keep it."
+            response.success = True
+        except InstrumentError as error:
+            response.success = False
+            response.status_message = str(error)
+        self.get_logger().info(f"set_camera_info: {response.status_message}")
+        return response
+
+    def _on_set_capture(self, request, response):
+        wanted = {"gain": request.gain, "exposure": request.exposure, "cadence": request.cadence}
+        # 0 s is neither an exposure nor a cadence, and a gain of 0 is no wish of those who have none
+        unset = [
+            name for name, value in wanted.items() if math.isnan(value) or (value == 0 and name != "gain")
+        ]
+        if wanted["gain"] == 0 and math.isnan(self._values["gain"]):
+            unset.append("gain")
+        changes = [RosParameter(name, value=value) for name, value in wanted.items() if name not in unset]
+        result = self.set_parameters_atomically(changes)
+        response.success = result.successful
+        response.message = (
+            result.reason
+            or "exposure {exposure:g} s, gain {gain:g}, cadence {cadence:g} s.".format(**self._values)
+        )
+        return response
+
+    def _report(self) -> Status:
+        level, sentence = self._state
+        skipped, self._skipped_before = self._skipped - self._skipped_before, self._skipped
+        cadence, last = self._values["cadence"], self._last
+        if level is Level.OK and skipped:
+            level = Level.WARN
+            sentence = (
+                f"a frame takes longer than the cadence of {cadence:g} s: {skipped} skipped; lengthen it."
+            )
+        if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds:
+            level, sentence = Level.WARN, "use_sim_time is set but no /clock has come yet."
+        values = {
+            "source": self._values["source"],
+            "frames": self._frames,
+            "failed": self._failed,
+            "skipped": self._skipped,
+            "cadence (s)": cadence,
+            "calibrated": self._calibration is not None,
+        }
+        if last:
+            values |= {
+                "size (px)": f"{last.image.width} x {last.image.height}",
+                "exposure (s)": last.capture.exposure,
+                "stamp from": STAMP_SOURCES[last.capture.stamp_source],
+                "taking one frame (s)": last.seconds,
+            }
+        return Status(level, sentence, values)
+
+
+def _settings(values) -> Settings:
+    exposure_s, gain = (None if math.isnan(values[name]) else values[name] for name in ("exposure", "gain"))
+    return Settings(exposure_s, gain, values["cadence"])
+
+
+def _complaint(values) -> str | None:
+    return source_class(values["source"]).refusal(values, _settings(values))

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `detector`: frames in, `stars` out."""
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Image
+from starpos.detection import Detection, DetectionSettings, detect
+from starpos.errors import StarposError, TimeError
+from starpos.frame import Frame
+from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.messages import message_to_frame, stars_to_message
+from starpos_common.parameters import declare
+from std_msgs.msg import Header
+
+from starpos_camera.detector_parameters import PARAMETERS
+from starpos_camera.worker import Worker
+from starpos_interfaces.msg import Capture, StarArray
+
+IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB
+CAPTURES_KEPT = 16
+COMPLAINT_PERIOD_S = 5.0
+MIN_SILENCE_S = 5.0  # without a frame, and three times as long as between the last two, before it is reported
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A frame with its message's header and the sigma of its stamp."""
+
+    frame: Frame
+    header: Header
+    stamp_stddev: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of a frame: its stars, ready to be published, and what it took."""
+
+    message: StarArray
+    detection: Detection
+    cpu_ms: float
+    seconds: float
+
+
+class DetectorNode(Node):
+    """Publishes starpos_interfaces/StarArray on `stars`; see README.md."""
+
+    def __init__(self, **options):
+        """options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
+        super().__init__("detector", **options)
+        self._values = declare(self, PARAMETERS, apply=self._apply)
+        self._settings = self._detection_settings()
+        self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
+        self._frames = self._bad = self._dropped = 0
+        self._complaint = ""  # about a frame since the last report
+        self._last: Outcome | None = None
+        self._size = None
+        self._last_frame_s = self._interval_s = None  # monotonic
+        overriding = QoSOverridingOptions.with_default_policies()
+        self._publisher = self.create_publisher(
+            StarArray, "stars", QoSProfile(depth=10), qos_overriding_options=overriding
+        )
+        # This one first: the executor takes what is ready in this order, and an image needs its Capture.
+        self.create_subscription(
+            Capture,
+            "camera/capture",
+            self._on_capture,
+            QoSProfile(depth=CAPTURES_KEPT),
+            qos_overriding_options=overriding,
+        )
+        self._images = self.create_subscription(
+            Image,
+            "camera/image_raw",
+            self._on_image,
+            QoSProfile(depth=IMAGE_DEPTH),
+            qos_overriding_options=overriding,
+        )
+        self._wake = self.create_guard_condition(self._on_wake)
+        self._worker = Worker(self._detect, self._wake.trigger, "detection")
+        self._diagnostics = Diagnostics(self, {"Stars": self._report})
+        _warm_up()
+        self._worker.start()
+
+    def destroy_node(self):
+        self._worker.stop()
+        super().destroy_node()
+
+    def submit(self, frame: Frame, header: Header, stamp_stddev: float = 0.0):
+        """Have a frame's stars published under `header`; it replaces one that still waits.
+
+        What the subscription does; from any thread. A camera node in the same process calls it to hand over
+        its pixels as they are.
+        """
+        if self._worker.offer(Job(frame, header, stamp_stddev)):
+            self._dropped += 1
+
+    def _detection_settings(self) -> DetectionSettings:
+        v = self._values
+        saturation = None if math.isnan(v["saturation"]) else v["saturation"]
+        return DetectionSettings(
+            threshold=v["threshold"],
+            min_snr=v["min_snr"],
+            max_stars=v["max_stars"],
+            saturation_dn=saturation,
+        )
+
+    def _apply(self, names: frozenset[str]):
+        self._settings = self._detection_settings()
+
+    def _on_capture(self, message: Capture):
+        if len(self._captures) >= CAPTURES_KEPT:
+            del self._captures[next(iter(self._captures))]
+        self._captures[_key(message.header)] = message
+
+    def _on_image(self, message: Image):
+        now = time.monotonic()
+        if self._last_frame_s is not None:
+            self._interval_s = now - self._last_frame_s
+        self._last_frame_s = now
+        try:
+            _check_stamp(message.header)
+            exposure, stamp_stddev = self._taken(message.header)
+            frame = message_to_frame(message, exposure or None)
+        except StarposError as error:
+            self._complain(str(error))
+            return
+        size = (frame.width, frame.height, message.encoding)
+        if size != self._size:
+            self._size = size
+            self.get_logger().info(f"frames of {frame.width} x {frame.height} px, {message.encoding}.")
+        self.submit(frame, message.header, stamp_stddev)
+
+    def _taken(self, header: Header) -> tuple[float, float]:
+        """Exposure and sigma of the stamp in s, 0 for unknown."""
+        capture = self._captures.pop(_key(header), None)
+        if capture is None:
+            return self._values["exposure"], 0.0
+        known = [v if math.isfinite(v) and v > 0 else 0.0 for v in (capture.exposure, capture.stamp_stddev)]
+        return known[0] or self._values["exposure"], known[1]
+
+    def _detect(self, job: Job) -> Outcome:
+        """In the worker's thread."""
+        begin, cpu = time.monotonic(), time.process_time()
+        detection = detect(job.frame, self._settings)
+        message = stars_to_message(detection.stars, job.header.frame_id, job.stamp_stddev)
+        message.header = job.header  # to the nanosecond: it is what goes with a frame finds it by
+        return Outcome(message, detection, (time.process_time() - cpu) * 1e3, time.monotonic() - begin)
+
+    def _on_wake(self):
+        for result in self._worker.fetch():
+            if isinstance(result, Outcome):
+                self._publisher.publish(result.message)
+                self._frames += 1
+                self._last = result
+            elif isinstance(result, StarposError):
+                self._complain(str(result))
+            else:
+                # One frame that no code foresaw must not end the instrument's night.
+                kind = type(result).__name__
+                self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
+
+    def _complain(self, sentence: str):
+        self._bad += 1
+        self._complaint = sentence
+        self.get_logger().warning(sentence, throttle_duration_sec=COMPLAINT_PERIOD_S)
+
+    def _report(self) -> Status:
+        level, sentence = Level.OK, "no stars in the last frame."
+        complaint, self._complaint = self._complaint, ""
+        last = self._last
+        if last and last.message.stars:
+            sentence = f"{len(last.message.stars)} stars in {last.seconds:.2f} s."
+        silence_s = time.monotonic() - self._last_frame_s if self._last_frame_s is not None else math.inf
+        if self._last_frame_s is None:
+            level, sentence = Level.WARN, f"no frame has come yet on {self._images.topic_name}."
+        elif complaint:
+            level, sentence = Level.WARN, complaint
+        elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
+            level = Level.WARN
+            sentence = f"no frame for {silence_s:.0f} s on {self._images.topic_name}: is the camera running?"
+        values = {"frames": self._frames, "bad frames": self._bad, "dropped": self._dropped}
+        if last:
+            values |= {
+                "stars": len(last.message.stars),
+                "background (DN)": last.detection.background,
+                "noise (DN)": last.detection.noise,
+                "fwhm (px)": last.detection.fwhm_px,
+                "cpu_ms": last.cpu_ms,
+                "seconds": last.seconds,
+            }
+        return Status(level, sentence, values)
+
+
+def _key(header: Header) -> tuple[int, int]:
+    return header.stamp.sec, header.stamp.nanosec
+
+
+def _check_stamp(header: Header):
+    """TimeError where the stamp is not set, or no time."""
+    sec, nanosec = _key(header)
+    if not sec and not nanosec:
+        raise TimeError(
+            "image_raw: the frame has no time stamp; set header.stamp to the middle of the exposure."
+        )
+    if sec < 0 or nanosec >= 1_000_000_000:
+        raise TimeError(
+            f"image_raw: the stamp {sec} s {nanosec} ns is no time after 1970; check the camera's clock."
+        )
+
+
+def _warm_up():
+    """Run everything once on a small frame with a few stars, so that the first real one is not slow."""
+    y, x = np.mgrid[:128, :128]
+    light = np.random.default_rng(0).normal(500.0, 10.0, x.shape)
+    for cx, cy in ((30.2, 40.7), (80.5, 30.1), (60.9, 95.4), (100.3, 101.8)):
+        light += 3000.0 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 2.0)
+    detection = detect(Frame(light.astype(np.uint16), "", 0.0, 1.0, "warm-up"))
+    stars_to_message(detection.stars, "")

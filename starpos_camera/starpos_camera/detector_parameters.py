@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of the node `detector`."""
+
+import math
+
+from starpos_common.parameters import Parameter
+
+PARAMETERS = (
+    Parameter(
+        "threshold",
+        5.0,
+        "Standard deviations of the smoothed noise a peak must stand out by; too low finds noise, too high loses "
+        "the faint stars that half of the accuracy comes from.",
+        "",
+        3.0,
+        1000.0,
+    ),
+    Parameter(
+        "min_snr",
+        6.5,
+        "Signal to noise a star must have to be published; too low lets false stars through.",
+        "",
+        0.0,
+        1000.0,
+    ),
+    Parameter(
+        "max_stars",
+        10000,
+        "The brightest so many are published; a frame takes time in proportion to them.",
+        "",
+        1,
+        100000,
+    ),
+    Parameter(
+        "saturation",
+        math.nan,
+        "Pixel value from which a pixel is full; unset finds it in each frame. Too high, and the centroids of "
+        "saturated stars pass as good.",
+        "DN",
+        1.0,
+        65535.0,
+    ),
+    Parameter(
+        "exposure",
+        0.0,
+        "Exposure time of frames that come without a Capture message, 0 unknown; the tilt is averaged over it.",
+        "s",
+        0.0,
+        3600.0,
+    ),
+)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where frames come from. Every camera is a Source; a new one is a module here and a line in `source_class`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from starpos.camera import Camera
+from starpos.errors import StarposError
+from starpos.frame import Frame
+
+
+class SourceEnded(StarposError):
+    """There are no more frames, and there will be none: not a fault."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to take the next frame.
+
+    exposure_s  None: the source's own
+    gain        in the camera's own unit; None: as the camera is set
+    cadence_s   from the start of one exposure to the start of the next
+    """
+
+    exposure_s: float | None
+    gain: float | None
+    cadence_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """One frame and how it was taken.
+
+    frame           with its time: mid_unix_s is set
+    stamp_source    one of starpos_interfaces/Capture's constants
+    stamp_stddev_s  standard deviation of frame.mid_unix_s; 0 unknown
+    camera          intrinsics that the source knows to be true; None: the node's
+    """
+
+    frame: Frame
+    stamp_source: int
+    stamp_stddev_s: float = 0.0
+    camera: Camera | None = None
+
+
+class Source(Protocol):
+    """A camera. Made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
+
+    Making one opens nothing and cannot fail for want of a device: `capture` opens what is not open, so that a
+    device may come, go and come back. All methods but `close` and `capture` return at once.
+    """
+
+    hardware_id: str
+    waits_for_listener: bool  # True: nothing is captured before someone subscribes to the images
+
+    @staticmethod
+    def refusal(values: Mapping, settings: Settings) -> str | None:
+        """A sentence where a source with these parameters cannot be made, or cannot take such frames."""
+
+    def capture(self, settings: Settings) -> Exposure:
+        """Take the next frame, in a thread of the node's; blocks until it is there.
+
+        StarposError in one sentence where there is none: the node reports it and calls again one cadence
+        later. SourceEnded where there will be none.
+        """
+
+    def update(self, values: Mapping):
+        """The node's parameters have changed; may be called while `capture` runs."""
+
+    def close(self):
+        """Release the device. Called once, after the last `capture` has returned."""
+
+
+def source_class(name: str) -> type[Source]:
+    """The class for a value of the parameter `source`; its module, which may be heavy, is imported here."""
+    if name == "files":
+        from starpos_camera.sources.files import Files
+
+        return Files
+    from starpos_camera.sources.simulated import Simulated
+
+    return Simulated
