@@ -66,18 +66,19 @@ def _sample(length, cell_px):
 
 
 def _clipped(sample):
-    """Mean and rms over the last axis of what lies within 3 sigma of the median; stars and defects do not."""
+    """Mean and rms over the last axis of what lies within 3.5 sigma of the median; stars and defects do not."""
     middle = sample.shape[-1] // 2
     median = np.partition(sample, middle, axis=-1)[..., middle, None]
     deviation = sample - median
     spread = np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
-    limit = np.maximum(3 * 1.4826 * spread, 1.0)
+    limit = np.maximum(3.5 * 1.4826 * spread, 1.0)
     inside = np.abs(deviation) <= limit
     count = inside.sum(-1, keepdims=True)
     deviation *= inside
     mean = deviation.sum(-1, keepdims=True) / count
     square = np.einsum("...i,...i->...", deviation, deviation)[..., None] / count
-    rms = np.sqrt(np.maximum(square - mean**2, 0)) / 0.9867  # what clipping at 3 sigma leaves of a Gaussian's
+    variance = np.maximum(square - mean**2, 0) * (count / np.maximum(count - 1, 1))
+    rms = np.sqrt(variance) / 0.9969  # what clipping at 3.5 sigma leaves of a Gaussian's
     return (median + mean)[..., 0], rms[..., 0]
 
 

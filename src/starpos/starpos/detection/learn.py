@@ -14,8 +14,8 @@ from starpos.detection.stamps import cut
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
 TEACHERS = 250
-TEACHING_PIXELS = 10000  # of wide stars fewer are enough
-ROUNDS = 3
+TEACHING_PIXELS = 12000  # of wide stars fewer are enough
+ROUNDS = 2
 UNDERSAMPLED = 0.6  # px2: narrower stars show their PSF and their places only together, in more rounds
 UNDERSAMPLED_ROUNDS = 8
 MAX_REACH = 20

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_ORDER = 8
+MAX_ORDER = 6
 
 
 @dataclass(frozen=True, eq=False)
