@@ -16,6 +16,7 @@ from starpos.errors import TimeError
 
 UNIX_EPOCH_JD = 2440587.5
 DAY_S = 86400.0
+TT_MINUS_TAI_S = 32.184
 SPEED_OF_LIGHT = erfa.CMPS
 ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
 EQUATOR_RADIUS_M, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3  # WGS 84
@@ -63,16 +64,16 @@ class EarthState:
         return erfa.s2c(*erfa.atciqz(ra, dec, self.astrom)) @ self.cirs_to_itrs.T
 
 
-def earth_state(utc_unix_s: float) -> EarthState:
+def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) -> EarthState:
     """EarthState at UTC seconds since 1970; TimeError where no Earth orientation is known.
 
-    IERS Conventions (2010) chapter 5, equation 5.1 with the CIO; precession-nutation IAU 2006/2000A.
+    IERS Conventions (2010) chapter 5, equation 5.1 with the CIO; precession-nutation IAU 2006/2000A.  orientation:
+    another than the table's.
     """
-    orientation = earth_orientation(utc_unix_s)
-    day = utc_unix_s / DAY_S
-    tai = erfa.utctai(UNIX_EPOCH_JD, day)
-    tt = erfa.taitt(*tai)
-    ut1 = erfa.utcut1(UNIX_EPOCH_JD, day, orientation.ut1_minus_utc_s)
+    orientation = orientation or earth_orientation(utc_unix_s)
+    # sums of seconds: ERFA's UTC stretches a day that ends in a leap second, Unix time does not
+    tt = UNIX_EPOCH_JD, (utc_unix_s + _tai_minus_utc(utc_unix_s) + TT_MINUS_TAI_S) / DAY_S
+    ut1 = UNIX_EPOCH_JD, (utc_unix_s + orientation.ut1_minus_utc_s) / DAY_S
     astrom, _ = erfa.apci13(*tt)  # TT serves as TDB: they differ by 2 ms
     pole = erfa.pom00(orientation.pole_x, orientation.pole_y, erfa.sp00(*tt))
     spin = erfa.rz(erfa.era00(*ut1), np.eye(3))
@@ -95,9 +96,7 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
             f"{utc_text(utc_unix_s)} lies outside the IERS tables (1973 to {_year(table.mjd[-1]):.1f}, and three years "
             "of extrapolation): check the frame's clock, or upgrade astropy-iers-data"
         )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # 'dubious year' is what the sigma is for
-        leap = float(erfa.utctai(2400000.5, mjd)[1] - mjd) * DAY_S
+    leap = _tai_minus_utc(utc_unix_s)
     if beyond > 0:
         ut1_minus_tai = table.ut1_minus_tai[-1] + beyond * table.slope
         sigma = np.hypot(table.ut1_sigma[-1], np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S))
@@ -118,9 +117,10 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
 
 @dataclass(frozen=True)
 class _Table:
-    """Daily values (N,): mjd, UT1-TAI (s; without leap seconds, so that it can be interpolated), pole (rad), sigmas."""
+    """Daily values (N,): mjd, TAI-UTC (s), UT1-TAI (s; free of leap seconds: it can be interpolated), pole (rad)."""
 
     mjd: np.ndarray
+    tai_minus_utc: np.ndarray
     ut1_minus_tai: np.ndarray
     ut1_sigma: np.ndarray
     pole_x: np.ndarray
@@ -149,6 +149,7 @@ def _table() -> _Table:
     pole_sigma = np.hypot(column("e_PM_x_A", "rad"), column("e_PM_y_A", "rad"))
     return _Table(
         mjd[:known],
+        leap[:known],
         ut1[:known],
         np.maximum(column("e_UT1_UTC_A", "s"), 1e-5)[:known],
         column("PM_x_A", "rad")[:known],
@@ -156,6 +157,13 @@ def _table() -> _Table:
         np.maximum(pole_sigma, 1e-10)[:known],
         float((ut1[known - 1] - ut1[known - 366]) / 365),
     )
+
+
+def _tai_minus_utc(utc_unix_s: float) -> float:
+    """Leap seconds of the day; beyond the table's end its last."""
+    table = _table()
+    day = int(utc_unix_s // DAY_S + UNIX_EPOCH_JD - 2400000.5 - table.mjd[0])
+    return float(table.tai_minus_utc[min(max(day, 0), len(table.mjd) - 1)])
 
 
 def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
