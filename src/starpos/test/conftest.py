@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SHARED = Path(__file__).resolve().parents[4] / "shared"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def triangle_cache(tmp_path_factory):
+    """Triangle catalogues are built once: in the user's cache where there is one, else in a temporary folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        if not (home / "starpos").is_dir():
+            patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def catalogue():
+    from starpos import catalogue
+
+    return catalogue.load()
+
+
+@pytest.fixture
+def rng(request):
+    """A generator of random numbers, the same for a test in every run."""
+    return np.random.default_rng(sum(request.node.name.encode()))
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """The folder of reference data next to the project; tests that need it skip without it."""
+    if not SHARED.is_dir():
+        pytest.skip("no reference data next to the project")
+    return SHARED
