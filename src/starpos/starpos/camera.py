@@ -86,13 +86,18 @@ class Camera:
     def _undistort(self, target: np.ndarray) -> np.ndarray:
         """Newton's method on the tangent plane; quadratic, so a few steps reach the last bit."""
         plane = target.copy()
-        for _ in range(MAX_NEWTON_STEPS):
-            residual = _distort(plane, self.distortion) - target
-            if np.max(np.abs(residual), initial=0.0) < 1e-14:
-                return plane
-            step = np.linalg.solve(_distortion_jacobian(plane, self.distortion), residual[..., None])[..., 0]
-            plane = plane - step
-        if np.max(np.abs(residual), initial=0.0) < 1e-12:
+        with np.errstate(all="ignore"):  # where it diverges, or meets a fold
+            for _ in range(MAX_NEWTON_STEPS):
+                residual = _distort(plane, self.distortion) - target
+                if np.max(np.abs(residual), initial=0.0) < 1e-14:
+                    break
+                (a, b), (c, d) = np.moveaxis(_distortion_jacobian(plane, self.distortion), (-2, -1), (0, 1))
+                u, v = np.moveaxis(residual, -1, 0)
+                plane = plane - np.stack([d * u - b * v, a * v - c * u], -1) / (a * d - b * c)[..., None]
+            # behind a fold lie further solutions, turned over or on the other side of the axis
+            upright = np.linalg.det(_distortion_jacobian(plane, self.distortion)) > 0
+            upright &= np.sum(plane * target, -1) >= 0
+        if np.max(np.abs(residual), initial=0.0) < 1e-12 and upright.all():
             return plane
         raise InstrumentError(
             f"distortion {self.distortion} cannot be inverted inside the frame: calibrate the camera again"

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+import cv2
+import numpy as np
+import pytest
+from starpos.camera import Camera
+from starpos.errors import InstrumentError
+
+SIZE = (5616, 3744)
+STRONG = (-0.28, 0.11, 1.2e-3, -8e-4, -0.02)  # of a wide lens
+WIDE = Camera(1392, 1040, 1300.0, 1305.0, 700.3, 515.8, STRONG)
+PAPER = Camera.from_focal(*SIZE, 93750.0)
+
+
+def pixels(camera, rng, n=500):
+    return rng.uniform(0, camera.width - 1, n), rng.uniform(0, camera.height - 1, n)
+
+
+@pytest.mark.parametrize(
+    "camera", [WIDE, PAPER, Camera(*SIZE, 93750.0, 93800.0, 2800, 1870, (0.3, 5.0, 1e-3, 2e-3, 0))]
+)
+def test_projection_is_opencvs(camera, rng):
+    """cv2.projectPoints has the same pinhole, the same plumb_bob and the same pixel (0, 0)."""
+    v = camera.directions(*pixels(camera, rng))
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    zero = np.zeros(3)
+    theirs = cv2.projectPoints(v.reshape(-1, 1, 3), zero, zero, matrix, np.array(camera.distortion))[0][:, 0]
+    np.testing.assert_allclose(camera.project(v), theirs, atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", [WIDE, PAPER])
+def test_round_trip(camera, rng):
+    x, y = pixels(camera, rng)
+    v = camera.directions(x, y)
+    np.testing.assert_allclose(np.linalg.norm(v, axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(camera.project(v), np.stack([x, y], 1), atol=1e-9)
+
+
+def test_axes():
+    """ERRATA: W = (X, Y, f) / norm, X along columns, Y along rows; DESIGN: z along the optical axis."""
+    cx, cy = PAPER.centre_px
+    assert (cx, cy) == (2807.5, 1871.5)
+    v = PAPER.directions([cx, cx + 93750, cx], [cy, cy, cy + 93750])
+    np.testing.assert_allclose(v, [[0, 0, 1], [0.5**0.5, 0, 0.5**0.5], [0, 0.5**0.5, 0.5**0.5]], atol=1e-15)
+
+
+def test_paper_scale_and_field():
+    """ERRATA: 2.2 arcsec a pixel; 3.43 by 2.29 deg, a diagonal of 4.13."""
+    assert 3600 * np.degrees(6.4e-6 / 0.6) == pytest.approx(PAPER.scale_arcsec)
+    assert PAPER.scale_arcsec == pytest.approx(2.2, abs=0.01)
+    assert 2 * np.degrees(PAPER.half_diagonal_rad) == pytest.approx(4.13, abs=0.01)
+
+
+def test_nothing_is_seen_behind_the_camera():
+    assert np.isnan(PAPER.project([[0, 0, -1.0], [1, 0, 0]])).all()
+
+
+def test_scaled_keeps_all_but_the_focal_lengths():
+    twice = WIDE.scaled(2.0)
+    assert (twice.fx, twice.fy, twice.cx, twice.distortion) == (2600.0, 2610.0, WIDE.cx, WIDE.distortion)
+
+
+def test_no_stars_are_no_error():
+    assert WIDE.directions([], []).shape == (0, 3)
+    assert WIDE.project(np.zeros((0, 3))).shape == (0, 2)
+
+
+def test_a_distortion_that_folds_the_frame_is_refused():
+    folded = Camera(1000, 1000, 500.0, 500.0, 499.5, 499.5, (-0.6, 0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(InstrumentError, match="cannot be inverted"):
+        folded.directions([0.0, 500.0], [0.0, 500.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"fx": 0.0}, "positive"), ({"fy": -1.0}, "positive"), ({"cx": float("nan")}, "not finite"),
+     ({"distortion": (0.0, 0.0, float("inf"), 0.0, 0.0)}, "not finite"), ({"width": 0}, "at least 1"),
+     ({"distortion": (0.1, 0.2)}, "plumb_bob has 5")],
+)  # fmt: skip
+def test_impossible_intrinsics_are_refused(change, words):
+    good = {"width": 100, "height": 80, "fx": 900.0, "fy": 900.0, "cx": 49.5, "cy": 39.5}
+    with pytest.raises(InstrumentError, match=words):
+        Camera(**good | change)
