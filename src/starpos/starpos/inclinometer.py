@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inclinometer: its readings, its transfer function, and A2, which takes its frame S into the local level L."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,13 +121,14 @@ def read_tilt_csv(path, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
     """A TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if it is none."""
     path = Path(path)
     try:
-        with path.open() as f:
-            names = f.readline().strip().lstrip("# ").split(",")
+        with path.open() as f, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # 'empty input file' is said below
+            names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
             rows = np.genfromtxt(f, delimiter=",", ndmin=2)
     except (OSError, ValueError, UnicodeDecodeError) as e:
         raise TiltError(f"{path}: not a readable table of tilts ({_first_line(e)})") from None
     need = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
-    if not set(need) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(names):
+    if not set(need) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(set(names)):
         raise TiltError(f"{path}: a tilt table needs the columns {', '.join(need)} and at least one row")
     column = dict(zip(names, rows.T, strict=True))
     order = np.argsort(column["utc_unix_s"], kind="stable")
