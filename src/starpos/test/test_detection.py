@@ -2,7 +2,6 @@
 import numpy as np
 import pytest
 from rendered import BIAS, bound, field, grid, match, noisy
-
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError
 from starpos.frame import Frame
@@ -59,7 +58,7 @@ def test_error_does_not_depend_on_where_in_a_pixel_a_star_falls():
     phase = 2 * np.pi * stars[:, :2]
     for wave in (np.sin(phase), np.cos(phase), np.sin(2 * phase)):
         amplitude = 2 * np.mean(error * wave, axis=0)
-        assert np.all(np.abs(amplitude) < 0.005)
+        assert np.all(np.abs(amplitude) < 0.002)
 
 
 @pytest.mark.parametrize("pattern", ["rggb", ""])
@@ -107,7 +106,7 @@ def test_faint_stars_down_to_snr_8_are_found():
     # matched SNR of a star of E electrons in this sky is E / sqrt(4 pi s^2 (sky + read^2)), s^2 = 1.04 + 1/12
     noise = np.sqrt(4 * np.pi * (1.04 + 1 / 12) * (20 + 25))
     _, _, missed, invented = errors((520, 520), 2, 9 * noise, seed=7)
-    assert missed <= 4 and invented == 0
+    assert missed < 10 and invented == 0  # of 512
 
 
 def test_moonlit_gradient_hot_pixels_and_cosmic_rays_add_no_star():
@@ -217,12 +216,13 @@ def test_no_frame_of_random_content_raises():
         shape = tuple(rng.integers(1, 90, 2)) + ((3,) if rng.random() < 0.2 else ())
         kind = np.uint8 if len(shape) == 3 or rng.random() < 0.5 else np.uint16
         top = np.iinfo(kind).max
-        pixels = [
-            lambda: rng.integers(0, top + 1, shape),
-            lambda: rng.choice([0, top], shape),
-            lambda: np.where(rng.random(shape) < 0.02, top, 0),
-            lambda: np.clip(np.cumsum(rng.integers(-3, 4, shape), axis=1) + 100, 0, top),
-        ][rng.integers(4)]().astype(kind)
+        kinds = (
+            rng.integers(0, top + 1, shape),
+            rng.choice([0, top], shape),
+            np.where(rng.random(shape) < 0.02, top, 0),
+            np.clip(np.cumsum(rng.integers(-3, 4, shape), axis=1) + 100, 0, top),
+        )
+        pixels = kinds[rng.integers(4)].astype(kind)
         pattern = "" if len(shape) == 3 else str(rng.choice(["", "rggb", "gbrg"]))
         detection = detect(Frame(pixels, pattern))
         assert np.all(detection.stars.snr > 0)

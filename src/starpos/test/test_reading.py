@@ -204,6 +204,16 @@ def test_an_absurd_header_is_refused(tmp_path, data, cards):
         read_frame(write_fits(tmp_path / "a.fits", data, **cards))
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.png", huge_png()), ("a.fits", huge_fits().replace(b"999999999", b"    99999"))],
+)
+def test_a_header_that_claims_gigabytes_is_refused_before_any_is_taken(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FrameError, match="claims"):
+        read_frame(tmp_path / name)
+
+
 def test_a_truncated_file_is_refused(tmp_path):
     big = np.tile(PIXELS, (100, 100))
     whole = write_fits(tmp_path / "a.fits", big, **NIGHT).read_bytes()

@@ -16,8 +16,6 @@ BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
 TEACHERS = 250
 TEACHING_PIXELS = 12000  # of wide stars fewer are enough
 ROUNDS = 2
-UNDERSAMPLED = 0.6  # px2: narrower stars show their PSF and their places only together, in more rounds
-UNDERSAMPLED_ROUNDS = 8
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
 SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
@@ -56,7 +54,7 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
     stamps, x, y = stamps.take(alike), x[alike], y[alike]
     most = max(TEACHING_PIXELS // stamps.signal[0].size, 40) if len(x) else 0
     stamps, x, y = stamps.take(slice(most)), x[:most], y[:most]
-    for _ in range(ROUNDS if np.linalg.eigvalsh(shape)[0] > UNDERSAMPLED else UNDERSAMPLED_ROUNDS):
+    for _ in range(ROUNDS):
         if len(x) == 0:
             break
         fit = fit_stars(stamps, psf, x, y, response, rounds=3)
