@@ -27,7 +27,7 @@ ENCODINGS = {
     **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
 }
 HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
-INT32_MAX = 2**31 - 1
+MAX_UNIX_S = 2**31 - 1e-6  # the end of Time.sec, in January 2038
 
 
 def stamp_to_unix(stamp: Time) -> float | None:
@@ -44,7 +44,7 @@ def unix_to_stamp(unix_s: float | None) -> Time:
     """
     if unix_s is None:
         return Time()
-    if not 0 <= unix_s <= INT32_MAX:
+    if not 0 <= unix_s <= MAX_UNIX_S:
         raise TimeError(f"{unix_s} s is not a Unix time between 1970 and 2038: check the clock it came from.")
     seconds, microseconds = divmod(round(unix_s * 1e6), 1_000_000)
     return Time(sec=seconds, nanosec=microseconds * 1000)
@@ -172,18 +172,14 @@ def message_to_camera(message: CameraInfo, source: str = "camera_info") -> Camer
 def frame_to_message(frame: Frame, frame_id: str) -> Image:
     """An Image; the pixels are copied once."""
     pixels = np.ascontiguousarray(frame.pixels)
-    bits = 8 * pixels.itemsize
-    if pixels.ndim == 3:
-        encoding = "bgr8"
-    else:
-        encoding = f"bayer_{frame.pattern}{bits}" if frame.pattern else f"mono{bits}"
-    data = array.array("B")  # rclpy takes this as it is; anything else it checks byte by byte, 10 s for 42 MB
+    layout = "bgr" if pixels.ndim == 3 else f"bayer_{frame.pattern}" if frame.pattern else "mono"
+    data = array.array("B")  # rclpy takes this as it is and copies, or checks byte by byte, anything else
     data.frombytes(memoryview(pixels).cast("B"))
     return Image(
         header=Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=frame_id),
         width=frame.width,
         height=frame.height,
-        encoding=encoding,
+        encoding=f"{layout}{8 * pixels.itemsize}",
         is_bigendian=int(HOST_IS_BIG_ENDIAN),
         step=pixels.strides[0],
         data=data,

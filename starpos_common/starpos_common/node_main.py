@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# rclpy's signal handler wakes the executor at once, except now and then when two signals come together (7.1).
+NOTICE_S = 0.5
 
 
 def run(make_node, args=None) -> int:
@@ -23,7 +25,6 @@ def run(make_node, args=None) -> int:
     """
     stopped = []
     for number in SIGNALS:
-        # rclpy's own handlers, which wake the executor, call these in turn.
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     try:
         return _run(make_node, args, stopped)
@@ -36,21 +37,26 @@ def run(make_node, args=None) -> int:
 def _run(make_node, args, stopped) -> int:
     import rclpy
     from rclpy.exceptions import ParameterException
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions, install_signal_handlers
     from starpos.errors import StarposError
 
     if stopped:
         return 0
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:
         # A bad command line or parameter file; rcl has an error class for each.
         return 0 if stopped else _refuse(error)
     node = None
     try:
         node = make_node()
-        if not stopped:
-            rclpy.spin(node)
+        # rclpy's handlers shut the context down, which would trip over a node half made; ours run as well.
+        install_signal_handlers(SignalHandlerOptions.ALL)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not stopped and rclpy.ok():
+            executor.spin_once(timeout_sec=NOTICE_S)
     except ExternalShutdownException:
         pass
     except (StarposError, ParameterException) as error:

@@ -3,7 +3,7 @@
 
 A line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the
 two clocks, and what lies above it is delay. The envelope is a line, because the clocks' rates differ: the
-lower hull's edge over the window's middle, which is the linear-programming fit of Moon, Skelly and Towsley (1999).
+lower hull's edge over the window's middle, the linear-programming fit of Moon, Skelly and Towsley (1999).
 """
 
 from collections import deque

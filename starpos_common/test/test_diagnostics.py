@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What arrives on /diagnostics."""
+
+import os
+import time
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from starpos_common.diagnostics import Diagnostics, Level, Status
+
+
+@pytest.fixture
+def node():
+    os.environ["ROS_DOMAIN_ID"] = str(100 + os.getpid() % 100)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("sensor", context=context, namespace="left")
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def broken():
+    raise ValueError("no number")
+
+
+def test_levels_are_those_of_the_message():
+    for level in Level:
+        assert getattr(DiagnosticStatus, level.name) == bytes([level])
+
+
+def test_every_task_is_published_each_second_even_in_paused_simulated_time(node):
+    node.set_parameters([rclpy.Parameter("use_sim_time", value=True)])
+    tasks = {
+        "Link": lambda: Status(Level.WARN, "weak", {"rate (Hz)": 9.5, "port": "/dev/x", "lost": 3}),
+        "Clock": broken,
+    }
+    diagnostics = Diagnostics(node, tasks, "unit 7")
+    received = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
+    executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end = time.monotonic() + 20
+    while len(received) < 2:
+        assert time.monotonic() < end
+        executor.spin_once(timeout_sec=0.5)
+    link, clock = received[-1].status
+    assert (link.name, link.level, link.message) == ("sensor: Link", DiagnosticStatus.WARN, "weak")
+    assert link.hardware_id == "unit 7"
+    assert {v.key: v.value for v in link.values} == {"rate (Hz)": "9.5", "port": "/dev/x", "lost": "3"}
+    assert clock.level == DiagnosticStatus.ERROR and "no number" in clock.message
+    before = len(received)
+    diagnostics.publish()
+    while len(received) == before:
+        assert time.monotonic() < end
+        executor.spin_once(timeout_sec=0.5)

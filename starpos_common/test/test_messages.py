@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages to starpos' types and back, and messages that do not hold together."""
+
+import array
+import math
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import CameraInfo, Image
+from starpos.camera import Camera
+from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
+from starpos.frame import Frame
+from starpos.inclinometer import Tilt
+from starpos.stars import EDGE, Stars, no_stars
+
+from starpos_common import messages
+from starpos_interfaces.msg import StarArray
+
+MID = 1_795_168_800.123456
+RNG = np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("microseconds", [0, 1, 123_456, 500_000, 999_999])
+@pytest.mark.parametrize("seconds", [1, 1_000_000_000, 1_795_168_800, 2**31 - 1])
+def test_stamps_are_exact_to_the_microsecond(seconds, microseconds):
+    stamp = Time(sec=seconds, nanosec=microseconds * 1000)
+    assert messages.unix_to_stamp(messages.stamp_to_unix(stamp)) == stamp
+
+
+def test_stamps_that_are_none_and_that_cannot_be():
+    assert messages.stamp_to_unix(Time()) is None
+    assert messages.unix_to_stamp(None) == Time()
+    assert messages.unix_to_stamp(1.9999999) == Time(sec=2)
+    for bad in (math.nan, math.inf, -1.0, 2.0**31):
+        with pytest.raises(TimeError):
+            messages.unix_to_stamp(bad)
+
+
+def stars(n=5):
+    flux = np.sort(RNG.uniform(100, 1e5, n))[::-1]
+    covariance = np.tile([[0.01, 0.002], [0.002, 0.02]], (n, 1, 1))
+    x, y = RNG.uniform(0, 100, (2, n))
+    return Stars(x, y, flux, np.sqrt(flux), covariance, np.full(n, EDGE), 200, 100, MID, 0.5)
+
+
+def test_stars_round_trip():
+    sent = stars()
+    message = messages.stars_to_message(sent, "optical", 1e-3)
+    assert (message.header.frame_id, message.stamp_stddev, message.exposure) == ("optical", 1e-3, 0.5)
+    got = messages.message_to_stars(message)
+    for name in ("x", "y", "covariance", "flags"):
+        assert np.array_equal(getattr(got, name), getattr(sent, name))
+    assert got.flux == pytest.approx(sent.flux, rel=1e-6)
+    assert (got.width, got.height, got.exposure_s) == (200, 100, 0.5)
+    assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
+
+
+def test_no_stars_and_no_time_round_trip():
+    got = messages.message_to_stars(messages.stars_to_message(no_stars(10, 10), "c"))
+    assert len(got) == 0 and got.mid_unix_s is None and got.exposure_s is None
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("x", math.nan), ("flux", math.inf), ("covariance", [0.0] * 4), ("flux", 1e9)]
+)
+def test_bad_stars_are_refused(field, value):
+    message = messages.stars_to_message(stars(), "c")
+    setattr(message.stars[-1], field, value)
+    with pytest.raises(FrameError, match="stars"):
+        messages.message_to_stars(message)
+
+
+def test_empty_star_message_is_refused():
+    with pytest.raises(FrameError, match="width"):
+        messages.message_to_stars(StarArray())
+
+
+def test_tilt_round_trip_and_unknown_covariance():
+    tilt = Tilt(0.1, -0.2, np.array([[4e-9, 1e-9], [1e-9, 5e-9]]), MID, 1, 21.5)
+    message = messages.tilt_to_message(tilt, "s", 7, 8)
+    assert (message.sequence, message.flags, message.header.frame_id) == (7, 8, "s")
+    got = messages.message_to_tilt(message)
+    assert (got.theta_x, got.theta_y, got.temperature_c) == (0.1, -0.2, 21.5)
+    assert np.array_equal(got.covariance, tilt.covariance)
+    message.covariance = [0.0] * 4
+    assert np.array_equal(messages.message_to_tilt(message, 1e-4).covariance, np.eye(2) * 1e-8)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("x", math.nan),
+        ("y", 0.6),
+        ("covariance", [1.0, 0.0, 0.0, -1.0]),
+        ("covariance", [1.0, 2.0, 2.0, 1.0]),
+        ("covariance", [1.0, 0.5, 0.0, 1.0]),
+        ("covariance", [math.nan, 0.0, 0.0, 1.0]),
+    ],
+)
+def test_bad_tilts_are_refused(field, value):
+    message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), MID), "s")
+    setattr(message, field, value)
+    with pytest.raises(TiltError):
+        messages.message_to_tilt(message)
+
+
+def test_tilt_without_a_stamp_is_refused():
+    message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), MID), "s")
+    message.header.stamp = Time()
+    with pytest.raises(TiltError, match="stamp"):
+        messages.message_to_tilt(message)
+
+
+def test_camera_round_trip():
+    camera = Camera(5616, 3744, 93750.0, 93751.0, 2807.5, 1871.5, (0.1, -0.2, 1e-4, 2e-4, 0.3))
+    assert messages.message_to_camera(messages.camera_to_message(camera, "c", MID)) == camera
+    message = messages.camera_to_message(camera, "c")
+    message.d = []
+    assert messages.message_to_camera(message).distortion == (0.0,) * 5
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"k": [0.0] * 9}, "not calibrated"),
+        ({"k": [math.nan] * 9}, "NaN"),
+        ({"d": [math.inf] * 5}, "NaN"),
+        ({"k": [-9.0, 0, 5, 0, 9.0, 5, 0, 0, 1]}, "positive"),
+        ({"k": [9.0, 0.1, 5, 0, 9.0, 5, 0, 0, 1]}, "skew"),
+        ({"distortion_model": "equidistant"}, "equidistant"),
+        ({"distortion_model": "rational_polynomial", "d": [0.0] * 8}, "8 terms"),
+        ({"d": [0.0] * 4}, "4 terms"),
+        ({"binning_x": 2}, "binned"),
+        ({"width": 0}, "size"),
+    ],
+)
+def test_cameras_that_are_not_understood_are_refused(change, word):
+    message = messages.camera_to_message(Camera.from_focal(100, 80, 1000.0), "c")
+    for name, value in change.items():
+        setattr(message, name, [float(v) for v in value] if isinstance(value, list) else value)
+    with pytest.raises(InstrumentError, match=word):
+        messages.message_to_camera(message)
+    with pytest.raises(InstrumentError, match="not calibrated"):
+        messages.message_to_camera(CameraInfo())
+
+
+def test_region_of_interest():
+    message = messages.camera_to_message(Camera.from_focal(100, 80, 1000.0), "c")
+    message.roi.width, message.roi.height = 100, 80
+    messages.message_to_camera(message)
+    message.roi.x_offset = 1
+    with pytest.raises(InstrumentError, match="cropped"):
+        messages.message_to_camera(message)
+
+
+def pixels(kind, channels=1):
+    shape = (6, 4) if channels == 1 else (6, 4, channels)
+    return RNG.integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
+
+
+@pytest.mark.parametrize("encoding", messages.ENCODINGS)
+def test_frames_round_trip_without_a_copy_on_arrival(encoding):
+    kind, channels, pattern = messages.ENCODINGS[encoding]
+    frame = Frame(pixels(kind, channels), pattern, MID, 0.5)
+    message = messages.frame_to_message(frame, "c")
+    assert message.encoding == encoding and isinstance(message.data, array.array)
+    got = messages.message_to_frame(message, 0.5)
+    assert np.array_equal(got.pixels, frame.pixels) and got.pixels.dtype == kind
+    assert got.pattern == pattern and got.exposure_s == 0.5
+    assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
+    assert np.shares_memory(got.pixels, np.frombuffer(message.data, np.uint8))
+
+
+def test_frames_that_are_views_are_sent_whole():
+    frame = Frame(pixels(np.uint16)[::2, ::-1])
+    assert np.array_equal(
+        messages.message_to_frame(messages.frame_to_message(frame, "c")).pixels, frame.pixels
+    )
+
+
+@pytest.mark.parametrize("padding", [0, 2, 3])
+def test_padded_rows_and_the_other_byte_order(padding):
+    truth = pixels(np.uint16)
+    rows = np.zeros((6, 8 + padding), np.uint8)
+    rows[:, :8] = truth.astype(">u2").view(np.uint8)
+    message = Image(width=4, height=6, step=8 + padding, encoding="mono16", is_bigendian=1)
+    message.data = array.array("B", rows.tobytes())
+    got = messages.message_to_frame(message).pixels
+    assert np.array_equal(got, truth) and got.dtype == np.uint16 and got.dtype.isnative
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"encoding": "rgba8"}, "rgba8"),
+        ({"encoding": ""}, "encoding"),
+        ({"width": 0}, "empty"),
+        ({"height": 0}, "empty"),
+        ({"height": 7}, "truncated"),
+        ({"height": 2**32 - 1}, "truncated"),
+        ({"width": 2**32 - 1}, "step"),
+        ({"step": 7}, "step"),
+        ({"step": 0}, "step"),
+        ({"step": 2**32 - 1}, "truncated"),
+        ({"data": array.array("B")}, "truncated"),
+    ],
+)
+def test_images_that_do_not_fit_together_are_refused(change, word):
+    message = messages.frame_to_message(Frame(pixels(np.uint16)), "c")
+    for name, value in change.items():
+        setattr(message, name, value)
+    with pytest.raises(FrameError, match=word):
+        messages.message_to_frame(message)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exit statuses of a node's process, whatever signal comes whenever."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+WAIT_S = 20.0
+PROGRAM = """
+import sys
+from starpos_common.node_main import run
+
+def make_node():
+    print("making", flush=True)
+    %s
+    from rclpy.node import Node
+    class Ready(Node):
+        def __init__(self):
+            super().__init__("ready")
+            self.create_timer(0.01, self.first)
+        def first(self):
+            print("spinning", flush=True)
+            self.timers.__next__().cancel()
+            %s
+    return Ready()
+
+sys.exit(run(make_node))
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain():
+    os.environ["ROS_DOMAIN_ID"] = str(100 + os.getpid() % 100)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+@pytest.fixture
+def start():
+    processes = []
+
+    def start(making="pass", spinning="pass", arguments=()):
+        command = [sys.executable, "-c", PROGRAM % (making, spinning), *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def await_line(process, wanted):
+    for line in process.stdout:
+        if line.strip() == wanted:
+            return
+    pytest.fail(f"it ended before it was {wanted}: {process.stderr.read()}")
+
+
+def end(process):
+    """Its exit status and what it had to say on standard error."""
+    _, err = process.communicate(timeout=WAIT_S)
+    return process.returncode, err
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGINT,), (signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
+@pytest.mark.parametrize("moment", ["making", "spinning"])
+def test_signals_end_it_cleanly(start, signals, moment):
+    process = start()
+    await_line(process, moment)
+    for number in signals:
+        process.send_signal(number)
+    status, err = end(process)
+    assert (status, err) == (0, "")
+
+
+def test_second_signal_at_any_later_time_changes_nothing(start):
+    process = start()
+    await_line(process, "spinning")
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    status, err = end(process)
+    assert (status, err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("making", "sentence"),
+    [
+        (
+            "from starpos.errors import FrameError; raise FrameError('no frames in /x;\\n give others')",
+            "no frames in /x; give others",
+        ),
+        (
+            "from starpos_common.parameters import ParameterError; raise ParameterError('a must be b')",
+            "a must be b",
+        ),
+    ],
+)
+def test_refused_start_is_one_line_and_status_1(start, making, sentence):
+    status, err = end(start(making))
+    assert status == 1
+    assert err == f"-c: {sentence}\n"
+
+
+def test_bad_command_line_is_said(start):
+    status, err = end(start(arguments=("--ros-args", "-p", "nonsense")))
+    assert status == 1
+    # rcl has logged a line of its own before.
+    assert "nonsense" in err.splitlines()[-1] and "Traceback" not in err
+
+
+def test_missing_parameter_file_is_said(start):
+    status, err = end(start(arguments=("--ros-args", "--params-file", "/nowhere.yaml")))
+    assert status == 1
+    assert "/nowhere.yaml" in err and "Traceback" not in err
+
+
+def test_a_defect_in_a_callback_shows_its_traceback(start):
+    status, err = end(start(spinning="raise KeyError('defect')"))
+    assert status == 1
+    assert "Traceback" in err and "KeyError: 'defect'" in err

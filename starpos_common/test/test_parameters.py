@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declaring, refusing and changing parameters on a real node."""
+
+import math
+import os
+
+import pytest
+import rclpy
+import yaml
+from rclpy.parameter import Parameter as RosParameter
+from starpos_common.parameters import Parameter, ParameterError, declare, to_yaml
+
+TABLE = (
+    Parameter("rate", 10, "Samples a second.", "Hz", 1, 50),
+    Parameter("noise", 0.5, "White noise.", "deg", 0.0, 10.0),
+    Parameter("cadence", 1.0, "Time between frames.", "s", minimum=0.0),
+    Parameter("altitude", math.nan, "Height; wrong by 1 km is wrong by 1 km.", "m", -500.0, 9000.0),
+    Parameter("refraction.pressure", 1.0e5, "Air pressure.", "Pa"),
+    Parameter("offsets", (2.5, 2.5), "Of x and y.", "V", 0.0, 5.0),
+    Parameter("source", "files", "Where frames come from.", choices=("files", "simulated")),
+    Parameter("loop", False, "Begin anew at the end."),
+    Parameter("port", "/dev/x", 'The "port".', read_only=True),
+)
+
+
+@pytest.fixture(scope="module")
+def context():
+    os.environ["ROS_DOMAIN_ID"] = str(100 + os.getpid() % 100)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def make(context):
+    nodes = []
+
+    def make(*overrides, **options):
+        arguments = ["--ros-args", *(word for o in overrides for word in ("-p", o))]
+        nodes.append(rclpy.create_node("params", context=context, cli_args=arguments))
+        return nodes[-1], declare(nodes[-1], TABLE, **options)
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+
+
+def change(node, **values):
+    return node.set_parameters_atomically([RosParameter(k, value=v) for k, v in values.items()])
+
+
+def test_defaults_and_overrides_have_the_types_of_the_table(make):
+    _, values = make("noise:=2", "offsets:=[1, 2]", "altitude:=100")
+    assert values["noise"] == 2.0 and type(values["noise"]) is float
+    assert values["offsets"] == (1.0, 2.0)
+    assert values["altitude"] == 100.0
+    assert math.isnan(make()[1]["altitude"])
+    assert dict(values).keys() == {p.name for p in TABLE}
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("rate:=51", "parameter rate must be a whole number from 1 to 50 Hz; 51 was given."),
+        ("rate:=2.5", "parameter rate must be a whole number from 1 to 50 Hz; 2.5 was given."),
+        ("rate:=true", "parameter rate must be a whole number from 1 to 50 Hz; True was given."),
+        ("noise:=.nan", "parameter noise must be a number from 0 to 10 deg; nan was given."),
+        ("cadence:=-1.0", "parameter cadence must be a number of at least 0 s; -1.0 was given."),
+        ("cadence:=.inf", "parameter cadence must be a number of at least 0 s; inf was given."),
+        ("altitude:=1e5", "must be a number from -500 to 9000 m, or nan for unset; 100000.0 was given."),
+        (
+            "refraction.pressure:=high",
+            "refraction.pressure must be a number in Pa; 'high' was given.",
+        ),
+        (
+            "offsets:=[1.0]",
+            "offsets must be 2 values, each a number from 0 to 5 V; [1.0] was given.",
+        ),
+        ("offsets:=[1.0, 9.0]", "[1.0, 9.0] was given."),
+        ("offsets:=1.0", "1.0 was given."),
+        ("source:=moon", "parameter source must be one of files, simulated; 'moon' was given."),
+        ("loop:=1", "parameter loop must be true or false; 1 was given."),
+    ],
+)
+def test_bad_start_values_are_refused_with_the_constraint(make, override, sentence):
+    with pytest.raises(ParameterError) as error:
+        make(override)
+    assert sentence in str(error.value)
+
+
+def test_descriptors_say_what_and_how_far(make):
+    node, _ = make()
+    describe = node.describe_parameter
+    assert describe("noise").description == "White noise. [deg]"
+    assert describe("rate").integer_range[0].to_value == 50
+    assert describe("noise").floating_point_range[0].to_value == 10.0
+    assert describe("cadence").floating_point_range[0].to_value == math.inf
+    assert not describe("altitude").floating_point_range
+    assert "or nan for unset" in describe("altitude").additional_constraints
+    assert describe("port").read_only and not describe("rate").read_only
+    assert not any(describe(p.name).dynamic_typing for p in TABLE)
+
+
+def test_changes_are_validated_then_applied(make):
+    applied = []
+    node, values = make(apply=lambda names: applied.append((names, values["noise"])))
+    assert change(node, noise=3, altitude=5).successful
+    assert applied == [({"noise", "altitude"}, 3.0)]
+    assert values["altitude"] == 5.0
+    assert change(node, altitude=math.nan).successful
+    for name, value, sentence in (
+        ("rate", 51, "50"),
+        ("noise", math.nan, "10"),
+        ("altitude", 1e5, "parameter altitude must be a number from -500 to 9000 m, or nan for unset"),
+        ("offsets", [1.0, math.nan], "parameter offsets must be 2 values, each a number from 0 to 5 V"),
+        ("source", "moon", "one of files, simulated"),
+        ("port", "/dev/y", "read-only"),
+        ("loop", 1, "BOOL"),
+    ):
+        before = values[name]
+        result = change(node, **{name: value})
+        assert not result.successful and sentence in result.reason
+        assert values[name] == before or name == "altitude"
+    assert not change(node, noise=4.0, rate=99).successful
+    assert values["noise"] == 3.0
+    assert len(applied) == 2
+
+
+def test_values_must_fit_together(make):
+    def check(values):
+        return "noise must not exceed cadence." if values["noise"] > values["cadence"] else None
+
+    with pytest.raises(ParameterError, match="must not exceed"):
+        make("noise:=2.0", check=check)
+    node, _ = make(check=check)
+    assert change(node, noise=2.0).reason == "noise must not exceed cadence."
+    assert change(node, noise=2.0, cadence=3.0).successful
+
+
+def test_other_parameters_of_the_node_are_left_alone(make):
+    node, _ = make(apply=lambda names: pytest.fail("not ours"))
+    node.declare_parameter("theirs", 1)
+    assert change(node, theirs=2).successful
+
+
+def test_yaml_holds_every_default_and_its_constraint(make, tmp_path):
+    text = to_yaml("params", TABLE)
+    loaded = yaml.safe_load(text)["/**/params"]["ros__parameters"]
+    assert loaded["offsets"] == [2.5, 2.5] and loaded["port"] == "/dev/x" and loaded["loop"] is False
+    assert "# rate must be a whole number from 1 to 50 Hz." in text
+    assert "fixed while the node runs" in text
+    assert (
+        Parameter("x", 1e-9, "").default
+        == yaml.safe_load(to_yaml("n", [Parameter("x", 1e-9, "")]))["/**/n"]["ros__parameters"]["x"]
+    )
