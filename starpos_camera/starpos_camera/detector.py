@@ -57,6 +57,7 @@ class DetectorNode(Node):
         self._settings = self._detection_settings()
         self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
         self._frames = self._bad = self._dropped = 0
+        self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
         self._complaint = ""  # about a frame since the last report
         self._last: Outcome | None = None
         self._size = None
@@ -117,7 +118,8 @@ class DetectorNode(Node):
             del self._captures[next(iter(self._captures))]
         self._captures[_key(message.header)] = message
 
-    def _on_image(self, message: Image):
+    def _on_image(self, message: Image, info: dict):
+        self._count_overwritten(info["publication_sequence_number"])
         now = time.monotonic()
         if self._last_frame_s is not None:
             self._interval_s = now - self._last_frame_s
@@ -134,6 +136,12 @@ class DetectorNode(Node):
             self._size = size
             self.get_logger().info(f"frames of {frame.width} x {frame.height} px, {message.encoding}.")
         self.submit(frame, message.header, stamp_stddev)
+
+    def _count_overwritten(self, sequence: int | None):
+        """Count the frames that newer ones replaced in the middleware; a lower number is another publisher's."""
+        if sequence is not None and self._sequence is not None and sequence > self._sequence:
+            self._dropped += sequence - self._sequence - 1
+        self._sequence = sequence
 
     def _taken(self, header: Header) -> tuple[float, float]:
         """Exposure and sigma of the stamp in s, 0 for unknown."""

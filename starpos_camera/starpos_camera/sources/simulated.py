@@ -4,8 +4,8 @@
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from starpos import catalogue
 from starpos.atmosphere import Atmosphere
+from starpos.catalogue import load as load_catalogue
 from starpos.instrument import focal_px_of
 from starpos.simulate import Scene, expose, render, scene_of
 
@@ -48,7 +48,7 @@ class Simulated:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s
         scene = self._scene
-        stars = expose(scene, catalogue.load(), start, exposure_s, self._rng)
+        stars = expose(scene, load_catalogue(), start, exposure_s, self._rng)
         frame = render(scene, stars, start, exposure_s, self._rng)
         return Exposure(frame, Capture.SIMULATED, STAMP_ROUNDING_S, scene.camera)
 

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `camera` as a process of its own."""
+
+import math
+import signal
+
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.srv import SetCameraInfo
+from starpos.camera import Camera
+from starpos.catalogue import load as load_catalogue
+from starpos.detection import detect
+from starpos.reading import read_frame
+from starpos.simulate import expose
+from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
+
+from starpos_camera import calibration
+from starpos_interfaces.msg import Capture
+from starpos_interfaces.srv import SetCapture
+
+SMALL = ("source:=simulated", "focal_mm:=50", "simulated.width:=640", "simulated.height:=480")
+OK, WARN, ERROR = 0, 1, 2
+
+
+def hear_all(listener):
+    """Lists of the images, the intrinsics and the captures to come."""
+    topics = ((Image, "image_raw"), (CameraInfo, "camera_info"), (Capture, "capture"))
+    return [listener.hear(kind, f"camera/{name}") for kind, name in topics]
+
+
+def set_capture(listener, exposure=math.nan, gain=math.nan, cadence=math.nan):
+    request = SetCapture.Request(exposure=exposure, gain=gain, cadence=cadence)
+    return listener.call(SetCapture, "camera/set_capture", request)
+
+
+def test_plays_files_and_says_which_one_is_broken(start, listener, folder):
+    images, infos, captures = hear_all(listener)
+    node = start("camera", f"files.path:={folder}", "cadence:=0.1", "focal_mm:=50")
+    listener.wait(lambda: len(images) == 2 and len(infos) == 2 and len(captures) == 2)
+    for k, image, info, capture in zip((0, 2), images, infos, captures, strict=True):
+        want, got = read_frame(folder / f"{k}.fits"), message_to_frame(image)
+        np.testing.assert_array_equal(got.pixels, want.pixels)
+        assert image.encoding == "mono16" and image.header.frame_id == "starpos_camera_optical_frame"
+        assert got.mid_unix_s == pytest.approx(want.mid_unix_s, abs=2e-6)
+        assert image.header == info.header == capture.header
+        assert (capture.exposure, capture.stamp_source) == (0.5, Capture.FILE)
+        assert message_to_camera(info) == Camera.from_focal(640, 480, 7812.5)
+    state = listener.wait_for_state("camera: Capture", OK, "are played")
+    assert (state["frames"], state["failed"], state["stamp from"]) == ("2", "1", "file")
+
+    assert "own exposure" in set_capture(listener, exposure=1.0).message
+    assert "own gain" in set_capture(listener, gain=3.0).message
+    changed = set_capture(listener, exposure=0.0, gain=0.0, cadence=2.0)
+    assert changed.success and "cadence 2 s" in changed.message
+
+    status, out = node.end(signal.SIGINT, signal.SIGINT)
+    assert status == 0 and "Traceback" not in out
+    assert out.count("1.fits") == 1 and len(out.splitlines()) <= 5
+
+
+def test_a_folder_that_comes_later(start, listener, tmp_path, folder):
+    images, _, _ = hear_all(listener)
+    later = tmp_path / "later"
+    node = start("camera", f"files.path:={later}", "cadence:=0.1")
+    listener.wait_for_state("camera: Capture", ERROR, "no frames here")
+    later.mkdir()
+    (folder / "0.fits").rename(later / "0.fits")
+    listener.wait(lambda: images)
+    status, out = node.end(signal.SIGTERM)
+    assert status == 0 and out.count("no frames here") == 1
+
+
+def test_simulated_sky_is_live_and_its_stars_are_where_starpos_says(start, listener, scene):
+    images, infos, captures = hear_all(listener)
+    node = start("camera", *SMALL, "cadence:=0.5")
+    listener.wait(lambda: len(images) >= 3 and captures and infos)
+    now = listener.node.get_clock().now().nanoseconds * 1e-9
+    capture = captures[0]
+    assert capture.stamp_source == Capture.SIMULATED and capture.exposure == 0.5
+    frame = message_to_frame(images[0])
+    assert 0 < now - frame.mid_unix_s < 30
+    stars = detect(frame).stars
+    start_s = frame.mid_unix_s - capture.exposure / 2
+    truth = expose(scene, load_catalogue(), start_s, capture.exposure, np.random.default_rng(9)).middle
+    away = np.hypot(stars.x[:8, None] - truth[:, 0], stars.y[:8, None] - truth[:, 1]).min(1)
+    assert away.max() < 0.3
+    steps = np.diff([stamp_to_unix(image.header.stamp) for image in images])
+    assert np.all(steps > 0)
+
+    assert set_capture(listener, exposure=0.25, cadence=0.4).success
+    listener.wait(lambda: captures[-1].exposure == 0.25)
+    assert "longer than `cadence`" in set_capture(listener, exposure=2.0).message
+    assert "no gain" in set_capture(listener, gain=2.0).message
+    assert "must be a number from 1e-06 to 3600 s" in set_capture(listener, exposure=-1.0).message
+    # What the service sets, the parameters show, and the other way round.
+    assert not listener.set("camera", cadence=0.1).successful
+    assert listener.set("camera", **{"simulated.azimuth": 90.0, "exposure": 0.1}).successful
+    listener.wait(lambda: captures[-1].exposure == 0.1)
+    assert not listener.set("camera", source="files").successful
+    status, out = node.end(signal.SIGTERM)
+    assert status == 0 and "taking frames of 640 x 480 px." in out and len(out.splitlines()) == 1
+
+
+def test_sim_time_drives_the_simulated_sky(start, listener):
+    images, _, _ = hear_all(listener)
+    clock = listener.node.create_publisher(Clock, "/clock", 10)
+    node = start("camera", *SMALL, "cadence:=2.0", "use_sim_time:=true")
+    listener.wait_for_state("camera: Capture", WARN, "no /clock")
+    moment = Clock()
+    moment.clock.sec = 1793642400
+
+    def later():
+        moment.clock.sec += 1
+        clock.publish(moment)
+        return len(images) >= 3
+
+    listener.wait(later)
+    stamps = [stamp_to_unix(image.header.stamp) for image in images]
+    # the clock moves in whole seconds, and the exposure of 0.5 s has just ended
+    assert all((t + 0.25) % 1 == 0 and 1793642400 < t <= moment.clock.sec for t in stamps)
+    assert min(np.diff(stamps)) >= 2.0
+    assert node.end(signal.SIGINT)[0] == 0
+
+
+def test_a_cadence_that_is_too_short_is_reported(start, listener):
+    size = ("simulated.width:=3000", "simulated.height:=3000")
+    node = start("camera", *SMALL, *size, "exposure:=0.01", "cadence:=0.01")
+    listener.wait_for_state("camera: Capture", WARN, "longer than the cadence of 0.01 s")
+    assert node.end(signal.SIGINT)[0] == 0
+
+
+def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, listener, tmp_path):
+    path = tmp_path / "config" / "camera.yaml"
+    options = (*SMALL, "cadence:=0.5", f"calibration_url:=file://{path}")
+    _, infos, _ = hear_all(listener)
+    node = start("camera", *options)
+    listener.wait(lambda: infos)
+    camera = Camera(640, 480, 7800.0, 7801.0, 320.5, 239.5, (0.1, -0.2, 1e-4, 2e-4, 0.0))
+    other_size = Camera.from_focal(320, 240, 7800.0)
+    crooked = camera_to_message(camera, "")
+    crooked.k[0] = math.nan
+    for wrong, sentence in ((camera_to_message(other_size, ""), "320 x 240"), (crooked, "NaN")):
+        answer = listener.call(
+            SetCameraInfo, "camera/set_camera_info", SetCameraInfo.Request(camera_info=wrong)
+        )
+        assert not answer.success and sentence in answer.status_message
+    assert not path.exists()
+    request = SetCameraInfo.Request(camera_info=camera_to_message(camera, ""))
+    answer = listener.call(SetCameraInfo, "camera/set_camera_info", request)
+    assert answer.success and str(path) in answer.status_message
+    listener.wait(lambda: message_to_camera(infos[-1]) == camera)
+    assert calibration.read(path) == camera
+    assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
+    status, out = node.end(signal.SIGINT)
+    assert status == 0 and "there is no calibration yet" in out
+
+    infos = listener.hear(CameraInfo, "camera/camera_info")
+    node = start("camera", *options)
+    listener.wait(lambda: infos)
+    assert message_to_camera(infos[0]) == camera
+    assert node.end(signal.SIGINT)[0] == 0
+
+
+def test_a_calibration_that_cannot_be_written_holds_for_the_session(start, listener, tmp_path):
+    (tmp_path / "file").write_text("")
+    _, infos, _ = hear_all(listener)
+    node = start("camera", *SMALL, "cadence:=0.5", f"calibration_url:={tmp_path}/file/camera.yaml")
+    camera = Camera.from_focal(640, 480, 1234.0)
+    request = SetCameraInfo.Request(camera_info=camera_to_message(camera, ""))
+    answer = listener.call(SetCameraInfo, "camera/set_camera_info", request)
+    assert not answer.success and "cannot be written" in answer.status_message
+    listener.wait(lambda: infos and message_to_camera(infos[-1]) == camera)
+    assert node.end(signal.SIGINT)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ((), "files.path must name a folder"),
+        (("source:=webcam",), "source must be one of files, simulated"),
+        (("source:=simulated", "exposure:=6"), "must not be longer than `cadence`"),
+        (("source:=simulated", "simulated.latitude:=91"), "from -90 to 90 deg"),
+        (("source:=simulated", "calibration_url:=http://x/y.yaml"), "file:///"),
+        (("source:=simulated", "calibration_url:=/etc/hostname"), "calibration file"),
+        (("files.path:=/x", "exposure:=1.0"), "own exposure"),
+    ],
+)
+def test_bad_parameters_end_with_one_line(start, options, sentence):
+    status, out = start("camera", *options).end()
+    assert status == 1
+    assert sentence in out and len(out.splitlines()) == 1
+
+
+def test_unset_parameters_are_nan_in_ros_too(start, listener):
+    node = start("camera", *SMALL)
+    assert listener.set("camera", exposure=1.0).successful
+    assert listener.set("camera", exposure=math.nan).successful
+    assert not listener.set("camera", exposure=math.inf).successful
+    assert node.end(signal.SIGTERM)[0] == 0

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `detector` as a process of its own."""
+
+import math
+import signal
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image
+from starpos.detection import detect
+from starpos.frame import Frame
+from starpos_common.messages import frame_to_message, message_to_stars
+
+from starpos_interfaces.msg import Capture, StarArray
+
+OK, WARN = 0, 1
+
+
+class Feed:
+    """A camera that shows the detector what a test gives it, and the stars that come back."""
+
+    def __init__(self, listener, start, *parameters):
+        self.listener = listener
+        self.stars = listener.hear(StarArray, "stars")
+        node = listener.node
+        self.images = node.create_publisher(Image, "camera/image_raw", QoSProfile(depth=100))
+        self.captures = node.create_publisher(Capture, "camera/capture", 10)
+        self.process = start("detector", *parameters)
+        listener.wait(
+            lambda: (
+                self.images.get_subscription_count()
+                and self.captures.get_subscription_count()
+                and node.count_publishers("stars")
+            )
+        )
+        self.stamp = 0
+
+    def message(self, frame):
+        message = frame_to_message(frame, "optical")
+        self.stamp += 1
+        message.header.stamp.sec, message.header.stamp.nanosec = 1793642400 + self.stamp, 123456789
+        return message
+
+    def show(self, frame):
+        """Stars of a frame."""
+        message = self.message(frame)
+        self.images.publish(message)
+        return self.wait_for(message)
+
+    def wait_for(self, message):
+        self.listener.wait(lambda: any(s.header == message.header for s in self.stars))
+        return next(s for s in self.stars if s.header == message.header)
+
+
+@pytest.fixture
+def feed(listener, start):
+    return Feed(listener, start)
+
+
+def test_stars_are_those_of_starpos_under_the_header_of_the_image(feed, frame):
+    message = feed.message(frame)
+    feed.captures.publish(Capture(header=message.header, exposure=0.75, stamp_stddev=0.003))
+    feed.images.publish(message)
+    got = feed.wait_for(message)
+    assert (got.width, got.height, got.exposure, got.stamp_stddev) == (640, 480, 0.75, 0.003)
+    want = detect(frame).stars
+    stars = message_to_stars(got)
+    assert len(want) >= 10
+    for name in ("x", "y", "flags", "covariance"):
+        np.testing.assert_array_equal(getattr(stars, name), getattr(want, name))
+    np.testing.assert_allclose(stars.flux, want.flux, rtol=1e-6)
+    state = feed.listener.wait_for_state("detector: Stars", OK, f"{len(want)} stars in")
+    assert state["stars"] == str(len(want)) and float(state["cpu_ms"]) > 0
+    assert 1 < float(state["fwhm (px)"]) < 5 and float(state["background (DN)"]) > 500
+    assert feed.process.end(signal.SIGINT, signal.SIGINT)[0] == 0
+
+
+def bad(**changes):
+    def spoil(message):
+        for name, value in changes.items():
+            if name == "stamp":
+                message.header.stamp.sec, message.header.stamp.nanosec = value
+            else:
+                setattr(message, name, value)
+        return message
+
+    return spoil
+
+
+def test_bad_images_are_said_and_the_next_good_one_gives_stars(feed, frame):
+    cases = (
+        (bad(encoding="yuv422"), "'yuv422' is unknown"),
+        (bad(data=b"\x00" * 1000), "truncated"),
+        (bad(width=0, height=0, step=0, data=b""), "0 x 0"),
+        (bad(step=10), "step is 10"),
+        (bad(height=2**31), "truncated"),
+        (bad(stamp=(0, 0)), "no time stamp"),
+        (bad(stamp=(-5, 0)), "no time after 1970"),
+        (bad(stamp=(1793642400, 4_000_000_000)), "no time after 1970"),
+    )
+    for count, (spoil, sentence) in enumerate(cases, 1):
+        feed.images.publish(spoil(feed.message(frame)))
+        state = feed.listener.wait_for_state("detector: Stars", WARN, sentence)
+        assert state["bad frames"] == str(count)
+    assert not feed.stars
+    assert feed.show(frame).stars
+    feed.listener.wait_for_state("detector: Stars", OK, "stars in")
+    status, out = feed.process.end(signal.SIGTERM)
+    assert status == 0 and "Traceback" not in out
+    assert 1 <= len(out.splitlines()) <= len(cases) + 1
+
+
+@pytest.mark.parametrize("value", [0, 1000, 65535])
+def test_frames_without_stars_give_none(feed, value):
+    got = feed.show(Frame(np.full((480, 640), value, np.uint16)))
+    assert (got.width, got.height, len(got.stars)) == (640, 480, 0)
+    feed.listener.wait_for_state("detector: Stars", OK, "no stars")
+    assert feed.show(Frame(np.full((1, 1), value, np.uint16))).width == 1
+
+
+def test_every_encoding_gives_the_same_places(feed, frame):
+    want = message_to_stars(feed.show(frame))
+    bright = slice(0, 5)
+    swapped = feed.message(frame)
+    swapped.is_bigendian = 1
+    swapped.data = frame.pixels.byteswap().tobytes()
+    feed.images.publish(swapped)
+    assert feed.wait_for(swapped).stars == feed.wait_for(feed_again(feed, frame)).stars
+    grey = np.clip((frame.pixels.astype(float) - 400) / 8, 0, 255).astype(np.uint8)
+    for other in (Frame(grey), Frame(np.dstack([grey] * 3)), Frame(frame.pixels, "rggb")):
+        got = message_to_stars(feed.show(other))
+        away = np.hypot(want.x[bright, None] - got.x, want.y[bright, None] - got.y).min(1)
+        assert away.max() < 0.3
+
+
+def feed_again(feed, frame):
+    message = feed.message(frame)
+    feed.images.publish(message)
+    return message
+
+
+def test_exposure_is_the_parameter_where_no_capture_says_it(listener, start, frame):
+    feed = Feed(listener, start, "exposure:=0.4")
+    assert feed.show(frame).exposure == 0.4
+    message = feed.message(frame)
+    feed.captures.publish(Capture(header=message.header, exposure=math.nan, stamp_stddev=math.nan))
+    feed.images.publish(message)
+    got = feed.wait_for(message)
+    assert (got.exposure, got.stamp_stddev) == (0.4, 0.0)
+
+
+def test_parameters_apply_at_run_time(feed, frame):
+    everything = len(feed.show(frame).stars)
+    assert feed.listener.set("detector", max_stars=3).successful
+    assert len(feed.show(frame).stars) <= 3
+    assert feed.listener.set("detector", max_stars=10000, min_snr=100.0).successful
+    assert len(feed.show(frame).stars) < everything
+    assert feed.listener.set("detector", saturation=2000.0, min_snr=6.5).successful
+    assert feed.show(frame).stars[0].flags & 1
+    refusal = feed.listener.set("detector", threshold=1.0)
+    assert not refusal.successful and "3.0" in refusal.reason
+    assert not feed.listener.set("detector", saturation=-1.0).successful
+
+
+def test_newest_frame_wins_and_the_others_are_counted(feed, frame):
+    feed.show(frame)
+    sent = [feed.message(frame) for _ in range(40)]
+    for message in sent:
+        feed.images.publish(message)
+    feed.wait_for(sent[-1])
+    state = feed.listener.wait_for_state("detector: Stars", OK, "stars in")
+    assert int(state["dropped"]) > 0
+    assert int(state["frames"]) + int(state["dropped"]) == 1 + len(sent)
+
+
+@pytest.mark.parametrize("parameter", ["threshold:=2", "min_snr:=.nan", "max_stars:=0", "exposure:=-1.0"])
+def test_bad_parameters_end_with_one_line(start, parameter):
+    status, out = start("detector", parameter).end()
+    assert status == 1
+    assert parameter.split(":")[0] in out and len(out.splitlines()) == 1

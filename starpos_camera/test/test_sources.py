@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame sources by themselves."""
+
+import cv2
+import numpy as np
+import pytest
+from starpos.catalogue import load as load_catalogue
+from starpos.detection import detect
+from starpos.errors import FrameError
+from starpos.simulate import expose
+from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.sources import Settings, SourceEnded, source_class
+
+from starpos_interfaces.msg import Capture
+
+NOW_S = 1793642400.0
+SETTINGS = Settings(None, None, 5.0)
+
+
+def values(**changes):
+    table = {p.name: p.default for p in PARAMETERS}
+    return table | {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def make(**changes):
+    v = values(**changes)
+    assert source_class(v["source"]).refusal(v, SETTINGS) is None
+    return source_class(v["source"])(v, lambda: NOW_S)
+
+
+def play(source, count):
+    """What each of `count` calls gave: the file's name and its time, or the error."""
+    out = []
+    for _ in range(count):
+        try:
+            out.append(source.capture(SETTINGS))
+        except (FrameError, SourceEnded) as error:
+            out.append(error)
+    return out
+
+
+def test_files_in_order_with_a_truncated_one_between(folder):
+    first, broken, last, end, still_ended = play(make(files__path=str(folder)), 5)
+    assert (first.frame.mid_unix_s, last.frame.mid_unix_s) == (NOW_S + 0.25, NOW_S + 10.25)
+    assert first.stamp_source == Capture.FILE and first.frame.exposure_s == 0.5
+    assert isinstance(broken, FrameError) and "1.fits" in str(broken)
+    assert isinstance(end, SourceEnded) and isinstance(still_ended, SourceEnded)
+
+
+def test_files_loop_passes_over_what_was_bad_and_finds_what_is_new(folder):
+    source = make(files__path=str(folder), files__loop=True)
+    play(source, 3)
+    (folder / "3.fits").write_bytes((folder / "0.fits").read_bytes())
+    names = [e.frame.source.rsplit("/", 1)[1] for e in play(source, 4)]
+    assert names == ["0.fits", "2.fits", "3.fits", "0.fits"]
+
+
+def test_files_by_pattern(folder):
+    (only,) = play(make(files__path=str(folder / "2*")), 1)
+    assert only.frame.source.endswith("2.fits")
+
+
+def test_frames_without_a_time_are_refused_or_stamped(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((48, 64), 7, np.uint16))
+    refused, ended = play(make(files__path=str(tmp_path)), 2)
+    assert "a.png" in str(refused) and "files.restamp" in str(refused)
+    assert isinstance(ended, SourceEnded)
+    (stamped,) = play(make(files__path=str(tmp_path), files__restamp=True), 1)
+    assert (stamped.frame.mid_unix_s, stamped.stamp_source) == (NOW_S, Capture.DRIVER)
+
+
+def test_restamped_frames_have_just_ended(folder):
+    (stamped,) = play(make(files__path=str(folder), files__restamp=True), 1)
+    assert stamped.frame.mid_unix_s == NOW_S - 0.25
+
+
+def test_a_folder_may_come_later_and_one_without_frames_is_said(tmp_path, folder):
+    source = make(files__path=str(tmp_path / "later"))
+    (error,) = play(source, 1)
+    assert "no frames here" in str(error)
+    (tmp_path / "later").mkdir()
+    (tmp_path / "later" / "a.fits").write_bytes((folder / "0.fits").read_bytes())
+    (exposure,) = play(source, 1)
+    assert exposure.frame.width == 640
+
+
+def test_a_loop_of_nothing_but_bad_files_says_so(tmp_path):
+    (tmp_path / "a.fits").write_bytes(b"no FITS")
+    source = make(files__path=str(tmp_path), files__loop=True)
+    assert [("none of its 1 files" in str(e)) for e in play(source, 3)] == [False, True, True]
+
+
+def test_files_refuse_what_they_cannot_do():
+    files = source_class("files")
+    assert "files.path" in files.refusal(values(), SETTINGS)
+    given = values(files__path="/x")
+    assert files.refusal(given, SETTINGS) is None
+    assert "`exposure`" in files.refusal(given, Settings(0.5, None, 5.0))
+    assert "`gain`" in files.refusal(given, Settings(None, 3.0, 5.0))
+
+
+SMALL = {"source": "simulated", "focal_mm": 50.0, "simulated__width": 640, "simulated__height": 480}
+
+
+def test_simulated_stars_are_where_starpos_says(scene):
+    exposure = make(**SMALL).capture(SETTINGS)
+    frame = exposure.frame
+    assert frame.mid_unix_s == NOW_S - 0.25 and frame.exposure_s == 0.5
+    assert exposure.stamp_source == Capture.SIMULATED and exposure.camera == scene.camera
+    truth = expose(scene, load_catalogue(), NOW_S - 0.5, 0.5, np.random.default_rng(9)).middle
+    stars = detect(frame).stars
+    assert len(stars) >= 10
+    away = np.hypot(stars.x[:10, None] - truth[:, 0], stars.y[:10, None] - truth[:, 1]).min(1)
+    assert away.max() < 0.3
+
+
+def test_simulated_sky_follows_its_parameters(scene):
+    source = make(**SMALL)
+    before = source.capture(SETTINGS).frame
+    source.update(values(**SMALL, simulated__azimuth=130.0))
+    after = source.capture(Settings(1.0, None, 5.0)).frame
+    assert after.exposure_s == 1.0
+    assert abs(before.pixels.astype(int) - after.pixels).max() > 1000
+    with pytest.raises(AssertionError):
+        np.testing.assert_array_equal(before.pixels, source.capture(SETTINGS).frame.pixels)
+
+
+@pytest.mark.parametrize(
+    ("settings", "changes", "sentence"),
+    [
+        (Settings(11.0, None, 60.0), {}, "at most 10 s"),
+        (Settings(2.0, None, 1.0), {}, "longer than `cadence`"),
+        (Settings(None, None, 0.1), {}, "longer than `cadence`"),
+        (Settings(None, 1.0, 5.0), {}, "gain"),
+        (SETTINGS, {"simulated__width": 20000, "simulated__height": 20000}, "at most 100000000 px"),
+    ],
+)
+def test_simulated_sky_refuses_what_it_cannot_do(settings, changes, sentence):
+    given = values(**(SMALL | changes))
+    assert sentence in source_class("simulated").refusal(given, settings)
