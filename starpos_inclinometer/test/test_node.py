@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import rclpy
@@ -15,6 +16,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from starpos_inclinometer.emulator import Mcu
+from starpos_inclinometer.node import PARAMETERS
 
 from starpos_inclinometer import sensor
 from starpos_interfaces.msg import Tilt
@@ -195,6 +197,11 @@ def test_bad_parameter_ends_with_one_line(start, parameter, sentence):
     status, out = start(parameter).end()
     assert status == 1
     assert sentence in out and len(out.splitlines()) == 1
+
+
+def test_readme_names_every_parameter():
+    readme = (Path(__file__).parent.parent / "README.md").read_text()
+    assert [p.name for p in PARAMETERS if f"| `{p.name}` |" not in readme] == []
 
 
 def test_flags_are_those_of_the_message():

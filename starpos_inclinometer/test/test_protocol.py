@@ -74,6 +74,13 @@ def test_resynchronises_after_garbage_and_counts_it():
     assert parser.counts == protocol.Counts(good=2, lost=1, garbage_bytes=2 * len(garbage) + 20)
 
 
+def test_a_stray_start_does_not_cost_the_line_after_it():
+    line = lines(1)[0]
+    parser = Parser()
+    assert parser.feed(b"$" + b"x" * 30 + line[:30]) == []
+    assert len(parser.feed(line[30:])) == 1
+
+
 def test_memory_stays_bounded_whatever_comes():
     parser = Parser()
     for chunk in (b"$" * 10_000, b"$" + b"A" * 10_000, b"x" * 10_000, b"$T,"):
