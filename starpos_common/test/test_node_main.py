@@ -33,7 +33,7 @@ sys.exit(run(make_node))
 
 @pytest.fixture(scope="module", autouse=True)
 def domain():
-    os.environ["ROS_DOMAIN_ID"] = str(100 + os.getpid() % 100)
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 

@@ -31,7 +31,7 @@ WAIT_S = 20.0
 
 @pytest.fixture(scope="module", autouse=True)
 def domain():
-    os.environ["ROS_DOMAIN_ID"] = str(100 + os.getpid() % 100)
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
