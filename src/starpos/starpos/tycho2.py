@@ -70,7 +70,10 @@ def _originals(source: Path) -> Iterator[tuple[str, bytes]]:
                 if Path(member.name).name in wanted and member.isfile():
                     yield Path(member.name).name, archive.extractfile(member).read()
     except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as e:
-        raise CatalogueError(f"{source}: not a folder or archive of Tycho-2's original files ({e})") from None
+        reason = str(e).partition("\n")[0]
+        raise CatalogueError(
+            f"{source}: not a folder or archive of Tycho-2's original files ({reason})"
+        ) from None
 
 
 def _read(text: bytes, columns: dict, record_bytes: int, name: str) -> dict[str, np.ndarray]:
@@ -85,7 +88,12 @@ def _read(text: bytes, columns: dict, record_bytes: int, name: str) -> dict[str,
         }
     )
     rows = np.frombuffer(text, layout)
-    return {c: rows[c] if c in ("pflag", "flag") else _numbers(rows[c]) for c in columns}
+    try:
+        return {c: rows[c] if c in ("pflag", "flag") else _numbers(rows[c]) for c in columns}
+    except ValueError as e:
+        raise CatalogueError(
+            f"{name}: a column of numbers holds something else ({e}): get the file again"
+        ) from None
 
 
 def _numbers(column: np.ndarray) -> np.ndarray:

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalogue's build, on records written here byte by byte as the ReadMe of CDS I/259 lays them out."""
+
+import tarfile
+
+import numpy as np
+import pytest
+from starpos.catalogue import MAS
+from starpos.errors import CatalogueError
+from starpos.tycho2 import build, johnson_v
+
+
+def record(size, **fields):
+    """One line of `size` bytes and a newline; each field is (first byte from 1, text)."""
+    line = bytearray(b" " * size)
+    for first, text in fields.values():
+        line[first - 1 : first - 1 + len(text)] = text.encode()
+    return bytes(line) + b"\n"
+
+
+def main(
+    tyc,
+    ra=None,
+    dec=None,
+    pm=(0.0, 0.0),
+    pflag=" ",
+    bt="",
+    vt="",
+    hip="",
+    observed=(10.0, 20.0),
+):
+    """A record of tyc2.dat; ra None: neither mean place nor motion, as pflag X has it."""
+    mean = {} if ra is None else {
+        "ra": (16, f"{ra:12.8f}"), "dec": (29, f"{dec:12.8f}"), "pmra": (42, f"{pm[0]:7.1f}"),
+        "pmde": (50, f"{pm[1]:7.1f}"), "e_ra": (58, " 10"), "e_dec": (62, " 12"), "e_pmra": (66, " 1.5"),
+        "e_pmde": (71, " 2.5"), "ep_ra": (76, "1980.00"), "ep_dec": (84, "1982.00"),
+    }  # fmt: skip
+    one, two, three = tyc
+    return record(
+        206, tyc1=(1, f"{one:04d}"), tyc2=(6, f"{two:05d}"), tyc3=(12, str(three)), pflag=(14, pflag), **mean,
+        bt=(111, f"{bt:>6}"), vt=(124, f"{vt:>6}"), hip=(143, f"{hip:>6}"), ra_o=(153, f"{observed[0]:12.8f}"),
+        dec_o=(166, f"{observed[1]:12.8f}"), ep_o=(179, "1.50"), ep_od=(184, "1.60"), e_rao=(189, " 60.0"),
+        e_deo=(195, " 80.0"),
+    )  # fmt: skip
+
+
+def supplement(tyc, flag, ra, dec, pm=None, bt="", vt="", hip=""):
+    moving = {} if pm is None else {
+        "pmra": (42, f"{pm[0]:7.1f}"), "pmde": (50, f"{pm[1]:7.1f}"), "e_pmra": (70, "  0.6"), "e_pmde": (76, "  0.8"),
+    }  # fmt: skip
+    one, two, three = tyc
+    return record(
+        122, tyc1=(1, f"{one:04d}"), tyc2=(6, f"{two:05d}"), tyc3=(12, str(three)), flag=(14, flag),
+        ra=(16, f"{ra:012.8f}"), dec=(29, f"{dec:+012.8f}"), **moving, e_ra=(58, "  3.0"), e_dec=(64, "  4.0"),
+        bt=(84, f"{bt:>6}"), vt=(97, f"{vt:>6}"), hip=(116, f"{hip:>6}"),
+    )  # fmt: skip
+
+
+FAINT = main((1, 1, 1), 1.0, 1.0, vt="14.000", bt="14.500")
+STARS = {
+    "tyc2.dat.00": main((1, 13, 1), 1.12558209, 2.26739400, (27.7, -0.5), bt="10.488", vt=" 8.670", hip="70")
+    + main((1, 14, 1), 1.5, 2.5, bt=" 8.000")  # VT never measured
+    + main((1, 15, 1), 1.6, 2.5, vt=" 8.000")  # BT never measured
+    + main((1, 16, 1), pflag="X", vt=" 7.000", bt=" 7.700", observed=(200.0, -30.0))
+    + FAINT,
+    "tyc2.dat.05": main((2682, 3566, 1), 300.87249478, 36.02500143, pflag="P", bt=" 7.201", vt=" 7.088", hip="98753")
+    + main((2682, 3566, 2), 300.87249478, 36.02500143, pflag="P", bt=" 7.880", vt=" 7.732", hip="98753"),
+    "suppl_1.dat": supplement((5949, 2777, 1), "H", 101.28854105, -16.71314306, (-546.0, -1223.1), vt="-1.088", hip=32349)
+    + supplement((2, 580, 1), "T", 3.03708871, 1.57351477, bt=" 8.688", vt=" 8.171"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def originals(tmp_path):
+    folder = tmp_path / "originals"
+    (folder / "data").mkdir(parents=True)
+    for name in [f"tyc2.dat.{i:02d}" for i in range(20)] + ["suppl_1.dat"]:
+        (folder / "data" / name).write_bytes(STARS.get(name, FAINT))
+    (folder / "ReadMe").write_text("not a table")
+    return folder
+
+
+@pytest.fixture
+def built(originals):
+    return build(originals, 11.0)
+
+
+def star(catalogue, *tyc):
+    found = np.flatnonzero((catalogue.tyc == tyc).all(1))
+    assert len(found) == 1
+    return found
+
+
+def place(catalogue, index):
+    return catalogue.ra_mas[index[0]] / 3.6e6, catalogue.dec_mas[index[0]] / 3.6e6
+
+
+def test_a_normal_star(built):
+    i = star(built, 1, 13, 1)
+    assert place(built, i) == pytest.approx((1.12558209, 2.26739400), abs=2e-7)
+    assert (built.pm_ra[i], built.pm_dec[i], built.hip[i]) == (28, 0, 70)  # -0.5 rounds to the even
+    assert built.vmag(i)[0] == pytest.approx(8.670 - 0.09 * (10.488 - 8.670), abs=0.006)
+    # sigma: rms of both axes, grown from the mean epoch 1981; stored rounded up
+    at_epoch, later = built.sigma(i, 1981.0)[0], built.sigma(i, 2026.0)[0]
+    assert at_epoch == pytest.approx(np.hypot(10, 12) / 2**0.5 * MAS, abs=2 * MAS)
+    assert later == pytest.approx(np.hypot(at_epoch, 45 * np.hypot(1.5, 2.5) / 2**0.5 * MAS), rel=0.1)
+
+
+def test_a_missing_magnitude_takes_the_middling_colour(built):
+    """BT - VT = 0.7, so V = VT - 0.063."""
+    assert built.vmag(star(built, 1, 15, 1))[0] == pytest.approx(8 - 0.063, abs=0.006)
+    assert built.vmag(star(built, 1, 14, 1))[0] == pytest.approx(8 - 0.7 - 0.063, abs=0.006)
+    assert np.isnan(johnson_v(np.array([np.nan]), np.array([np.nan])))
+
+
+def test_a_star_without_mean_place_keeps_its_observed_one_with_a_growing_error(built):
+    i = star(built, 1, 16, 1)
+    assert place(built, i) == pytest.approx((200.0, -30.0), abs=2e-7)
+    assert (built.pm_ra[i], built.pm_dec[i]) == (0, 0)
+    assert built.sigma(i, 1991.5)[0] == pytest.approx(np.hypot(60, 80) / 2**0.5 * MAS, rel=0.1)
+    assert built.sigma(i, 2026.0)[0] > 500 * MAS
+
+
+def test_a_pair_with_one_photocentre_is_one_star_with_both_lights(built):
+    i = star(built, 2682, 3566, 1)
+    a, b = (vt - 0.09 * (bt - vt) for bt, vt in ((7.201, 7.088), (7.880, 7.732)))
+    assert built.vmag(i)[0] == pytest.approx(-2.5 * np.log10(10 ** (-0.4 * a) + 10 ** (-0.4 * b)), abs=0.006)
+    assert not (built.tyc == (2682, 3566, 2)).all(1).any()
+
+
+def test_supplement_stars_move_from_1991_25_to_2000(built):
+    i = star(built, 5949, 2777, 1)
+    # Hipparcos' own place of Sirius at J2000: 6 45 08.9173 -16 42 58.017
+    assert place(built, i) == pytest.approx(
+        (15 * (6 + 45 / 60 + 8.9173 / 3600), -(16 + 42 / 60 + 58.017 / 3600)), abs=1e-6
+    )
+    assert built.epoch_code[i] == 91
+    assert built.sigma(i, 2026.0)[0] == pytest.approx(np.hypot(5, 34.75 * 1.0) / 2**0.5 * MAS, rel=0.15)
+
+
+def test_a_supplement_star_without_motion(built):
+    i = star(built, 2, 580, 1)
+    assert (built.pm_ra[i], built.pm_dec[i]) == (0, 0)
+    assert built.sigma(i, 2026.0)[0] > 500 * MAS
+
+
+def test_the_limit_is_on_v(originals):
+    bright = build(originals, 7.5)
+    # 1-14-1 has V 7.24, 1-16-1 V 6.94, the pair V 6.60, Sirius
+    assert sorted(bright.tyc[:, 1].tolist()) == [14, 16, 2777, 3566]
+
+
+def test_from_an_archive_with_progress(originals, tmp_path):
+    archive = tmp_path / "tycho2_2.orig.tar.xz"
+    with tarfile.open(archive, "w:xz") as f:
+        f.add(originals, "tycho2-2")
+    seen = []
+    made = build(archive, 11.0, lambda what, done: seen.append(done))
+    assert len(made) == 7
+    assert len(seen) == 21
+    assert seen[-1] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["missing", "incomplete", "short record", "no archive", "truncated archive", "words", "empty file"],
+)
+def test_bad_originals_give_one_sentence(kind, originals, tmp_path):
+    data, source = originals / "data", originals
+    if kind == "missing":
+        source = tmp_path / "none"
+    elif kind == "incomplete":
+        (data / "tyc2.dat.07").unlink()
+    elif kind == "short record":
+        (data / "tyc2.dat.07").write_bytes(FAINT[:-10])
+    elif kind == "no archive":
+        source = tmp_path / "x.tar.xz"
+        source.write_bytes(b"nothing of the kind" * 99)
+    elif kind == "truncated archive":
+        source = tmp_path / "x.tar.xz"
+        with tarfile.open(source, "w:xz") as f:
+            f.add(originals, "tycho2-2")
+        source.write_bytes(source.read_bytes()[:-500])
+    elif kind == "words":
+        (data / "tyc2.dat.07").write_bytes(FAINT.replace(b"14.000", b"a word"))
+    elif kind == "empty file":
+        (data / "tyc2.dat.07").write_bytes(b"")
+    with pytest.raises(CatalogueError) as e:
+        build(source, 11.0)
+    assert "\n" not in str(e.value)
