@@ -5,6 +5,7 @@ The equation is the paper's (15), A2 A3 W = A4 A1 V, with refraction in L and th
 residuals are taken in pixels, where the errors of the stars live.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,8 @@ from starpos.inclinometer import Tilt, a2_matrix
 
 OUTLIER_SIGMA = 5.0
 MAX_ROUNDS = 6
+MAX_SCATTER = 0.003  # of the frame's diagonal: identified stars that scatter more are not these stars
+MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
 MIN_STARS = 3
 STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
 STEP_REFRACTION = 0.01
@@ -105,11 +108,13 @@ def solve_fix(
             raise FixError(f"only {int(keep.sum())} stars agree with each other: no fix from so few")
         total = covariance_px2 + catalogue_px2 + np.eye(2) * jitter2
         state = problem.refine(state, np.linalg.cholesky(np.linalg.inv(total)), keep)
-        residual = problem.residual(state)
-        jitter2_new = _extra_variance(residual[keep], (covariance_px2 + catalogue_px2)[keep])
-        total = covariance_px2 + catalogue_px2 + np.eye(2) * jitter2_new
-        distance2 = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(total), residual)
-        keep_new = distance2 < OUTLIER_SIGMA**2
+        residual, stated = problem.residual(state), covariance_px2 + catalogue_px2
+        # by the median, else an outlier among a dozen stars would widen the gate enough to pass itself
+        typical = _extra_variance(
+            residual[keep], stated[keep], lambda d2, share: np.median(d2) / MEDIAN_OF_CHI2 - share
+        )
+        keep_new = _distance2(residual, stated, typical) < OUTLIER_SIGMA**2
+        jitter2_new = _extra_variance(residual[keep], stated[keep], lambda d2, share: d2.mean() / 2 - share)
         settled = np.array_equal(keep, keep_new) and abs(jitter2_new - jitter2) <= 0.02 * (jitter2 + 1e-6)
         keep, jitter2 = keep_new, jitter2_new
         if settled:
@@ -118,22 +123,33 @@ def solve_fix(
         raise FixError(
             f"only {int(keep.sum())} of {len(xy)} identified stars agree on one attitude: no fix from them"
         )
+    if jitter2 > (MAX_SCATTER * np.hypot(camera.width, camera.height)) ** 2:
+        raise FixError(
+            f"the identified stars lie {np.sqrt(jitter2):.1f} px off the best attitude: check the camera's distortion"
+        )
     return _report(problem, state, keep, covariance_px2, catalogue_px2, jitter2, tilt, mounting, atmosphere, earth,
                    clock_stddev_s)  # fmt: skip
 
 
-def _extra_variance(residual: np.ndarray, covariance: np.ndarray) -> float:
-    """The isotropic variance (px2) that brings chi-square to its expectation; 0 where it is not above it."""
-    freedom = max(2 * len(residual) - 4, 1)
+def _distance2(residual: np.ndarray, covariance: np.ndarray, extra: float) -> np.ndarray:
+    """Squared residuals (N,) in units of their covariance and an extra isotropic variance (px2)."""
+    return np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance + np.eye(2) * extra), residual)
 
-    def excess(extra):
-        inverse = np.linalg.inv(covariance + np.eye(2) * extra)
-        return np.einsum("ni,nij,nj->", residual, inverse, residual) - freedom
 
-    if excess(0.0) <= 0:
+def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callable) -> float:
+    """The isotropic variance (px2) at which excess(squared distances, share of freedom) is 0; 0 where it never is above.
+
+    The share: of the stars' 2 N coordinates, those that the four parameters of the fit leave free.
+    """
+    share = max(1 - 2 / len(residual), 1 / len(residual))
+
+    def above(extra):
+        return excess(_distance2(residual, covariance, extra), share)
+
+    if above(0.0) <= 0:
         return 0.0
-    high = 2 * np.sum(residual**2) / freedom + 1e-12
-    return float(brentq(excess, 0.0, high, rtol=1e-3)) if excess(high) < 0 else float(high)
+    high = 8 * np.sum(residual**2) + 1e-12
+    return float(brentq(above, 0.0, high, rtol=1e-3)) if above(high) < 0 else float(high)
 
 
 @dataclass(frozen=True)

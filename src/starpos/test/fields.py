@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fields of identified stars as an instrument at a known place would see them, for the tests of fix and average."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
+from starpos.earth import EarthState, earth_state, station_velocity
+from starpos.fix import Fix, Mounting, solve_fix
+from starpos.inclinometer import Tilt
+from starpos.instrument import TOP_OF_FRAME
+from starpos.sky import Site, camera_to_enu
+
+from starpos import rotation
+
+ARCSEC = np.radians(1 / 3600)
+UTC = 1793642400.0  # 2026-11-02T18:00:00
+PAPER = Camera.from_focal(5616, 3744, 93750.0)
+NO_ERROR = np.zeros((2, 2))
+
+
+@dataclass(frozen=True)
+class Field:
+    """A camera somewhere, with `stars` stars spread over its frame; angles in deg."""
+
+    latitude: float = 35.7
+    longitude: float = 51.4
+    azimuth: float = 40.0
+    altitude: float = 78.0
+    roll: float = 15.0
+    misalignment: tuple = (0.0, 0.0, 0.0)
+    stars: int = 40
+    utc: float = UTC
+    camera: Camera = PAPER
+    air: Atmosphere = field(default_factory=lambda: Atmosphere(88000.0, 12.0, 0.3))
+
+    @property
+    def attitude(self) -> np.ndarray:
+        return camera_to_enu(self.azimuth, self.altitude, self.roll)
+
+    @property
+    def a3(self) -> np.ndarray:
+        rx, ry, rz = np.radians(self.misalignment)
+        return rotation.about_axis(2, rz) @ rotation.about_axis(1, ry) @ rotation.about_axis(0, rx)
+
+    @property
+    def heading(self) -> float:
+        """Azimuth in rad of the top of the frame, C's -y."""
+        up = -self.attitude[:, 1]
+        return float(np.arctan2(up[0], up[1]) % (2 * np.pi))
+
+    def tilt(self, covariance=NO_ERROR) -> Tilt:
+        up = self.a3 @ self.attitude[2]
+        return Tilt(*np.arcsin(up[:2]), covariance, self.utc)
+
+    def places(self, state: EarthState, rng) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (N, 2) of N stars without error and the ICRS directions (N, 3) that a catalogue would have of them."""
+        xy = rng.uniform(0, [self.camera.width - 1, self.camera.height - 1], (self.stars, 2))
+        site = Site(self.latitude, self.longitude, self.air)
+        wanted = self.camera.directions(*xy.T) @ self.attitude.T
+        itrs = self.air.refraction().unbend(wanted) @ site.enu
+        # any catalogue will do: the directions near these that the forward chain takes to the frame
+        icrs = (itrs @ state.cirs_to_itrs) @ np.asarray(state.astrom["bpn"]).reshape(3, 3)
+        v = state.to_itrs(icrs) + station_velocity(site.enu[2])
+        seen = self.air.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ site.enu.T)
+        return self.camera.project(seen @ self.attitude), icrs
+
+    def mounting(self, calibration=0.0) -> Mounting:
+        """Calibration errors in arcsec, 1 sigma a axis."""
+        return Mounting(self.a3, np.array(TOP_OF_FRAME), np.eye(3) * (calibration * ARCSEC) ** 2)
+
+    def solve(self, xy, places, state=None, **given) -> Fix:
+        """solve_fix with what this field knows, each part replaceable."""
+        n = len(xy)
+        parts = {
+            "covariance_px2": np.eye(2)[None].repeat(n, 0) * 0.05**2,
+            "place_sigma": np.full(n, 1e-9),
+            "camera": self.camera,
+            "tilt": self.tilt(),
+            "mounting": self.mounting(),
+            "atmosphere": self.air,
+            "earth": state or earth_state(self.utc),
+            "clock_stddev_s": 0.0,
+        }
+        return solve_fix(xy=xy, places=places, **parts | given)
+
+
+def random_field(rng, **fixed) -> Field:
+    """Any place on Earth, any heading, leaning up to 25 deg from the zenith, bent by up to 3 deg."""
+    drawn = {
+        "latitude": float(np.degrees(np.arcsin(rng.uniform(-1, 1)))),
+        "longitude": float(rng.uniform(-180, 180)),
+        "azimuth": float(rng.uniform(0, 360)),
+        "altitude": float(rng.uniform(65, 90)),
+        "roll": float(rng.uniform(-180, 180)),
+        "misalignment": tuple(rng.uniform(-3, 3, 3).tolist()),
+    }
+    return replace(Field(), **drawn | fixed)
+
+
+def turn(angle):
+    """An angle, or an array of them, in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
