@@ -110,7 +110,13 @@ def read(path) -> Instrument:
         if path.stat().st_size > SIZE_LIMIT:
             raise InstrumentError(f"{path}: over 1 MiB, no instrument file")
         content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        RecursionError,
+        yaml.YAMLError,
+    ) as e:  # what PyYAML is seen to raise
         raise InstrumentError(
             f"{path}: not a readable instrument file ({' '.join(str(e).split())[:120]})"
         ) from None
@@ -127,34 +133,52 @@ def read(path) -> Instrument:
 
 
 def _from_mapping(content: dict) -> Instrument:
-    known = {
+    known = (
         "camera",
         "misalignment_deg",
         "calibration_stddev_arcsec",
         "link_to_camera",
         "tilt_noise_deg",
         "clock_stddev_s",
-    }
-    if unknown := sorted(set(content) - known):
-        raise InstrumentError(f"unknown key {unknown[0]!r}: the keys are {', '.join(sorted(known))}")
-    camera = dict(content["camera"])
-    given = {}
+    )
+    _refuse_others(content, known)
+    camera, given = content["camera"], {}
     if "focal_mm" in camera:
+        _refuse_others(camera, ("focal_mm", "pixel_um"))
         focal_px = focal_px_of(float(camera["focal_mm"]), float(camera["pixel_um"]))
     else:
-        sizes = (int(camera["width"]), int(camera["height"]))
-        numbers = (float(camera[k]) for k in ("fx", "fy", "cx", "cy"))
+        axes = ("fx", "fy", "cx", "cy")
+        _refuse_others(camera, ("width", "height", *axes, "distortion"))
+        for side in ("width", "height"):
+            if not isinstance(camera[side], int):
+                raise InstrumentError(
+                    f"the camera's {side} is {camera[side]!r}: give a whole number of pixels"
+                )
         given["camera"] = Camera(
-            *sizes, *numbers, tuple(float(d) for d in camera.get("distortion", [0.0] * 5))
+            camera["width"],
+            camera["height"],
+            *(float(camera[k]) for k in axes),
+            _row(camera.get("distortion", [0.0] * 5)),
         )
         focal_px = given["camera"].fx
     for key in ("misalignment_deg", "calibration_stddev_arcsec"):
         if key in content:
-            given[key] = tuple(float(v) for v in content[key])
+            given[key] = _row(content[key])
     if "link_to_camera" in content:
-        given["link_to_camera"] = tuple(tuple(float(v) for v in row) for row in content["link_to_camera"])
+        given["link_to_camera"] = tuple(_row(row) for row in content["link_to_camera"])
     if "tilt_noise_deg" in content:
         given["tilt_noise_rad"] = float(np.radians(float(content["tilt_noise_deg"])))
     if "clock_stddev_s" in content:
         given["clock_stddev_s"] = float(content["clock_stddev_s"])
     return Instrument(focal_px, **given)
+
+
+def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
+    if unknown := [key for key in mapping if key not in known]:
+        raise InstrumentError(f"unknown key {unknown[0]!r}: the keys here are {', '.join(known)}")
+
+
+def _row(numbers: list) -> tuple[float, ...]:
+    if not isinstance(numbers, list):
+        raise InstrumentError(f"{numbers!r} stands where a list of numbers should")
+    return tuple(float(v) for v in numbers)  # float reads 1e-3 too, which YAML takes for text
