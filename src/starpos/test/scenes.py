@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated exposures of wide fields, whose triangles build fast: for the tests of solver and command line."""
+
+from dataclasses import replace
+
+import numpy as np
+from starpos.atmosphere import Atmosphere
+from starpos.inclinometer import Tilt
+from starpos.simulate import Optics, Scene, detected, expose, read_tilt, scene_of
+from starpos.solve import Solver
+from starpos.stars import Stars
+
+START = 1793642400.0  # 2026-11-02T18:00:00
+EXPOSURE = 0.5
+SIZE, FOCAL_PX = (1000, 700), 4636.0  # a diagonal of 15 deg, 44.5 arcsec a pixel
+AIR = Atmosphere(88000.0, 12.0, 0.3)
+
+
+def wide_scene(limit_mag=7.5, tilt_noise_deg=0.0035, **more) -> Scene:
+    """A 15 deg field of about 200 stars."""
+    given = {"size": SIZE, "focal_px": FOCAL_PX, "atmosphere": AIR, "tilt_noise_deg": tilt_noise_deg} | more
+    return replace(scene_of(**given), optics=Optics(limit_mag=limit_mag, fwhm_px=2.2, sky_mag_arcsec2=20.0))
+
+
+def stars_of(scene, catalogue, rng, start=START) -> Stars:
+    exposed = expose(scene, catalogue, start, EXPOSURE, rng)
+    return detected(scene, exposed, start + EXPOSURE / 2, EXPOSURE, rng)
+
+
+def tilt_of(scene, rng, start=START) -> Tilt:
+    """One reading, with the error it says."""
+    sigma = max(scene.tilt_errors.noise, np.radians(1e-6))
+    return Tilt(*read_tilt(scene, 0.0, rng), np.eye(2) * sigma**2, start + EXPOSURE / 2)
+
+
+def solver_of(scene, catalogue, **more) -> Solver:
+    return Solver(scene.instrument, catalogue, scene.site.atmosphere, **more)
+
+
+def with_false_stars(stars, xy, flux_factor=10.0) -> Stars:
+    """The list with stars at xy (N, 2) put before all others in brightness."""
+    n = len(xy)
+    return Stars(
+        np.r_[xy[:, 0], stars.x], np.r_[xy[:, 1], stars.y],
+        np.r_[np.linspace(2, 1, n) * flux_factor * max(stars.flux.max(initial=1.0), 1.0), stars.flux],
+        np.r_[np.full(n, 1000.0), stars.snr],
+        np.concatenate([np.eye(2)[None].repeat(n, 0) * 0.02**2, stars.covariance]),
+        np.r_[np.zeros(n, np.uint8), stars.flags], stars.width, stars.height, stars.mid_unix_s, stars.exposure_s,
+        stars.source,
+    )  # fmt: skip
+
+
+def random_stars(n, rng, width=SIZE[0], height=SIZE[1], mid_unix_s=START) -> Stars:
+    """Points that are nothing of the sky."""
+    x, y = rng.uniform(0, width - 1, n), rng.uniform(0, height - 1, n)
+    flux = np.sort(rng.exponential(1e4, n))[::-1]
+    covariance = np.eye(2)[None].repeat(n, 0) * 0.05**2
+    return Stars(
+        x, y, flux, np.full(n, 50.0), covariance, np.zeros(n), width, height, mid_unix_s, EXPOSURE, "random"
+    )

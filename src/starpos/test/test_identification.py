@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lost in space: simulated fields whose stars and pointing are known."""
+
+import numpy as np
+import pytest
+from scenes import FOCAL_PX, SIZE, random_stars
+from starpos.camera import Camera
+from starpos.identification import Sky, Status, identify
+
+from starpos import triangles
+
+ARCSEC = np.radians(1 / 3600)
+FIELDS = {
+    "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),
+    "4 deg": (Camera.from_focal(1404, 936, 23437.5), 9.5),  # the paper's field, pixels binned by four
+}
+
+
+def sky_for(catalogue, camera, **more):
+    return Sky(catalogue, triangles.cached(catalogue, camera.half_diagonal_rad), **more)
+
+
+def random_attitude(rng):
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.linalg.det(q)
+
+
+def seen(sky, camera, attitude, limit_mag, rng, sigma=0.05, missing=0.0):
+    """Pixels (N, 2), brightest first, and catalogue indices of the stars on a frame."""
+    index = sky.catalogue.cone(attitude[2], camera.half_diagonal_rad * 1.05, limit_mag)
+    xy = camera.project(sky.directions(index) @ attitude.T)
+    on = (
+        (xy >= 0).all(1)
+        & (xy <= [camera.width - 1, camera.height - 1]).all(1)
+        & (rng.random(len(xy)) >= missing)
+    )
+    return xy[on] + rng.normal(0, sigma, (on.sum(), 2)), index[on]
+
+
+def check(found, attitude, index, camera, sky, tolerance_px=0.3):
+    """The boresight is right, and each matched star is the one it was made from, or its neighbour within a pixel."""
+    assert found.status is Status.OK
+    apart = np.arccos(np.clip(found.attitude[2] @ attitude[2], -1, 1))
+    assert apart < tolerance_px / camera.fx
+    truth = index[found.star]
+    assert truth.min() >= 0
+    beside = np.linalg.norm(sky.directions(truth) - sky.directions(found.catalogue), axis=1)
+    assert beside.max() < 1 / camera.fx
+
+
+@pytest.mark.parametrize("size", FIELDS)
+@pytest.mark.parametrize("false_stars", [0, 1, 2])
+def test_fields_are_found_with_false_stars_brighter_than_all_others(size, false_stars, catalogue, rng):
+    camera, limit = FIELDS[size]
+    sky = sky_for(catalogue, camera)
+    found = 0
+    for _ in range(10):
+        attitude = random_attitude(rng)
+        xy, index = seen(sky, camera, attitude, limit, rng)
+        xy = np.concatenate([rng.uniform(0, [camera.width - 1, camera.height - 1], (false_stars, 2)), xy])
+        index = np.concatenate([np.full(false_stars, -1), index])
+        answer = identify(xy, np.full(len(xy), 0.05), camera, sky)
+        if answer.ok:
+            found += 1
+            check(answer, attitude, index, camera, sky)
+            assert answer.focal_scale == pytest.approx(1, abs=1e-3)
+            assert answer.residual_px == pytest.approx(0.05, abs=0.03)
+            assert not answer.mirrored
+    assert found >= 9
+
+
+def test_stars_missing_from_the_frame(catalogue, rng):
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    for _ in range(6):
+        attitude = random_attitude(rng)
+        xy, index = seen(sky, camera, attitude, limit, rng, sigma=0.2, missing=0.1)
+        check(identify(xy, np.full(len(xy), 0.2), camera, sky), attitude, index, camera, sky)
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.02])
+def test_a_focal_length_two_percent_off(factor, catalogue, rng):
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    for _ in range(4):
+        attitude = random_attitude(rng)
+        xy, index = seen(sky, camera.scaled(factor), attitude, limit, rng)
+        answer = identify(xy, np.full(len(xy), 0.05), camera, sky)
+        check(answer, attitude, index, camera, sky)
+        assert answer.focal_scale == pytest.approx(factor, rel=1e-3)
+
+
+def test_a_focal_length_a_third_off_is_not_found(catalogue, rng):
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    for _ in range(2):
+        xy, _ = seen(sky, camera.scaled(1.33), random_attitude(rng), limit, rng)
+        assert identify(xy, np.full(len(xy), 0.05), camera, sky).status is Status.NOT_IDENTIFIED
+
+
+def test_a_mirrored_frame_is_found_and_said(catalogue, rng):
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    attitude = random_attitude(rng)
+    xy, index = seen(sky, camera, attitude, limit, rng)
+    answer = identify(xy * [1, -1] + [0, camera.height - 1], np.full(len(xy), 0.05), camera, sky)
+    assert answer.mirrored
+    check(answer, attitude, index, camera, sky)
+
+
+def test_random_points_are_nothing(catalogue, rng):
+    camera, _ = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    for n in (4, 6, 12, 30, 200):
+        for _ in range(2):
+            s = random_stars(n, rng)
+            answer = identify(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky)
+            assert answer.status is Status.NOT_IDENTIFIED
+            assert len(answer.star) == len(answer.catalogue) == 0
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
+def test_too_few(n, catalogue, rng):
+    camera, _ = FIELDS["15 deg"]
+    answer = identify(rng.uniform(0, 600, (n, 2)), np.full(n, 0.05), camera, sky_for(catalogue, camera))
+    assert answer.status is Status.TOO_FEW_STARS
+    assert not answer.ok
+
+
+def test_aberration_of_the_date(catalogue, rng):
+    """20.5 arcsec of annual aberration, given to Sky, is not left in the boresight."""
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera, year=2026.8, velocity=(6e-5, -7e-5, -3e-5))
+    attitude = random_attitude(rng)
+    xy, index = seen(sky, camera, attitude, limit, rng)
+    check(identify(xy, np.full(len(xy), 0.05), camera, sky), attitude, index, camera, sky)
+    v = np.array([0.0, 0.6, 0.8])
+    bent = sky.catalogue.directions(np.array([5]), 2026.8)[0]
+    np.testing.assert_allclose(sky.unaberrated(sky.directions(np.array([5]))[0]), bent, atol=1e-8)
+    assert np.linalg.norm(sky.unaberrated(v)) == pytest.approx(1)
+
+
+DEGENERATE = {
+    "one place": lambda rng: np.full((30, 2), 300.0),
+    "a row": lambda rng: np.stack([np.arange(30) * 20.0, np.full(30, 300.0)], 1),
+    "a grid": lambda rng: np.stack(np.meshgrid(np.arange(6) * 100.0, np.arange(6) * 100.0), -1).reshape(
+        -1, 2
+    ),
+    "pairs": lambda rng: np.repeat(rng.uniform(0, 600, (15, 2)), 2, 0),
+    "a corner": lambda rng: rng.uniform(0, 1e-6, (20, 2)),
+    "outside": lambda rng: rng.uniform(1e5, 2e5, (20, 2)),
+}
+
+
+@pytest.mark.parametrize("kind", DEGENERATE)
+def test_degenerate_lists_raise_nothing(kind, catalogue, rng):
+    camera, _ = FIELDS["15 deg"]
+    xy = DEGENERATE[kind](rng)
+    answer = identify(xy, np.full(len(xy), 0.05), camera, sky_for(catalogue, camera))
+    assert answer.status is Status.NOT_IDENTIFIED

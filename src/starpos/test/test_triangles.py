@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from starpos.errors import CatalogueError
+
+from starpos import triangles
+
+WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
+
+
+@pytest.fixture(scope="module")
+def table(catalogue):
+    return triangles.cached(catalogue, WIDE)
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """An empty cache and nothing remembered from it, before and after."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    triangles._cached.cache_clear()
+    yield tmp_path / "cache" / "starpos"
+    triangles._cached.cache_clear()
+
+
+def unit(ra_deg, dec_deg):
+    ra, dec = np.radians([ra_deg, dec_deg])
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+def test_the_papers_triangle(catalogue):
+    """ERRATA: 2.27327, 0.634202, 0.234213 rad at HIP 99002, 98753 component A, 99145.
+
+    The catalogue has 98753's photocentre, 0.5 arcsec from A, so A is Tycho-2's own observed place of it (TYC 2682-3566-1,
+    epoch 1991.56) moved to J2000 by the pair's motion of (-10.7, -4.3) mas/yr.
+    """
+    first, last = (catalogue.directions(np.flatnonzero(catalogue.hip == hip))[0] for hip in (99002, 99145))
+    mas, years = 1 / 3.6e6, 2000 - 1991.56
+    a = unit(300.87250833 - 10.7 * years * mas / np.cos(np.radians(36.025)), 36.02515667 - 4.3 * years * mas)
+    assert triangles.angles(first, a, last) == pytest.approx([2.27327, 0.634202, 0.234213], abs=1.5e-5)
+    photocentre = catalogue.directions(np.flatnonzero(catalogue.hip == 98753))[0]
+    assert np.abs(triangles.angles(first, photocentre, last) - [2.27327, 0.634202, 0.234213]).max() > 1e-4
+
+
+def test_an_octant_has_three_right_angles():
+    x, y, z = np.eye(3)
+    assert triangles.angles(x, y, z) == pytest.approx([np.pi / 2] * 3, abs=1e-15)
+    assert triangles.sides(x, y) == pytest.approx(np.pi / 2)
+
+
+def test_angles_by_the_law_of_cosines_and_the_excess(rng):
+    """Equation 4 as the paper prints it; the sum exceeds pi by the area (Girard; L'Huilier by the triple product)."""
+    v = rng.normal(size=(500, 3, 3))
+    v /= np.linalg.norm(v, axis=2, keepdims=True)
+    angles = triangles.angles(*np.moveaxis(v, 1, 0))
+    a, b, c = (triangles.sides(v[:, i], v[:, j]) for i, j in ((1, 2), (0, 2), (0, 1)))
+    at_first = np.arccos((np.cos(a) - np.cos(b) * np.cos(c)) / (np.sin(b) * np.sin(c)))
+    np.testing.assert_allclose(angles[:, 0], at_first, atol=1e-7)
+    product = np.abs(np.einsum("ni,ni->n", v[:, 0], np.cross(v[:, 1], v[:, 2])))
+    area = 2 * np.arctan2(product, 1 + np.cos(a) + np.cos(b) + np.cos(c))
+    np.testing.assert_allclose(angles.sum(1) - np.pi, area % (2 * np.pi), atol=1e-9)
+
+
+def test_small_triangles_keep_their_digits():
+    """An arcsec-sized one: plane angles to nine digits, where the cosine formula would lose them all."""
+    s = np.radians(1 / 3600)
+    v = np.array([[0, 0, 1.0], [3 * s, 0, 1], [0, 4 * s, 1]])
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    assert triangles.angles(*v) == pytest.approx([np.pi / 2, np.arctan(4 / 3), np.arctan(3 / 4)], abs=1e-9)
+
+
+def test_degenerate_triangles_give_numbers():
+    x, y, _ = np.eye(3)
+    for v in ((x, x, x), (x, x, y), (x, y, (x + y) / 2**0.5)):
+        assert np.isfinite(triangles.angles(*v)).all()
+
+
+def test_near_is_what_brute_force_finds(table, rng):
+    pick = rng.integers(0, len(table.largest), 40)
+    largest = table.largest[pick] + rng.normal(0, 1e-3, 40)
+    smallest = table.smallest[pick] + rng.normal(0, 1e-3, 40)
+    largest[:4], smallest[:4] = (
+        (np.pi, np.pi / 3, 2.0, 3.2),
+        (0.0, np.pi / 3, 0.0, -0.01),
+    )  # the table's edges
+    tol_largest, tol_smallest = rng.uniform(1e-4, 5e-3, (2, 40))
+    query, found = table.near(largest, smallest, tol_largest, tol_smallest)
+    for q in range(40):
+        close = np.abs(table.largest - largest[q]) <= tol_largest[q]
+        close &= np.abs(table.smallest - smallest[q]) <= tol_smallest[q]
+        assert set(found[query == q].tolist()) == set(np.flatnonzero(close).tolist())
+    assert len(found) > 36
+
+
+def test_near_without_queries(table):
+    none = np.zeros(0)
+    query, found = table.near(none, none, none, none)
+    assert len(query) == len(found) == 0
+
+
+def test_triangles_are_those_of_their_corners(table, catalogue, rng):
+    pick = rng.integers(0, len(table.largest), 2000)
+    v = table.directions[table.corners[pick]]
+    np.testing.assert_array_equal(
+        v, catalogue.directions(table.star[table.corners[pick]].ravel()).reshape(v.shape)
+    )
+    angles = triangles.angles(*np.moveaxis(v, 1, 0))
+    assert np.all(np.diff(angles, axis=1) <= 1e-12)  # the largest's corner first, the smallest's last
+    np.testing.assert_allclose(table.largest[pick], angles[:, 0], atol=1e-6)
+    np.testing.assert_allclose(table.smallest[pick], angles[:, 2], atol=1e-6)
+    longest = max(triangles.sides(v[:, i], v[:, j]).max() for i, j in ((0, 1), (0, 2), (1, 2)))
+    assert longest < 2 * WIDE * 1.05
+
+
+def test_no_triangle_is_there_twice(table):
+    corners = np.sort(table.corners, axis=1)
+    assert len(np.unique(corners, axis=0)) == len(corners)
+
+
+def test_every_part_of_the_sky_has_enough(table, catalogue, rng):
+    """ERRATA: a limit of one magnitude leaves fields with fewer than three stars; here the table has stars everywhere,
+    and triangles among the brightest five of nearly every frame."""
+    v = table.directions[np.unique(table.corners)]
+    centres = rng.normal(size=(400, 3))
+    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
+    inscribed = np.cos(WIDE * 700 / 1221)  # of a 1000 x 700 frame
+    counts = (centres @ v.T >= inscribed).sum(1)
+    assert counts.min() >= 4
+    stars = np.sort(table.star[np.sort(table.corners, axis=1)], axis=1)
+    known = set(map(tuple, stars.tolist()))
+    hits = 0
+    for centre in centres:
+        brightest = np.sort(catalogue.cone(centre, WIDE * 700 / 1221)[:5])
+        hits += any(
+            (brightest[i], brightest[j], brightest[k]) in known
+            for i, j, k in ((0, 1, 2), (0, 1, 3), (1, 2, 3), (2, 3, 4), (0, 2, 4))
+        )
+    assert hits > 0.97 * len(centres)
+
+
+def test_it_is_built_once_then_mapped(own_cache, catalogue, monkeypatch):
+    built = []
+    table = triangles.cached(catalogue, WIDE, lambda what, done: built.append(done))
+    assert built[-1] == pytest.approx(1)
+    (folder,) = own_cache.iterdir()
+    triangles._cached.cache_clear()
+    monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built again"))
+    again = triangles.cached(catalogue, WIDE)
+    np.testing.assert_array_equal(again.corners, table.corners)
+    # a refined focal length does not build another
+    assert triangles.cached(catalogue, WIDE * 1.0001) is not None
+    assert [p.name for p in own_cache.iterdir()] == [folder.name]
+
+
+@pytest.mark.parametrize(
+    "damage", ["a column is missing", "a column is truncated", "a column is empty", "a column is text"]
+)
+def test_a_broken_cache_gives_a_sentence_or_is_built_anew(damage, own_cache, catalogue):
+    good = triangles.cached(catalogue, WIDE)
+    (folder,) = own_cache.iterdir()
+    column = folder / "corners.npy"
+    data = column.read_bytes()
+    triangles._cached.cache_clear()
+    column.unlink()
+    if damage != "a column is missing":
+        column.write_bytes(
+            {"a column is truncated": data[: len(data) // 2], "a column is empty": b""}.get(damage, b"text\n")
+        )
+    try:
+        again = triangles.cached(catalogue, WIDE)
+    except CatalogueError as e:
+        assert str(folder) in str(e)
+        assert "\n" not in str(e)
+    else:
+        np.testing.assert_array_equal(again.corners, good.corners)
+
+
+def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch, catalogue):
+    """Where the home is read-only (here: a file), either a sentence or a table kept in memory."""
+    (tmp_path / "cache").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    triangles._cached.cache_clear()
+    try:
+        assert len(triangles.cached(catalogue, WIDE).corners) > 1000
+    except CatalogueError as e:
+        assert "\n" not in str(e)
+        assert "XDG_CACHE_HOME" in str(e)
+    finally:
+        triangles._cached.cache_clear()
+
+
+def test_two_processes_at_once(own_cache):
+    program = (
+        "import numpy as np; from starpos import catalogue, triangles\n"
+        f"t = triangles.cached(catalogue.load(), {WIDE}); print(len(t.corners), int(t.corners.sum()))"
+    )
+    environment = os.environ | {"XDG_CACHE_HOME": str(own_cache.parent)}
+    running = [
+        subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [p.communicate(timeout=120)[0] for p in running]
+    assert [p.returncode for p in running] == [0, 0]
+    assert said[0] == said[1] != ""
+    assert len(list(own_cache.iterdir())) == 1  # nothing half made is left
