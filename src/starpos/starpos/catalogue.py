@@ -88,26 +88,30 @@ class Catalogue:
 
     def cone(self, centre, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Indices of the stars within radius_rad of the unit vector `centre` at J2000, brightest first."""
-        dec0, ra0 = np.arcsin(np.clip(centre[2], -1, 1)), np.arctan2(centre[1], centre[0]) % (2 * np.pi)
-        low, high = np.degrees([dec0 - radius_rad, dec0 + radius_rad])
-        zones = range(max(0, int(np.floor(low)) + 90), min(ZONES - 1, int(np.floor(high)) + 90) + 1)
-        if abs(dec0) + radius_rad >= np.pi / 2 - 1e-9:
-            half = np.pi
-        else:
-            half = np.arcsin(min(1.0, np.sin(radius_rad) / np.cos(dec0))) + 1e-9
-        spans = [(0.0, 2 * np.pi)] if half >= np.pi else _wrapped(ra0 - half, ra0 + half)
-        pieces = []
-        for z in zones:
-            first, last = self.zone_start[z], self.zone_start[z + 1]
-            ra = self.ra_mas[first:last]
-            for a, b in spans:
-                i, j = np.searchsorted(ra, (np.uint32(a / MAS), np.uint32(np.ceil(b / MAS))))
-                pieces.append(np.arange(first + i, first + j))
-        index = np.concatenate(pieces) if pieces else np.zeros(0, int)
+        index = rows_near(self.ra_mas, self.zone_start, centre, radius_rad)
         if np.isfinite(limit_mag):
             index = index[self.vmag_centi[index] < limit_mag * 100]
         index = index[self.directions(index) @ centre >= np.cos(radius_rad)]
         return index[np.argsort(self.vmag_centi[index], kind="stable")]
+
+
+def rows_near(ra_mas: np.ndarray, zone_start: np.ndarray, centre, radius_rad: float) -> np.ndarray:
+    """Rows of a table in zones (sorted by declination zone, then right ascension) that a cone may touch."""
+    dec0, ra0 = np.arcsin(np.clip(centre[2], -1, 1)), np.arctan2(centre[1], centre[0]) % (2 * np.pi)
+    low, high = np.degrees([dec0 - radius_rad, dec0 + radius_rad])
+    zones = range(max(0, int(np.floor(low)) + 90), min(ZONES - 1, int(np.floor(high)) + 90) + 1)
+    half = np.pi
+    if abs(dec0) + radius_rad < np.pi / 2 - 1e-9:
+        half = np.arcsin(min(1.0, np.sin(radius_rad) / np.cos(dec0))) + 1e-9
+    spans = [(0.0, 2 * np.pi)] if half >= np.pi else _wrapped(ra0 - half, ra0 + half)
+    edges = [(np.uint32(a / MAS), np.uint32(np.ceil(b / MAS))) for a, b in spans]
+    pieces = []
+    for z in zones:
+        first, last = zone_start[z], zone_start[z + 1]
+        for edge in edges:
+            i, j = ra_mas[first:last].searchsorted(edge)
+            pieces.append(np.arange(first + i, first + j))
+    return np.concatenate(pieces)
 
 
 def _wrapped(a: float, b: float) -> list[tuple[float, float]]:

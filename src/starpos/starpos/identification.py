@@ -12,6 +12,7 @@ from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from starpos import rotation
 from starpos.camera import Camera
@@ -19,20 +20,17 @@ from starpos.catalogue import Catalogue
 from starpos.triangles import TriangleCatalogue, angles, sides
 
 ACCEPT_LOG_ODDS = np.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
+WORTH_A_FIT = 3.0  # log-odds of a raw triangle below which it is not looked at again
 FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
 TEST_STARS = 50  # the brightest of a frame, which decide
+FAINTEST_FIT = 2000  # stars that take part in the last fit
 SCALE_TOLERANCE = 0.03  # of the focal length
-STAGES = (
-    (5, 0.35),
-    (7, 0.35),
-    (10, 0.35),
-    (14, 0.35),
-    (8, 2.5),
-    (12, 6.0),
-)  # (brightest stars, their error in px)
+# (brightest stars, their error in px): the second kind is for lenses that distort
+STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (8, 2.5), (12, 6.0))
+LOOSE_PX = 1.0  # above it a candidate must be supported by another
 TRIANGLE_SIGMA = 3.0
-MAX_VERIFIED = 60  # candidates a stage
-FAINTEST_FIT = 400  # stars
+MATCH_SIGMA = 3.5
+MAX_VERIFIED = 25  # candidates a stage
 
 
 class Status(str, Enum):
@@ -47,9 +45,9 @@ class Status(str, Enum):
 class Identification:
     """Matched stars and the attitude they give.
 
-    star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): ICRS into C (places as
-    given by `Sky`); focal_scale: factor on the camera's focal length; residual_px: rms of one axis; log_odds: of the
-    match against chance; mirrored: the frame's rows run bottom-up.
+    star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): `Sky`'s directions
+    into C; focal_scale: factor on the camera's focal length; residual_px: rms of one axis; log_odds: of the match
+    against chance; mirrored: the frame's rows run bottom-up, all of this holds for the frame flipped.
     """
 
     status: Status
@@ -84,7 +82,7 @@ class Sky:
     def directions(self, index: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3)."""
         v = self.catalogue.directions(index, self.year) + np.asarray(self.velocity)
-        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
 
     def unaberrated(self, v: np.ndarray) -> np.ndarray:
         """ICRS direction (3,) of one seen at v (3,)."""
@@ -102,8 +100,8 @@ def identify(xy: np.ndarray, sigma_px: np.ndarray, camera: Camera, sky: Sky) -> 
     search = _Search(xy, sigma_px, camera, sky)
     best = float("-inf")
     for stars, error_px in STAGES:
-        for hypothesis in search.candidates(min(stars, len(xy)), error_px):
-            match = search.verify(hypothesis, error_px)
+        for triangle in search.candidates(min(stars, len(xy)), error_px):
+            match = search.verify(triangle, error_px)
             best = max(best, match.log_odds)
             if match.log_odds > ACCEPT_LOG_ODDS + np.log(search.tried):
                 return search.finish(match)
@@ -111,21 +109,30 @@ def identify(xy: np.ndarray, sigma_px: np.ndarray, camera: Camera, sky: Sky) -> 
 
 
 @dataclass(frozen=True)
-class _Hypothesis:
-    attitude: np.ndarray  # Sky's directions into the camera
-    scale: float
+class _Pose:
+    """A pinhole camera among the stars: attitude (3, 3), Sky into C; focal length in px; rows bottom-up or not."""
+
+    attitude: np.ndarray
+    focal_px: float
     mirrored: bool
-    stars: tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class _Match:
-    attitude: np.ndarray
-    scale: float
-    mirrored: bool
+    pose: _Pose
     log_odds: float
     star: np.ndarray
     catalogue: np.ndarray
+    directions: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Triangle:
+    """Three stars (rows of the frame's) as three catalogue stars (rows of the triangle catalogue's)."""
+
+    star: np.ndarray
+    corner: np.ndarray
+    mirrored: bool
 
 
 @lru_cache(maxsize=32)
@@ -136,197 +143,225 @@ def _triples(n: int) -> np.ndarray:
 
 
 class _Search:
-    """The state of one frame's search: what was looked at is not looked at again."""
+    """One frame's search: pixels from the principal point, and what was looked at already."""
 
-    def __init__(self, xy, sigma_px, camera: Camera, sky: Sky):
-        self.xy, self.sigma, self.camera, self.sky = xy, sigma_px, camera, sky
-        self.flipped = np.stack([xy[:, 0], (camera.height - 1) - xy[:, 1]], -1)
-        self.v = camera.directions(xy[:, 0], xy[:, 1])
+    def __init__(self, xy: np.ndarray, sigma_px: np.ndarray, camera: Camera, sky: Sky):
+        self.camera, self.sky, self.sigma = camera, sky, sigma_px
+        centre = np.array([camera.cx, camera.cy])
+        self.xy = xy - centre
+        flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1) - centre
+        self.both = {False: self.xy, True: flipped}
+        self.middle = np.array(camera.centre_px) - centre
+        self.v = _directions(self.xy, camera.fx)
+        self.log_area = np.log(camera.width * camera.height)
         self.tried = 1
         self._done: dict[float, int] = {}
-        area = camera.width * camera.height
-        self.log_area = np.log(area)
 
     def candidates(self, stars: int, error_px: float):
-        """Hypotheses of triangles among the `stars` brightest that this error has not tried, best supported first."""
+        """Catalogue triangles for those of the `stars` brightest not yet tried at this error, best supported first."""
         done = self._done.get(error_px, 0)
         triples = _triples(stars)[done:]
         self._done[error_px] = done + len(triples)
-        if not len(triples):
+        seen = _Seen.of(self.v, self.sigma, triples, error_px / self.camera.fx)
+        if not len(seen.star):
             return
-        f = self.camera.fx
-        p = [self.v[triples[:, k]] for k in range(3)]
-        angle = angles(*p)
-        order = np.argsort(-angle, axis=1, kind="stable")
-        triples = np.take_along_axis(triples, order, 1)
-        angle = np.take_along_axis(angle, order, 1)
-        p = [self.v[triples[:, k]] for k in range(3)]
-        length = np.stack([sides(p[1], p[2]), sides(p[0], p[2]), sides(p[0], p[1])], -1)  # a >= b >= c
-        error = TRIANGLE_SIGMA * np.hypot(error_px, self.sigma[triples].max(1)) / f
-        a, b, c = np.maximum(length, 1e-9).T
-        tol_large = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
-        tol_small = error * np.sqrt(1 / a**2 + 1 / b**2 + (c / (a * b)) ** 2)
-        usable = (tol_small < 0.1) & (tol_large < 0.2)
-        rows = np.flatnonzero(usable)
-        # corners whose angles are equal within the error may stand in either order
-        swap_first = rows[(angle[rows, 0] - angle[rows, 1]) < 2 * tol_large[rows]]
-        swap_last = rows[(angle[rows, 1] - angle[rows, 2]) < 2 * tol_large[rows]]
-        variants = [triples[rows], triples[swap_first][:, [1, 0, 2]], triples[swap_last][:, [0, 2, 1]]]
-        source = np.concatenate([rows, swap_first, swap_last])
-        triples = np.concatenate(variants)
         tri = self.sky.triangles
-        query, found = tri.near(angle[source, 0], angle[source, 2], tol_large[source], tol_small[source])
-        corner = tri.corners[found]
-        star = triples[query]
-        w = tri.directions[corner]  # (M, 3, 3)
-        seen = self.v[star]
-        ratio = sides(w[:, 1], w[:, 2]) / np.maximum(sides(seen[:, 1], seen[:, 2]), 1e-9)
-        fits = np.abs(np.log(ratio)) < SCALE_TOLERANCE + error[source[query]] / a[source[query]]
-        star, corner, w, seen = star[fits], corner[fits], w[fits], seen[fits]
+        query, found = tri.near(seen.largest, seen.smallest, seen.tol_largest, seen.tol_smallest)
+        size = np.log(tri.longest[found] / seen.longest[query])
+        fits = np.abs(size) < SCALE_TOLERANCE + seen.error[query] / seen.longest[query]
+        size, star, corner = size[fits], seen.star[query[fits]], tri.corners[found[fits]]
+        self.tried += len(star)
         if not len(star):
             return
-        self.tried += len(star)
-        hand = np.sign(_triple_product(w)) * np.sign(_triple_product(seen))
-        support = _shared_sides(star, corner, hand)
-        best = np.lexsort((star.sum(1), -support))
-        if error_px > 1:
-            best = best[support[best] > 0]
-        for k in best[:MAX_VERIFIED].tolist():
-            yield self._hypothesis(star[k], corner[k], bool(hand[k] < 0))
+        mirrored = _handedness(tri.directions[corner]) != _handedness(self.v[star])
+        support = _shared_sides(star, corner, mirrored)
+        order = np.lexsort((np.abs(size), -support))
+        if error_px > LOOSE_PX:
+            order = order[support[order] > 0]
+        for k in order[:MAX_VERIFIED].tolist():
+            yield _Triangle(star[k], corner[k], bool(mirrored[k]))
 
-    def _hypothesis(self, star, corner, mirrored) -> _Hypothesis:
-        xy = (self.flipped if mirrored else self.xy)[star]
-        w = self.sky.directions(self.sky.triangles.star[corner])
-        scale = 1.0
-        for _ in range(2):  # the focal length that gives the triangle its size
-            v = self.camera.scaled(scale).directions(xy[:, 0], xy[:, 1])
-            seen = sides(v[1], v[2]) + sides(v[0], v[2]) + sides(v[0], v[1])
-            scale *= seen / (sides(w[1], w[2]) + sides(w[0], w[2]) + sides(w[0], w[1]))
-        v = self.camera.scaled(scale).directions(xy[:, 0], xy[:, 1])
-        return _Hypothesis(rotation.best_rotation(w, v), float(scale), mirrored, tuple(star.tolist()))
-
-    def verify(self, h: _Hypothesis, error_px: float) -> _Match:
-        """Log-odds of a hypothesis over the frame's other bright stars, improved by a fit to its matches."""
-        attitude, scale = h.attitude, h.scale
-        xy = self.flipped if h.mirrored else self.xy
-        test = np.arange(min(TEST_STARS, len(xy)))
-        index, w = self._in_field(attitude, scale, 2 * len(test) + 10)
-        if len(index) < 3:
-            return _Match(attitude, scale, h.mirrored, float("-inf"), test[:0], index[:0])
-        own = np.isin(test, h.stars)
-        reach = np.hypot(self.sigma[test], error_px)
+    def verify(self, t: _Triangle, error_px: float) -> _Match:
+        """Log-odds of a triangle over the frame's other bright stars; a promising one is fitted to its matches first."""
+        pose = self._pose_of(t)
+        xy = self.both[t.mirrored][:TEST_STARS]
+        sigma = np.hypot(self.sigma[: len(xy)], error_px)
+        tri = self.sky.triangles
+        rows = tri.cone(*self._cone(pose))[: 4 * len(xy) + 30]
+        index, w = self._on_frame(pose, tri.star[rows], 2 * len(xy) + 10)
         # a triangle's error grows with the distance from it
-        middle = xy[list(h.stars)].mean(0)
-        size = max(np.hypot(*(xy[list(h.stars)] - middle).T).mean(), 1.0)
-        grown = reach * np.sqrt(1 + (np.hypot(*(xy[test] - middle).T) / size) ** 2)
-        for sigma in (grown, np.minimum(reach, grown)):
-            predicted = self.camera.scaled(scale).project(w @ attitude.T)
-            apart = np.hypot(*(xy[test][:, None] - predicted[None]).transpose(2, 0, 1))
-            nearest = np.argmin(apart, axis=1)
-            distance = apart[np.arange(len(test)), nearest]
-            hit = distance < 3.5 * sigma
-            hit[own] = True
-            # one catalogue star answers one detection only: the nearer
-            order = np.lexsort((distance, nearest))
-            first = np.r_[True, np.diff(nearest[order]) != 0]
-            hit &= np.isin(np.arange(len(test)), order[first])
-            if hit.sum() < 3:
-                return _Match(attitude, scale, h.mirrored, float("-inf"), test[:0], index[:0])
-            attitude, scale = _fit(xy[test[hit]], w[nearest[hit]], attitude, scale, self.camera)
-        predicted = self.camera.scaled(scale).project(w @ attitude.T)
-        offset = xy[test] - predicted[nearest]
-        distance2 = np.sum(offset**2, 1)
-        variance = sigma**2
-        likelihood = (
-            (1 - FALSE_FRACTION)
-            / len(index)
-            * np.exp(self.log_area - 0.5 * distance2 / variance)
-            / (2 * np.pi * variance)
-        )
-        odds = np.log(FALSE_FRACTION + np.where(hit, likelihood, 0.0))
-        return _Match(attitude, scale, h.mirrored, float(odds[~own].sum()), test[hit], index[nearest[hit]])
+        corners = xy[t.star]
+        middle = corners.mean(0)
+        size2 = max(np.square(corners - middle).sum() / 3, 1.0)
+        grown = sigma * np.sqrt(1 + np.square(xy - middle).sum(1) / size2)
+        own = np.zeros(len(xy), bool)
+        own[t.star] = True
+        log_odds, hit, nearest = self._log_odds(xy, w, pose, grown, own)
+        if log_odds > WORTH_A_FIT:
+            pose = _fit(xy[hit], w[nearest[hit]], pose)
+            log_odds, hit, nearest = self._log_odds(xy, w, pose, sigma, own)
+        return _Match(pose, log_odds, np.flatnonzero(hit), index[nearest[hit]], w[nearest[hit]])
 
-    def _in_field(self, attitude, scale, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """The brightest catalogue stars on the frame: indices, directions."""
-        camera = self.camera.scaled(scale)
-        centre = camera.directions(*np.array(camera.centre_px)[:, None])[0] @ attitude
-        index = self.sky.catalogue.cone(centre, camera.half_diagonal_rad * 1.02 + 1e-4)
-        index = index[: 3 * most]
+    def _log_odds(self, xy, w, pose: _Pose, sigma, own):
+        """Log-odds of the stars that are not `own` (n,), which of all agree, and the catalogue star nearest to each."""
+        none = np.zeros(len(xy), bool)
+        if not len(w):
+            return float("-inf"), none, np.zeros(len(xy), int)
+        predicted = _project(w, pose)
+        apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
+        nearest = apart2.argmin(1)
+        distance2 = apart2[np.arange(len(xy)), nearest]
+        variance = sigma * sigma
+        # one catalogue star answers one detection: the one nearest to it
+        hit = (distance2 < MATCH_SIGMA**2 * variance) & (apart2.argmin(0)[nearest] == np.arange(len(xy)))
+        chance = np.log((1 - FALSE_FRACTION) / len(w) / (2 * np.pi * variance)) + self.log_area
+        odds = np.log(FALSE_FRACTION + np.where(hit, np.exp(chance - 0.5 * distance2 / variance), 0.0))
+        return float(odds[~own].sum()), hit, nearest
+
+    def _pose_of(self, t: _Triangle) -> _Pose:
+        """The focal length that gives the triangle its size, and the rotation that brings it into place."""
+        xy = self.both[t.mirrored][t.star]
+        w = self.sky.directions(self.sky.triangles.star[t.corner])
+        wanted = _perimeter(w)
+        focal = self.camera.fx
+        for _ in range(2):
+            v = _directions(xy, focal)
+            focal *= _perimeter(v) / wanted
+        return _Pose(rotation.best_rotation(w, _directions(xy, focal)), float(focal), t.mirrored)
+
+    def _cone(self, pose: _Pose) -> tuple[np.ndarray, float]:
+        """Centre and radius of a cone that holds the frame."""
+        centre = _directions(self.middle[None], pose.focal_px)[0] @ pose.attitude
+        half = np.arctan(0.5 * np.hypot(self.camera.width, self.camera.height) / pose.focal_px)
+        return centre, half * 1.02 + 2e-4
+
+    def _on_frame(self, pose: _Pose, index: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Those of the catalogue's stars `index` that fall on the frame: the first `most`, and their directions."""
         w = self.sky.directions(index)
-        px = camera.project(w @ attitude.T)
-        on = (px > -2).all(1) & (px < [camera.width + 1, camera.height + 1]).all(1)
-        index, w = index[on][:most], w[on][:most]
-        return index, w
+        apart = np.abs(_project(w, pose) - self.middle)
+        half = np.array([self.camera.width, self.camera.height]) / 2 + 2
+        on = np.flatnonzero((apart < half).all(1))[:most]
+        return index[on], w[on]
 
     def finish(self, match: _Match) -> Identification:
         """The accepted match carried to the faintest stars: all detections against all catalogue stars of the field."""
-        xy = (self.flipped if match.mirrored else self.xy)[:FAINTEST_FIT]
-        attitude, scale = match.attitude, match.scale
-        index, w = self._in_field(attitude, scale, 3 * len(xy) + 50)
-        residual = xy[match.star] - self.camera.scaled(scale).project(
-            self.sky.directions(match.catalogue) @ attitude.T
+        xy, pose = self.both[match.pose.mirrored][:FAINTEST_FIT], match.pose
+        sigma = self.sigma[: len(xy)]
+        index, w = self._on_frame(
+            pose, self.sky.catalogue.cone(*self._cone(pose))[: 6 * len(xy) + 100], 3 * len(xy) + 50
         )
-        spread = max(float(np.sqrt(np.mean(residual**2))), 0.1)
-        star, near = match.star, None
-        for _ in range(3):
-            predicted = self.camera.scaled(scale).project(w @ attitude.T)
-            star, near = _mutual_nearest(xy, predicted, 4 * np.hypot(spread, self.sigma[: len(xy)]) + 0.2)
-            if len(star) < 3:
-                break
-            attitude, scale = _fit(xy[star], w[near], attitude, scale, self.camera)
-            residual = xy[star] - self.camera.scaled(scale).project(w[near] @ attitude.T)
-            spread = max(float(1.4826 * np.median(np.abs(residual))), 0.02)
-        rms = float(np.sqrt(np.mean(residual**2)))
+        residual = xy[match.star] - _project(match.directions, pose)
+        for _ in range(2):
+            spread = np.clip(1.4826 * np.median(np.abs(residual)), 0.02, None)
+            star, near = _mutual_nearest(xy, _project(w, pose), 4 * np.hypot(spread, sigma) + 0.2)
+            pose = _fit(xy[star], w[near], pose)
+            residual = xy[star] - _project(w[near], pose)
         return Identification(
-            Status.OK, star, index[near], attitude, float(scale), rms, match.log_odds, match.mirrored
+            Status.OK,
+            star,
+            index[near],
+            pose.attitude,
+            pose.focal_px / self.camera.fx,
+            float(np.sqrt(np.mean(residual**2))),
+            match.log_odds,
+            pose.mirrored,
         )
 
 
-def _triple_product(v: np.ndarray) -> np.ndarray:
-    return np.einsum("mi,mi->m", np.cross(v[:, 0], v[:, 1]), v[:, 2])
+@dataclass(frozen=True)
+class _Seen:
+    """Triangles of a frame as they are looked up, with both orders of corners whose angles are equal within the error.
+
+    star (Q, 3): the corner of the largest angle first, of the smallest last; angles and tolerances (Q,) rad; longest
+    side and the stars' error (Q,) rad.
+    """
+
+    star: np.ndarray
+    largest: np.ndarray
+    smallest: np.ndarray
+    tol_largest: np.ndarray
+    tol_smallest: np.ndarray
+    longest: np.ndarray
+    error: np.ndarray
+
+    @classmethod
+    def of(cls, v: np.ndarray, sigma_px: np.ndarray, triples: np.ndarray, error: float) -> "_Seen":
+        p = v[triples]
+        angle = angles(p[:, 0], p[:, 1], p[:, 2])
+        order = np.argsort(-angle, axis=1, kind="stable")
+        rows = np.arange(len(triples))[:, None]
+        triples, angle, p = triples[rows, order], angle[rows, order], p[rows, order]
+        a = sides(p[:, 1], p[:, 2])
+        b = sides(p[:, 0], p[:, 2])
+        c = np.maximum(sides(p[:, 0], p[:, 1]), 1e-9)
+        a, b = np.maximum(a, c), np.maximum(b, c)
+        error = np.full(len(triples), TRIANGLE_SIGMA * error)
+        tol_largest = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
+        tol_smallest = error * np.sqrt(1 / a**2 + 1 / b**2 + (c / (a * b)) ** 2)
+        usable = (tol_smallest < 0.1) & (tol_largest < 0.2)
+        first = usable & (angle[:, 0] - angle[:, 1] < 2 * tol_largest)
+        last = usable & (angle[:, 1] - angle[:, 2] < 2 * tol_largest)
+        star = np.concatenate([triples[usable], triples[first][:, [1, 0, 2]], triples[last][:, [0, 2, 1]]])
+        row = np.concatenate([np.flatnonzero(k) for k in (usable, first, last)])
+        return cls(
+            star, angle[row, 0], angle[row, 2], tol_largest[row], tol_smallest[row], a[row], error[row]
+        )
 
 
-def _shared_sides(star: np.ndarray, corner: np.ndarray, hand: np.ndarray) -> np.ndarray:
+def _handedness(v: np.ndarray) -> np.ndarray:
+    """Whether triples of directions (M, 3, 3) turn one way or the other."""
+    return np.einsum("mi,mi->m", np.cross(v[:, 0], v[:, 1]), v[:, 2]) > 0
+
+
+def _perimeter(v: np.ndarray) -> float:
+    return float(sides(v, v[[1, 2, 0]]).sum())
+
+
+def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) -> np.ndarray:
     """How many other candidates share a side (two stars with the same two identities) with each (M,)."""
-    one = star.astype(np.int64) * (1 << 40) + corner  # (detection, catalogue star) as one number
-    support = np.zeros(len(star), int)
-    flat = np.unique(one.ravel(), return_inverse=True)[1].reshape(one.shape).astype(np.int64)
-    n = flat.max() + 1
-    keys = []
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        low, high = np.minimum(flat[:, i], flat[:, j]), np.maximum(flat[:, i], flat[:, j])
-        keys.append((low * n + high) * 2 + (hand > 0))
-    inverse, count = np.unique(np.concatenate(keys), return_inverse=True, return_counts=True)[1:]
-    for k in range(3):
-        support += count[inverse[k * len(star) : (k + 1) * len(star)]] - 1
-    return support
+    pair = star.astype(np.int64) << 40 | corner  # a detection and its identity as one number
+    same = np.unique(pair, return_inverse=True)[1].reshape(pair.shape).astype(np.int64)
+    n = same.max() + 1
+    one, other = same, same[:, [1, 2, 0]]
+    key = (np.minimum(one, other) * n + np.maximum(one, other)) * 2 + mirrored[:, None]
+    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    return (count[inverse].reshape(key.shape) - 1).sum(1)
 
 
 def _mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
-    from scipy.spatial import cKDTree
-
-    there = cKDTree(predicted)
+    there, here = cKDTree(predicted), cKDTree(xy)
     distance, nearest = there.query(xy)
-    back = cKDTree(xy).query(predicted)[1]
-    good = (distance < radius) & (back[np.minimum(nearest, len(predicted) - 1)] == np.arange(len(xy)))
+    good = (distance < radius) & (here.query(predicted)[1][nearest] == np.arange(len(xy)))
     return np.flatnonzero(good), nearest[good]
 
 
-def _fit(xy, w, attitude, scale, camera: Camera, rounds: int = 2):
+def _directions(xy: np.ndarray, focal_px: float) -> np.ndarray:
+    """Unit vectors (N, 3) in C of pixels (N, 2) from the principal point."""
+    v = np.empty((len(xy), 3))
+    v[:, :2] = xy
+    v[:, 2] = focal_px
+    return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
+
+
+def _project(w: np.ndarray, pose: _Pose) -> np.ndarray:
+    """Pixels (N, 2) from the principal point; far away for what is behind the camera."""
+    u = w @ pose.attitude.T
+    return u[:, :2] * (pose.focal_px / np.maximum(u[:, 2:], 1e-6))
+
+
+def _fit(xy: np.ndarray, w: np.ndarray, pose: _Pose) -> _Pose:
     """Least squares for a small rotation and the focal length from pixels xy (N, 2) of directions w (N, 3)."""
-    for _ in range(rounds):
-        cam = camera.scaled(scale)
-        u = w @ attitude.T
-        plane = u[:, :2] / u[:, 2:]
-        x, y = plane.T
-        residual = (xy - [cam.cx, cam.cy]) / [cam.fx, cam.fy] - plane
-        # d plane for a rotation by d about the camera's axes, and for a relative change of the focal length
-        jx = np.stack([-x * y, 1 + x * x, -y, x], -1)
-        jy = np.stack([-(1 + y * y), x * y, x, y], -1)
-        d = np.linalg.lstsq(
-            np.concatenate([jx, jy]), np.concatenate([residual[:, 0], residual[:, 1]]), rcond=None
-        )[0]
-        attitude = rotation.from_vector(d[:3]) @ attitude
-        scale = scale * (1 + d[3])
-    return attitude, scale
+    u = w @ pose.attitude.T
+    x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
+    # d(x, y) for a rotation by d about the camera's axes, and for a relative change of the focal length
+    j = np.empty((2, len(x), 4))
+    j[0, :, 0], j[0, :, 1], j[0, :, 2], j[0, :, 3] = -x * y, 1 + x * x, -y, x
+    j[1, :, 0], j[1, :, 1], j[1, :, 2], j[1, :, 3] = -1 - y * y, x * y, x, y
+    j = j.reshape(-1, 4)
+    residual = (xy / pose.focal_px - np.stack([x, y], -1)).T.ravel()
+    try:
+        d = np.linalg.solve(j.T @ j, j.T @ residual)
+    except np.linalg.LinAlgError:  # all stars in one place
+        return pose
+    return _Pose(rotation.from_vector(d[:3]) @ pose.attitude, pose.focal_px * (1 + d[3]), pose.mirrored)

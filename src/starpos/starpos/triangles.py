@@ -2,7 +2,7 @@
 """Spherical triangles: their angles (the paper's equations 3 and 4), and the catalogue of them that is searched.
 
 The angles hardly depend on the focal length, which is why the paper keys by them.  Stars are chosen by local density:
-a star belongs if it is among the brightest of its neighbourhood, so every field of the instrument holds enough.
+every circle of the field's size gives its own brightest stars, so that every field of the instrument holds enough.
 """
 
 import hashlib
@@ -11,19 +11,24 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from itertools import combinations
+from math import comb
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos.catalogue import Catalogue
+from starpos.catalogue import Catalogue, rows_near
 from starpos.errors import CatalogueError
 
-FORMAT = 2
-BRIGHTER_NEIGHBOURS = 16  # a star is kept if fewer than this many outshine it within half a field
-MAX_TRIANGLES = 4_000_000
+FORMAT = 4
 SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
 LARGEST_BINS, SMALLEST_BINS = 2048, 1024  # of the largest angle, 60..180 deg, and of the smallest, 0..60 deg
+POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smaller kind
+# Circles laid over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken).
+# The first fits into a field of 3:2 or 4:3, the second is the whole field's own.
+CIRCLES = ((0.6, 0.85, 7), (1.0, 0.85, 8))
+MAX_TRIANGLES = 5_000_000  # before those that several circles share are counted once
 
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
@@ -52,20 +57,30 @@ def angles(v1: np.ndarray, v2: np.ndarray, v3: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TriangleCatalogue:
-    """Triangles of chosen stars in bins of (largest angle, smallest angle).
+    """Triangles of the sky's brightest stars in bins of (largest angle, smallest angle).
 
-    star (S,): index into the star catalogue; directions (S, 3): ICRS at J2000; corners (T, 3): rows of `star`, the
-    corner of the largest angle first, of the smallest last; largest, smallest (T,) rad; bin_start (bins + 1,);
-    longest_side (1,) rad.
+    The stars, in zones as the catalogue's: star (S,) index into the star catalogue; ra_mas (S,), zone_start (181,);
+    rank (S,) in brightness over the sky; directions (S, 3) ICRS at J2000.
+    The triangles: corners (T, 3) rows of `star`, the corner of the largest angle first, of the smallest last; largest,
+    smallest angle and longest side (T,) rad; bin_start (bins + 1,).
     """
 
     star: np.ndarray
+    ra_mas: np.ndarray
+    zone_start: np.ndarray
+    rank: np.ndarray
     directions: np.ndarray
     corners: np.ndarray
     largest: np.ndarray
     smallest: np.ndarray
+    longest: np.ndarray
     bin_start: np.ndarray
-    longest_side: np.ndarray
+
+    def cone(self, centre: np.ndarray, radius_rad: float) -> np.ndarray:
+        """Rows of `star` within radius_rad of the unit vector `centre`, brightest first."""
+        row = rows_near(self.ra_mas, self.zone_start, centre, radius_rad)
+        row = row[self.directions[row] @ centre >= np.cos(radius_rad)]
+        return row[np.argsort(self.rank[row])]
 
     def near(self, largest, smallest, tol_largest, tol_smallest) -> tuple[np.ndarray, np.ndarray]:
         """Triangles within tolerances of Q pairs of angles (Q,): (query (M,), triangle (M,)), any order.
@@ -100,75 +115,90 @@ Progress = Callable[[str, float], None]
 
 
 def build(
-    catalogue: Catalogue, longest_side: float, progress: Progress = lambda what, done: None
+    catalogue: Catalogue, half_diagonal: float, progress: Progress = lambda what, done: None
 ) -> TriangleCatalogue:
-    """Triangles with every side below `longest_side` rad, the diagonal of the field.
+    """Triangles for a field of this half diagonal (rad): those of the brightest stars of every circle over the sky.
 
-    Each star makes triangles with the pairs of its brighter neighbours within half of that, so that each triangle is
-    made once, by its faintest star.
+    A circle takes its own brightest stars, however bright its neighbours are, so that every part of the sky has enough.
     """
-    reach = longest_side / 2
     by_light = np.argsort(catalogue.vmag_centi, kind="stable")
-    brighter = BRIGHTER_NEIGHBOURS
-    # the density that makes at most MAX_TRIANGLES: brighter/(pi reach^2) stars, each with about brighter^2/6 pairs
-    cells = 4 / reach**2
-    while brighter > 8 and cells * brighter * (brighter - 1) * (brighter - 2) / 6 > MAX_TRIANGLES:
-        brighter -= 1
-    enough = min(len(by_light), int(6 * cells * brighter) + 1000)
-    candidates = by_light[:enough]
-    v = catalogue.directions(candidates)
-    tree = cKDTree(v)
-    corners = []
-    block = max(1000, enough // 40)
-    for start in range(0, enough, block):
-        own = np.arange(start, min(start + block, enough))
-        corners.append(_with_brighter_pairs(tree, own, 2 * np.sin(reach / 2), brighter))
-        progress("triangles", (start + len(own)) / enough)
-    return _assemble(candidates, v, np.concatenate(corners), longest_side)
-
-
-def _with_brighter_pairs(tree: cKDTree, own: np.ndarray, chord: float, brighter: int) -> np.ndarray:
-    """Triangles (M, 3) of each star of `own` with the pairs of its brighter neighbours, if these are not too many.
-
-    The tree's rows are in order of brightness, so a smaller row is a brighter star.
-    """
-    by_rank: dict[int, list] = {}
-    for star, near in zip(
-        own.tolist(), tree.query_ball_point(tree.data[own], chord, return_sorted=True), strict=True
+    smallest_circle = min(radius for radius, _, _ in CIRCLES) * half_diagonal
+    circles = 4 / smallest_circle**2  # that make up a sphere
+    pool = np.sort(by_light[: int(POOL_PER_CIRCLE * circles) + 1000])
+    rank = np.argsort(np.argsort(catalogue.vmag_centi[pool], kind="stable"))
+    v = catalogue.directions(pool)
+    brightest_first = np.argsort(rank)
+    tree = cKDTree(v[brightest_first])
+    fewer = 0  # stars taken from each circle, so that a small field does not make too many triangles
+    while (
+        sum(_circles(r * half_diagonal, s) * comb(n - fewer, 3) for r, s, n in CIRCLES) > MAX_TRIANGLES
+        and fewer < 3
     ):
-        rank = int(np.searchsorted(near, star))
-        if 2 <= rank < brighter:
-            by_rank.setdefault(rank, []).append([star, *near[:rank]])
-    triangles = [np.zeros((0, 3), np.int64)]
-    for rank, rows in by_rank.items():
-        i, j = np.triu_indices(rank, 1)
-        rows = np.array(rows)
-        faintest = np.repeat(rows[:, 0], len(i))
-        triangles.append(np.stack([faintest, rows[:, 1 + i].ravel(), rows[:, 1 + j].ravel()], -1))
-    return np.concatenate(triangles)
+        fewer += 1
+    keys = []
+    for k, (radius, spacing, most) in enumerate(CIRCLES):
+        keys.append(_triples_of_circles(tree, radius * half_diagonal, spacing, most - fewer))
+        progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
+    key = np.unique(np.concatenate(keys))
+    n = len(pool)
+    corner = brightest_first[np.stack([key // (n * n), key // n % n, key % n], -1)]
+    corner, largest, smallest, longest, bin_start = _in_bins(v, corner, 2 * half_diagonal)
+    progress("star triangles", 1.0)
+    return TriangleCatalogue(
+        pool.astype(np.int32),
+        catalogue.ra_mas[pool],
+        np.searchsorted(pool, catalogue.zone_start),
+        rank.astype(np.int32),
+        v,
+        corner.astype(np.int32),
+        *(column.astype(np.float32) for column in (largest, smallest, longest)),
+        bin_start.astype(np.int32),
+    )
 
 
-def _assemble(candidates, v, corner, longest_side) -> TriangleCatalogue:
+def _triples_of_circles(tree: cKDTree, radius: float, spacing: float, most: int) -> np.ndarray:
+    """Keys of all triples among the `most` first rows of the tree in each circle; a key is (a n + b) n + c, a < b < c."""
+    centres = _spread(_circles(radius, spacing))
+    n, chord = tree.n, 2 * np.sin(radius / 2)
+    found = []
+    for block in np.array_split(centres, max(1, len(centres) // 4000)):
+        lists = [near[:most] for near in tree.query_ball_point(block, chord, return_sorted=True)]
+        size = np.array([len(near) for near in lists])
+        for m in range(3, most + 1):
+            rows = np.array([near for near, k in zip(lists, size == m, strict=True) if k], np.int64).reshape(
+                -1, m
+            )
+            i, j, k = np.array(list(combinations(range(m), 3))).T
+            found.append(np.unique((rows[:, i] * n + rows[:, j]) * n + rows[:, k]))
+    return np.unique(np.concatenate(found))
+
+
+def _circles(radius: float, spacing: float) -> int:
+    """How many circles of this radius (rad) lie spacing * radius apart on a sphere."""
+    return int(4 * np.pi / (spacing * radius) ** 2) + 50
+
+
+def _spread(n: int) -> np.ndarray:
+    """n nearly even unit vectors (n, 3) over the sphere, from south to north: a golden spiral."""
+    k = np.arange(n)
+    z = (2 * k + 1) / n - 1
+    angle = k * (np.pi * (3 - np.sqrt(5)))
+    level = np.sqrt(1 - z * z)
+    return np.stack([level * np.cos(angle), level * np.sin(angle), z], -1)
+
+
+def _in_bins(v: np.ndarray, corner: np.ndarray, longest_side: float):
+    """Usable triangles in order of their bins: corners (largest angle first), angles, longest, bin starts."""
     p = [v[corner[:, k]] for k in range(3)]
     length = np.stack([sides(p[1], p[2]), sides(p[0], p[2]), sides(p[0], p[1])], -1)
     good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)
-    corner = corner[good]
     angle = angles(*(q[good] for q in p))
-    order = np.argsort(-angle, axis=1, kind="stable")
-    corner = np.take_along_axis(corner, order, 1)
+    corner = np.take_along_axis(corner[good], np.argsort(-angle, axis=1, kind="stable"), 1)
     largest, smallest = angle.max(1), angle.min(1)
     key = _bin_largest(largest) * SMALLEST_BINS + _bin_smallest(smallest)
-    sort = np.argsort(key, kind="stable")
-    used = np.unique(corner)
-    return TriangleCatalogue(
-        candidates[used].astype(np.int32),
-        v[used],
-        np.searchsorted(used, corner[sort]).astype(np.int32),
-        largest[sort].astype(np.float32),
-        smallest[sort].astype(np.float32),
-        np.searchsorted(key[sort], np.arange(LARGEST_BINS * SMALLEST_BINS + 1)).astype(np.int32),
-        np.array([longest_side]),
-    )
+    order = np.argsort(key, kind="stable")
+    starts = np.searchsorted(key[order], np.arange(LARGEST_BINS * SMALLEST_BINS + 1))
+    return corner[order], largest[order], smallest[order], length[good].max(1)[order], starts
 
 
 def cache_folder() -> Path:
@@ -181,18 +211,19 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
 
     The field is rounded up to steps of 5 %, so that a refined focal length does not build a new one.
     """
-    step = np.ceil(np.log(2 * half_diagonal_rad) / np.log(1.05))
+    step = np.ceil(np.log(half_diagonal_rad) / np.log(1.05))
     return _cached(catalogue, float(1.05**step), progress)
 
 
 @lru_cache(maxsize=4)
-def _cached(catalogue: Catalogue, longest_side: float, progress: Progress) -> TriangleCatalogue:
-    limits = (BRIGHTER_NEIGHBOURS, MAX_TRIANGLES, SHORTEST_SIDE)
-    settings = f"{FORMAT} {catalogue.fingerprint} {longest_side:.6f} {limits}"
+def _cached(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
+    settings = (
+        f"{FORMAT} {catalogue.fingerprint} {half_diagonal:.6f} {CIRCLES} {POOL_PER_CIRCLE} {SHORTEST_SIDE}"
+    )
     digest = hashlib.sha256(settings.encode()).hexdigest()[:16]
-    folder = cache_folder() / f"triangles-{np.degrees(longest_side):.2f}deg-{digest}"
+    folder = cache_folder() / f"triangles-{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
     if not folder.is_dir():
-        _store(build(catalogue, longest_side, progress), folder)
+        _store(build(catalogue, half_diagonal, progress), folder)
     return _map(folder)
 
 
