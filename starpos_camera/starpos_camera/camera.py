@@ -142,7 +142,10 @@ class CameraNode(Node):
                 self._failed += 1
                 self._say(Level.ERROR, str(result))
             elif isinstance(result, Exception):
-                raise result
+                # One frame that no code foresaw must not end the instrument's night.
+                self._failed += 1
+                kind = type(result).__name__
+                self._say(Level.ERROR, f"a frame was given up ({kind}: {result}); keep it and report this.")
             else:
                 self._publish(result)
 

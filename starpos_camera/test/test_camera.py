@@ -91,6 +91,7 @@ def test_simulated_sky_is_live_and_its_stars_are_where_starpos_says(start, liste
 
     assert set_capture(listener, exposure=0.25, cadence=0.4).success
     listener.wait(lambda: captures[-1].exposure == 0.25)
+    assert "exposure 0.25 s, gain nan, cadence 0.4 s" in set_capture(listener).message
     assert "longer than `cadence`" in set_capture(listener, exposure=2.0).message
     assert "no gain" in set_capture(listener, gain=2.0).message
     assert "must be a number from 1e-06 to 3600 s" in set_capture(listener, exposure=-1.0).message

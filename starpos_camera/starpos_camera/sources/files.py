@@ -63,7 +63,7 @@ class Files:
                     f"{path}: it does not say when it was taken; add DATE-OBS and EXPTIME to it, or set "
                     "files.restamp."
                 )
-        except FrameError:
+        except Exception:
             self._bad.add(path)
             raise
         return Exposure(frame, Capture.FILE)
