@@ -219,12 +219,13 @@ class CameraNode(Node):
         if wanted["gain"] == 0 and math.isnan(self._values["gain"]):
             unset.append("gain")
         changes = [RosParameter(name, value=value) for name, value in wanted.items() if name not in unset]
-        result = self.set_parameters_atomically(changes)
-        response.success = result.successful
-        response.message = (
-            result.reason
-            or "exposure {exposure:g} s, gain {gain:g}, cadence {cadence:g} s.".format(**self._values)
-        )
+        refusal = ""
+        if changes:  # rclpy refuses to change nothing
+            result = self.set_parameters_atomically(changes)
+            refusal = "" if result.successful else result.reason or "the parameters were refused."
+        response.success = not refusal
+        now = "exposure {exposure:g} s, gain {gain:g}, cadence {cadence:g} s.".format(**self._values)
+        response.message = refusal or now
         return response
 
     def _report(self) -> Status:
