@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chain from stars and tilt to a solution, and every way it can fail."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import erfa
+import numpy as np
+import pytest
+from scenes import (
+    EXPOSURE,
+    FOCAL_PX,
+    SIZE,
+    START,
+    random_stars,
+    solver_of,
+    stars_of,
+    tilt_of,
+    wide_scene,
+    with_false_stars,
+)
+from starpos.camera import Camera
+from starpos.earth import curvature_radii_m, earth_state, station_velocity
+from starpos.errors import TiltError
+from starpos.inclinometer import Tilt, TiltLog
+from starpos.instrument import Instrument
+from starpos.solve import Solver, Status
+from starpos.stars import SATURATED, Stars, no_stars
+
+ARCSEC = np.radians(1 / 3600)
+
+
+@pytest.fixture(scope="module")
+def night(catalogue):
+    """A scene, the stars of one exposure, its tilt, and the solver of its instrument."""
+    rng = np.random.default_rng(5)
+    scene = wide_scene()
+    return scene, stars_of(scene, catalogue, rng), tilt_of(scene, rng), solver_of(scene, catalogue)
+
+
+def refused(solution, status):
+    """The solution has no fix but this status and one sentence."""
+    assert solution.status is status
+    assert solution.fix is None
+    assert not solution.ok
+    assert solution.message
+    assert "\n" not in solution.message
+    return solution.message
+
+
+def off_by_sigma(fix, scene):
+    """Position error over the claimed sigma (Mahalanobis), heading error over its sigma."""
+    phi = np.radians(scene.site.latitude_deg)
+    prime, meridian = curvature_radii_m(phi)
+    east = (fix.longitude - np.radians(scene.site.longitude_deg) + np.pi) % (2 * np.pi) - np.pi
+    moved = np.array([east * prime * np.cos(phi), (fix.latitude - phi) * meridian])
+    turned = (fix.heading - scene.heading + np.pi) % (2 * np.pi) - np.pi
+    c = fix.covariance
+    return np.sqrt(moved @ np.linalg.solve(c[:2, :2], moved)), abs(turned) / np.sqrt(c[2, 2])
+
+
+def test_a_fix(night):
+    scene, stars, tilt, solver = night
+    s = solver.solve(stars, tilt)
+    assert (s.status, s.message, s.stars_detected) == (Status.OK, "fix", len(stars))
+    position, heading = off_by_sigma(s.fix, scene)
+    assert position < 4
+    assert heading < 4
+    assert len(s.names) == len(s.star) == len(s.fix.used) > 50
+    assert s.tilt is tilt
+    assert s.utc_unix_s == START + EXPOSURE / 2
+
+
+@pytest.mark.parametrize(
+    "where",
+    [{"latitude_deg": -24.6, "longitude_deg": -70.4, "pointing_deg": (205.0, 71.0, 133.0)},
+     {"latitude_deg": 78.2, "longitude_deg": 15.6, "pointing_deg": (0.0, 90.0, 0.0)},
+     {"latitude_deg": 0.0, "longitude_deg": 180.0, "pointing_deg": (300.0, 68.0, -77.0),
+      "misalignment_deg": (0.4, -0.9, 91.0)}],
+)  # fmt: skip
+def test_fixes_anywhere_without_tilt_noise_are_good_to_the_stars(where, catalogue, rng):
+    scene = wide_scene(tilt_noise_deg=0.0, **where)
+    s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
+    assert s.ok, s.message
+    position, heading = off_by_sigma(s.fix, scene)
+    assert position < 4
+    assert heading < 4
+    assert abs(s.fix.latitude - np.radians(scene.site.latitude_deg)) < 3 * ARCSEC
+
+
+def test_over_many_nights_the_claims_hold(catalogue, rng):
+    """Chi-square of 25 fixes with the inclinometer's noise, whole chain."""
+    position, heading = [], []
+    for _ in range(25):
+        scene = wide_scene(
+            latitude_deg=float(rng.uniform(-65, 65)), longitude_deg=float(rng.uniform(-180, 180)),
+            pointing_deg=(float(rng.uniform(0, 360)), float(rng.uniform(68, 85)), float(rng.uniform(0, 360))),
+        )  # fmt: skip
+        exact = replace(scene.instrument, calibration_stddev_arcsec=(0.0,) * 3, clock_stddev_s=0.0)
+        scene = replace(scene, instrument=exact)
+        s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
+        assert s.ok, s.message
+        p, h = off_by_sigma(s.fix, scene)
+        position.append(p**2 / 2)
+        heading.append(h**2)
+    assert np.mean(position) == pytest.approx(1, abs=4 / np.sqrt(25))
+    assert np.mean(heading) < 1 + 4 * np.sqrt(2 / 25)
+
+
+def test_the_tilt_may_be_a_function_of_the_exposure(night):
+    _, stars, tilt, solver = night
+    asked = []
+
+    def average(mid, exposure):
+        asked.append((mid, exposure))
+        return tilt
+
+    assert solver.solve(stars, average).fix.latitude == solver.solve(stars, tilt).fix.latitude
+    assert asked == [(START + EXPOSURE / 2, EXPOSURE)]
+
+
+def test_identify_gives_the_pointing_of_the_frames_centre(night, catalogue):
+    scene, stars, _, solver = night
+    s = solver.identify(stars)
+    assert s.ok
+    a = s.attitude
+    # where a star stands that is seen in the centre: refraction, diurnal aberration and, by ERFA, A1 taken off
+    state, site = earth_state(stars.mid_unix_s), scene.site
+    itrs = site.atmosphere.refraction().unbend(scene.attitude[:, 2]) @ site.enu - station_velocity(
+        site.enu[2]
+    )
+    ra, dec = erfa.aticq(*erfa.c2s(itrs @ state.cirs_to_itrs), state.astrom)
+    assert (a.ra, a.dec) == pytest.approx((ra, dec), abs=4 * ARCSEC)  # 0.1 px
+    assert a.focal_px == pytest.approx(FOCAL_PX, rel=3e-3)
+    assert not a.mirrored
+    state_free = solver.identify(replace(stars, mid_unix_s=None))
+    assert state_free.ok
+    # without a time neither aberration nor proper motion: 21 arcsec at most, and some
+    d_dec = abs(state_free.attitude.dec - a.dec) / ARCSEC
+    d_ra = abs(state_free.attitude.ra - a.ra) * np.cos(a.dec) / ARCSEC
+    assert 0.1 < np.hypot(d_ra, d_dec) < 23
+
+
+def test_a_mirrored_frame_has_a_pointing_but_no_fix(night):
+    _, stars, tilt, solver = night
+    flipped = replace(stars, y=SIZE[1] - 1 - stars.y)
+    straight, mirrored = solver.identify(stars).attitude, solver.identify(flipped).attitude
+    assert mirrored.mirrored
+    assert (mirrored.ra, mirrored.dec) == pytest.approx((straight.ra, straight.dec), abs=5 * ARCSEC)
+    assert "mirrored" in refused(solver.solve(flipped, tilt), Status.BAD_INPUT)
+
+
+def test_false_bright_stars_do_no_harm(night):
+    scene, stars, tilt, solver = night
+    dirty = with_false_stars(stars, np.array([[100.0, 600.0], [777.0, 50.0]]))
+    s = solver.solve(dirty, tilt)
+    assert s.ok
+    assert off_by_sigma(s.fix, scene)[0] < 4
+    assert s.star.min() >= 2
+
+
+def test_too_few_stars(night):
+    _, stars, tilt, solver = night
+    for n in range(4):
+        assert "at least 4" in refused(solver.solve(stars.take(slice(0, n)), tilt), Status.TOO_FEW_STARS)
+        assert solver.identify(stars.take(slice(0, n))).status is Status.TOO_FEW_STARS
+    burnt = no_stars(*SIZE, START, EXPOSURE)
+    assert "0 stars detected" in refused(solver.solve(burnt, tilt), Status.TOO_FEW_STARS)
+    saturated = replace(stars.take(slice(0, 3)), flags=np.full(3, SATURATED))
+    assert "3 saturated" in refused(solver.solve(saturated, tilt), Status.TOO_FEW_STARS)
+
+
+def test_not_identified(night, rng):
+    _, _, tilt, solver = night
+    message = refused(solver.solve(random_stars(40, rng), tilt), Status.NOT_IDENTIFIED)
+    assert "focal length" in message
+    assert "4636" in message
+
+
+def test_a_wrong_focal_length_is_not_identified_and_says_which_was_given(night, catalogue):
+    _, stars, tilt, _ = night
+    wrong = Solver(Instrument(FOCAL_PX * 1.3), catalogue)
+    assert "6027 px given" in refused(wrong.solve(stars, tilt), Status.NOT_IDENTIFIED)
+
+
+def test_a_focal_length_that_is_none(night, catalogue):
+    _, stars, tilt, _ = night
+    for focal in (50.0, 1e7):
+        assert "deg across" in refused(
+            Solver(Instrument(focal), catalogue).solve(stars, tilt), Status.BAD_INPUT
+        )
+
+
+def test_no_tilt(night):
+    _, stars, _, solver = night
+    far = TiltLog(np.array([START - 100]), np.zeros(1), np.zeros(1), np.zeros(1))
+    assert "no tilt reading" in refused(solver.solve(stars, far.average), Status.NO_TILT)
+    nan = TiltLog(np.array([START]), np.full(1, np.nan), np.zeros(1), np.zeros(1))
+    assert "no tilt reading" in refused(solver.solve(stars, nan.average), Status.NO_TILT)
+
+    def broken(mid, exposure):
+        return Tilt(np.nan, 0.0, np.eye(2), mid)
+
+    assert "not a finite number" in refused(solver.solve(stars, broken), Status.NO_TILT)
+
+
+def test_tilt_out_of_range(night):
+    _, stars, _, solver = night
+
+    def leaning(mid, exposure):
+        return Tilt(0.6, 0.0, np.eye(2), mid)
+
+    assert "30 deg" in refused(solver.solve(stars, leaning), Status.TILT_OUT_OF_RANGE)
+
+
+@pytest.mark.parametrize("utc", [0.0, 4e9, -1e12, 1e300])
+def test_time_outside_the_tables(utc, night):
+    _, stars, tilt, solver = night
+    late = replace(stars, mid_unix_s=utc)
+    assert "tables" in refused(solver.solve(late, tilt), Status.TIME_OUTSIDE_TABLES)
+    assert solver.identify(late).status is Status.TIME_OUTSIDE_TABLES
+
+
+def test_a_frame_without_a_time(night):
+    _, stars, tilt, solver = night
+    assert "DATE-OBS" in refused(solver.solve(replace(stars, mid_unix_s=None), tilt), Status.BAD_INPUT)
+
+
+def test_a_frame_of_another_size_than_the_intrinsics(night, catalogue):
+    _, stars, tilt, _ = night
+    camera = Camera.from_focal(640, 480, FOCAL_PX)
+    assert "640 x 480" in refused(
+        Solver(Instrument(FOCAL_PX, camera), catalogue).solve(stars, tilt), Status.BAD_INPUT
+    )
+
+
+def test_a_distortion_that_cannot_be_inverted(night, catalogue):
+    _, stars, tilt, _ = night
+    camera = Camera(*SIZE, FOCAL_PX, FOCAL_PX, 499.5, 349.5, (-90.0, 0.0, 0.0, 0.0, 0.0))
+    assert "distortion" in refused(
+        Solver(Instrument(FOCAL_PX, camera), catalogue).solve(stars, tilt), Status.BAD_INPUT
+    )
+
+
+def test_poor_fit(night, catalogue):
+    _, stars, tilt, _ = night
+    demanding = Solver(Instrument(FOCAL_PX), catalogue, min_stars=1000)
+    s = demanding.solve(stars, tilt)
+    assert "min_stars is 1000" in refused(s, Status.POOR_FIT)
+    assert s.attitude is not None
+
+
+def test_every_status_is_tested_here():
+    """Each name of Status stands in a test above."""
+    text = Path(__file__).read_text()
+    assert all(f"Status.{s.name}" in text for s in Status)
+
+
+def test_no_content_of_a_frame_raises(night, rng):
+    """Hostile lists: coincident, collinear, far away, tiny or huge sigmas, negative flux, tiny and huge frames."""
+    _, stars, tilt, solver = night
+    sigmas = (1e-9, 0.05, 50.0, 1e6)
+    makers = (
+        lambda n: rng.uniform(-1e6, 1e6, (n, 2)),
+        lambda n: np.full((n, 2), 5.0),
+        lambda n: np.stack([np.arange(n) * 1.0, np.arange(n) * 2.0], 1),
+        lambda n: np.round(rng.uniform(0, 3, (n, 2))),
+        lambda n: rng.normal(500, 1e-7, (n, 2)),
+        lambda n: rng.uniform(0, 700, (n, 2)),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for make in makers:
+            for n in (1, 4, 5, 12, 300):
+                xy = make(n)
+                hostile = Stars(
+                    xy[:, 0], xy[:, 1], -np.sort(rng.exponential(1, n)), rng.normal(size=n),
+                    np.eye(2)[None].repeat(n, 0) * rng.choice(sigmas) ** 2, rng.integers(0, 16, n),
+                    *SIZE, START, EXPOSURE,
+                )  # fmt: skip
+                assert not solver.solve(hostile, tilt).ok
+                assert not solver.identify(hostile).ok
+        for size in ((1, 1), (1_000_000, 1_000_000)):
+            assert (
+                solver.solve(replace(stars, width=size[0], height=size[1]), tilt).status is Status.BAD_INPUT
+            )
+
+
+def test_true_stars_with_absurd_errors_give_a_fix_with_an_absurd_sigma_or_none(night):
+    scene, stars, tilt, solver = night
+    for sigma in (1e-9, 30.0):
+        s = solver.solve(replace(stars, covariance=np.eye(2)[None].repeat(len(stars), 0) * sigma**2), tilt)
+        if s.ok:
+            assert off_by_sigma(s.fix, scene)[0] < 5
+
+
+def test_prepare_builds_what_solve_needs(night, monkeypatch):
+    _, stars, tilt, solver = night
+    solver.prepare(*SIZE)
+    from starpos import triangles
+
+    monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built while solving"))
+    assert solver.solve(stars, tilt).ok
+
+
+def test_an_error_of_the_tilts_source_is_the_frames(night):
+    _, stars, _, solver = night
+
+    def gone(mid, exposure):
+        raise TiltError("the port is gone: plug it in")
+
+    assert refused(solver.solve(stars, gone), Status.NO_TILT) == "the port is gone: plug it in"
