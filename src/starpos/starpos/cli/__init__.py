@@ -6,6 +6,7 @@ import os
 import sys
 from importlib import import_module
 
+from starpos import __version__
 from starpos.errors import StarposError
 
 COMMANDS = {
@@ -18,9 +19,17 @@ COMMANDS = {
 BAD_CALL = 2
 
 
+class Parser(argparse.ArgumentParser):
+    """One line for a bad call, as for any other error."""
+
+    def error(self, message: str):
+        self.exit(BAD_CALL, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
-    parser = argparse.ArgumentParser(prog="starpos", description="Position and heading from the stars.")
+    parser = Parser(prog="starpos", description="Position and heading from the stars.")
+    parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     given = sys.argv[1:] if argv is None else argv
     for name, text in COMMANDS.items():

@@ -9,6 +9,7 @@ import numpy as np
 
 from starpos import catalogue
 from starpos.cli import common
+from starpos.errors import CatalogueError
 
 ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source package tycho2:
     apt-get source --download-only tycho2        (with a deb-src line in the apt sources)
@@ -19,14 +20,18 @@ def define(parser) -> None:
     kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     info = kinds.add_parser("info", help="stars, magnitudes and errors of the catalogue in use")
     info.add_argument("path", nargs="?", metavar="FILE", help="another file than the one in use")
-    info.add_argument("--year", type=float, default=2026.0, help="for the errors of places (2026)")
+    info.add_argument(
+        "--year", type=common.number(1900, 2200), default=2026.0, help="for the errors of places (2026)"
+    )
     info.set_defaults(run=show)
     build = kinds.add_parser(
         "build", help="make the compact file from Tycho-2's original files", epilog=ORIGINALS
     )
     build.formatter_class = argparse.RawDescriptionHelpFormatter
     build.add_argument("originals", metavar="ORIGINALS", help="folder or archive of the original files")
-    build.add_argument("--limit-mag", type=float, default=11.0, metavar="V", help="faintest V kept (11.0)")
+    build.add_argument(
+        "--limit-mag", type=common.number(0, 20), default=11.0, metavar="V", help="faintest V kept (11.0)"
+    )
     build.add_argument(
         "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
     )
@@ -54,7 +59,10 @@ def build_file(args) -> int:
     from starpos import tycho2
 
     made = tycho2.build(args.originals, args.limit_mag, common.ProgressBar())
-    catalogue.save(made, args.out)
+    try:
+        catalogue.save(made, args.out)
+    except OSError as e:
+        raise CatalogueError(f"{args.out}: cannot be written ({e.strerror}): give another --out") from None
     size = Path(args.out).stat().st_size / 1e6
     print(f"{args.out}: {len(made)} stars with V < {args.limit_mag:g}, {size:.1f} MB", file=sys.stderr)
     return 0

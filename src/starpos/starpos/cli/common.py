@@ -37,6 +37,19 @@ def add_air(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--humidity", type=float, default=0.3, metavar="0..1", help="relative humidity (0.3)")
 
 
+def number(low: float, high: float, kind: type = float):
+    """An argparse type: a number from low to high."""
+
+    def parse(text: str):
+        value = kind(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text} must lie between {low:g} and {high:g}")
+        return value
+
+    parse.__name__ = kind.__name__  # what argparse calls it
+    return parse
+
+
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
     """The air as far as it was given."""
     pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100

@@ -2,12 +2,13 @@
 """`starpos identify`: where frames look, from their stars alone."""
 
 import time
+from contextlib import suppress
 
 import numpy as np
 
 from starpos import catalogue
 from starpos.cli import common
-from starpos.errors import FrameError
+from starpos.errors import FrameError, StarposError
 from starpos.solve import Solution, Solver, Status
 
 
@@ -30,7 +31,8 @@ def run(args) -> int:
                 solver = Solver(
                     common.instrument_of(args, item), catalogue.load(), progress=common.ProgressBar()
                 )
-            solver.prepare(*_size(item))
+            with suppress(StarposError):  # identify says it
+                solver.prepare(item.width, item.height)
             begin = time.process_time()
             answer = solver.identify(common.stars_of(item))
             cpu_ms = 1000 * (time.process_time() - begin)
@@ -42,10 +44,6 @@ def run(args) -> int:
         else:
             print(_line(path, answer))
     return common.UNREADABLE if unreadable else 0 if any_found else 1
-
-
-def _size(item) -> tuple[int, int]:
-    return (item.width, item.height) if hasattr(item, "width") else item.pixels.shape[1::-1]
 
 
 def as_json(path: str, s: Solution) -> dict:

@@ -47,7 +47,7 @@ def define(parser) -> None:
 
 def run(args) -> int:
     deflection = _deflection(args)
-    tilts, solver, fixes, unreadable = None, None, [], False
+    tilts, solver, solved, unreadable = None, None, [], False
     for path, item in common.frames_of(args.frames):
         if isinstance(item, FrameError):
             common.complain("solve", item)
@@ -62,16 +62,16 @@ def run(args) -> int:
                 )
             answer = solver.solve(common.stars_of(item), tilts.average)
             if answer.fix:
-                fixes.append(answer.fix)
+                solved.append(answer)
             else:
                 common.complain("solve", answer.message)
         if args.json:
             common.print_json({"file": path} | _json_of(answer.fix, deflection) | _json_about(answer))
         else:
             print(_line(path, answer))
-    if fixes:
-        _print_combined(average(fixes), fixes, args, deflection)
-    return common.UNREADABLE if unreadable else 0 if fixes else NO_FIX
+    if solved:
+        _print_combined(average([s.fix for s in solved]), solved, args, deflection)
+    return common.UNREADABLE if unreadable else 0 if solved else NO_FIX
 
 
 def _deflection(args) -> Deflection:
@@ -144,15 +144,21 @@ def _where(fix: Fix | Average) -> str:
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
-def _print_combined(all_together: Average, fixes: list[Fix], args, deflection: Deflection) -> None:
+def _print_combined(all_together: Average, solved: list[Solution], args, deflection: Deflection) -> None:
     if args.json:
-        about = {"combined": True, "frames": len(fixes), "status": Status.OK.value}
-        about["stars_matched"] = int(sum(len(f.used) for f in fixes))
-        about["residual_arcsec"] = float(np.sqrt(np.mean([f.residual_arcsec**2 for f in fixes])))
-        common.print_json(about | _json_of(all_together, deflection))
+        about = {
+            "stars_detected": sum(s.stars_detected for s in solved),
+            "stars_matched": sum(len(s.names) for s in solved),
+            "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved])),
+            "log_odds": sum(s.attitude.log_odds for s in solved),
+            "status": Status.OK.value,
+        }
+        common.print_json(
+            {"combined": True, "frames": len(solved)} | _json_of(all_together, deflection) | about
+        )
         return
     ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, deflection)
-    print(f"{len(fixes)} frames together: {_where(all_together)} (astronomic)")
+    print(f"{len(solved)} frames together: {_where(all_together)} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
