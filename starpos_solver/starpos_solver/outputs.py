@@ -40,7 +40,7 @@ def nav_sat_fix(
 ) -> NavSatFix:
     """The position on WGS 84; without one a NO_FIX with NaN, so that a consumer sees that the instrument lives."""
     message = NavSatFix(header=header)
-    message.status.service = NavSatStatus.SERVICE_UNKNOWN if hasattr(NavSatStatus, "SERVICE_UNKNOWN") else 0
+    message.status.service = 0  # no satellites
     if ground is None:
         message.status.status = NavSatStatus.STATUS_NO_FIX
         message.latitude = message.longitude = message.altitude = NAN
@@ -79,6 +79,7 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
     message = Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
     message.ids = list(answer.names)
+    message.indices = [] if answer.star is None else answer.star.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
     message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
     a, fix = answer.attitude, answer.fix

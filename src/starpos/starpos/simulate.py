@@ -21,6 +21,7 @@ from starpos.stars import Stars
 
 FWHM_PER_SIGMA = 2.354820045
 STAMP_SIGMAS = 5.0
+STRIP_PX = 1 << 20
 CENTROID_FLOOR_PX, DETECTED_SNR = 0.02, 6.0
 TILT_QUANTUM_RAD = np.radians(0.0035 / 8)
 
@@ -120,13 +121,17 @@ def render(
     light = np.full(camera.height * camera.width, sky, np.float32)
     place, amount = _star_light(camera, optics, stars)
     np.add.at(light, place, amount)
-    light += rng.standard_normal(len(light), dtype=np.float32) * np.sqrt(
-        light + np.float32(optics.read_noise_e**2)
-    )
-    light *= np.float32(1 / optics.gain_e_dn)
-    light += np.float32(optics.bias_dn + 0.5)
-    np.clip(light, 0, optics.full_well_dn, out=light)
-    pixels = light.astype(np.uint16).reshape(camera.height, camera.width)
+    pixels = np.empty(len(light), np.uint16)
+    for begin in range(0, len(light), STRIP_PX):  # the noise of a whole frame at once is 250 MB
+        part = light[begin : begin + STRIP_PX]
+        part += rng.standard_normal(len(part), dtype=np.float32) * np.sqrt(
+            part + np.float32(optics.read_noise_e**2)
+        )
+        part *= np.float32(1 / optics.gain_e_dn)
+        part += np.float32(optics.bias_dn + 0.5)
+        np.clip(part, 0, optics.full_well_dn, out=part)
+        pixels[begin : begin + STRIP_PX] = part
+    pixels = pixels.reshape(camera.height, camera.width)
     return Frame(pixels, "", start_unix_s + exposure_s / 2, exposure_s, source, camera.fx)
 
 
