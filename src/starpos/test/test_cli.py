@@ -14,8 +14,8 @@ WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 10
 PLACE = {"latitude": 47.3, "longitude": -122.8}
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",
-              "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched", "residual_arcsec",
-              "log_odds", "status"}  # fmt: skip
+              "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched",
+              "residual_arcsec", "log_odds", "status"}  # fmt: skip
 IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
                  "log_odds", "status", "cpu_ms"}  # fmt: skip
 
