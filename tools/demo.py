@@ -288,8 +288,8 @@ def conclude(watcher: Watcher, codes: dict, trouble: str | None, out: Path) -> i
     summary, errors, covariance = summarise(good, watcher.place)
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     print(
-        f"\n{summary['frames']} fixes together: {summary['north_m']:+.0f} m north, {summary['east_m']:+.0f} m east of the "
-        f"truth, claimed {summary['sigma_north_m']:.0f} and {summary['sigma_east_m']:.0f} m; "
+        f"\n{summary['frames']} fixes together: {summary['north_m']:+.0f} m north, {summary['east_m']:+.0f} m east "
+        f"of the truth, claimed {summary['sigma_north_m']:.0f} and {summary['sigma_east_m']:.0f} m; "
         f"heading {summary['heading_error_arcsec']:+.1f} arcsec"
     )
     if watcher.frame is not None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import yaml
+
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
 

@@ -13,17 +13,17 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
+
 from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.instrument import focal_px_of
-from starpos_common.diagnostics import Diagnostics, Level, Status
-from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera
-from starpos_common.parameters import declare
-
 from starpos_camera import calibration
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings, Source, SourceEnded, source_class
 from starpos_camera.worker import Worker
+from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera
+from starpos_common.parameters import declare
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 

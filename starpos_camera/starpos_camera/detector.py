@@ -10,16 +10,16 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frame import Frame
+from starpos_camera.detector_parameters import PARAMETERS
+from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import message_to_frame, stars_to_message
 from starpos_common.parameters import declare
-from std_msgs.msg import Header
-
-from starpos_camera.detector_parameters import PARAMETERS
-from starpos_camera.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
 
 IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB

@@ -12,6 +12,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
+
 from starpos.catalogue import load as load_catalogue
 from starpos.night import write_fits
 from starpos.simulate import expose, render, scene_of

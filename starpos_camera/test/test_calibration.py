@@ -4,9 +4,9 @@
 import threading
 
 import pytest
+
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
-
 from starpos_camera import calibration
 
 CAMERA = Camera(640, 480, 7800.5, 7801.25, 320.1, 239.7, (0.1, -0.2, 1e-4, -2e-4, 0.05))

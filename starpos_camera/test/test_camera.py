@@ -9,14 +9,14 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
+
 from starpos.camera import Camera
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
 from starpos.reading import read_frame
 from starpos.simulate import expose
-from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
-
 from starpos_camera import calibration
+from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 

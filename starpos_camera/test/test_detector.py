@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
+
 from starpos.detection import detect
 from starpos.frame import Frame
 from starpos_common.messages import frame_to_message, message_to_stars
-
 from starpos_interfaces.msg import Capture, StarArray
 
 OK, WARN = 0, 1

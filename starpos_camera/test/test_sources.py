@@ -4,13 +4,13 @@
 import cv2
 import numpy as np
 import pytest
+
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.simulate import expose
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings, SourceEnded, source_class
-
 from starpos_interfaces.msg import Capture
 
 NOW_S = 1793642400.0

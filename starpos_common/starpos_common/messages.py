@@ -8,13 +8,13 @@ import sys
 import numpy as np
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
 from starpos.frame import Frame
 from starpos.inclinometer import SCA100T_NOISE_RAD, Tilt
 from starpos.stars import Stars
-from std_msgs.msg import Header
-
 from starpos_interfaces.msg import Star, StarArray
 from starpos_interfaces.msg import Tilt as TiltMessage
 

@@ -39,6 +39,7 @@ def _run(make_node, args, stopped) -> int:
     from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions, install_signal_handlers
+
     from starpos.errors import StarposError
 
     if stopped:

@@ -9,6 +9,7 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+
 from starpos.errors import StarposError
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1

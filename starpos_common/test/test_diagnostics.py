@@ -7,6 +7,7 @@ import time
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
 from starpos_common.diagnostics import Diagnostics, Level, Status
 
 

@@ -8,6 +8,7 @@ import pytest
 import rclpy
 import yaml
 from rclpy.parameter import Parameter as RosParameter
+
 from starpos_common.parameters import Parameter, ParameterError, declare, to_yaml
 
 TABLE = (

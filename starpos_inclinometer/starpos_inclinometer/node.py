@@ -7,9 +7,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
+
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.parameters import Parameter, declare
-
 from starpos_inclinometer import protocol, sensor
 from starpos_inclinometer.clock import ArrivalFilter
 from starpos_inclinometer.link import Arrival, LinkState, Phase, SerialLink

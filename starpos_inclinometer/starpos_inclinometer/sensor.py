@@ -7,6 +7,7 @@ Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (An
 from dataclasses import dataclass
 
 import numpy as np
+
 from starpos.inclinometer import (
     LIMIT_RAD,
     SCA100T_NOISE_RAD,
@@ -14,7 +15,6 @@ from starpos.inclinometer import (
     SCA100T_SENSITIVITY_V_PER_G,
     sca100t_angle,
 )
-
 from starpos_inclinometer.protocol import Sample, Status
 
 # Bipolar conversions of the AD7730 are offset binary: 0x000000 at minus full scale, 0x800000 at zero.

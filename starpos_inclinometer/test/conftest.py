@@ -4,6 +4,7 @@
 import threading
 
 import pytest
+
 from starpos_inclinometer.emulator import Emulator, Mcu
 
 

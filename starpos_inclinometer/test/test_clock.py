@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+
 from starpos_inclinometer.clock import ArrivalFilter
 
 LATENCY_S = 0.031

@@ -9,11 +9,11 @@ import sys
 
 import numpy as np
 import pytest
+
+from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import Mcu, Pty
 from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Status
 from starpos_inclinometer.sensor import OUT_OF_RANGE, SATURATED, Sensor
-
-from starpos_inclinometer import protocol
 
 COMMAND = [
     sys.executable,

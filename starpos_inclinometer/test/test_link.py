@@ -6,6 +6,7 @@ import threading
 import time
 
 import pytest
+
 from starpos_inclinometer.emulator import Faults, Mcu
 from starpos_inclinometer.link import LinkState, Phase, SerialLink
 

@@ -15,10 +15,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from starpos_inclinometer.emulator import Mcu
-from starpos_inclinometer.node import PARAMETERS
 
 from starpos_inclinometer import sensor
+from starpos_inclinometer.emulator import Mcu
+from starpos_inclinometer.node import PARAMETERS
 from starpos_interfaces.msg import Tilt
 
 NODE = [

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Sample, Status
 
 from starpos_inclinometer import protocol
+from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Sample, Status
 
 PROTOCOL = Path(__file__).parent.parent / "PROTOCOL.md"
 

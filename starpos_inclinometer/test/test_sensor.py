@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from starpos_inclinometer.protocol import Sample, Status
-from starpos_inclinometer.sensor import Calibration, Sensor
 
 from starpos_inclinometer import sensor
+from starpos_inclinometer.protocol import Sample, Status
+from starpos_inclinometer.sensor import Calibration, Sensor
 
 
 def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):

@@ -12,6 +12,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from starpos import catalogue
 from starpos.camera import Camera
 from starpos.errors import StarposError
 from starpos.solve import Solution as Answer
@@ -21,10 +25,6 @@ from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
 from starpos_common.messages import message_to_camera, message_to_stars
 from starpos_common.parameters import declare
-from std_msgs.msg import Header
-from std_srvs.srv import Trigger
-
-from starpos import catalogue
 from starpos_interfaces.msg import Solution, StarArray, Tilt
 from starpos_interfaces.srv import Solve
 from starpos_solver import outputs, parameters

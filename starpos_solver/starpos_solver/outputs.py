@@ -5,13 +5,13 @@ import math
 
 import numpy as np
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
+from std_msgs.msg import Header
+
+from starpos import rotation
 from starpos.solve import Solution as Answer
 from starpos.solve import Status
 from starpos.vertical import ARCSEC, Deflection, Geodetic, geodetic
 from starpos_common.messages import tilt_to_message
-from std_msgs.msg import Header
-
-from starpos import rotation
 from starpos_interfaces.msg import ErrorTerm, Solution
 
 NO_CAMERA = "no camera"

@@ -5,13 +5,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
+from starpos import instrument
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.instrument import Instrument
 from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection
 from starpos_common.parameters import Parameter
-
-from starpos import instrument
 
 NAN = math.nan
 

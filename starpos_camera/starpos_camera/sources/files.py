@@ -9,7 +9,6 @@ from pathlib import Path
 from starpos.errors import FrameError
 from starpos.frame import Frame
 from starpos.reading import FITS, PICTURE, RAW, read_frame
-
 from starpos_camera.sources import Exposure, Settings, SourceEnded
 from starpos_interfaces.msg import Capture
 

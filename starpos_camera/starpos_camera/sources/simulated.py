@@ -4,11 +4,11 @@
 from collections.abc import Callable, Mapping
 
 import numpy as np
+
 from starpos.atmosphere import Atmosphere
 from starpos.catalogue import load as load_catalogue
 from starpos.instrument import focal_px_of
 from starpos.simulate import Scene, expose, render, scene_of
-
 from starpos_camera.sources import Exposure, Settings
 from starpos_interfaces.msg import Capture
 
