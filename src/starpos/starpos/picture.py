@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-STRETCH = (50.0, 99.8)  # percentiles of the frame shown from black to white
+STRETCH = (80.0, 99.95)  # percentiles of the frame shown from black to white
 SHOWN_PX = 1600  # of a frame's longer side
 
 
@@ -20,9 +20,10 @@ def draw(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 6.2), layout="constrained")
+    figure = Figure(figsize=(15, 6.4))
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, width_ratios=(1, 1.55))
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))
+    figure.subplots_adjust(left=0.06, right=0.985, bottom=0.09, top=0.88, wspace=0.14)
     scatter(left, fixes_m, covariance_m2)
     annotated_frame(right, pixels, stars_px, names)
     figure.suptitle(title)
