@@ -4,6 +4,8 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+
+from starpos import rotation
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.earth import EarthState, earth_state, station_velocity
@@ -11,8 +13,6 @@ from starpos.fix import Fix, Mounting, solve_fix
 from starpos.inclinometer import Tilt
 from starpos.instrument import TOP_OF_FRAME
 from starpos.sky import Site, camera_to_enu
-
-from starpos import rotation
 
 ARCSEC = np.radians(1 / 3600)
 UTC = 1793642400.0  # 2026-11-02T18:00:00

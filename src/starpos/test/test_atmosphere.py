@@ -2,6 +2,7 @@
 import erfa
 import numpy as np
 import pytest
+
 from starpos.atmosphere import Atmosphere, Refraction
 from starpos.errors import InstrumentError
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fields import ARCSEC, UTC, Field, random_field, turn
+
+from starpos import rotation
 from starpos.average import average
 from starpos.earth import curvature_radii_m, earth_state
 from starpos.inclinometer import Tilt
-
-from starpos import rotation
 
 STATE = earth_state(UTC)
 

@@ -2,6 +2,7 @@
 import cv2
 import numpy as np
 import pytest
+
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
 

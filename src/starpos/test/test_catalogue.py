@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from starpos.catalogue import MAS, Catalogue, load, pack, read, save
-from starpos.errors import CatalogueError
 
 from starpos import catalogue as module
+from starpos.catalogue import MAS, Catalogue, load, pack, read, save
+from starpos.errors import CatalogueError
 
 ARCSEC = np.radians(1 / 3600)
 

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from starpos.cli import COMMANDS, main
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px

@@ -7,6 +7,7 @@ import warnings
 import erfa
 import numpy as np
 import pytest
+
 from starpos.atmosphere import Atmosphere
 from starpos.earth import (
     EXTRAPOLATION_DAYS,

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fields import ARCSEC, PAPER, UTC, Field, random_field, turn
+
+from starpos import rotation
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.earth import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.fix import Mounting
 from starpos.inclinometer import Tilt
-
-from starpos import rotation
 
 STATE = earth_state(UTC)
 PLACES = {

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 from scenes import FOCAL_PX, SIZE, random_stars
-from starpos.camera import Camera
-from starpos.identification import Sky, Status, identify
 
 from starpos import triangles
+from starpos.camera import Camera
+from starpos.identification import Sky, Status, identify
 
 ARCSEC = np.radians(1 / 3600)
 FIELDS = {

@@ -3,6 +3,7 @@ import warnings
 
 import numpy as np
 import pytest
+
 from starpos.errors import TiltError, TiltRangeError
 from starpos.inclinometer import (
     SCA100T_NOISE_RAD,

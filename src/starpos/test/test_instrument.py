@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
 from starpos.instrument import Instrument, focal_px_of, read

@@ -9,6 +9,7 @@ import sys
 import erfa
 import numpy as np
 import pytest
+
 from starpos.atmosphere import Atmosphere
 from starpos.average import average
 from starpos.detection import detect
@@ -79,7 +80,7 @@ def night(shared, tmp_path_factory):
         "--azimuth",
         "310",
         "--altitude",
-        "72",
+        "85",
         "--roll",
         "200",
         "--seed",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 from scipy.spatial import cKDTree
+
 from starpos.earth import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.inclinometer import a2_matrix, read_tilt_csv

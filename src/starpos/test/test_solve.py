@@ -20,6 +20,7 @@ from scenes import (
     wide_scene,
     with_false_stars,
 )
+
 from starpos.camera import Camera
 from starpos.earth import curvature_radii_m, earth_state, station_velocity
 from starpos.errors import TiltError

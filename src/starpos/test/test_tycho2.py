@@ -5,6 +5,7 @@ import tarfile
 
 import numpy as np
 import pytest
+
 from starpos.catalogue import MAS
 from starpos.errors import CatalogueError
 from starpos.tycho2 import build, johnson_v
