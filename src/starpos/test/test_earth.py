@@ -200,6 +200,12 @@ def test_beyond_the_tables_the_sigma_grows_without_a_jump_or_a_warning():
     assert o[3].pole_sigma > o[1].pole_sigma
 
 
+def test_beyond_the_tables_the_days_go_on_lengthening_as_in_the_last_year():
+    end, day = last_day(), 86400.0
+    before, at, after = (earth_orientation(end + d * day).ut1_minus_utc_s for d in (-365, 0, 365))
+    assert after - at == pytest.approx(at - before, abs=0.003)
+
+
 def last_day():
     """The table's last instant, found through the public function."""
     low, high = unix_of(2024, 1, 1), unix_of(2100, 1, 1)

@@ -191,7 +191,7 @@ SOURCES = {
 def test_errors_are_as_large_as_their_covariance_says(source, rng):
     """Each error drawn from its sigma: chi-squares of position, heading and attitude average to their freedom."""
     drawn_from, tries = SOURCES[source], 120
-    position, heading, attitude = [], [], []
+    position, heading, attitude, together = [], [], [], []
     for _ in range(tries):
         field = random_field(rng, stars=25, altitude=rng.uniform(65, 85), latitude=rng.uniform(-75, 75))
         fix = drawn(field, rng, **drawn_from)
@@ -201,11 +201,15 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
         c = fix.covariance
         position.append(moved @ np.linalg.solve(c[:2, :2], moved))
         heading.append(turned**2 / c[2, 2])
+        unit = np.array([1.0, 1.0, ARCSEC / 30])  # of like size
+        all_three = np.array([*moved, turned]) / unit
+        together.append(all_three @ np.linalg.solve(c / np.outer(unit, unit), all_three))
         spin = rotation.to_small_vector(
             fix.link_to_enu @ (field.attitude @ np.array(field.mounting().link_to_camera)).T
         )
         attitude.append(np.sum(spin**2) / np.trace(fix.attitude_covariance))
     bound = 4 * np.sqrt(2 / tries)
+    assert np.mean(together) / 3 == pytest.approx(1, abs=bound / np.sqrt(3))  # with what they have in common
     assert np.mean(position) / 2 == pytest.approx(1, abs=bound / np.sqrt(2))
     if source not in ("clock", "ut1"):  # these turn the Earth: heading and attitude do not mind
         assert np.mean(heading) == pytest.approx(1, abs=bound)

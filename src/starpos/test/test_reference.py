@@ -16,6 +16,7 @@ from starpos.detection import detect
 from starpos.inclinometer import read_tilt_csv
 from starpos.instrument import Instrument, focal_px_of
 from starpos.reading import read_frame
+from starpos.simulate import scene_of
 from starpos.solve import Solver
 
 ARCSEC = np.radians(1 / 3600)
@@ -94,6 +95,9 @@ def night(shared, tmp_path_factory):
 def test_a_night_made_by_others(night, catalogue):
     """Within 0.3 arcsec in latitude and longitude and 3 arcsec in heading of what they put in."""
     truth = json.loads((night / "truth.json").read_text())
+    mine = scene_of(pointing_deg=(310.0, 85.0, 200.0))
+    assert np.degrees(mine.heading) == pytest.approx(truth["frames"][0]["heading_deg"], abs=1e-9)
+    assert np.degrees(mine.tilt) == pytest.approx(truth["frames"][0]["theta_ideal_deg"], abs=1e-9)
     site, tilts = truth["site"], read_tilt_csv(night / "tilt.csv")
     solver = Solver(Instrument(focal_px_of(600.0, 6.4)), catalogue, Atmosphere.measured(88000.0, 12.0, 0.3))
     solved = [solver.solve(read_frame(path), tilts.average) for path in sorted(night.glob("centroids_*.csv"))]

@@ -24,6 +24,9 @@ def test_a_camera_points_where_it_is_told():
     np.testing.assert_allclose(east[:, 2], [np.cos(np.pi / 6), 0, 0.5], atol=1e-15)
     np.testing.assert_allclose(east[:, 0], [0, -1, 0], atol=1e-15)  # south is on the right
     assert east[2, 1] < 0  # y down
+    np.testing.assert_allclose(
+        camera_to_enu(0.0, 0.0, 90.0)[:, 0], [0, 0, 1], atol=1e-15
+    )  # roll lifts the right side
     for roll in (0.0, 33.0, -120.0):
         c = camera_to_enu(200.0, 66.0, roll)
         np.testing.assert_allclose(c @ c.T, np.eye(3), atol=1e-15)
