@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What consumers of fix and heading rely on: frames, signs, covariances, and NaN where nothing is known."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import NavSatFix, NavSatStatus
+from std_msgs.msg import Header
+
+from starpos.budget import ErrorTerm, heading_of
+from starpos.fix import Fix
+from starpos.solve import Solution as Answer
+from starpos.solve import Status
+from starpos.vertical import Deflection
+from starpos_interfaces.msg import Solution
+from starpos_solver import outputs
+
+EXACT = Deflection(0.0, 0.0, 0.0)
+
+
+def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
+    """A fix of a level link whose x axis points to an azimuth."""
+    a = math.radians(azimuth_deg)
+    forward, up = np.array([math.sin(a), math.cos(a), 0.0]), np.array([0.0, 0.0, 1.0])
+    link = np.stack([forward, np.cross(up, forward), up], 1)
+    factor = np.diag([100.0, 50.0, 1e-4, 2e-4, 3e-4, 1e-4])
+    return Fix(1.8e9, math.radians(latitude_deg), 1.0, heading_of(link), link, (ErrorTerm("all", factor, False),),
+               np.arange(3), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05)  # fmt: skip
+
+
+def answer_facing(azimuth_deg: float) -> Answer:
+    return Answer(
+        Status.OK, "fix", "stars", 1.8e9, 3, ("a", "b", "c"), np.arange(3), fix=fix_facing(azimuth_deg)
+    )
+
+
+def yaw_deg(imu) -> float:
+    q = imu.orientation
+    return math.degrees(math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
+
+
+@pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
+def test_yaw_is_counterclockwise_from_east(azimuth, yaw):
+    answer = answer_facing(azimuth)
+    message = outputs.imu(Header(), answer, outputs.on_ground(answer, EXACT), EXACT)
+    assert (yaw_deg(message) - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-9)
+
+
+def test_heading_north_is_not_taken_for_none():
+    answer = answer_facing(0.0)
+    message = outputs.solution(Header(), answer, outputs.on_ground(answer, EXACT), EXACT)
+    assert message.heading == 0.0
+    assert message.status == Solution.OK
+
+
+def test_rates_and_accelerations_are_declared_unmeasured():
+    answer = answer_facing(10.0)
+    message = outputs.imu(Header(), answer, outputs.on_ground(answer, EXACT), EXACT)
+    assert message.angular_velocity_covariance[0] == -1.0
+    assert message.linear_acceleration_covariance[0] == -1.0
+    assert np.all(np.linalg.eigvalsh(np.array(message.orientation_covariance).reshape(3, 3)) > 0)
+
+
+def test_a_fix_has_a_known_covariance_of_east_and_north():
+    ground = outputs.on_ground(answer_facing(10.0), EXACT)
+    message = outputs.nav_sat_fix(Header(), ground, 250.0, 10.0)
+    assert message.status.status == NavSatStatus.STATUS_FIX
+    assert message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_KNOWN
+    assert np.diag(np.array(message.position_covariance).reshape(3, 3)) == pytest.approx([1e4, 2500.0, 100.0])
+
+
+def test_an_unset_altitude_stays_nan_and_its_variance_finite():
+    message = outputs.nav_sat_fix(Header(), outputs.on_ground(answer_facing(10.0), EXACT), math.nan, 10.0)
+    assert math.isnan(message.altitude)
+    assert np.isfinite(message.position_covariance).all()
+
+
+def test_no_fix_is_nan_with_an_unknown_covariance():
+    message = outputs.nav_sat_fix(Header(), None, 250.0, 10.0)
+    assert message.status.status == NavSatStatus.STATUS_NO_FIX
+    assert math.isnan(message.latitude) and math.isnan(message.longitude) and math.isnan(message.altitude)
+    assert message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN
+
+
+def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
+    answer, deflection = answer_facing(10.0), Deflection(10.0, -20.0, 5.0)
+    ground, plain = outputs.on_ground(answer, deflection), outputs.on_ground(answer, EXACT)
+    arcsec = math.radians(1 / 3600)
+    assert ground.latitude - plain.latitude == pytest.approx(-10 * arcsec, rel=1e-6)
+    assert ground.longitude - plain.longitude == pytest.approx(
+        20 * arcsec / math.cos(ground.latitude), rel=1e-6
+    )
+    assert ground.covariance[0, 0] - plain.covariance[0, 0] == pytest.approx(
+        (5 * arcsec * 6.387e6) ** 2, rel=1e-2
+    )
+    turned = yaw_deg(outputs.imu(Header(), answer, ground, deflection)) - yaw_deg(
+        outputs.imu(Header(), answer, plain, EXACT)
+    )
+    # azimuth = A - eta tan(phi): a smaller azimuth is a larger yaw
+    assert turned * 3600 == pytest.approx(-20.0 * math.tan(ground.latitude), rel=1e-3)
+
+
+def test_without_a_fix_every_number_that_is_missing_is_nan():
+    answer = replace(
+        answer_facing(10.0), status=Status.NOT_IDENTIFIED, fix=None, names=(), star=None, message="why"
+    )
+    message = outputs.solution(Header(), answer, None, EXACT)
+    assert message.status == Solution.NOT_IDENTIFIED
+    assert message.status_text == "why"
+    for name in ("latitude", "longitude", "heading", "heading_stddev", "focal_px", "log_odds", "residual"):
+        assert math.isnan(getattr(message, name)), name
+    assert np.isnan(message.covariance).all() and np.isnan(message.covariance_geodetic).all()
+
+
+def test_every_status_has_a_code_of_the_message():
+    assert set(outputs.STATUS) == set(Status)
+    assert len(set(outputs.STATUS.values())) == len(Status)

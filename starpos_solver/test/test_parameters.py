@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the parameters mean to starpos."""
+
+import math
+
+import numpy as np
+import pytest
+
+from starpos.camera import Camera
+from starpos.errors import InstrumentError
+from starpos_solver.parameters import PARAMETERS, atmosphere_of, deflection_of, instrument_of
+
+CAMERA = Camera.from_focal(100, 80, 1000.0)
+
+
+def values(**changes):
+    return {p.name: p.default for p in PARAMETERS} | {k.replace("__", "."): v for k, v in changes.items()}
+
+
+def test_unset_air_widens_the_refraction_and_measured_air_does_not():
+    assert atmosphere_of(values()).relative_sigma > 0.08
+    known = atmosphere_of(values(refraction__pressure=88000.0, refraction__temperature=12.0))
+    assert (known.pressure_pa, known.temperature_c) == (88000.0, 12.0)
+    assert known.relative_sigma < 0.01
+
+
+def test_the_cameras_intrinsics_come_from_camera_info():
+    instrument = instrument_of(values(misalignment=(0.1, 0.2, 0.3), misalignment_stddev=7.0), CAMERA)
+    assert instrument.camera is CAMERA
+    sigma = np.sqrt(np.diag(instrument.mounting.calibration_covariance))
+    assert sigma == pytest.approx(np.radians(7.0 / 3600))
+
+
+def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):
+    path = tmp_path / "instrument.yaml"
+    path.write_text(
+        "starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [1, 2, 3]\n"
+        "calibration_stddev_arcsec: [1, 1, 1]\n"
+    )
+    instrument = instrument_of(values(calibration_url=f"file://{path}"), CAMERA)
+    assert instrument.misalignment_deg == (1.0, 2.0, 3.0)
+    assert instrument.camera is CAMERA
+
+
+def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):
+    with pytest.raises(InstrumentError, match=r"missing\.yaml"):
+        instrument_of(values(calibration_url=str(tmp_path / "missing.yaml")), CAMERA)
+
+
+def test_the_deflection_defaults_to_knowing_nothing():
+    assert deflection_of(values()).stddev_arcsec > 1
+    assert not math.isnan(deflection_of(values()).xi_arcsec)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tilts matched to exposures by their time stamps, whatever order and state they come in."""
+
+import math
+
+import numpy as np
+import pytest
+
+from starpos.errors import TiltError, TiltRangeError
+from starpos_common.messages import unix_to_stamp
+from starpos_interfaces.msg import Tilt
+from starpos_solver.tilts import CAPACITY, TiltBuffer
+
+NOISE = math.radians(0.0035)
+T0 = 1_793_642_400.0
+
+
+def sample(
+    seconds: float, x_deg: float = 1.0, y_deg: float = -2.0, flags: int = 0, variance: float = 0.0
+) -> Tilt:
+    message = Tilt(x=math.radians(x_deg), y=math.radians(y_deg), flags=flags, temperature=10.0)
+    message.header.stamp = unix_to_stamp(T0 + seconds)
+    message.covariance = [variance, 0.0, 0.0, variance]
+    return message
+
+
+def buffer_of(messages) -> TiltBuffer:
+    buffer = TiltBuffer()
+    for message in messages:
+        buffer.add(message, NOISE)
+    return buffer
+
+
+def test_the_average_takes_the_exposures_samples_only_in_any_order():
+    inside = [sample(k / 10, 1 + k * 0.002) for k in range(-2, 3)]
+    outside = [sample(k / 10, 20.0) for k in (-9, -4, 4, 9)]
+    messages = inside + outside
+    np.random.default_rng(1).shuffle(messages)
+    tilt = buffer_of(messages).average(T0, 0.5)
+    assert tilt.samples == 5
+    assert tilt.theta_x == pytest.approx(math.radians(1.0), abs=1e-9)
+    assert tilt.theta_y == pytest.approx(math.radians(-2.0), abs=1e-12)
+
+
+def test_an_unknown_covariance_becomes_the_parameters_and_averages_down():
+    tilt = buffer_of(sample(k / 10) for k in range(-2, 3)).average(T0, 0.5)
+    assert tilt.covariance == pytest.approx(np.eye(2) * NOISE**2 / 5)
+
+
+def test_a_stated_covariance_is_used():
+    tilt = buffer_of(sample(k / 10, variance=1e-8) for k in range(-2, 3)).average(T0, 0.5)
+    assert tilt.covariance == pytest.approx(np.eye(2) * 1e-8 / 5)
+
+
+def test_a_gap_before_a_sample_does_not_spoil_it():
+    assert buffer_of([sample(0.0, flags=Tilt.GAP)]).average(T0, 0.5).samples == 1
+
+
+@pytest.mark.parametrize("flag", [Tilt.OUT_OF_RANGE, Tilt.SATURATED])
+def test_flagged_samples_explain_a_missing_tilt(flag):
+    with pytest.raises(TiltRangeError, match="30 deg"):
+        buffer_of([sample(0.0, flags=flag)]).average(T0, 0.5)
+
+
+def test_a_stuck_converter_is_named():
+    with pytest.raises(TiltError, match="same value"):
+        buffer_of([sample(0.0, flags=Tilt.STUCK)]).average(T0, 0.5)
+
+
+def test_nothing_near_says_how_far_the_nearest_is():
+    with pytest.raises(TiltError, match=r"60\.0 s off"):
+        buffer_of([sample(60.0)]).average(T0, 0.5)
+    with pytest.raises(TiltError, match="none has arrived"):
+        TiltBuffer().average(T0, 0.5)
+
+
+def test_broken_samples_are_refused_and_not_kept():
+    buffer = TiltBuffer()
+    for broken in (sample(0.0, math.nan), sample(0.0, variance=-1.0), Tilt(x=0.1)):
+        with pytest.raises(TiltError):
+            buffer.add(broken, NOISE)
+    with pytest.raises(TiltRangeError):
+        buffer.add(sample(0.0, 31.0), NOISE)
+    assert len(buffer) == 0
+
+
+def test_complete_once_a_sample_of_the_exposures_end_is_here():
+    buffer = buffer_of(sample(k / 10) for k in range(-5, 1))
+    assert not buffer.complete(T0, 0.5)
+    buffer.add(sample(0.15), NOISE)
+    assert buffer.complete(T0, 0.5)
+
+
+def test_days_of_samples_stay_bounded():
+    buffer = buffer_of(sample(k / 10) for k in range(CAPACITY + 500))
+    assert len(buffer) == CAPACITY
