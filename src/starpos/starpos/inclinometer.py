@@ -82,7 +82,8 @@ class TiltLog:
     def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:
         """The mean tilt over an exposure; where no reading falls into it, the nearest within one second.
 
-        A single wild reading does not move it: readings further than 6 sigma from the median are left out.
+        A single wild reading does not move it: readings further than 6 sigma from the median are left out.  Readings that
+        scatter clearly more than noise_rad (wind, footsteps) widen the covariance.
         Raises TiltError with the distance in time where there is none.
         """
         apart = np.abs(self.utc_unix_s - mid_unix_s)
@@ -107,10 +108,14 @@ class TiltLog:
             )
         mean = theta[sane].mean(0)
         n = int(sane.sum())
+        variance = np.full(2, self.noise_rad**2)
+        if n > 1:
+            scatter = theta[sane].var(0, ddof=1)
+            variance = np.where(scatter > variance * (1 + 3 * np.sqrt(2 / (n - 1))), scatter, variance)
         return Tilt(
             float(mean[0]),
             float(mean[1]),
-            np.eye(2) * self.noise_rad**2 / n,
+            np.diag(variance / n),
             float(self.utc_unix_s[use][sane].mean()),
             n,
             float(self.temperature_c[use][sane].mean()),

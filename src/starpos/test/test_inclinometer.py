@@ -82,6 +82,14 @@ def test_averages_err_as_their_covariance_says(rng):
     assert 0.85 < np.std(pulls) < 1.15
 
 
+def test_a_mount_that_shakes_widens_the_covariance(rng):
+    shaken = rng.normal(0, 2.2 * SCA100T_NOISE_RAD, 60)
+    shaken = np.clip(shaken, -5 * SCA100T_NOISE_RAD, 5 * SCA100T_NOISE_RAD)
+    tilt = log(3 + shaken / DEG).average(1002.95, 6.0)
+    assert tilt.samples == 60
+    assert np.diag(tilt.covariance) == pytest.approx(np.var(shaken, ddof=1) / 60 * np.ones(2))
+
+
 def test_a_wild_reading_does_not_move_the_average():
     calm = np.full(11, 2.0)
     wild = calm.copy()
