@@ -11,6 +11,8 @@ import pytest
 from starpos.atmosphere import Atmosphere
 from starpos.earth import (
     EXTRAPOLATION_DAYS,
+    EXTRAPOLATION_SIGMA_S,
+    POLE_SIGMA_RAD,
     EarthOrientation,
     curvature_radii_m,
     earth_orientation,
@@ -204,6 +206,23 @@ def test_beyond_the_tables_the_days_go_on_lengthening_as_in_the_last_year():
     end, day = last_day(), 86400.0
     before, at, after = (earth_orientation(end + d * day).ut1_minus_utc_s for d in (-365, 0, 365))
     assert after - at == pytest.approx(at - before, abs=0.003)
+
+
+def test_the_sigmas_of_extrapolation_are_what_it_would_have_erred_since_1974():
+    from astropy.utils import iers
+    from astropy_iers_data import IERS_A_FILE
+
+    table = iers.IERS_A.open(IERS_A_FILE)
+    measured = np.asarray(table["UT1Flag"]) != "P"
+    mjd, ut1 = np.asarray(table["MJD"].value)[measured], np.asarray(table["UT1_UTC"].value)[measured]
+    ut1 = ut1 - np.round((erfa.utctai(2400000.5, mjd)[1] - mjd) * 86400)  # without leap seconds
+    pole = np.stack([table[c][measured].to_value("rad") for c in ("PM_x", "PM_y")], -1)
+    for days, sigma in zip(EXTRAPOLATION_DAYS[1:], EXTRAPOLATION_SIGMA_S[1:], strict=True):
+        now = np.arange(365, len(ut1) - int(days))
+        carried = ut1[now] + (ut1[now] - ut1[now - 365]) * days / 365
+        rms = np.sqrt(np.mean((carried - ut1[now + int(days)]) ** 2))
+        assert rms < sigma < 1.3 * rms
+        assert np.sqrt(np.mean((pole[now] - pole[now + int(days)]) ** 2)) < 1.2 * POLE_SIGMA_RAD
 
 
 def last_day():
