@@ -191,7 +191,8 @@ class Solver:
         return camera
 
     def _identify(self, stars: Stars, camera: Camera, directions, year, velocity):
-        ideal = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        # of square pixels, which is what identify fits
+        ideal = Camera(camera.width, camera.height, camera.fx, camera.fx, camera.cx, camera.cy)
         table = triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
         sky = ident.Sky(self.catalogue, table, year, velocity)
         sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)

@@ -109,6 +109,16 @@ def test_over_many_nights_the_claims_hold(catalogue, rng):
     assert np.mean(heading) < 1 + 4 * np.sqrt(2 / 25)
 
 
+def test_pixels_that_are_not_square_and_a_lens_that_distorts(catalogue, rng):
+    camera = Camera(*SIZE, FOCAL_PX, FOCAL_PX * 1.03, 510.0, 330.0, (-0.3, 0.2, 1e-3, -1e-3, 0.0))
+    scene = wide_scene(tilt_noise_deg=0.0)
+    scene = replace(scene, camera=camera, instrument=replace(scene.instrument, camera=camera))
+    s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
+    assert s.ok, s.message
+    assert off_by_sigma(s.fix, scene)[0] < 4
+    assert s.attitude.residual_arcsec < 0.1 * camera.scale_arcsec
+
+
 def test_the_tilt_may_be_a_function_of_the_exposure(night):
     _, stars, tilt, solver = night
     asked = []
