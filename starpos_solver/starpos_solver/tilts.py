@@ -13,6 +13,7 @@ from starpos_interfaces.msg import Tilt as TiltMessage
 CAPACITY = 6000  # ten minutes at 10 Hz
 UNUSABLE = TiltMessage.OUT_OF_RANGE | TiltMessage.STUCK | TiltMessage.SATURATED
 NEAR_S = 1.0  # how far from an exposure a flagged sample still explains why there is no good one
+USUAL_PERIOD_S, JITTER = 0.1, 0.9  # between samples; how much of it the next one may come early
 
 
 class TiltBuffer:
@@ -41,16 +42,22 @@ class TiltBuffer:
             raise
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
-        """Whether no further sample of this exposure is to come: one from its end, or after it, is here."""
-        times = [t.utc_unix_s for t in self._good]
+        """Whether no further sample of this exposure is to come: one is here that leaves no room for another."""
+        times = [s.utc_unix_s for s in self._near(mid_unix_s, span_s)]
         if not times:
             return False
-        period = 0.1 if len(times) < 3 else float(np.median(np.abs(np.diff(times[-20:]))))
-        return max(times) >= mid_unix_s + span_s / 2 - 1.5 * period
+        period = float(np.median(np.diff(times))) if len(times) > 2 else USUAL_PERIOD_S
+        return times[-1] >= mid_unix_s + span_s / 2 - JITTER * period
+
+    def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
+        """The samples about an exposure in order of time, however they came; none counts twice."""
+        reach = span_s / 2 + NEAR_S
+        near = {s.utc_unix_s: s for s in self._good if abs(s.utc_unix_s - mid_unix_s) <= reach}
+        return [near[t] for t in sorted(near)]
 
     def average(self, mid_unix_s: float, span_s: float) -> Tilt:
         """The mean over an exposure; TiltRangeError or TiltError with the reason where there is none."""
-        near = [s for s in self._good if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + NEAR_S]
+        near = self._near(mid_unix_s, span_s)
         if not near:
             self._explain(mid_unix_s, span_s)
         noise = np.sqrt(np.mean([np.trace(s.covariance) / 2 for s in near]))
