@@ -21,5 +21,7 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
-    entry_points={"console_scripts": ["solver = starpos_solver.main:solver"]},
+    entry_points={
+        "console_scripts": ["replay = starpos_solver.replay:replay", "solver = starpos_solver.main:solver"]
+    },
 )
