@@ -34,7 +34,9 @@ def test_bend_is_erfas():
     a = erfa.apio(0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0, *erfa.refco(1013.25, 15.0, 0.5, 0.55))
     z = np.array([0.1, 10, 45, 70, 80, 86])
     zob = erfa.atioq(np.zeros(6), np.pi / 2 - np.radians(z), a)[1]
-    assert lifted_arcsec(air.refraction(), z) == pytest.approx(z * 3600 - np.degrees(zob) * 3600, rel=2e-6, abs=2e-6)
+    assert lifted_arcsec(air.refraction(), z) == pytest.approx(
+        z * 3600 - np.degrees(zob) * 3600, rel=2e-6, abs=2e-6
+    )
 
 
 def test_standard_refraction():
