@@ -103,6 +103,14 @@ class Instrument:
         """The name of a process that has ended, if any."""
         return next((name for name, p in self.running.items() if p.poll() is not None), None)
 
+    def peak_mb(self) -> dict[str, int]:
+        """Peak resident memory of each node."""
+        peak = {}
+        for name, p in self.running.items():
+            lines = Path(f"/proc/{p.pid}/status").read_text().splitlines()
+            peak[name] = next((int(line.split()[1]) // 1024 for line in lines if line.startswith("VmHWM")), 0)
+        return peak
+
     def stop(self) -> dict[str, int | str]:
         """Stop all as launch does, with SIGINT; their exit codes."""
         for p in self.running.values():
@@ -133,7 +141,7 @@ class Watcher:
 
         rclpy.init()
         self.rclpy, self.node, self.place = rclpy, rclpy.create_node("demo"), place
-        self.solutions, self.published, self.stars, self.frame = [], {}, {}, None
+        self.solutions, self.seconds, self.published, self.stars, self.frame = [], [], {}, {}, None
         self.node.create_subscription(Solution, "solver/solution", self._on_solution, 10)
         self.node.create_subscription(Capture, "camera/capture", self._on_capture, 10)
         self.node.create_subscription(StarArray, "stars", lambda m: self.stars.update({_stamp(m): m}), 10)
@@ -147,8 +155,8 @@ class Watcher:
 
     def _on_solution(self, message):
         self.solutions.append(message)
-        seconds = time.monotonic() - self.published.get(_stamp(message), math.nan)
-        print(_row(len(self.solutions), message, self.place, seconds), flush=True)
+        self.seconds.append(time.monotonic() - self.published.get(_stamp(message), math.nan))
+        print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
 
     def watch(self, frames: int, instrument: Instrument) -> str | None:
         """Until so many frames are solved; a sentence if it will not come to that."""
@@ -267,16 +275,17 @@ def main() -> int:
         instrument = Instrument(place, folder, seed)
         try:
             trouble = watcher.watch(args.frames, instrument)
+            memory = {} if trouble else instrument.peak_mb()
         except KeyboardInterrupt:
-            trouble = "interrupted"
+            trouble, memory = "interrupted", {}
         codes = instrument.stop()
         for log in folder.glob("*.log"):
             shutil.copy(log, args.out)
     watcher.close()
-    return conclude(watcher, codes, trouble, args.out)
+    return conclude(watcher, codes, memory, trouble, args.out)
 
 
-def conclude(watcher: Watcher, codes: dict, trouble: str | None, out: Path) -> int:
+def conclude(watcher: Watcher, codes: dict, memory: dict, trouble: str | None, out: Path) -> int:
     good = [s for s in watcher.solutions if s.status == s.OK]
     unclean = {name: code for name, code in codes.items() if code != 0}
     if trouble or not good or unclean:
@@ -286,11 +295,16 @@ def conclude(watcher: Watcher, codes: dict, trouble: str | None, out: Path) -> i
         )
         return 1
     summary, errors, covariance = summarise(good, watcher.place)
+    summary |= {"seconds_median": float(np.nanmedian(watcher.seconds)), "peak_memory_mb": memory}
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     print(
         f"\n{summary['frames']} fixes together: {summary['north_m']:+.0f} m north, {summary['east_m']:+.0f} m east "
         f"of the truth, claimed {summary['sigma_north_m']:.0f} and {summary['sigma_east_m']:.0f} m; "
         f"heading {summary['heading_error_arcsec']:+.1f} arcsec"
+    )
+    print(
+        f"frame published to fix received: median {np.nanmedian(watcher.seconds):.2f} s; peak memory "
+        + ", ".join(f"{name} {mb} MB" for name, mb in memory.items() if name != "emulator")
     )
     if watcher.frame is not None:
         picture(watcher, errors, covariance, out / "demo.png")
