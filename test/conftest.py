@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A ROS domain of this session's own, the graph's other end, and a solver that a file's tests share."""
+
+import os
+
+import pytest
+from domain_coordinator import domain_id
+from graph import Graph
+from shots import SOLVER
+
+
+@pytest.fixture(scope="session", autouse=True)
+def domain():
+    """A ROS_DOMAIN_ID from 1 to 100 that no other test session on this machine has."""
+    with domain_id() as number:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        yield number
+
+
+@pytest.fixture(scope="module")
+def graph(domain):
+    graph = Graph()
+    yield graph
+    graph.close()
+
+
+@pytest.fixture
+def run(graph, tmp_path):
+    """Start an executable that ends with the test: run(package, name, *parameters, arguments=())."""
+    mine = []
+
+    def run(package, name, *parameters, arguments=()):
+        log = tmp_path / f"{len(mine)}-{name}.log"
+        mine.append(graph.start(log, package, name, *parameters, arguments=arguments))
+        return mine[-1]
+
+    yield run
+    for process in mine:
+        process.kill()
+        if process in graph.processes:
+            graph.processes.remove(process)
+    names = {p.name for p in mine}
+    graph.wait(lambda: not names & set(graph.node.get_node_names()), f"for {names} to leave the graph")
+
+
+@pytest.fixture(scope="module")
+def solver(graph, tmp_path_factory):
+    """A solver that knows the air of the shots, for all tests of a file."""
+    process = graph.start(tmp_path_factory.mktemp("solver") / "log", "starpos_solver", "solver", *SOLVER)
+    graph.wait_for_solver()
+    return process

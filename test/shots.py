@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an instrument at a known place would send: intrinsics, stars and tilts of one exposure, or an image."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from sensor_msgs.msg import CameraInfo, Image
+
+from starpos.atmosphere import Atmosphere
+from starpos.catalogue import load as load_catalogue
+from starpos.inclinometer import Tilt
+from starpos.simulate import Scene, detected, expose, read_tilt, render, scene_of
+from starpos.stars import no_stars
+from starpos_common.messages import camera_to_message, frame_to_message, stars_to_message, tilt_to_message
+from starpos_interfaces.msg import Capture, StarArray
+from starpos_interfaces.msg import Tilt as TiltMessage
+
+START_S = 1793642400.0  # 2026-11-02T18:00:00Z
+EXPOSURE_S, CADENCE_S, SAMPLES = 0.5, 10.0, 5
+PRESSURE_PA, TEMPERATURE_C, HUMIDITY = 95000.0, 8.0, 0.5
+LATITUDE_DEG, LONGITUDE_DEG = -23.1, -68.25
+NOISE_DEG = 0.0001
+FULL, FULL_FOCAL_PX = (5616, 3744), 93750.0
+SMALL = (1000, 700)
+FRAME = "starpos_camera_optical_frame"
+
+# Parameters of a solver that knows the air of this place and needs no long patience.
+SOLVER = (
+    f"refraction.pressure:={PRESSURE_PA}",
+    f"refraction.temperature:={TEMPERATURE_C}",
+    f"refraction.humidity:={HUMIDITY}",
+    "misalignment_stddev:=0.5",
+    "deflection.stddev:=0.0",
+)
+
+
+def focal_of(size) -> float:
+    """The focal length in px that gives this frame the full one's field: one catalogue of triangles does for all."""
+    return FULL_FOCAL_PX * float(np.hypot(*size) / np.hypot(*FULL))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One exposure as messages, and the truth about it."""
+
+    info: CameraInfo
+    stars: StarArray
+    tilts: list[TiltMessage]
+    scene: Scene
+
+    @property
+    def stamp(self) -> tuple[int, int]:
+        return self.stars.header.stamp.sec, self.stars.header.stamp.nanosec
+
+    def error_m(self, solution) -> np.ndarray:
+        """East, north in m of a solution's place against the truth (a sphere will do)."""
+        east = np.radians(solution.longitude - LONGITUDE_DEG) * np.cos(np.radians(LATITUDE_DEG))
+        return np.array([east, np.radians(solution.latitude - LATITUDE_DEG)]) * 6.371e6
+
+    def heading_error_deg(self, heading_deg: float) -> float:
+        return (heading_deg - np.degrees(self.scene.heading) + 180) % 360 - 180
+
+
+def scene_at(azimuth_deg=40.0, size=FULL) -> Scene:
+    air = Atmosphere(PRESSURE_PA, TEMPERATURE_C, HUMIDITY)
+    scene = scene_of(size, focal_of(size), LATITUDE_DEG, LONGITUDE_DEG, air, tilt_noise_deg=NOISE_DEG)
+    return replace(scene, azimuth_deg=azimuth_deg)
+
+
+def azimuth_for_heading(heading_deg: float) -> float:
+    """The optical axis' azimuth that turns the base link's x axis there."""
+    return heading_deg - float(np.degrees(scene_at(0.0).heading))
+
+
+_count = iter(range(1, 100000))
+
+
+def shoot(azimuth_deg=40.0, **changes) -> Shot:
+    """A shot 10 s after the one before, so that every one has a stamp of its own."""
+    k = next(_count)
+    scene = replace(scene_at(azimuth_deg), **changes)
+    start, rng = START_S + k * CADENCE_S, np.random.default_rng(k)
+    light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
+    stars = detected(scene, light, start + EXPOSURE_S / 2, EXPOSURE_S, rng)
+    return Shot(
+        camera_to_message(scene.camera, FRAME, stars.mid_unix_s),
+        stars_to_message(stars, FRAME),
+        tilts_of(scene, start, rng),
+        scene,
+    )
+
+
+def tilts_of(scene: Scene, start: float, rng) -> list[TiltMessage]:
+    covariance = np.eye(2) * np.radians(NOISE_DEG) ** 2
+    return [
+        tilt_to_message(
+            Tilt(
+                *read_tilt(scene, 0.0, rng),
+                covariance,
+                start + (j + 0.5) * EXPOSURE_S / SAMPLES,
+                1,
+                TEMPERATURE_C,
+            ),
+            "starpos_inclinometer_frame",
+            j,
+        )
+        for j in range(SAMPLES)
+    ]
+
+
+def photograph(azimuth_deg=40.0) -> tuple[Shot, Image, Capture]:
+    """A shot of the small camera whose stars are still in the image."""
+    k = next(_count)
+    scene = scene_at(azimuth_deg, SMALL)
+    start, rng = START_S + k * CADENCE_S, np.random.default_rng(k)
+    light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
+    image = frame_to_message(render(scene, light, start, EXPOSURE_S, rng), FRAME)
+    info = camera_to_message(scene.camera, FRAME, start + EXPOSURE_S / 2)
+    empty = stars_to_message(no_stars(*SMALL, start + EXPOSURE_S / 2), FRAME)
+    capture = Capture(header=image.header, exposure=EXPOSURE_S, stamp_source=Capture.SIMULATED)
+    return Shot(info, empty, tilts_of(scene, start, rng), scene), image, capture
