@@ -16,10 +16,15 @@ import numpy as np
 from starpos.errors import CatalogueError
 
 EPOCH = 2000.0  # of ra, dec, Julian year
-FORMAT = 1
+FORMAT = 3
 ZONES = 180  # of one degree of declination each
 MAS = np.radians(1 / 3.6e6)
-SIGMA_UNIT_MAS, PM_SIGMA_UNIT, EPOCH_ZERO = 2.0, 0.2, 1900.0
+EPOCH_ZERO = 1900.0
+SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = (
+    1.0,
+    0.1,
+    1.03,
+)  # an error is the smallest times CODE_STEP ** code
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
 
@@ -60,7 +65,10 @@ class Catalogue:
         return self.vmag_centi[index] * 0.01
 
     def directions(self, index, year: float = EPOCH) -> np.ndarray:
-        """ICRS unit vectors (n, 3), barycentric, at a Julian year: linear space motion without parallax."""
+        """ICRS unit vectors (n, 3), barycentric, at a Julian year: linear motion; parallax is left out.
+
+        It is 0.75 arcsec for the nearest star and below 0.03 for nearly all.
+        """
         ra, dec = self.ra_mas[index] * MAS, self.dec_mas[index] * MAS
         cr, sr, cd, sd = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
         v = np.stack([cd * cr, cd * sr, sd], -1)
@@ -76,8 +84,8 @@ class Catalogue:
     def sigma(self, index, year: float) -> np.ndarray:
         """Error of a place at a Julian year, rad, one axis, 1 sigma (n,)."""
         years = year - (EPOCH_ZERO + self.epoch_code[index])
-        motion = self.pm_sigma_code[index] * PM_SIGMA_UNIT * years
-        return np.hypot(self.sigma_code[index] * SIGMA_UNIT_MAS, motion) * MAS
+        motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
+        return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
     def names(self, index) -> list[str]:
         """Designations: 'HIP 1234' where there is one, else 'TYC 1-2-3'."""
@@ -138,13 +146,18 @@ def pack(tyc, hip, vmag, ra_deg, dec_deg, pm_ra, pm_dec, sigma_mas, sigma_pm, ep
         column(pm_ra, np.int16),
         column(pm_dec, np.int16),
         column(np.asarray(vmag) * 100, np.int16),
-        column(np.ceil(np.asarray(sigma_mas) / SIGMA_UNIT_MAS), np.uint8),
-        column(np.ceil(np.asarray(sigma_pm) / PM_SIGMA_UNIT), np.uint8),
+        column(_code(sigma_mas, SMALLEST_MAS), np.uint8),
+        column(_code(sigma_pm, SMALLEST_MAS_YEAR), np.uint8),
         column(np.asarray(epoch) - EPOCH_ZERO, np.uint8),
         np.asarray(tyc, np.int16)[order],
         np.asarray(hip, np.int32)[order],
         np.searchsorted(zone[order], np.arange(ZONES + 1)),
     )
+
+
+def _code(sigma, smallest: float) -> np.ndarray:
+    """The code of an error, rounded up."""
+    return np.ceil(np.log(np.maximum(np.asarray(sigma, float), smallest) / smallest) / np.log(CODE_STEP))
 
 
 def save(catalogue: Catalogue, path) -> None:

@@ -42,6 +42,17 @@ class Mounting:
 
 
 @dataclass(frozen=True)
+class MatchedStars:
+    """Identified stars: xy (N, 2) px and covariance_px2 (N, 2, 2) on the frame; places (N, 3), ICRS directions at the
+    date, and place_sigma (N,) rad, one axis."""
+
+    xy: np.ndarray
+    covariance_px2: np.ndarray
+    places: np.ndarray
+    place_sigma: np.ndarray
+
+
+@dataclass(frozen=True)
 class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 
@@ -76,10 +87,7 @@ class Fix:
 
 
 def solve_fix(
-    xy: np.ndarray,
-    covariance_px2: np.ndarray,
-    places: np.ndarray,
-    place_sigma: np.ndarray,
+    stars: MatchedStars,
     camera: Camera,
     tilt: Tilt,
     mounting: Mounting,
@@ -89,46 +97,62 @@ def solve_fix(
 ) -> Fix:
     """The fix of one frame from identified stars.
 
-    xy (N, 2) px; covariance_px2 (N, 2, 2); places (N, 3): ICRS directions at the date; place_sigma (N,) rad, one axis.
     The start is closed (singular values), the rest Levenberg-Marquardt over the rotation A4 and the plate scale.
     Raises FixError where the stars are too few or do not agree.
     """
     problem = _Problem(
-        xy,
+        stars.xy,
         camera,
         a2_matrix(tilt.theta_x, tilt.theta_y) @ mounting.a3,
-        earth.to_itrs(places),
+        earth.to_itrs(stars.places),
         atmosphere.refraction(),
     )
-    catalogue_px2 = np.eye(2) * ((place_sigma * camera.fx) ** 2)[:, None, None]
-    keep, jitter2 = np.ones(len(xy), bool), 0.0
-    state = problem.closed_form()
+    catalogue_px2 = np.eye(2) * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
+    stated = stars.covariance_px2 + catalogue_px2
+    keep, jitter2 = np.ones(len(stars.xy), bool), 0.0
+    state, settled = problem.closed_form(), False
     for _ in range(MAX_ROUNDS):
-        if keep.sum() < MIN_STARS:
-            raise FixError(f"only {int(keep.sum())} stars agree with each other: no fix from so few")
-        total = covariance_px2 + catalogue_px2 + np.eye(2) * jitter2
-        state = problem.refine(state, np.linalg.cholesky(np.linalg.inv(total)), keep)
-        residual, stated = problem.residual(state), covariance_px2 + catalogue_px2
+        if keep.sum() < max(MIN_STARS, 0.5 * len(keep)):
+            raise FixError(
+                f"only {int(keep.sum())} of {len(keep)} identified stars agree on one attitude: no fix from them"
+            )
+        state = problem.refine(state, stated + np.eye(2) * jitter2, keep)
+        if settled:
+            break
+        residual, before = problem.residual(state), (keep, jitter2)
         # by the median, else an outlier among a dozen stars would widen the gate enough to pass itself
         typical = _extra_variance(
             residual[keep], stated[keep], lambda d2, share: np.median(d2) / MEDIAN_OF_CHI2 - share
         )
-        keep_new = _distance2(residual, stated, typical) < OUTLIER_SIGMA**2
-        jitter2_new = _extra_variance(residual[keep], stated[keep], lambda d2, share: d2.mean() / 2 - share)
-        settled = np.array_equal(keep, keep_new) and abs(jitter2_new - jitter2) <= 0.02 * (jitter2 + 1e-6)
-        keep, jitter2 = keep_new, jitter2_new
-        if settled:
-            break
-    if keep.sum() < max(MIN_STARS, 0.5 * len(xy)):
-        raise FixError(
-            f"only {int(keep.sum())} of {len(xy)} identified stars agree on one attitude: no fix from them"
-        )
+        jitter2 = _extra_variance(residual[keep], stated[keep], lambda d2, share: d2.mean() / 2 - share)
+        keep = _distance2(residual, stated, typical) < OUTLIER_SIGMA**2
+        settled = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
     if jitter2 > (MAX_SCATTER * np.hypot(camera.width, camera.height)) ** 2:
         raise FixError(
             f"the identified stars lie {np.sqrt(jitter2):.1f} px off the best attitude: check the camera's distortion"
         )
-    return _report(problem, state, keep, covariance_px2, catalogue_px2, jitter2, tilt, mounting, atmosphere, earth,
-                   clock_stddev_s)  # fmt: skip
+    errors = _StarCovariances(stars.covariance_px2[keep] + np.eye(2) * jitter2, catalogue_px2[keep])
+    terms = _terms(problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s)
+    place = place_of(state.a4)
+    link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
+    axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
+    bent = np.linalg.norm(np.cross(axis, problem.refraction.unbend(axis)))
+    return Fix(
+        utc_unix_s=earth.utc_unix_s,
+        latitude=place.latitude,
+        longitude=place.longitude,
+        heading=heading_of(link_to_enu),
+        link_to_enu=link_to_enu,
+        terms=terms,
+        used=np.flatnonzero(keep),
+        residual_arcsec=float(np.sqrt(np.mean(problem.residual(state)[keep] ** 2)) * camera.scale_arcsec),
+        jitter_px=float(np.sqrt(jitter2)),
+        focal_scale=state.scale,
+        zenith_distance=float(np.arccos(np.clip(axis[0, 2], -1, 1))),
+        refraction_arcsec=float(np.degrees(bent) * 3600),
+        diurnal_aberration_arcsec=float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
+        ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
+    )
 
 
 def _distance2(residual: np.ndarray, covariance: np.ndarray, extra: float) -> np.ndarray:
@@ -173,14 +197,12 @@ class _Problem:
             a4 = rotation.best_rotation(self.itrs + station_velocity(a4[2]), local)
         return _State(a4, 1.0)
 
-    def predict(
-        self, state: _State, refraction: Refraction | None = None, g: np.ndarray | None = None
-    ) -> np.ndarray:
+    def predict(self, state: _State, refraction: Refraction | None = None) -> np.ndarray:
         """Pixels (N, 2) where the stars should be."""
         v = self.itrs + station_velocity(state.a4[2])
         v = v / np.linalg.norm(v, axis=1, keepdims=True)
         observed = (refraction or self.refraction).bend(v @ state.a4.T)
-        return self.camera.scaled(state.scale).project(observed @ (self.g if g is None else g))
+        return self.camera.scaled(state.scale).project(observed @ self.g)
 
     def residual(self, state: _State) -> np.ndarray:
         return self.predict(state) - self.xy
@@ -189,12 +211,13 @@ class _Problem:
         """The state after a small rotation p[:3] about L's axes and a relative change p[3] of the scale."""
         return _State(rotation.from_vector(p[:3]) @ state.a4, state.scale * (1 + p[3]))
 
-    def refine(self, state: _State, whiten: np.ndarray, keep: np.ndarray) -> _State:
-        """Levenberg-Marquardt (MINPACK) from `state`; whiten (N, 2, 2): Cholesky factors of the inverse covariances."""
+    def refine(self, state: _State, covariance_px2: np.ndarray, keep: np.ndarray) -> _State:
+        """Levenberg-Marquardt (MINPACK) from `state` over the stars to keep."""
+        whiten = np.linalg.cholesky(np.linalg.inv(covariance_px2[keep]))
 
         def whitened(p):
             r = self.residual(self.moved(state, p))[keep]
-            return np.einsum("nji,nj->ni", whiten[keep], r).ravel()
+            return np.einsum("nji,nj->ni", whiten, r).ravel()
 
         if np.isnan(whitened(np.zeros(4))).any():
             raise FixError(
@@ -215,54 +238,30 @@ class _Problem:
         return np.stack(columns, -1)
 
 
-def _report(
-    problem,
-    state,
-    keep,
-    centroid_px2,
-    catalogue_px2,
-    jitter2,
-    tilt,
-    mounting,
-    atmosphere,
-    earth,
-    clock_stddev_s,
-) -> Fix:
-    centroid_px2 = centroid_px2[keep] + np.eye(2) * jitter2
-    catalogue_px2 = catalogue_px2[keep]
+@dataclass(frozen=True)
+class _StarCovariances:
+    centroids: np.ndarray  # (M, 2, 2) px2, scatter included
+    catalogue: np.ndarray  # (M, 2, 2) px2
+
+
+def _terms(
+    problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s
+) -> tuple[ErrorTerm, ...]:
+    """The budget: how the fit passes on the errors of its stars, and what else there is."""
     place = place_of(state.a4)
-    link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
     j = problem.jacobian(state)[keep]
-    weighted = np.linalg.solve(centroid_px2 + catalogue_px2, j)
+    weighted = np.linalg.solve(errors.centroids + errors.catalogue, j)
     normal = np.einsum("nki,nkj->ij", j, weighted)
     gain = np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3]
     stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
     bending = -np.einsum("ank,nk->a", gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
-    terms = error_terms(
-        Sensitivity.of(state.a4, link_to_enu),
-        StarErrors(gain, centroid_px2, catalogue_px2),
+    return error_terms(
+        Sensitivity.of(state.a4, place.local_to_enu @ problem.g @ mounting.link_to_camera),
+        StarErrors(gain, errors.centroids, errors.catalogue),
         tilt,
         mounting.calibration_covariance,
         bending,
         place.latitude,
         earth,
         clock_stddev_s,
-    )
-    axis = problem.camera.directions(*np.array(problem.camera.centre_px)[:, None]) @ problem.g.T
-    bent = np.linalg.norm(np.cross(axis, problem.refraction.unbend(axis)))
-    return Fix(
-        earth.utc_unix_s,
-        place.latitude,
-        place.longitude,
-        heading_of(link_to_enu),
-        link_to_enu,
-        terms,
-        np.flatnonzero(keep),
-        float(np.sqrt(np.mean(problem.residual(state)[keep] ** 2)) * problem.camera.scale_arcsec),
-        float(np.sqrt(jitter2)),
-        state.scale,
-        float(np.arccos(np.clip(axis[0, 2], -1, 1))),
-        float(np.degrees(bent) * 3600),
-        float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
-        earth.orientation.ut1_minus_utc_s,
     )

@@ -7,7 +7,6 @@ and never by a count, and fitted by least squares to the faintest stars seen.
 """
 
 from dataclasses import dataclass
-from enum import Enum
 from functools import lru_cache
 from itertools import combinations
 
@@ -30,15 +29,9 @@ STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (8, 2.5), (12, 6.0))
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
 TRIANGLE_SIGMA = 3.0
 MATCH_SIGMA = 3.5
+FEWEST_STARS = 4
+BLEND_PX = 2.5  # closer stars make one image
 MAX_VERIFIED = 25  # candidates a stage
-
-
-class Status(str, Enum):
-    """How an identification ended."""
-
-    OK = "ok"
-    TOO_FEW_STARS = "too few stars"
-    NOT_IDENTIFIED = "not identified"
 
 
 @dataclass(frozen=True)
@@ -46,28 +39,19 @@ class Identification:
     """Matched stars and the attitude they give.
 
     star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): `Sky`'s directions
-    into C; focal_scale: factor on the camera's focal length; residual_px: rms of one axis; log_odds: of the match
-    against chance; mirrored: the frame's rows run bottom-up, all of this holds for the frame flipped.
+    into C; blend_px (M,): how far unresolved neighbours may draw each star's image; focal_scale: factor on the camera's
+    focal length; residual_px: rms of one axis; log_odds: of the match against chance; mirrored: the frame's rows run
+    bottom-up, all of this holds for the frame flipped.
     """
 
-    status: Status
     star: np.ndarray
     catalogue: np.ndarray
+    blend_px: np.ndarray
     attitude: np.ndarray
     focal_scale: float
     residual_px: float
     log_odds: float
     mirrored: bool
-
-    @property
-    def ok(self) -> bool:
-        return self.status is Status.OK
-
-
-def nothing(status: Status, log_odds: float = float("-inf")) -> Identification:
-    """An Identification that found nothing."""
-    empty = np.zeros(0, int)
-    return Identification(status, empty, empty, np.eye(3), float("nan"), float("nan"), log_odds, False)
 
 
 @dataclass(frozen=True)
@@ -90,22 +74,21 @@ class Sky:
         return v / np.linalg.norm(v)
 
 
-def identify(xy: np.ndarray, sigma_px: np.ndarray, camera: Camera, sky: Sky) -> Identification:
+def identify(xy: np.ndarray, sigma_px: np.ndarray, camera: Camera, sky: Sky) -> Identification | None:
     """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction taken off).
 
-    sigma_px (N,): their errors, one axis.  The focal length may be off by SCALE_TOLERANCE.
+    sigma_px (N,): their errors, one axis.  The focal length may be off by SCALE_TOLERANCE.  None: no part of the sky
+    is these stars beyond doubt.
     """
-    if len(xy) < 4:
-        return nothing(Status.TOO_FEW_STARS)
+    if len(xy) < FEWEST_STARS:
+        return None
     search = _Search(xy, sigma_px, camera, sky)
-    best = float("-inf")
     for stars, error_px in STAGES:
         for triangle in search.candidates(min(stars, len(xy)), error_px):
             match = search.verify(triangle, error_px)
-            best = max(best, match.log_odds)
             if match.log_odds > ACCEPT_LOG_ODDS + np.log(search.tried):
                 return search.finish(match)
-    return nothing(Status.NOT_IDENTIFIED, best)
+    return None
 
 
 @dataclass(frozen=True)
@@ -250,6 +233,7 @@ class _Search:
         index, w = self._on_frame(
             pose, self.sky.catalogue.cone(*self._cone(pose))[: 6 * len(xy) + 100], 3 * len(xy) + 50
         )
+        index, w, blend = self._resolved(pose, index, w)
         residual = xy[match.star] - _project(match.directions, pose)
         for _ in range(2):
             spread = np.clip(1.4826 * np.median(np.abs(residual)), 0.02, None)
@@ -257,15 +241,30 @@ class _Search:
             pose = _fit(xy[star], w[near], pose)
             residual = xy[star] - _project(w[near], pose)
         return Identification(
-            Status.OK,
             star,
             index[near],
+            blend[near],
             pose.attitude,
             pose.focal_px / self.camera.fx,
             float(np.sqrt(np.mean(residual**2))),
             match.log_odds,
             pose.mirrored,
         )
+
+    def _resolved(self, pose: _Pose, index: np.ndarray, w: np.ndarray):
+        """Stars (brightest first) without those that melt into a brighter one, and how far these may draw it (px)."""
+        pixel = _project(w, pose)
+        pair = cKDTree(pixel).query_pairs(BLEND_PX, output_type="ndarray")
+        brighter, fainter = pair[:, 0], pair[:, 1]
+        ratio = 10 ** (
+            -0.4 * (self.sky.catalogue.vmag(index[fainter]) - self.sky.catalogue.vmag(index[brighter]))
+        )
+        apart = np.hypot(*(pixel[fainter] - pixel[brighter]).T)
+        drawn = np.zeros(len(index))
+        np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
+        single = np.ones(len(index), bool)
+        single[fainter] = False
+        return index[single], w[single], drawn[single]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 """A simulated night on disk: frames (FITS) or star lists (CSV), tilt.csv, and truth.json to hold a solution against."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 from starpos.catalogue import Catalogue
 from starpos.errors import FrameError, TimeError
 from starpos.frame import Frame
+from starpos.progress import Progress, quiet
 from starpos.simulate import Scene, detected, expose, read_tilt, render
 from starpos.stars import Stars
 
@@ -28,7 +28,7 @@ def write_night(
     turn_deg: float,
     stars_only: bool,
     rng: np.random.Generator,
-    progress: Callable[[str, float], None] = lambda what, done: None,
+    progress: Progress = quiet,
 ) -> None:
     """Write `frames` exposures of a scene that turns by turn_deg of azimuth from one to the next."""
     begin = unix_of(start_utc)

@@ -3,7 +3,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import erfa
@@ -14,14 +14,17 @@ from starpos import triangles
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
-from starpos.earth import earth_state
+from starpos.earth import EarthState, earth_state
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
-from starpos.fix import Fix, solve_fix
+from starpos.fix import Fix, MatchedStars, solve_fix
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Instrument
-from starpos.stars import SATURATED, Stars
+from starpos.progress import Progress, quiet
+from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 
 J2000 = 2000.0
+UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED
+ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
 
 
@@ -68,6 +71,11 @@ class Solution:
     identify_s: float = 0.0
     fix_s: float = 0.0
 
+    @classmethod
+    def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
+        """Nothing but the reason."""
+        return cls(status, message, stars.source, stars.mid_unix_s, len(stars))
+
     @property
     def ok(self) -> bool:
         return self.status is Status.OK
@@ -81,7 +89,7 @@ class Solver:
     catalogue: Catalogue
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
     min_stars: int = 5
-    progress: Callable[[str, float], None] = lambda what, done: None
+    progress: Progress = quiet
 
     def prepare(self, width: int, height: int) -> None:
         """Have the triangles of this frame size at hand, building them if need be; raises StarposError."""
@@ -98,19 +106,15 @@ class Solver:
                 year, velocity = state.year, tuple(state.velocity)
             found, sky = self._identify(stars, camera, camera.directions(stars.x, stars.y), year, velocity)
         except StarposError as e:
-            return self._failure(stars, e)
+            return _failure(stars, e)
         spent = time.perf_counter() - begin
-        if not found.ok:
-            return self._unidentified(stars, found, spent)
-        return Solution(
-            Status.OK,
-            "identified",
-            stars.source,
-            stars.mid_unix_s,
-            len(stars),
-            tuple(self.catalogue.names(found.catalogue)),
-            found.star,
-            _attitude(found, sky, camera),
+        if found is None:
+            return replace(self._unidentified(stars), identify_s=spent)
+        return replace(
+            Solution.failed(stars, Status.OK, "identified"),
+            names=tuple(self.catalogue.names(found.catalogue)),
+            star=found.star,
+            attitude=_attitude(found, sky, camera),
             identify_s=spent,
         )
 
@@ -133,52 +137,53 @@ class Solver:
             directions = self.atmosphere.refraction().unbend(camera.directions(stars.x, stars.y) @ g.T) @ g
             found, sky = self._identify(stars, camera, directions, state.year, tuple(state.velocity))
         except StarposError as e:
-            return self._failure(stars, e)
+            return _failure(stars, e)
         identified = time.perf_counter()
-        if not found.ok:
-            return self._unidentified(stars, found, identified - begin)
-        attitude = _attitude(found, sky, camera)
+        if found is None:
+            return replace(self._unidentified(stars), tilt=tilt, identify_s=identified - begin)
+        known = {"attitude": _attitude(found, sky, camera), "tilt": tilt, "identify_s": identified - begin}
         try:
-            if len(found.star) < self.min_stars:
-                raise FixError(
-                    f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix"
-                )
-            if found.mirrored:
-                raise InstrumentError(
-                    "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
-                )
-            fix = solve_fix(
-                np.stack([stars.x, stars.y], -1)[found.star],
-                stars.covariance[found.star],
-                self.catalogue.directions(found.catalogue, state.year),
-                self.catalogue.sigma(found.catalogue, state.year),
-                camera.scaled(found.focal_scale),
-                tilt,
-                self.instrument.mounting,
-                self.atmosphere,
-                state,
-                self.instrument.clock_stddev_s,
-            )
+            fix = self._fix(stars, found, camera, tilt, state)
         except StarposError as e:
-            failed = self._failure(stars, e)
-            return Solution(
-                failed.status, failed.message, stars.source, stars.mid_unix_s, len(stars), (), None, attitude, None, tilt,
-                identified - begin,
-            )  # fmt: skip
-        return Solution(
-            Status.OK,
-            "fix",
-            stars.source,
-            stars.mid_unix_s,
-            len(stars),
-            tuple(self.catalogue.names(found.catalogue[fix.used])),
-            found.star[fix.used],
-            attitude,
-            fix,
-            tilt,
-            identified - begin,
-            time.perf_counter() - identified,
+            return replace(_failure(stars, e), **known)
+        return replace(
+            Solution.failed(stars, Status.OK, "fix"),
+            names=tuple(self.catalogue.names(found.catalogue[fix.used])),
+            star=found.star[fix.used],
+            fix=fix,
+            fix_s=time.perf_counter() - identified,
+            **known,
         )
+
+    def _fix(
+        self, stars: Stars, found: ident.Identification, camera: Camera, tilt: Tilt, state: EarthState
+    ) -> Fix:
+        if len(found.star) < self.min_stars:
+            raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
+        if found.mirrored:
+            raise InstrumentError(
+                "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
+            )
+        # a saturated, cut or blended image has its centroid elsewhere; such stars serve where there are no others
+        sound = (stars.flags[found.star] & UNSOUND) == 0
+        use = sound if sound.sum() >= max(self.min_stars, ENOUGH_SOUND) else np.ones(len(sound), bool)
+        star, index = found.star[use], found.catalogue[use]
+        matched = MatchedStars(
+            np.stack([stars.x, stars.y], -1)[star],
+            stars.covariance[star],
+            self.catalogue.directions(index, state.year),
+            np.hypot(self.catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
+        )
+        fix = solve_fix(
+            matched,
+            camera.scaled(found.focal_scale),
+            tilt,
+            self.instrument.mounting,
+            self.atmosphere,
+            state,
+            self.instrument.clock_stddev_s,
+        )
+        return replace(fix, used=np.flatnonzero(use)[fix.used])
 
     def _camera(self, width: int, height: int) -> Camera:
         camera = self.instrument.camera_for(width, height)
@@ -198,34 +203,30 @@ class Solver:
         sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
         return ident.identify(ideal.project(directions), sigma, ideal, sky), sky
 
-    def _unidentified(self, stars: Stars, found: ident.Identification, spent: float) -> Solution:
-        place = stars.source or "the frame"
-        if found.status is ident.Status.TOO_FEW_STARS:
+    def _unidentified(self, stars: Stars) -> Solution:
+        place, n = stars.source or "the frame", len(stars)
+        if n < ident.FEWEST_STARS:
             saturated = int(np.sum((stars.flags & SATURATED) != 0))
             hint = f" ({saturated} saturated)" if saturated else ""
-            message = (
-                f"{place}: {len(stars)} stars detected{hint}, at least 4 are needed: check clouds and focus"
-            )
-            return Solution(
-                Status.TOO_FEW_STARS, message, stars.source, stars.mid_unix_s, len(stars), identify_s=spent
-            )
+            needed = f"at least {ident.FEWEST_STARS} are needed: check clouds, focus and exposure"
+            message = f"{place}: {n} stars detected{hint}, {needed}"
+            return Solution.failed(stars, Status.TOO_FEW_STARS, message)
         message = (
-            f"{place}: none of the sky fits its {len(stars)} stars: check the focal length "
+            f"{place}: none of the sky fits its {n} stars: check the focal length "
             f"({self.instrument.focal_px:.0f} px given, 3 % is allowed), clouds and exposure"
         )
-        return Solution(
-            Status.NOT_IDENTIFIED, message, stars.source, stars.mid_unix_s, len(stars), identify_s=spent
-        )
+        return Solution.failed(stars, Status.NOT_IDENTIFIED, message)
 
-    def _failure(self, stars: Stars, error: StarposError) -> Solution:
-        kinds = (
-            (TiltRangeError, Status.TILT_OUT_OF_RANGE),
-            (TiltError, Status.NO_TILT),
-            (TimeError, Status.BAD_INPUT if stars.mid_unix_s is None else Status.TIME_OUTSIDE_TABLES),
-            (FixError, Status.POOR_FIT),
-        )
-        status = next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
-        return Solution(status, str(error), stars.source, stars.mid_unix_s, len(stars))
+
+def _failure(stars: Stars, error: StarposError) -> Solution:
+    kinds = (
+        (TiltRangeError, Status.TILT_OUT_OF_RANGE),
+        (TiltError, Status.NO_TILT),
+        (TimeError, Status.BAD_INPUT if stars.mid_unix_s is None else Status.TIME_OUTSIDE_TABLES),
+        (FixError, Status.POOR_FIT),
+    )
+    status = next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
+    return Solution.failed(stars, status, str(error))
 
 
 def _attitude(found: ident.Identification, sky: ident.Sky, camera: Camera) -> Attitude:

@@ -8,9 +8,9 @@ every circle of the field's size gives its own brightest stars, so that every fi
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+import threading
+import warnings
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from itertools import combinations
 from math import comb
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from starpos.catalogue import Catalogue, rows_near
-from starpos.errors import CatalogueError
+from starpos.progress import Progress, quiet
 
 FORMAT = 4
 SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
@@ -28,6 +28,7 @@ POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circl
 # Circles laid over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken).
 # The first fits into a field of 3:2 or 4:3, the second is the whole field's own.
 CIRCLES = ((0.6, 0.85, 7), (1.0, 0.85, 8))
+MOST_IN_USE = 4
 MAX_TRIANGLES = 5_000_000  # before those that several circles share are counted once
 
 
@@ -111,12 +112,7 @@ def _bin_smallest(angle):
     return np.clip((angle * (SMALLEST_BINS / (np.pi / 3))).astype(np.int64), 0, SMALLEST_BINS - 1)
 
 
-Progress = Callable[[str, float], None]
-
-
-def build(
-    catalogue: Catalogue, half_diagonal: float, progress: Progress = lambda what, done: None
-) -> TriangleCatalogue:
+def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet) -> TriangleCatalogue:
     """Triangles for a field of this half diagonal (rad): those of the brightest stars of every circle over the sky.
 
     A circle takes its own brightest stars, however bright its neighbours are, so that every part of the sky has enough.
@@ -206,56 +202,81 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "starpos"
 
 
-def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = lambda what, done: None):
+def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> TriangleCatalogue:
     """The TriangleCatalogue for a field of this half diagonal: memory-mapped from the cache, built when it is not there.
 
     The field is rounded up to steps of 5 %, so that a refined focal length does not build a new one.
     """
-    step = np.ceil(np.log(half_diagonal_rad) / np.log(1.05))
-    return _cached(catalogue, float(1.05**step), progress)
+    half_diagonal = float(1.05 ** np.ceil(np.log(half_diagonal_rad) / np.log(1.05)))
+    with _lock:
+        key = (catalogue.fingerprint, half_diagonal, cache_folder())
+        if key not in _in_use:
+            while len(_in_use) >= MOST_IN_USE:
+                _in_use.pop(next(iter(_in_use)))
+            _in_use[key] = _load_or_build(catalogue, half_diagonal, progress)
+        return _in_use[key]
 
 
-@lru_cache(maxsize=4)
-def _cached(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
+_lock = threading.Lock()
+_in_use: dict[tuple, TriangleCatalogue] = {}
+
+
+def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
     settings = (
         f"{FORMAT} {catalogue.fingerprint} {half_diagonal:.6f} {CIRCLES} {POOL_PER_CIRCLE} {SHORTEST_SIDE}"
     )
     digest = hashlib.sha256(settings.encode()).hexdigest()[:16]
     folder = cache_folder() / f"triangles-{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
-    if not folder.is_dir():
-        _store(build(catalogue, half_diagonal, progress), folder)
-    return _map(folder)
+    if (stored := _map(folder)) is not None:
+        return stored
+    built = build(catalogue, half_diagonal, progress)
+    try:
+        _store(built, folder)
+    except OSError as e:
+        warnings.warn(
+            f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}) and is built at every start: "
+            "free the disk or set XDG_CACHE_HOME",
+            stacklevel=2,
+        )
+        return built
+    return _map(folder) or built
 
 
 def _store(triangles: TriangleCatalogue, folder: Path) -> None:
     """Write all columns into a new folder, then name it: another process sees all of it or nothing."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
-            whole = Path(scratch) / "whole"
-            whole.mkdir()
-            for f in fields(triangles):
-                np.save(whole / f"{f.name}.npy", getattr(triangles, f.name))
-            try:
-                whole.rename(folder)
-            except OSError:
-                if not folder.is_dir():  # otherwise another process was first
-                    raise
-    except OSError as e:
-        raise CatalogueError(f"{folder.parent}: cannot keep the triangle catalogue there ({e}); free the disk or set "
-                             "XDG_CACHE_HOME") from None  # fmt: skip
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        whole = Path(scratch) / "whole"
+        whole.mkdir()
+        for f in fields(triangles):
+            np.save(whole / f"{f.name}.npy", getattr(triangles, f.name))
+        if folder.exists():  # it was broken, or it would have been used
+            folder.rename(Path(scratch) / "broken")
+        try:
+            whole.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # otherwise another process was first
+                raise
 
 
-def _map(folder: Path) -> TriangleCatalogue:
+def _map(folder: Path) -> TriangleCatalogue | None:
+    """The stored catalogue; None where there is none or its parts do not fit together."""
     try:
         columns = {
-            f.name: np.load(folder / f"{f.name}.npy", mmap_mode="r", allow_pickle=False)
+            f.name: np.asarray(np.load(folder / f"{f.name}.npy", mmap_mode="r", allow_pickle=False))
             for f in fields(TriangleCatalogue)
         }
-        if len(columns["bin_start"]) != LARGEST_BINS * SMALLEST_BINS + 1:
-            raise ValueError("bins do not fit")
-        return TriangleCatalogue(**{k: np.asarray(v) for k, v in columns.items()})
-    except (OSError, ValueError, EOFError) as e:
-        raise CatalogueError(
-            f"{folder}: a broken triangle catalogue ({e}): remove the folder, it is built anew"
-        ) from None
+    except (OSError, ValueError, EOFError):
+        return None
+    t = TriangleCatalogue(**columns)
+    stars, count = len(t.star), len(t.corners)
+    fit = (
+        t.bin_start.shape == (LARGEST_BINS * SMALLEST_BINS + 1,)
+        and t.bin_start[-1] == count
+        and t.corners.shape == (count, 3)
+        and len(t.largest) == len(t.smallest) == len(t.longest) == count
+        and t.directions.shape == (stars, 3)
+        and len(t.ra_mas) == len(t.rank) == t.zone_start[-1] == stars
+        and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
+    )
+    return t if fit else None

@@ -6,18 +6,19 @@ Tycho-2: Hog et al. 2000, A&A 355, L27.  Byte positions as in the catalogue's ow
 
 import lzma
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from starpos.catalogue import EPOCH, Catalogue, pack
 from starpos.errors import CatalogueError
+from starpos.progress import Progress, quiet
 
 SUPPLEMENT_EPOCH = 1991.25
-UNKNOWN_MOTION_MAS_YEAR = (
-    25.0  # 1 sigma of a star whose proper motion was never measured: the V ~ 10 stars' own spread
-)
+# 68 % of the measured proper motions of stars of magnitude V, one axis, are below: what an unmeasured one may be
+MOTION_V = (3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 10.5)
+MOTION_MAS_YEAR = (79.0, 52.0, 41.0, 30.0, 23.0, 18.0, 14.0, 12.0)
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
 
 _MAIN = {  # name: (first byte from 0, length)
@@ -33,9 +34,7 @@ _SUPPLEMENT = {
 }  # fmt: skip
 
 
-def build(
-    source, limit_mag: float, progress: Callable[[str, float], None] = lambda what, done: None
-) -> Catalogue:
+def build(source, limit_mag: float, progress: Progress = quiet) -> Catalogue:
     """The catalogue of all stars with V < limit_mag from a folder (or Debian's tycho2_*.orig.tar.xz) of the originals.
 
     Every star carries its own position error: mean position and motion where Tycho-2 has them, the observed place
@@ -107,6 +106,11 @@ def johnson_v(bt: np.ndarray, vt: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(vt), vt, bt - colour) - 0.09 * colour
 
 
+def _unmeasured_motion(t: dict) -> np.ndarray:
+    """1 sigma (mas/yr) of a proper motion that is not in the catalogue: bright stars are near and quick."""
+    return np.interp(johnson_v(t["bt"], t["vt"]), MOTION_V, MOTION_MAS_YEAR)
+
+
 def _identity(t: dict) -> dict[str, np.ndarray]:
     return {
         "tyc": np.stack([t["tyc1"], t["tyc2"], t["tyc3"]], -1).astype(np.int32),
@@ -126,9 +130,7 @@ def _main_stars(t: dict) -> dict[str, np.ndarray]:
             mean, np.hypot(t["e_ra"], t["e_dec"]), np.hypot(t["e_ra_observed"], t["e_dec_observed"])
         )
         / np.sqrt(2),
-        "sigma_pm": np.where(
-            mean, np.hypot(t["e_pm_ra"], t["e_pm_dec"]) / np.sqrt(2), UNKNOWN_MOTION_MAS_YEAR
-        ),
+        "sigma_pm": np.where(mean, np.hypot(t["e_pm_ra"], t["e_pm_dec"]) / np.sqrt(2), _unmeasured_motion(t)),
         "epoch": np.where(mean, (t["epoch_ra"] + t["epoch_dec"]) / 2, 1990 + t["epoch"]),
         "photocentre": t["pflag"] == b"P",
     }
@@ -145,7 +147,7 @@ def _supplement_stars(t: dict) -> dict[str, np.ndarray]:
         "pm_dec": pm_dec,
         "sigma_mas": np.hypot(t["e_ra"], t["e_dec"]) / np.sqrt(2),
         "sigma_pm": np.where(
-            moving, np.nan_to_num(np.hypot(t["e_pm_ra"], t["e_pm_dec"])) / np.sqrt(2), UNKNOWN_MOTION_MAS_YEAR
+            moving, np.nan_to_num(np.hypot(t["e_pm_ra"], t["e_pm_dec"])) / np.sqrt(2), _unmeasured_motion(t)
         ),
         "epoch": np.full(len(moving), SUPPLEMENT_EPOCH),
         "photocentre": np.zeros(len(moving), bool),

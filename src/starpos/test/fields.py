@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.earth import EarthState, earth_state, station_velocity
-from starpos.fix import Fix, Mounting, solve_fix
+from starpos.fix import Fix, MatchedStars, Mounting, solve_fix
 from starpos.inclinometer import Tilt
 from starpos.instrument import TOP_OF_FRAME
 from starpos.sky import Site, camera_to_enu
@@ -73,9 +73,9 @@ class Field:
     def solve(self, xy, places, state=None, **given) -> Fix:
         """solve_fix with what this field knows, each part replaceable."""
         n = len(xy)
+        covariance = given.pop("covariance_px2", np.eye(2)[None].repeat(n, 0) * 0.05**2)
+        stars = MatchedStars(xy, covariance, places, given.pop("place_sigma", np.full(n, 1e-9)))
         parts = {
-            "covariance_px2": np.eye(2)[None].repeat(n, 0) * 0.05**2,
-            "place_sigma": np.full(n, 1e-9),
             "camera": self.camera,
             "tilt": self.tilt(),
             "mounting": self.mounting(),
@@ -83,7 +83,7 @@ class Field:
             "earth": state or earth_state(self.utc),
             "clock_stddev_s": 0.0,
         }
-        return solve_fix(xy=xy, places=places, **parts | given)
+        return solve_fix(stars, **parts | given)
 
 
 def random_field(rng, **fixed) -> Field:

@@ -2,6 +2,7 @@
 import numpy as np
 import pytest
 from rendered import BIAS, bound, field, grid, match, noisy
+
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError
 from starpos.frame import Frame

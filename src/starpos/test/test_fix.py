@@ -129,7 +129,7 @@ def test_scatter_beyond_the_centroids_errors_widens_the_fix(rng):
 def test_too_few_stars(rng):
     field = Field(stars=2)
     xy, places = field.places(STATE, rng)
-    with pytest.raises(FixError, match="no fix from so few"):
+    with pytest.raises(FixError, match="only 2 of 2"):
         field.solve(xy, places, STATE)
 
 

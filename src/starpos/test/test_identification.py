@@ -7,7 +7,7 @@ from scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos import triangles
 from starpos.camera import Camera
-from starpos.identification import Sky, Status, identify
+from starpos.identification import Sky, identify
 
 ARCSEC = np.radians(1 / 3600)
 FIELDS = {
@@ -39,7 +39,7 @@ def seen(sky, camera, attitude, limit_mag, rng, sigma=0.05, missing=0.0):
 
 def check(found, attitude, index, camera, sky, tolerance_px=0.3):
     """The boresight is right, and each matched star is the one it was made from, or its neighbour within a pixel."""
-    assert found.status is Status.OK
+    assert found is not None
     apart = np.arccos(np.clip(found.attitude[2] @ attitude[2], -1, 1))
     assert apart < tolerance_px / camera.fx
     truth = index[found.star]
@@ -60,7 +60,7 @@ def test_fields_are_found_with_false_stars_brighter_than_all_others(size, false_
         xy = np.concatenate([rng.uniform(0, [camera.width - 1, camera.height - 1], (false_stars, 2)), xy])
         index = np.concatenate([np.full(false_stars, -1), index])
         answer = identify(xy, np.full(len(xy), 0.05), camera, sky)
-        if answer.ok:
+        if answer is not None:
             found += 1
             check(answer, attitude, index, camera, sky)
             assert answer.focal_scale == pytest.approx(1, abs=1e-3)
@@ -95,7 +95,7 @@ def test_a_focal_length_a_third_off_is_not_found(catalogue, rng):
     sky = sky_for(catalogue, camera)
     for _ in range(2):
         xy, _ = seen(sky, camera.scaled(1.33), random_attitude(rng), limit, rng)
-        assert identify(xy, np.full(len(xy), 0.05), camera, sky).status is Status.NOT_IDENTIFIED
+        assert identify(xy, np.full(len(xy), 0.05), camera, sky) is None
 
 
 def test_a_mirrored_frame_is_found_and_said(catalogue, rng):
@@ -114,17 +114,13 @@ def test_random_points_are_nothing(catalogue, rng):
     for n in (4, 6, 12, 30, 200):
         for _ in range(2):
             s = random_stars(n, rng)
-            answer = identify(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky)
-            assert answer.status is Status.NOT_IDENTIFIED
-            assert len(answer.star) == len(answer.catalogue) == 0
+            assert identify(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky) is None
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
 def test_too_few(n, catalogue, rng):
     camera, _ = FIELDS["15 deg"]
-    answer = identify(rng.uniform(0, 600, (n, 2)), np.full(n, 0.05), camera, sky_for(catalogue, camera))
-    assert answer.status is Status.TOO_FEW_STARS
-    assert not answer.ok
+    assert identify(rng.uniform(0, 600, (n, 2)), np.full(n, 0.05), camera, sky_for(catalogue, camera)) is None
 
 
 def test_aberration_of_the_date(catalogue, rng):
@@ -157,4 +153,4 @@ def test_degenerate_lists_raise_nothing(kind, catalogue, rng):
     camera, _ = FIELDS["15 deg"]
     xy = DEGENERATE[kind](rng)
     answer = identify(xy, np.full(len(xy), 0.05), camera, sky_for(catalogue, camera))
-    assert answer.status is Status.NOT_IDENTIFIED
+    assert answer is None

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
+
 from starpos.errors import FrameError
 from starpos.frame import Frame
 from starpos.reading import read_frame

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+
 from starpos.errors import FrameError
 from starpos.stars import EDGE, SATURATED, Stars, no_stars
 
