@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `solver`: stars and tilts in, `fix`, `heading/imu` and `solver/solution` out."""
 
+import math
 import threading
+import traceback
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -44,6 +46,15 @@ class Waiting:
     since_ns: int
 
 
+@dataclass(frozen=True)
+class Made:
+    """What the thread made of a camera: a solver, or why there is none."""
+
+    camera: Camera
+    solver: Solver | None
+    trouble: str
+
+
 class SolverNode(Node):
     """See README.md."""
 
@@ -57,6 +68,7 @@ class SolverNode(Node):
         self._camera: Camera | None = None
         self._solver: Solver | None = None
         self._preparing: threading.Thread | None = None
+        self._made: Made | None = None
         self._trouble = ""  # why there is no solver
         self._latest: Waiting | None = None
         self._answer: Answer | None = None
@@ -119,11 +131,13 @@ class SolverNode(Node):
         try:
             camera = message_to_camera(message)
         except StarposError as e:
+            if self._camera is None:
+                self._trouble = str(e)
             self._reject(str(e))
             return
         if camera == self._camera:
             return
-        self._camera, self._solver = camera, None
+        self._camera, self._solver, self._trouble = camera, None, ""
         if self._preparing is None:
             self._prepare(camera)
 
@@ -132,27 +146,32 @@ class SolverNode(Node):
 
         def work():
             try:
-                self._make_solver(camera).prepare(camera.width, camera.height)
-                self._trouble = ""
+                solver = self._make_solver(camera)
+                solver.prepare(camera.width, camera.height)
+                self._made = Made(camera, solver, "")
             except StarposError as e:
-                self._trouble = str(e)
+                self._made = Made(camera, None, str(e))
             self._prepared.trigger()
 
         self._preparing = threading.Thread(target=work, daemon=True)
         self._preparing.start()
 
     def _on_prepared(self):
-        self._preparing = None
+        made, self._preparing = self._made, None
+        if made.camera != self._camera:  # another one has come meanwhile
+            self._prepare(self._camera)
+            return
+        self._solver, self._trouble = made.solver, made.trouble
         if self._trouble:
             self._log_change(self._trouble, good=False)
-        elif self._camera is not None:
-            self._solver = self._make_solver(self._camera)
+        else:
+            self._apply(frozenset())  # with the parameters of now
         self._work()
 
     def _on_tilt(self, message: Tilt):
         self._seen("tilt")
         try:
-            self._tilts.add(message, float(self._values["tilt_stddev"]) * 0.017453292519943295)
+            self._tilts.add(message, math.radians(self._values["tilt_stddev"]))
         except StarposError as e:
             self._reject(str(e))
         if self._waiting:
@@ -213,13 +232,22 @@ class SolverNode(Node):
             reason = self._trouble or (
                 f"{self.resolve_topic_name('camera/camera_info')}: no camera calibration has arrived: start the camera"
             )
-            return Answer(Status.BAD_INPUT, reason, "stars", stars.mid_unix_s, len(stars))
+            return Answer.failed(stars, Status.BAD_INPUT, reason)
         solver = self._solver
         stamp_stddev = frame.message.stamp_stddev
+        if not 0 <= stamp_stddev < math.inf:
+            reason = f"stars: stamp_stddev is {stamp_stddev} s: it must be 0 (unknown) or more"
+            return Answer.failed(stars, Status.BAD_INPUT, reason)
         if stamp_stddev > 0:
-            clock = (solver.instrument.clock_stddev_s**2 + stamp_stddev**2) ** 0.5
+            clock = math.hypot(solver.instrument.clock_stddev_s, stamp_stddev)
             solver = replace(solver, instrument=replace(solver.instrument, clock_stddev_s=clock))
-        return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)))
+        try:
+            return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)))
+        except Exception as e:  # a defect costs this frame, not the night
+            self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
+            return Answer.failed(
+                stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
+            )
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
