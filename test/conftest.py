@@ -37,11 +37,9 @@ def run(graph, tmp_path):
 
     yield run
     for process in mine:
-        process.kill()
+        process.end()
         if process in graph.processes:
             graph.processes.remove(process)
-    names = {p.name for p in mine}
-    graph.wait(lambda: not names & set(graph.node.get_node_names()), f"for {names} to leave the graph")
 
 
 @pytest.fixture(scope="module")

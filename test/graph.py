@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The installed executables as processes, and a node that feeds and hears them; it waits for events, never sleeps."""
 
+import signal
 import subprocess
 import time
 from pathlib import Path
@@ -17,6 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix
 from starpos_interfaces.msg import Capture, Solution, StarArray, Tilt
 
 WAIT_S = 40.0  # for anything; a fresh machine builds its star triangles meanwhile
+END_S = 10.0
 
 
 def executable(package: str, name: str) -> str:
@@ -44,8 +46,13 @@ class Process:
     def wait(self) -> int:
         return self.process.wait(WAIT_S)
 
-    def kill(self):
+    def end(self):
+        """End it in whatever state it is; by a signal it handles, so that it takes its leave of the others."""
         if self.process.poll() is None:
+            self.signal(signal.SIGINT)
+        try:
+            self.process.wait(END_S)
+        except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
 
@@ -80,7 +87,7 @@ class Graph:
 
     def close(self):
         for p in self.processes:
-            p.kill()
+            p.end()
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
@@ -107,49 +114,54 @@ class Graph:
         self.processes.append(Process(log, package, name, arguments, parameters))
         return self.processes[-1]
 
-    def wait(self, condition, why="") -> None:
-        end = time.monotonic() + WAIT_S
+    def comes(self, condition, seconds: float) -> bool:
+        """Whether it comes true within so many seconds."""
+        end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
-                tails = "\n".join(f"{p.name}: {p.output[-2000:]}" for p in self.processes)
-                raise AssertionError(f"waited {WAIT_S:g} s in vain {why}\n{tails}")
+                return False
             self._executor.spin_once(timeout_sec=0.2)
+        return True
+
+    def wait(self, condition, why="") -> None:
+        if not self.comes(condition, WAIT_S):
+            tails = "\n".join(f"{p.name}: {p.output[-2000:]}" for p in self.processes)
+            raise AssertionError(f"waited {WAIT_S:g} s in vain {why}\n{tails}")
 
     def wait_for_solver(self):
         """Until it hears our publishers and we hear its."""
-        self.wait(
-            lambda: (
-                all(p.get_subscription_count() == 1 for p in (self.info, self.stars, self.tilt))
-                and all(e.get_publisher_count() == 1 for e in self._ears)
-                and self.node.count_publishers("stars") >= 1
-            ),
-            "for the solver",
-        )
 
-    def wait_for_detector(self):
+        def counts():
+            ears = [e.get_publisher_count() for e in self._ears]
+            return [p.get_subscription_count() for p in (self.info, self.stars, self.tilt)] + ears
+
+        if not self.comes(lambda: counts() == [1] * 6, WAIT_S):
+            raise AssertionError(f"the solver is not there, or there are two: {counts()}")
+
+    def wait_for_detector(self, photograph):
+        """Until an image that is sent comes back as a solution: nobody else knows that detector and solver met."""
         self.wait(lambda: self.image.get_subscription_count() and self.capture.get_subscription_count())
-        self.wait(lambda: self.node.count_publishers("stars") == 2, "for the detector")
+        for _ in range(20):
+            shot, image, capture = photograph()
+            self.send(shot, image, capture)
+            if self.comes(lambda s=shot: s.stamp in self.solutions, 2.0):
+                return
+        raise AssertionError("detector and solver do not find each other")
 
-    def stop(self, process: Process, *signals) -> int:
-        """Signal it and wait until it is gone from the graph as well; its exit status."""
-        process.signal(*signals)
-        status = process.wait()
-        self.processes.remove(process)
-        self.wait(
-            lambda: process.name not in self.node.get_node_names(), f"for {process.name} to leave the graph"
-        )
-        return status
-
-    def forget(self):
-        for kept in (self.solutions, self.fixes, self.imus):
-            kept.clear()
-
-    def answer(self, shot, tilts=None):
-        """Send a shot; the Solution and the NavSatFix of its stamp, and the Imu where the solution is one."""
+    def send(self, shot, image=None, capture=None):
+        """A shot's intrinsics, its tilts, then its stars or the image they are in."""
         self.info.publish(shot.info)
-        for tilt in shot.tilts if tilts is None else tilts:
+        for tilt in shot.tilts:
             self.tilt.publish(tilt)
-        self.stars.publish(shot.stars)
+        if image is None:
+            self.stars.publish(shot.stars)
+        else:
+            self.capture.publish(capture)
+            self.image.publish(image)
+
+    def answer(self, shot):
+        """Send a shot; the Solution and the NavSatFix of its stamp, and the Imu where the solution is one."""
+        self.send(shot)
         return self.result(shot.stamp)
 
     def result(self, stamp):

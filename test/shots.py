@@ -15,7 +15,7 @@ from starpos_common.messages import camera_to_message, frame_to_message, stars_t
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_interfaces.msg import Tilt as TiltMessage
 
-START_S = 1793642400.0  # 2026-11-02T18:00:00Z
+START_S = 1793728800.0  # 2026-11-03T18:00:00Z
 EXPOSURE_S, CADENCE_S, SAMPLES = 0.5, 10.0, 5
 PRESSURE_PA, TEMPERATURE_C, HUMIDITY = 95000.0, 8.0, 0.5
 LATITUDE_DEG, LONGITUDE_DEG = -23.1, -68.25
@@ -39,9 +39,9 @@ def focal_of(size) -> float:
     return FULL_FOCAL_PX * float(np.hypot(*size) / np.hypot(*FULL))
 
 
-@dataclass(frozen=True)
+@dataclass
 class Shot:
-    """One exposure as messages, and the truth about it."""
+    """One exposure as messages, for tests to spoil, and the truth about it."""
 
     info: CameraInfo
     stars: StarArray

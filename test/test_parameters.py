@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, services and diagnostics of the running solver."""
+
+import math
+
+import numpy as np
+import pytest
+from shots import PRESSURE_PA, shoot
+from std_srvs.srv import Trigger
+
+from starpos_interfaces.msg import Solution
+from starpos_interfaces.srv import Solve
+
+
+def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
+    response = graph.call(Solve, "solver/solve", Solve.Request())
+    assert not response.success and "no frame has arrived" in response.message
+    assert response.solution.status == Solution.BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [  # rclpy itself refuses what a native range or the type excludes, with its own words
+        ({"refraction__pressure": -5.0}, "refraction.pressure must be a number from 0 to 120000 Pa"),
+        ({"refraction__pressure": math.inf}, "refraction.pressure must be a number from 0 to 120000 Pa"),
+        ({"misalignment": [1.0, 2.0]}, "misalignment must be 3 values"),
+        ({"calibration_url": "/nowhere/instrument.yaml"}, "/nowhere/instrument.yaml"),
+        ({"refraction__humidity": 1.5}, "refraction.humidity 0 1"),
+        ({"min_stars": 2}, "min_stars 4 1000"),
+        ({"clock_stddev": 0.5, "min_stars": 0}, "min_stars 4 1000"),
+        ({"deflection__xi": 200.0}, "deflection.xi -120 120"),
+        ({"refraction__temperature": "warm"}, "DOUBLE STRING"),
+    ],
+)
+def test_what_is_refused_comes_back_with_its_constraint(graph, solver, values, words):
+    done, reason = graph.set("solver", **values)
+    assert not done and all(word in reason for word in words.split()), reason
+
+
+def test_pressure_moves_the_next_fix_and_solve_solves_the_last_frame_again(graph, solver):
+    shot = shoot()
+    before, _, _ = graph.answer(shot)
+    assert graph.set("solver", refraction__pressure=0.0) == (True, "")
+    response = graph.call(Solve, "solver/solve", Solve.Request())
+    assert response.success, response.message
+    after = response.solution
+    moved = shot.error_m(after) - shot.error_m(before)
+    # 12 deg from the zenith air of this pressure lifts the stars by some 11 arcsec
+    assert before.refraction == pytest.approx(11.5, abs=1) and after.refraction == 0
+    assert 300 < np.hypot(*moved) < 400
+    next_shot = shoot()
+    following = graph.answer(next_shot)[0]
+    assert np.hypot(*(next_shot.error_m(following) - shot.error_m(after))) < 60
+    assert graph.set("solver", refraction__pressure=PRESSURE_PA)[0]
+    assert np.hypot(*shot.error_m(graph.call(Solve, "solver/solve", Solve.Request()).solution)) < 60
+
+
+def test_deflection_and_altitude(graph, solver):
+    shot = shoot()
+    assert graph.set(
+        "solver", deflection__xi=10.0, deflection__eta=-5.0, altitude=2410.0, altitude_stddev=3.0
+    )[0]
+    solution, fix, _ = graph.answer(shot)
+    assert (solution.latitude - fix.latitude) * 3600 == pytest.approx(10, abs=1e-6)
+    cos_phi = math.cos(math.radians(fix.latitude))
+    assert (solution.longitude - fix.longitude) * 3600 * cos_phi == pytest.approx(-5, abs=1e-6)
+    assert (fix.altitude, fix.position_covariance[8]) == (2410.0, 9.0)
+    assert graph.set("solver", deflection__xi=0, deflection__eta=0, altitude=math.nan)[0]  # whole numbers do
+
+
+def test_reset_forgets(graph, solver):
+    graph.answer(shoot())
+    response = graph.call(Trigger, "solver/reset", Trigger.Request())
+    assert response.success and response.message
+    assert "no frame has arrived" in graph.call(Solve, "solver/solve", Solve.Request()).message
+
+
+def test_solve_says_why_there_is_no_fix(graph, solver):
+    shot = shoot()
+    shot.tilts.clear()
+    graph.answer(shot)
+    response = graph.call(Solve, "solver/solve", Solve.Request())
+    assert not response.success and "tilt" in response.message
+    assert response.solution.status == Solution.NO_TILT
+
+
+def test_diagnostics_come_once_a_second_and_name_what_is_missing(graph, solver):
+    graph.answer(shoot())
+    graph.state("solver: Solution", "fix")
+    graph.diagnostics.clear()
+    graph.wait(lambda: len(graph.diagnostics.get("solver: Inputs", ())) == 4)
+    times = [t for t, _ in graph.diagnostics["solver: Inputs"]]
+    np.testing.assert_allclose(np.diff(times), 1.0, atol=0.5)
+    assert {"solver: Solution", "solver: Inputs"} <= set(graph.diagnostics)
+    assert graph.state("solver: Inputs", "nothing on").level == b"\x01"
