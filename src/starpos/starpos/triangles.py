@@ -29,6 +29,7 @@ POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circl
 # The first fits into a field of 3:2 or 4:3, the second is the whole field's own.
 CIRCLES = ((0.6, 0.85, 7), (1.0, 0.85, 8))
 MOST_IN_USE = 4
+BLOCK = 100_000
 MAX_TRIANGLES = 5_000_000  # before those that several circles share are counted once
 
 
@@ -137,7 +138,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
     key = np.unique(np.concatenate(keys))
     n = len(pool)
-    corner = brightest_first[np.stack([key // (n * n), key // n % n, key % n], -1)]
+    corner = brightest_first.astype(np.int32)[np.stack([key // (n * n), key // n % n, key % n], -1)]
     corner, largest, smallest, longest, bin_start = _in_bins(v, corner, 2 * half_diagonal)
     progress("star triangles", 1.0)
     return TriangleCatalogue(
@@ -146,8 +147,10 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         np.searchsorted(pool, catalogue.zone_start),
         rank.astype(np.int32),
         v,
-        corner.astype(np.int32),
-        *(column.astype(np.float32) for column in (largest, smallest, longest)),
+        corner,
+        largest,
+        smallest,
+        longest,
         bin_start.astype(np.int32),
     )
 
@@ -184,17 +187,26 @@ def _spread(n: int) -> np.ndarray:
 
 
 def _in_bins(v: np.ndarray, corner: np.ndarray, longest_side: float):
-    """Usable triangles in order of their bins: corners (largest angle first), angles, longest, bin starts."""
+    """Usable triangles in order of their bins: corners (largest angle first), angles, longest side, bin starts."""
+    blocks = np.array_split(corner, len(corner) // BLOCK + 1)  # a whole sky of triangles at once is 500 MB
+    parts = [_measured(v, block, longest_side) for block in blocks]
+    corner, largest, smallest, longest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    key = _bin_largest(largest) * SMALLEST_BINS + _bin_smallest(smallest)
+    order = np.argsort(key, kind="stable")
+    starts = np.searchsorted(key[order], np.arange(LARGEST_BINS * SMALLEST_BINS + 1))
+    return corner[order], largest[order], smallest[order], longest[order], starts
+
+
+def _measured(v: np.ndarray, corner: np.ndarray, longest_side: float):
+    """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; their angles and longest side."""
     p = [v[corner[:, k]] for k in range(3)]
     length = np.stack([sides(p[1], p[2]), sides(p[0], p[2]), sides(p[0], p[1])], -1)
     good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)
     angle = angles(*(q[good] for q in p))
     corner = np.take_along_axis(corner[good], np.argsort(-angle, axis=1, kind="stable"), 1)
-    largest, smallest = angle.max(1), angle.min(1)
-    key = _bin_largest(largest) * SMALLEST_BINS + _bin_smallest(smallest)
-    order = np.argsort(key, kind="stable")
-    starts = np.searchsorted(key[order], np.arange(LARGEST_BINS * SMALLEST_BINS + 1))
-    return corner[order], largest[order], smallest[order], length[good].max(1)[order], starts
+    return corner.astype(np.int32), *(
+        x.astype(np.float32) for x in (angle.max(1), angle.min(1), length[good].max(1))
+    )
 
 
 def cache_folder() -> Path:
