@@ -129,7 +129,7 @@ class Graph:
             raise AssertionError(f"waited {WAIT_S:g} s in vain {why}\n{tails}")
 
     def wait_for_solver(self):
-        """Until it hears our publishers and we hear its."""
+        """Until it hears our publishers and we hear its; before a detector is there."""
 
         def counts():
             ears = [e.get_publisher_count() for e in self._ears]

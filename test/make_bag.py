@@ -72,12 +72,12 @@ class Bag:
             for log_ns, topic, kind, data in sorted(self._messages, key=lambda m: m[0]):
                 if topic not in self._connections:
                     self._connections[topic] = writer.add_connection(
-                        topic, kind, typestore=self.store, offered_qos_profiles=[_qos()]
+                        topic, kind, typestore=self.store, offered_qos_profiles=[reliable()]
                     )
                 writer.write(self._connections[topic], log_ns, data)
 
 
-def _qos() -> Qos:
+def reliable() -> Qos:
     return Qos(
         QosHistory.KEEP_LAST,
         10,

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags through the running graph, and what the replay says to those that are none."""
+
+import json
+import os
+import signal
+import sqlite3
+from pathlib import Path
+
+import make_bag
+import numpy as np
+import pytest
+import yaml
+from graph import stamp_of
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from rosgraph_msgs.msg import Clock
+from shots import photograph
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from starpos_interfaces.msg import Solution
+
+NIGHT = Path(__file__).parent / "data" / "night"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+S = 10**9
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return json.loads(NIGHT.with_suffix(".json").read_text())
+
+
+@pytest.fixture(scope="module")
+def instrument(graph, truth, tmp_path_factory):
+    """Detector and solver that know what the bag's instrument is."""
+    folder = tmp_path_factory.mktemp("instrument")
+    parameters = {
+        "use_sim_time": "true",
+        "refraction.pressure": truth["pressure_pa"],
+        "refraction.temperature": truth["temperature_c"],
+        "refraction.humidity": truth["humidity"],
+        "misalignment": truth["misalignment_deg"],
+        "misalignment_stddev": 0.1,
+    }
+    words = [f"{name}:={value}" for name, value in parameters.items()]
+    graph.start(folder / "solver.log", "starpos_solver", "solver", *words)
+    graph.wait_for_solver()
+    graph.start(folder / "detector.log", "starpos_camera", "detector", "use_sim_time:=true")
+    graph.wait_for_detector(photograph)
+
+
+def play(graph, run, truth):
+    """The bag as fast as it is taken: (solution, imu) of each frame, by stamp."""
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    graph.solutions.clear(), graph.imus.clear()
+    replay = run("starpos_solver", "replay", arguments=(str(NIGHT), "--rate", "0"))
+    assert replay.wait() == 0, replay.output
+    count = len(truth["frames"])
+    graph.wait(lambda: len(graph.solutions) == len(graph.imus) == count, f"for all; {replay.output}")
+    return {s: (graph.solutions[s][0], graph.imus[s][0]) for s in sorted(graph.solutions)}
+
+
+def test_the_bag_gives_its_place_twice_the_same(graph, run, instrument, truth):
+    clock = graph.hear(Clock, "/clock", 1000)
+    first = play(graph, run, truth)
+    for (stamp, (solution, imu)), frame in zip(first.items(), truth["frames"], strict=True):
+        assert stamp[0] + stamp[1] * 1e-9 == frame["mid_unix_s"] and stamp_of(imu) == stamp
+        assert solution.status == Solution.OK, solution.status_text
+        assert solution.tilt_samples == 5
+        off = np.array(
+            [
+                np.radians(solution.longitude - truth["longitude_deg"])
+                * np.cos(np.radians(truth["latitude_deg"])),
+                np.radians(solution.latitude - truth["latitude_deg"]),
+            ]
+        )
+        turned = (solution.heading - frame["heading_deg"] + 180) % 360 - 180
+        error = np.array([*off * 6.38e6, turned])
+        covariance = np.reshape(solution.covariance, (3, 3))
+        assert (np.abs(error) < 4 * np.sqrt(np.diag(covariance))).all(), (error, np.sqrt(np.diag(covariance)))
+        stars = frame["kind"] == "stars"
+        assert np.degrees(np.abs(off).max()) * 3600 < (1.5 if stars else 5.0)
+        assert abs(turned) * 3600 < (5.0 if stars else 20.0)
+    graph.wait(lambda: len(clock) > 700, "for the clock")
+    times = [m.clock.sec * S + m.clock.nanosec for m in clock]
+    assert times == sorted(set(times))
+
+    second = play(graph, run, truth)
+    assert list(first) == list(second)
+    for stamp, (solution, imu) in first.items():
+        solution.identify_seconds = solution.fix_seconds = 0.0
+        other, other_imu = second[stamp]
+        other.identify_seconds = other.fix_seconds = 0.0
+        assert repr(solution) == repr(other) and imu == other_imu  # repr: NaN equals NaN
+
+
+def test_the_kept_script_makes_this_bag(tmp_path, truth):
+    make_bag.make(tmp_path / "night")
+    assert json.loads((tmp_path / "night.json").read_text()) == truth
+    made, kept = (
+        yaml.safe_load((folder / "metadata.yaml").read_text()) for folder in (tmp_path / "night", NIGHT)
+    )
+    assert made == kept
+
+
+def write_bag(folder, messages, plugin=StoragePlugin.MCAP):
+    """A bag of (log ns, topic, type, bytes); every topic latched. Types that nobody knows get a definition."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    latched = make_bag.reliable()._replace(durability=QosDurability.TRANSIENT_LOCAL)
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for log_ns, topic, kind, data in messages:
+            if topic not in connections:
+                given = (
+                    {"typestore": store}
+                    if kind in store.types
+                    else {"msgdef": "int8 a\n", "rihs01": "RIHS01_0"}
+                )
+                connections[topic] = writer.add_connection(
+                    topic, kind, offered_qos_profiles=[latched], **given
+                )
+            writer.write(connections[topic], log_ns, data)
+    return folder
+
+
+def text(words: str) -> bytes:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    return bytes(store.serialize_cdr(store.types["std_msgs/msg/String"](data=words), "std_msgs/msg/String"))
+
+
+STRING = "std_msgs/msg/String"
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_latched_topics_reach_latecomers_and_a_signal_ends_it(graph, run, tmp_path, plugin):
+    messages = [(S, "/words", STRING, text("early")), (1000 * S, "/words", STRING, text("late"))]
+    bag = write_bag(tmp_path / "bag", messages, plugin)
+    replay = run("starpos_solver", "replay", arguments=(str(bag), "--wait", "0"))
+    graph.wait(lambda: graph.node.count_publishers("/words"))
+    clock = graph.hear(Clock, "/clock")
+    graph.wait(lambda: len(clock) > 3)  # it is past its first message
+    heard = graph.hear(String, "/words", LATCHED)
+    graph.wait(lambda: heard)
+    assert heard[0].data == "early"
+    replay.signal(signal.SIGINT, signal.SIGINT)
+    assert replay.wait() == 0 and "Traceback" not in replay.output, replay.output
+
+
+def test_a_single_file_and_chosen_topics(graph, run, tmp_path):
+    messages = [(S + k, f"/words{k % 2}", STRING, text(str(k))) for k in range(8)]
+    bag = write_bag(tmp_path / "bag", messages)
+    heard = [graph.hear(String, f"/words{k}", LATCHED) for k in range(2)]
+    replay = run(
+        "starpos_solver", "replay", arguments=(str(bag / "bag.mcap"), "--topics", "/words1", "--rate", "0")
+    )
+    assert replay.wait() == 0, replay.output
+    graph.wait(lambda: len(heard[1]) == 4)
+    assert [m.data for m in heard[1]] == ["1", "3", "5", "7"] and not heard[0]
+
+
+def test_what_a_bag_may_not_bring(graph, run, tmp_path):
+    """Types that are not installed, names that are none, bytes that are no message: left out, the rest is played."""
+    messages = [
+        (1 * S, "/a", "os/msg/Path", b"\0\1\0\0\0"),
+        (2 * S, "/b", "os.path/msg/../X", b"\0\1\0\0\0"),
+        (3 * S, "not a name", STRING, text("x")),
+        (4 * S, "/clock", "rosgraph_msgs/msg/Clock", b"\0\1\0\0" + bytes(8)),
+        (5 * S, "/words", STRING, b"\0\1\0\0\xff\xff\xff\x7fabc"),
+        (6 * S, "/words", STRING, text("good")),
+        (7 * S, "/words", STRING, b""),
+    ]
+    bag = write_bag(tmp_path / "bag", messages)
+    heard, clock = graph.hear(String, "/words", LATCHED), graph.hear(Clock, "/clock")
+    replay = run("starpos_solver", "replay", arguments=(str(bag), "--rate", "0"))
+    assert replay.wait() == 0, replay.output
+    graph.wait(lambda: heard)
+    assert [m.data for m in heard] == ["good"]
+    assert all(m.clock.sec for m in clock)
+    for words in ("'os/msg/Path' is not installed", "'not a name' is left out", "2 broken ones left out"):
+        assert words in replay.output, replay.output
+
+
+def changed(tmp_path, change) -> Path:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for file in NIGHT.iterdir():
+        (folder / file.name).write_bytes(change(file.name, file.read_bytes()))
+    return folder
+
+
+def no_folder(tmp_path):
+    return tmp_path / "none", "there is no such bag"
+
+
+def empty_folder(tmp_path):
+    return tmp_path, "no bag"
+
+
+def a_picture(tmp_path):
+    (tmp_path / "x.png").write_bytes(b"\x89PNG")
+    return tmp_path / "x.png", "not a readable bag"
+
+
+def truncated(tmp_path):
+    return changed(
+        tmp_path, lambda name, data: data[:5000] if name.endswith("mcap") else data
+    ), "not a readable"
+
+
+def garbage(tmp_path):
+    return changed(
+        tmp_path, lambda name, data: b"\xff" * 100 if name.endswith("mcap") else data
+    ), "not a readable"
+
+
+def bad_metadata(tmp_path):
+    return changed(
+        tmp_path, lambda name, data: data if name.endswith("mcap") else b"a: [1"
+    ), "not a readable bag"
+
+
+def another_version_of_a_type(tmp_path):
+    def change(name, data):
+        return data if name.endswith("mcap") else data.replace(b"RIHS01_", b"RIHS01_0000")
+
+    return changed(tmp_path, change), "nothing in it to play"
+
+
+def a_broken_database(tmp_path):
+    with sqlite3.connect(tmp_path / "x.db3") as database:
+        database.execute("create table topics (id int)")
+    return tmp_path / "x.db3", "not a readable bag"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [no_folder, empty_folder, a_picture, truncated, garbage, bad_metadata, another_version_of_a_type, a_broken_database],
+)  # fmt: skip
+def test_what_is_no_bag_is_refused_in_a_sentence(domain, run, tmp_path, make):
+    bag, words = make(tmp_path)
+    replay = run("starpos_solver", "replay", arguments=(str(bag),))
+    assert replay.wait() == 2
+    assert words in replay.output and str(tmp_path) in replay.output
+    assert "Traceback" not in replay.output and all(
+        x.startswith("replay:") for x in replay.output.splitlines()
+    )
+
+
+def test_bad_calls(run):
+    for words, said in (
+        ((str(NIGHT), "--rate", "-1"), "--rate"),
+        ((str(NIGHT), "--rate", "nan"), "--rate"),
+        ((str(NIGHT), "--topics", "/nothing"), "no topic /nothing"),
+        ((), "BAG"),
+        ((str(NIGHT), "--ros-args", "-p"), "replay: "),
+    ):
+        replay = run("starpos_solver", "replay", arguments=words)
+        assert replay.wait() == 2 and said in replay.output and "Traceback" not in replay.output, (
+            replay.output
+        )
+
+
+def test_without_rosbags(run, tmp_path, monkeypatch):
+    (tmp_path / "rosbags.py").write_text("raise ImportError\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    replay = run("starpos_solver", "replay", arguments=(str(NIGHT),))
+    assert replay.wait() == 2
+    assert replay.output == "replay: rosbags, which reads bags, is not installed: pip install rosbags\n"
