@@ -14,7 +14,8 @@ COMMANDS = {
     "detect": "the stars of frames",
     "identify": "where frames look, lost in space",
     "simulate": "write a night of frames and tilts from a place you choose",
-    "catalogue": "build the star catalogue, or say what it holds",
+    "catalogue": "build the star catalogue, or say what it and its triangles hold",
+    "montecarlo": "identify random fields with false stars, and count: the paper's table",
 }
 BAD_CALL = 2
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos catalogue`: what the star catalogue holds, and building it, or a deeper one, from the original files."""
+"""`starpos catalogue`: what the catalogues of stars and triangles hold, and building them."""
 
 import argparse
 import sys
@@ -36,6 +36,11 @@ def define(parser) -> None:
         "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
     )
     build.set_defaults(run=build_file)
+    triangle = kinds.add_parser("triangles", help="the catalogue of triangles of a field; the paper's")
+    triangle.add_argument("--paper", action="store_true", help="count the paper's triangles again instead")
+    common.add_optics(triangle)
+    common.add_size(triangle)
+    triangle.set_defaults(run=show_triangles)
 
 
 def show(args) -> int:
@@ -66,3 +71,66 @@ def build_file(args) -> int:
     size = Path(args.out).stat().st_size / 1e6
     print(f"{args.out}: {len(made)} stars with V < {args.limit_mag:g}, {size:.1f} MB", file=sys.stderr)
     return 0
+
+
+def show_triangles(args) -> int:
+    return show_paper() if args.paper else show_field(common.camera_of(args))
+
+
+def show_paper() -> int:
+    from starpos import paper
+
+    c = catalogue.load()
+    row = paper.stars(c)
+    count = paper.count_triangles(c.directions(row), np.radians(paper.LONGEST_SIDE_DEG))
+    print(f"Tycho-2's main table, V < {paper.LIMIT_MAG:g} with a HIP number: {len(row)} stars")
+    print(f"triangles with every side below {paper.LONGEST_SIDE_DEG:g} deg: {count}")
+    for whose, number in (
+        ("printed by the paper", paper.PRINTED_TRIANGLES),
+        ("by its errata", paper.TRIANGLES),
+    ):
+        print(f"    {number} {whose}: {100 * (count / number - 1):+.2f} %")
+    print("angles of its triangle, rad:  here       paper     difference")
+    for name, here, printed in zip(paper.CORNERS, paper.angles_of_printed(c), paper.ANGLES, strict=True):
+        print(f"    at {name:12s}       {here:9.6f}  {printed:9.6f}  {here - printed:+.1e}")
+    print("    (Tycho-2 knows no motion of component A but the pair's: 27 mas in its place are 1.4e-05 rad)")
+    return 0
+
+
+def show_field(camera) -> int:
+    from starpos import triangles
+    from starpos.instrument import Instrument
+    from starpos.solve import Solver
+
+    c = catalogue.load()
+    Solver(Instrument(camera.fx), c, progress=common.ProgressBar()).prepare(camera.width, camera.height)
+    table = triangles.cached(c, camera.half_diagonal_rad)
+    used = np.unique(table.corners)
+    size = sum(getattr(table, column).nbytes for column in table.__dataclass_fields__) / 1e6
+    width, height = np.degrees(2 * np.arctan([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy]))
+    print(
+        f"field of {width:.2f} x {height:.2f} deg, {2 * np.degrees(camera.half_diagonal_rad):.2f} deg across"
+    )
+    print(
+        f"{len(table.corners)} triangles of {len(used)} stars, V to {c.vmag(table.star[used]).max():.2f}; {size:.0f} MB"
+    )
+    on_frame = _stars_on_frames(camera, table.directions[used])
+    shares = np.percentile(on_frame, (0, 1, 10, 50, 90, 99, 100)).astype(int)
+    print("of these a frame holds at least, in 1 %, 10 %, the median, 90 %, 99 %, at most:", *shares)
+    return 0
+
+
+def _stars_on_frames(camera, v: np.ndarray, frames: int = 2000) -> np.ndarray:
+    """How many of the directions v (N, 3) lie on each of some frames all over the sky."""
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
+    attitudes = Rotation.random(frames, random_state=1).as_matrix()
+    near = cKDTree(v).query_ball_point(attitudes[:, 2], 2 * np.sin(camera.half_diagonal_rad / 2))
+    size = [camera.width - 0.5, camera.height - 0.5]
+    return np.array(
+        [
+            ((xy >= -0.5) & (xy <= size)).all(1).sum()
+            for xy in (camera.project(v[rows] @ a.T) for rows, a in zip(near, attitudes, strict=True))
+        ]
+    )

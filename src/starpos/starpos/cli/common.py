@@ -11,6 +11,7 @@ import numpy as np
 
 from starpos import instrument
 from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.frame import Frame
 from starpos.reading import read_frame
@@ -27,6 +28,18 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
 def add_optics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--focal-mm", type=float, metavar="MM", help="focal length; within 3 %%")
     parser.add_argument("--pixel-um", type=float, metavar="UM", help="pixel size")
+
+
+def add_size(parser: argparse.ArgumentParser) -> None:
+    """Frame size; with it the optics are the paper's where they are not given."""
+    size = {"type": number(16, 100_000, int), "metavar": ("W", "H"), "nargs": 2, "default": (5616, 3744)}
+    parser.add_argument("--size", **size, help="frame size in px (5616 3744)")
+    parser.set_defaults(focal_mm=600.0, pixel_um=6.4)
+
+
+def camera_of(args: argparse.Namespace) -> Camera:
+    """An ideal camera from --focal-mm, --pixel-um and --size."""
+    return Camera.from_focal(*args.size, instrument.focal_px_of(args.focal_mm, args.pixel_um))
 
 
 def add_air(parser: argparse.ArgumentParser) -> None:

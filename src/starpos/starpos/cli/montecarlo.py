@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos montecarlo`: the paper's table of identified random fields, on this program."""
+
+import argparse
+import json
+import sys
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from starpos import catalogue, montecarlo
+from starpos.camera import Camera
+from starpos.cli import common
+from starpos.errors import FrameError
+from starpos.instrument import Instrument
+from starpos.solve import Solver
+
+PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}  # % of 1000 fields with so many false stars
+PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}  # % of fields of so many stars
+PAPER_CAMERA = Camera.from_focal(5616, 3744, 93750.0)
+PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9  # the stars a field of the paper holds on average
+
+EPILOG = """Realistic fields: brightness off by 0.3 mag, 5 % of the stars not detected, stars closer than 4 px one.
+--ideal leaves all three out, as the paper does.  False stars are brighter than all others.  Fields of 5, 6, 7 stars are
+the brightest ones of random fields.  A right answer has the frame's centre within 20 arcsec, or a pixel.
+Exit status: 0; 1 where an answer was wrong or invented."""
+
+
+def define(parser) -> None:
+    parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
+    whole = common.number(0, 10_000_000, int)
+    parser.add_argument("--fields", type=whole, default=1000, metavar="N", help="of each kind (1000)")
+    parser.add_argument("--seed", type=whole, default=1, metavar="S", help="of the random numbers (1)")
+    parser.add_argument(
+        "--false",
+        type=common.number(0, 100, int),
+        nargs="*",
+        default=[0, 1, 2],
+        metavar="K",
+        help="false stars (0 1 2)",
+    )
+    parser.add_argument(
+        "--stars", type=common.number(1, 100, int), nargs="*", default=[5, 6, 7], metavar="K",
+        help="fields of only so many stars (5 6 7)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--points",
+        type=whole,
+        metavar="N",
+        help="fields of random points, nothing to find (a fifth of --fields)",
+    )
+    common.add_optics(parser)
+    common.add_size(parser)
+    parser.add_argument(
+        "--limit-mag",
+        type=common.number(0, 20),
+        metavar="V",
+        help="faintest star (9; what gives as many in other fields)",
+    )
+    parser.add_argument(
+        "--noise-px", type=common.number(0.001, 10), default=0.05, metavar="PX", help="centroids' (0.05)"
+    )
+    parser.add_argument("--ideal", action="store_true", help="the paper's conditions, see below")
+    parser.add_argument(
+        "--focal-error",
+        type=common.number(0, 3),
+        default=0.0,
+        metavar="PERCENT",
+        help="of the focal length, at most (0)",
+    )
+    parser.add_argument(
+        "--keep", metavar="FOLDER", help="write the fields that failed there, as CSV for `identify`"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object a row")
+    parser.set_defaults(run=run)
+
+
+def run(args) -> int:
+    stars, camera = catalogue.load(), common.camera_of(args)
+    conditions = _conditions(args, stars, camera)
+    solver = Solver(Instrument(camera.fx), stars, progress=common.ProgressBar())
+    solver.prepare(camera.width, camera.height)
+    if not args.json:
+        _print_head(conditions, stars)
+    wrong = 0
+    for label, paper, number, fields in _rows(args, stars, conditions):
+        tally, bar = montecarlo.Tally(), common.ProgressBar()
+        for done, given in enumerate(islice(fields, number), 1):
+            tally.ask(given, given.stars(conditions), looking(solver), conditions.tolerance_rad)
+            bar(label, done / number)
+        wrong += tally.wrong
+        _print_row(label, paper, tally, args.json)
+        if args.keep:
+            _keep(tally, conditions, Path(args.keep))
+    return int(wrong > 0)
+
+
+def looking(solver: Solver) -> montecarlo.Answer:
+    """Where `solver` says that a frame's centre looks."""
+
+    def answer(stars):
+        a = solver.identify(stars).attitude
+        if a is None:
+            return None
+        return np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)])
+
+    return answer
+
+
+def _conditions(args, stars, camera) -> montecarlo.Conditions:
+    limit = args.limit_mag
+    if limit is None:
+        limit = (
+            PAPER_LIMIT_MAG if camera == PAPER_CAMERA else montecarlo.limit_for(camera, stars, PAPER_STARS)
+        )
+    make = montecarlo.ideal if args.ideal else montecarlo.Conditions
+    return make(camera, limit, sigma_px=args.noise_px, focal_error=args.focal_error / 100)
+
+
+def _rows(args, stars, conditions):
+    """Label, the paper's figure in %, number of fields and fields of each row of the table."""
+    papers = conditions.camera == PAPER_CAMERA and conditions.limit_mag == PAPER_LIMIT_MAG
+    for k in args.false:
+        fields = montecarlo.false_stars(stars, conditions, args.seed, k)
+        yield f"{k} false star{'s'[: k != 1]}", PAPER_FALSE.get(k, "") if papers else "", args.fields, fields
+    for k in args.stars:
+        fields = montecarlo.few_stars(stars, conditions, args.seed, k)
+        yield f"{k} stars", PAPER_FEW.get(k, "") if papers else "", args.fields, fields
+    number = args.fields // 5 if args.points is None else args.points
+    yield "random points", "", number, montecarlo.points(conditions, args.seed)
+
+
+def _print_head(conditions, stars) -> None:
+    c, camera = conditions, conditions.camera
+    width, height = np.degrees(2 * np.arctan([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy]))
+    print(
+        f"fields of {width:.2f} x {height:.2f} deg, V < {c.limit_mag:g}, centroids to {c.sigma_px:g} px; brightness to "
+        f"{c.scatter_mag:g} mag, {100 * c.missing:g} % missing, {c.blend_px:g} px blend, focal length to "
+        f"{100 * c.focal_error:g} %; {len(stars)} catalogue stars"
+    )
+    print(
+        f"{'':15}{'fields':>8}{'correct %':>11}   {'(95 %)':16}{'wrong':>6}{'none':>6}   median, worst ms   paper %"
+    )
+
+
+def _print_row(label: str, paper: str, t: montecarlo.Tally, as_json: bool) -> None:
+    low, high = montecarlo.wilson(t.correct, t.fields)
+    median, worst = (float(f(t.cpu_ms)) if t.cpu_ms else float("nan") for f in (np.median, np.max))
+    if as_json:
+        common.print_json(
+            {
+                "row": label, "fields": t.fields, "correct": t.correct, "wrong": t.wrong, "none": t.none,
+                "correct_low": low, "correct_high": high, "cpu_ms_median": median, "cpu_ms_worst": worst,
+                "paper_percent": paper or None,
+            }
+        )  # fmt: skip
+        return
+    share = 100 * t.correct / t.fields if t.fields else float("nan")
+    right = f"{share:11.2f}   ({100 * low:.2f} .. {100 * high:.2f})" if label != "random points" else ""
+    print(
+        f"{label:15}{t.fields:8d}{right:30}{t.wrong:6d}{t.none:6d}{median:9.2f}{worst:8.1f}   {paper:>9}",
+        flush=True,
+    )
+
+
+def _keep(tally: montecarlo.Tally, conditions, folder: Path) -> None:
+    """Fields that failed, as CSV with their truth in the first line."""
+    head = {"NAXIS1": conditions.camera.width, "NAXIS2": conditions.camera.height}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for given, verdict in tally.failed:
+            truth = None if given.centre is None else given.centre.tolist()
+            lines = ["# " + json.dumps(head | {"VERDICT": verdict, "CENTRE": truth}), "x,y,flux"]
+            s = given.stars(conditions)
+            lines += [f"{x:.5f},{y:.5f},{flux:.6g}" for x, y, flux in zip(s.x, s.y, s.flux, strict=True)]
+            (folder / f"{given.name.replace(' ', '_')}.csv").write_text("\n".join(lines) + "\n")
+            print(f"{given.name}: {verdict}, {len(given)} stars", file=sys.stderr)
+    except OSError as e:
+        raise FrameError(f"{folder}: cannot be written ({e.strerror}): give another --keep") from None

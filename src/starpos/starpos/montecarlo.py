@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random star fields whose pointing is known, and what identification makes of them: the paper's table again.
+
+Catalogue places at J2000 without aberration.  A field is known by its seed and number: the same stars whatever is
+done to them afterwards.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count
+
+import numpy as np
+
+from starpos.camera import Camera
+from starpos.catalogue import Catalogue
+from starpos.errors import CatalogueError
+from starpos.stars import Stars
+
+TOLERANCE_ARCSEC = 20.0  # of the frame's centre, or a pixel where that is more
+FALSE_STEP_MAG = 0.1  # a false star outshines the next one by this
+POINTS = (5, 60)  # fewest and most of a field of random points
+
+Answer = Callable[[Stars], np.ndarray | None]  # where the frame's centre looks, ICRS (3,)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a camera sees of the stars brighter than limit_mag.
+
+    sigma_px: error of a centroid, one axis; scatter_mag: of a brightness; missing: share of the stars not detected;
+    blend_px: closer stars are one; focal_error: largest relative error of the focal length that is assumed.
+    """
+
+    camera: Camera
+    limit_mag: float = 9.0
+    sigma_px: float = 0.05
+    scatter_mag: float = 0.3
+    missing: float = 0.05
+    blend_px: float = 4.0
+    focal_error: float = 0.0
+
+    @property
+    def tolerance_rad(self) -> float:
+        """How far off the frame's centre may be in a right answer."""
+        return max(np.radians(TOLERANCE_ARCSEC / 3600), 1 / self.camera.fx)
+
+
+def ideal(camera: Camera, limit_mag: float = 9.0) -> Conditions:
+    """The paper's: every star is seen with its catalogue brightness, however close to the next."""
+    return Conditions(camera, limit_mag, scatter_mag=0.0, missing=0.0, blend_px=0.0)
+
+
+def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:
+    """The magnitude at which a frame of this camera holds so many stars on average."""
+    sky = 4 * np.pi * camera.fx * camera.fy / (camera.width * camera.height)  # frames that make up a sphere
+    rank = min(int(stars * sky), len(catalogue) - 1)
+    return round(float(np.partition(catalogue.vmag_centi, rank)[rank]) / 100, 2)
+
+
+@dataclass(frozen=True)
+class Field:
+    """Stars of a frame at xy (N, 2) px, brightest first; centre (3,): where it looks, None: nowhere."""
+
+    xy: np.ndarray
+    mag: np.ndarray
+    centre: np.ndarray | None
+    name: str
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def brightest(self, n: int) -> "Field":
+        """The field as it is when no more than n stars are detected."""
+        return Field(self.xy[:n], self.mag[:n], self.centre, f"{self.name} {n} stars")
+
+    def with_false(self, n: int, camera: Camera) -> "Field":
+        """The field with n random points brighter than all its stars; of n + 1 points the last n are the same."""
+        rng = np.random.default_rng(list(self.name.encode()))
+        points = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))[::-1]
+        top = self.mag[0] if len(self.mag) else 9.0
+        mag = top - FALSE_STEP_MAG * np.arange(n, 0, -1)
+        return Field(
+            np.concatenate([points, self.xy]),
+            np.concatenate([mag, self.mag]),
+            self.centre,
+            f"{self.name} {n} false",
+        )
+
+    def stars(self, conditions: Conditions) -> Stars:
+        """What a detector would have made of it."""
+        n, camera = len(self), conditions.camera
+        covariance = np.broadcast_to(np.eye(2) * conditions.sigma_px**2, (n, 2, 2))
+        flux = 10 ** (-0.4 * (self.mag - 15))
+        flags = np.zeros(n, np.uint8)
+        return Stars(
+            *self.xy.T,
+            flux,
+            np.full(n, 100.0),
+            covariance,
+            flags,
+            camera.width,
+            camera.height,
+            source=self.name,
+        )
+
+
+def draw(catalogue: Catalogue, conditions: Conditions, seed: int, number: int) -> Field:
+    """One field of a random part of the sky at a random angle."""
+    c, rng = conditions, np.random.default_rng([seed, number])
+    attitude, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    attitude = attitude * np.sign(np.diag(r))
+    attitude[0] *= np.linalg.det(attitude)
+    camera = c.camera.scaled(1 + c.focal_error * rng.uniform(-1, 1))
+    reach = camera.half_diagonal_rad * 1.01
+    index = catalogue.cone(attitude[2], reach, c.limit_mag + 4 * c.scatter_mag)
+    xy = camera.project(catalogue.directions(index) @ attitude.T)
+    xy = xy + rng.normal(0, c.sigma_px, xy.shape)
+    mag = catalogue.vmag(index) + rng.normal(0, 1, len(index)) * c.scatter_mag
+    seen = (xy > 0).all(1) & (xy < [camera.width - 1, camera.height - 1]).all(1) & (mag < c.limit_mag)
+    seen &= rng.random(len(index)) >= c.missing
+    order = np.flatnonzero(seen)[np.argsort(mag[seen], kind="stable")]
+    return Field(*_blended(xy[order], mag[order], c.blend_px), attitude[2], f"seed {seed} field {number}")
+
+
+def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
+    """Random points: no part of the sky."""
+    rng, camera = np.random.default_rng([seed, number, 1]), conditions.camera
+    n = int(rng.integers(*POINTS))
+    xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
+    return Field(xy, np.sort(rng.uniform(4, 9, n)), None, f"seed {seed} points {number}")
+
+
+def _blended(xy: np.ndarray, mag: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Stars closer than reach_px to a brighter one, joined to it; again brightest first."""
+    xy, light, single = xy.copy(), 10 ** (-0.4 * mag), np.ones(len(mag), bool)
+    apart = np.linalg.norm(xy[:, None] - xy, axis=2)
+    for a, b in zip(*np.nonzero(np.triu(apart < reach_px, 1)), strict=True):
+        if single[a] and single[b]:
+            xy[a] = (light[a] * xy[a] + light[b] * xy[b]) / (light[a] + light[b])
+            light[a] += light[b]
+            single[b] = False
+    order = np.flatnonzero(single)[np.argsort(-light[single], kind="stable")]
+    return xy[order], -2.5 * np.log10(light[order])
+
+
+def false_stars(catalogue: Catalogue, conditions: Conditions, seed: int, n: int) -> Iterator[Field]:
+    """Fields with n false stars, without end."""
+    for number in count():
+        yield draw(catalogue, conditions, seed, number).with_false(n, conditions.camera)
+
+
+def few_stars(catalogue: Catalogue, conditions: Conditions, seed: int, n: int) -> Iterator[Field]:
+    """The n brightest stars of the fields that hold as many, without end; CatalogueError where hardly any does."""
+    found = 0
+    for number in count():
+        drawn = draw(catalogue, conditions, seed, number)
+        if len(drawn) >= n:
+            found += 1
+            yield drawn.brightest(n)
+        elif number > 1000 * (found + 1):
+            raise CatalogueError(
+                f"fields with V < {conditions.limit_mag:g} hardly ever hold {n} stars: ask for fewer"
+            )
+
+
+def points(conditions: Conditions, seed: int) -> Iterator[Field]:
+    """Fields of random points, without end."""
+    for number in count():
+        yield draw_points(conditions, seed, number)
+
+
+@dataclass
+class Tally:
+    """Answers to fields: how many were right, wrong (or invented) and none; cpu_ms of each; fields not answered right."""
+
+    correct: int = 0
+    wrong: int = 0
+    none: int = 0
+    cpu_ms: list[float] = field(default_factory=list)
+    failed: list[tuple[Field, str]] = field(default_factory=list)
+
+    @property
+    def fields(self) -> int:
+        return self.correct + self.wrong + self.none
+
+    def ask(self, given: Field, stars: Stars, answer: Answer, tolerance_rad: float) -> None:
+        """Have one more field answered."""
+        begin = time.process_time()
+        found = answer(stars)
+        self.cpu_ms.append(1000 * (time.process_time() - begin))
+        if found is None:
+            self.none += 1
+            if given.centre is not None:
+                self.failed.append((given, "none"))
+        elif given.centre is not None and np.linalg.norm(found - given.centre) < tolerance_rad:
+            self.correct += 1
+        else:
+            self.wrong += 1
+            self.failed.append((given, "wrong"))
+
+
+def wilson(successes: int, n: int) -> tuple[float, float]:
+    """The 95 % confidence interval of a share of which n trials found so many successes (Wilson 1927)."""
+    if n == 0:
+        return 0.0, 1.0
+    z2, p = 1.96**2, successes / n
+    middle = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = np.sqrt(z2 * (p * (1 - p) / n + z2 / (4 * n * n))) / (1 + z2 / n)
+    return max(0.0, float(middle - half)), min(1.0, float(middle + half))

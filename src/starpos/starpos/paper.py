@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's own triangle catalogue, counted again: its stars, its triangles and the one it prints the angles of."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from starpos.catalogue import EPOCH, MAS, Catalogue
+from starpos.errors import CatalogueError
+from starpos.triangles import angles
+
+LIMIT_MAG = 7.0
+LONGEST_SIDE_DEG = 4.13  # the diagonal of 3.43 x 2.30 deg
+PRINTED_TRIANGLES = 951_181
+STARS, TRIANGLES = 15_236, 952_970  # what its data give
+ANGLES = (2.27327, 0.634202, 0.234213)  # rad, of the triangle it prints
+CORNERS = ("HIP 99002", "HIP 98753 A", "HIP 99145")  # which stars these are; the numbers it prints are others
+EXCEPTIONS = Path(__file__).with_name("data") / "paper_stars.csv"
+
+# TYC 2682-3566-1, the brighter of a pair 1.9 arcsec apart that the catalogue merges: Tycho-2's observed place and epoch,
+# and the pair's motion
+_A_RA_DEG, _A_DEC_DEG, _A_EPOCH = 300.87250833, 36.02515667, 1991.6
+_A_PM_RA, _A_PM_DEC = -10.7, -4.3  # mas/yr, the first times cos(dec)
+
+
+def plain_cut(catalogue: Catalogue) -> np.ndarray:
+    """Rows of all stars brighter than LIMIT_MAG with a HIP number: nearly the paper's."""
+    return np.flatnonzero((catalogue.vmag_centi < 100 * LIMIT_MAG) & (catalogue.hip > 0))
+
+
+def stars(catalogue: Catalogue) -> np.ndarray:
+    """Rows of the paper's stars, those of Tycho-2's main table; a merged pair of which it has both stars comes twice.
+
+    EXCEPTIONS holds what the compact catalogue no longer knows; `tools/paper_stars.py` makes it from the original files.
+    """
+    *tyc, times = np.loadtxt(EXCEPTIONS, int, delimiter=",", skiprows=2, unpack=True)
+    there = _number(catalogue.tyc.T.astype(int))
+    order = np.argsort(there)
+    place = np.searchsorted(there[order], _number(tyc)).clip(max=len(there) - 1)
+    row = order[place]
+    if not np.array_equal(there[row], _number(tyc)):
+        raise CatalogueError(
+            f"the catalogue in use lacks stars brighter than V = {LIMIT_MAG:g}: unset STARPOS_CATALOGUE, or build it anew"
+        )
+    return np.concatenate([np.setdiff1d(plain_cut(catalogue), row), np.repeat(row, times)])
+
+
+def _number(tyc) -> np.ndarray:
+    return (tyc[0] * 100_000 + tyc[1]) * 10 + tyc[2]
+
+
+def count_triangles(v: np.ndarray, longest_side_rad: float) -> int:
+    """How many triples of the unit vectors v (N, 3) have all sides below longest_side_rad.
+
+    Pairs run from the lower row to the higher, so that a path of two sides whose ends are a pair is one triangle.
+    """
+    pairs = cKDTree(v).query_pairs(2 * np.sin(longest_side_rad / 2), output_type="ndarray")
+    near = csr_array((np.ones(len(pairs), np.int64), (pairs[:, 0], pairs[:, 1])), (len(v), len(v)))
+    return int(((near @ near) * near).sum())
+
+
+def angles_of_printed(catalogue: Catalogue) -> np.ndarray:
+    """The angles (3,) in rad of the triangle whose angles the paper prints, at CORNERS."""
+    first, last = (_named(catalogue, int(CORNERS[k].split()[1])) for k in (0, 2))
+    ra, dec = np.radians([_A_RA_DEG, _A_DEC_DEG])
+    years = EPOCH - _A_EPOCH
+    ra, dec = ra + _A_PM_RA * MAS * years / np.cos(dec), dec + _A_PM_DEC * MAS * years
+    a = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    return angles(first, a, last)
+
+
+def _named(catalogue: Catalogue, hip: int) -> np.ndarray:
+    row = np.flatnonzero(catalogue.hip == hip)
+    if len(row) != 1:
+        raise CatalogueError(f"the catalogue in use has no HIP {hip}: unset STARPOS_CATALOGUE")
+    return catalogue.directions(row)[0]
