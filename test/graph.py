@@ -73,7 +73,11 @@ class Graph:
         self.processes: list[Process] = []
         self.info = self._publisher(CameraInfo, "camera/camera_info")
         self.capture = self._publisher(Capture, "camera/capture")
-        self.image = self._publisher(Image, "camera/image_raw", 2)
+        # a participant of its own, as a camera has: images fill the shared memory, and what is lost comes a second later
+        self._camera_context = rclpy.Context()
+        rclpy.init(context=self._camera_context)
+        self._camera = rclpy.create_node("test_camera", context=self._camera_context)
+        self.image = self._camera.create_publisher(Image, "camera/image_raw", QoSProfile(depth=2))
         self.stars = self._publisher(StarArray, "stars")
         self.tilt = self._publisher(Tilt, "tilt", 1000)
         self.solutions, self.fixes, self.imus = {}, {}, {}
@@ -90,7 +94,9 @@ class Graph:
             p.end()
         self._executor.shutdown()
         self.node.destroy_node()
+        self._camera.destroy_node()
         rclpy.shutdown(context=self._context)
+        rclpy.shutdown(context=self._camera_context)
 
     def _publisher(self, kind, topic, depth=100):
         return self.node.create_publisher(kind, topic, QoSProfile(depth=depth))

@@ -425,7 +425,7 @@ class Player:
             return
         if self._rate == 0:
             self._hold()
-        for publisher in self._publishers.values():
+        for publisher in (*self._publishers.values(), self._clock):
             publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
 
     def close(self):
