@@ -46,9 +46,9 @@ class Conditions:
         return max(np.radians(TOLERANCE_ARCSEC / 3600), 1 / self.camera.fx)
 
 
-def ideal(camera: Camera, limit_mag: float = 9.0) -> Conditions:
+def ideal(camera: Camera, limit_mag: float = 9.0, **more) -> Conditions:
     """The paper's: every star is seen with its catalogue brightness, however close to the next."""
-    return Conditions(camera, limit_mag, scatter_mag=0.0, missing=0.0, blend_px=0.0)
+    return Conditions(camera, limit_mag, scatter_mag=0.0, missing=0.0, blend_px=0.0, **more)
 
 
 def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:

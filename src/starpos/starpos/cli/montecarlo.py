@@ -128,7 +128,8 @@ def _rows(args, stars, conditions):
         fields = montecarlo.few_stars(stars, conditions, args.seed, k)
         yield f"{k} stars", PAPER_FEW.get(k, "") if papers else "", args.fields, fields
     number = args.fields // 5 if args.points is None else args.points
-    yield "random points", "", number, montecarlo.points(conditions, args.seed)
+    if number:
+        yield "random points", "", number, montecarlo.points(conditions, args.seed)
 
 
 def _print_head(conditions, stars) -> None:

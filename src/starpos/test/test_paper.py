@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's own figures, from the committed catalogue."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from starpos import paper, triangles
+from starpos.catalogue import pack
+from starpos.cli import main
+from starpos.errors import CatalogueError
+
+
+def test_the_papers_stars_and_triangles(catalogue):
+    """ERRATA: 15,236 stars; 952,970 triangles with every side below the field's diagonal."""
+    row = paper.stars(catalogue)
+    assert len(row) == 15_236
+    count = paper.count_triangles(catalogue.directions(row), np.radians(paper.LONGEST_SIDE_DEG))
+    assert count == pytest.approx(952_970, rel=0.005)
+    shorter = paper.count_triangles(catalogue.directions(row), np.radians(3.43))
+    assert shorter == pytest.approx(490_000, rel=0.05)
+
+
+def test_the_papers_stars_differ_little_from_the_plain_cut(catalogue):
+    row, plain = paper.stars(catalogue), paper.plain_cut(catalogue)
+    assert len(np.setdiff1d(plain, row)) < 250
+    added = np.setdiff1d(row, plain)
+    # one of a merged pair, or one whose V was rounded up to the limit
+    assert catalogue.vmag(added) == pytest.approx(paper.LIMIT_MAG, abs=0.011)
+    twice, times = np.unique(row, return_counts=True)
+    assert times.max() == 2
+    assert (catalogue.vmag(twice[times == 2]) < 6.5).all()
+
+
+def test_the_printed_angles(catalogue):
+    """ERRATA's triangle; 27 mas in the place of HIP 98753's component A are 1.4e-5 rad."""
+    assert paper.angles_of_printed(catalogue) == pytest.approx(paper.ANGLES, abs=1.5e-5)
+
+
+@pytest.mark.parametrize("side_deg", [3, 20, 200])
+def test_triangles_by_brute_force(side_deg, rng):
+    v = rng.normal((0, 0, 4), 1, (40, 3))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    v[7] = v[3]  # a pair in one place counts as two stars
+    longest = np.radians(side_deg)
+    near = triangles.sides(v[:, None], v) < longest
+    expected = sum(near[i, j] and near[i, k] and near[j, k] for i, j, k in combinations(range(40), 3))
+    assert paper.count_triangles(v, min(longest, np.pi)) == expected
+
+
+def test_a_catalogue_without_the_bright_stars():
+    faint = pack([[1, 2, 3]], [7], [10.0], [1.0], [2.0], [0], [0], [5], [1], [1991])
+    for function in (paper.stars, paper.angles_of_printed):
+        with pytest.raises(CatalogueError, match="STARPOS_CATALOGUE"):
+            function(faint)
+
+
+def test_the_command_prints_both(capsys):
+    assert main(["catalogue", "triangles", "--paper"]) == 0
+    out = capsys.readouterr().out
+    for printed in ("15236", "951181", "952970", "2.273270", "0.634202", "0.234213"):
+        assert printed in out
+
+
+def test_the_command_says_what_a_fields_catalogue_holds(capsys):
+    wide = ["--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700"]
+    assert main(["catalogue", "triangles", *wide]) == 0
+    out = capsys.readouterr().out
+    assert "15.00 deg across" in out
+    fewest = int(out.splitlines()[-1].split(":")[1].split()[0])
+    assert fewest >= 3
+
+
+def test_a_field_too_wide_is_a_bad_call(capsys):
+    assert main(["catalogue", "triangles", "--focal-mm", "5", "--pixel-um", "6.4"]) == 2
+    assert "check focal length" in capsys.readouterr().err

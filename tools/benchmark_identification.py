@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same random fields through starpos and its peers, in one run: a table.
+
+`benchmark_identification.py [--fields N] [--seed S] [--false K ...] [--index FOLDER]`.  Peers run where they can be
+imported (`pip install cedar-solve astrometry`): cedar-solve with a database made here from this program's catalogue for
+this field of view (five minutes, 2 GB of memory), kept in the cache; astrometry.net's engine with FOLDER's index files.
+Every program is told the focal length to 3 % and gets the stars brightest first; each field is answered by all.
+"""
+
+import argparse
+import importlib.util
+import math
+import sys
+import time
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from starpos import catalogue, montecarlo, triangles
+from starpos.camera import Camera
+from starpos.cli.common import ProgressBar
+from starpos.cli.montecarlo import looking
+from starpos.instrument import Instrument
+from starpos.solve import Solver
+
+CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
+LIMIT_MAG, DEEPER_MAG = 9.0, 0.5  # a peer's catalogue reaches deeper, for the scatter of brightness
+SCALE_ERROR = 0.03
+TIMEOUT_MS = 5000
+
+
+class Absent(Exception):
+    """Why a peer takes no part."""
+
+
+def starpos(stars, args) -> montecarlo.Answer:
+    solver = Solver(Instrument(CAMERA.fx), stars, progress=ProgressBar())
+    solver.prepare(CAMERA.width, CAMERA.height)
+    return looking(solver)
+
+
+def cedar_solve(stars, args) -> montecarlo.Answer:
+    if importlib.util.find_spec("tetra3") is None:
+        raise Absent("not installed (pip install cedar-solve)")
+    from tetra3 import Tetra3
+
+    fov_deg = math.degrees(2 * math.atan(CAMERA.width / 2 / CAMERA.fx))
+    limit = LIMIT_MAG + DEEPER_MAG
+    database = triangles.cache_folder() / f"cedar-{fov_deg:.2f}deg-{limit:g}mag-{stars.fingerprint}.npz"
+    solver = Tetra3(load_database=None)
+    if not database.exists():
+        print(f"making cedar-solve's database {database} ...", file=sys.stderr)
+        begin = time.monotonic()
+        source = database.with_name("tyc_main.dat")
+        write_tyc_main(stars, limit, source)
+        solver.generate_database(
+            max_fov=fov_deg,
+            save_as=database,
+            star_catalog=source,
+            star_max_magnitude=limit,
+            epoch_proper_motion=None,
+        )
+        source.unlink()
+        print(
+            f"... took {time.monotonic() - begin:.0f} s, {database.stat().st_size / 1e6:.0f} MB",
+            file=sys.stderr,
+        )
+    solver.load_database(database)
+
+    def answer(given):
+        found = solver.solve_from_centroids(
+            np.stack([given.y, given.x], 1), (given.height, given.width), fov_estimate=fov_deg,
+            fov_max_error=SCALE_ERROR * fov_deg, solve_timeout=TIMEOUT_MS,
+        )  # fmt: skip
+        return None if found["RA"] is None else unit(found["RA"], found["Dec"])
+
+    return answer
+
+
+def write_tyc_main(stars, limit_mag: float, path: Path) -> None:
+    """The columns that cedar-solve reads of the Tycho catalogue: identifier, V, place, with J2000 places in them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as f:
+        for k in np.flatnonzero(stars.vmag_centi < 100 * limit_mag):
+            row = [""] * 14
+            row[1] = "{} {} {}".format(*stars.tyc[k])
+            row[5] = f"{stars.vmag_centi[k] / 100:.2f}"
+            row[8], row[9] = (f"{x / 3.6e6:.8f}" for x in (stars.ra_mas[k], stars.dec_mas[k]))
+            f.write("|".join(row) + "\n")
+
+
+def astrometry_net(stars, args) -> montecarlo.Answer:
+    if importlib.util.find_spec("astrometry") is None:
+        raise Absent("not installed (pip install astrometry)")
+    index = sorted(args.index.rglob("index-*.fits")) if args.index else []
+    if not index:
+        raise Absent("no index files (--index FOLDER)")
+    import astrometry
+
+    solver = astrometry.Solver(index)
+    scale = CAMERA.scale_arcsec
+    size = astrometry.SizeHint(scale * (1 - SCALE_ERROR), scale * (1 + SCALE_ERROR))
+    settings = astrometry.SolutionParameters(
+        sip_order=0, tune_up_logodds_threshold=None, parity=astrometry.Parity.NORMAL,
+        logodds_callback=lambda odds: astrometry.Action.STOP,
+    )  # fmt: skip
+
+    def answer(given):
+        solution = solver.solve(np.stack([given.x, given.y], 1), size, None, settings)
+        if not solution.has_match():
+            return None
+        wcs = solution.best_match().astropy_wcs()
+        return unit(*(float(a) for a in wcs.all_pix2world(*CAMERA.centre_px, 0)))
+
+    return answer
+
+
+def unit(ra_deg: float, dec_deg: float) -> np.ndarray:
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--fields", type=int, default=1000, metavar="N", help="of each kind (1000)")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the random numbers (1)")
+    parser.add_argument(
+        "--false", type=int, nargs="+", default=[0, 1, 2], metavar="K", help="false stars (0 1 2)"
+    )
+    parser.add_argument("--index", type=Path, metavar="FOLDER", help="astrometry.net's index files")
+    args = parser.parse_args()
+    stars, answers = catalogue.load(), {}
+    for name, peer in (
+        ("starpos", starpos),
+        ("cedar-solve", cedar_solve),
+        ("astrometry.net", astrometry_net),
+    ):
+        try:
+            answers[name] = peer(stars, args)
+        except Absent as reason:
+            print(f"{name}: skipped, {reason}")
+    for title, make in (("ideal", montecarlo.ideal), ("realistic", montecarlo.Conditions)):
+        conditions = make(CAMERA, LIMIT_MAG)
+        print(f"{args.fields} {title} fields, seed {args.seed}")
+        print(f"{'':18}{'false':>6}{'correct %':>11}{'wrong':>7}{'none':>6}{'median ms':>11}{'worst ms':>10}")
+        for k in args.false:
+            tallies, bar = {name: montecarlo.Tally() for name in answers}, ProgressBar()
+            fields = islice(montecarlo.false_stars(stars, conditions, args.seed, k), args.fields)
+            for done, given in enumerate(fields, 1):
+                for name, tally in tallies.items():
+                    tally.ask(given, given.stars(conditions), answers[name], conditions.tolerance_rad)
+                bar(f"{k} false stars", done / args.fields)
+            for name, t in tallies.items():
+                print(
+                    f"{name:18}{k:6d}{100 * t.correct / t.fields:11.2f}{t.wrong:7d}{t.none:6d}"
+                    f"{np.median(t.cpu_ms):11.2f}{max(t.cpu_ms):10.1f}",
+                    flush=True,
+                )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
