@@ -60,6 +60,8 @@ class TiltBuffer:
         near = self._near(mid_unix_s, span_s)
         if not near:
             self._explain(mid_unix_s, span_s)
+        # later ones must not matter: how many have come by now is chance
+        near = [s for s in near if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + 1e-6] or near
         noise = np.sqrt(np.mean([np.trace(s.covariance) / 2 for s in near]))
         log = TiltLog(
             np.array([s.utc_unix_s for s in near]),
