@@ -21,12 +21,15 @@ from starpos.triangles import TriangleCatalogue, angles, sides
 ACCEPT_LOG_ODDS = np.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
 WORTH_A_FIT = 3.0  # log-odds of a raw triangle below which it is not looked at again
 FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
+EXPECTED_RANK = (10, 2)  # a + b n: how deep among the catalogue stars the n-th brightest detection may be
 TEST_STARS = 50  # the brightest of a frame, which decide
 FAINTEST_FIT = 2000  # stars that take part in the last fit
 SCALE_TOLERANCE = 0.03  # of the focal length
 # (brightest stars, their error in px): the second kind is for lenses that distort
-STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (8, 2.5), (12, 6.0))
+STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0))
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
+SMALLER_PX = (0.7, 1.5)
+CHOICE = np.log(1 + len(SMALLER_PX))
 TRIANGLE_SIGMA = 3.0
 MATCH_SIGMA = 3.5
 FEWEST_STARS = 4
@@ -183,6 +186,11 @@ class _Search:
         if log_odds > WORTH_A_FIT:
             pose = _fit(xy[hit], w[nearest[hit]], pose)
             log_odds, hit, nearest = self._log_odds(xy, w, pose, sigma, own)
+            # a looser error than the fit needs hides what the match is worth; to choose among errors costs their number
+            for smaller in (e for e in SMALLER_PX if e < error_px):
+                tighter = self._log_odds(xy, w, pose, np.hypot(self.sigma[: len(xy)], smaller), own)
+                if tighter[0] - CHOICE > log_odds:
+                    log_odds, hit, nearest = tighter[0] - CHOICE, *tighter[1:]
         return _Match(pose, log_odds, np.flatnonzero(hit), index[nearest[hit]], w[nearest[hit]])
 
     def _log_odds(self, xy, w, pose: _Pose, sigma, own):
@@ -197,9 +205,13 @@ class _Search:
         variance = sigma * sigma
         # one catalogue star answers one detection: the one nearest to it
         hit = (distance2 < MATCH_SIGMA**2 * variance) & (apart2.argmin(0)[nearest] == np.arange(len(xy)))
-        chance = np.log((1 - FALSE_FRACTION) / len(w) / (2 * np.pi * variance)) + self.log_area
-        odds = np.log(FALSE_FRACTION + np.where(hit, np.exp(chance - 0.5 * distance2 / variance), 0.0))
-        return float(odds[~own].sum()), hit, nearest
+        # the n-th brightest detection is expected among the brightest catalogue stars
+        expected = np.minimum(EXPECTED_RANK[0] + EXPECTED_RANK[1] * np.arange(len(xy)), len(w))
+        chance = np.log((1 - FALSE_FRACTION) / expected / (2 * np.pi * variance)) + self.log_area
+        likely = np.where(hit & (nearest < expected), np.exp(chance - 0.5 * distance2 / variance), 0.0)
+        odds = np.log(FALSE_FRACTION + likely)
+        # the best from the brightest down to any: under chance a likelihood ratio seldom rises high (Ville's inequality)
+        return float(np.cumsum(np.where(own, 0.0, odds)).max()), hit, nearest
 
     def _pose_of(self, t: _Triangle) -> _Pose:
         """The focal length that gives the triangle its size, and the rotation that brings it into place."""

@@ -21,16 +21,16 @@ from scipy.spatial import cKDTree
 from starpos.catalogue import Catalogue, rows_near
 from starpos.progress import Progress, quiet
 
-FORMAT = 4
+FORMAT = 5
 SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
 LARGEST_BINS, SMALLEST_BINS = 2048, 1024  # of the largest angle, 60..180 deg, and of the smallest, 0..60 deg
 POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smaller kind
 # Circles laid over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken).
 # The first fits into a field of 3:2 or 4:3, the second is the whole field's own.
-CIRCLES = ((0.6, 0.85, 7), (1.0, 0.85, 8))
+CIRCLES = ((0.6, 0.7, 7), (1.0, 0.7, 9))
 MOST_IN_USE = 4
 BLOCK = 100_000
-MAX_TRIANGLES = 5_000_000  # before those that several circles share are counted once
+MAX_TRIANGLES = 6_000_000  # before those that several circles share are counted once
 
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
