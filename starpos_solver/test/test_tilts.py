@@ -87,7 +87,7 @@ def test_broken_samples_are_refused_and_not_kept():
 def test_complete_once_a_sample_of_the_exposures_end_is_here():
     buffer = buffer_of(sample(k / 10) for k in range(-5, 1))
     assert not buffer.complete(T0, 0.5)
-    buffer.add(sample(0.15), NOISE)
+    buffer.add(sample(0.2), NOISE)
     assert buffer.complete(T0, 0.5)
 
 

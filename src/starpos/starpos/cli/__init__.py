@@ -39,7 +39,9 @@ def main(argv: list[str] | None = None) -> int:
             import_module(f"starpos.cli.{name}").define(sub)
     args = parser.parse_args(given)
     try:
-        return args.run(args)
+        status = args.run(args)
+        sys.stdout.flush()  # here, where a reader that has gone is expected, and not while the interpreter ends
+        return status
     except StarposError as e:
         print(f"starpos {args.command}: {e}", file=sys.stderr)
         return BAD_CALL
