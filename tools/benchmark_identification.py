@@ -3,7 +3,7 @@
 
 `benchmark_identification.py [--fields N] [--seed S] [--false K ...] [--index FOLDER]`.  Peers run where they can be
 imported (`pip install cedar-solve astrometry`): cedar-solve with a database made here from this program's catalogue for
-this field of view (five minutes, 2 GB of memory), kept in the cache; astrometry.net's engine with FOLDER's index files
+this field of view (five minutes), kept in the cache; astrometry.net's engine with FOLDER's index files
 (its figures are those of these files: `build-astrometry-index -P 7 .. 10 -n 30` of a V < 9.5 list finds 97 to 98 %).
 Every program is told the focal length to 3 % and gets the stars brightest first; each field is answered by all.
 """
