@@ -6,43 +6,24 @@ For machines without `ros2 bag play`, and for what that cannot do: as fast as th
 
 import argparse
 import math
-import re
 import signal
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
+
+from starpos_solver.bag import Bag, ReplayError, Topic
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PLAYED, CUT_SHORT, REFUSED = 0, 1, 2  # exit statuses
-TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 FRAMES = ("sensor_msgs/msg/Image", "starpos_interfaces/msg/StarArray")
 HELD = (*FRAMES, "sensor_msgs/msg/CameraInfo")  # what must not overtake the solution of the frame before
 SOLUTION = "solver/solution"
-METADATA_LIMIT = 1 << 24
-LAST_NS = (2**31 - 1) * 10**9  # what a Clock message holds
 CLOCK_PERIOD_S = 0.025
 ANSWER_S = 3.0  # the solver's own patience with a frame is far shorter
 UNANSWERED = 3  # frames of a topic in a row, until nothing is expected of it
 ACKNOWLEDGED_S = 3.0
-BURST, BURST_REST_S = (
-    100,
-    0.05,
-)  # at rate 0: no faster than subscribers' queues of some hundred messages are emptied
-
-
-class ReplayError(Exception):
-    """One sentence: what, where, what to do."""
-
-
-@dataclass(frozen=True)
-class Topic:
-    """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too."""
-
-    name: str
-    kind: type
-    type_name: str
-    latched: bool
+# at rate 0: no faster than subscribers' queues of some hundred messages are emptied
+BURST, BURST_REST_S = 100, 0.05
 
 
 def replay() -> int:
@@ -59,24 +40,21 @@ def replay() -> int:
 
 def main(arguments: list[str], stopped: list) -> int:
     """Play until the end, or until `stopped`, filled by a signal handler, is not empty; the exit status."""
-    ours, _, ros = _split(arguments)
+    ours, ros = _split(arguments)
     options = _parser().parse_args(ours)
     try:
         with Bag(options.bag) as bag:
-            topics = bag.topics(options.topics)
+            topics = bag.topics(options.topics, left_out=_say)
             return 0 if stopped else _play(bag, topics, options, ros, stopped)
     except ReplayError as error:
         _say(str(error))
         return REFUSED
 
 
-def _split(arguments: list[str]):
-    """What is ours, and what `--ros-args` brings for rclpy."""
-    head, mark, tail = arguments, "", []
-    if "--ros-args" in arguments:
-        k = arguments.index("--ros-args")
-        head, mark, tail = arguments[:k], "--ros-args", arguments[k:]
-    return head, mark, tail
+def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """What is ours, and what is rclpy's: from `--ros-args` on."""
+    k = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    return arguments[:k], arguments[k:]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -111,131 +89,6 @@ def _rate(text: str) -> float:
 
 def _say(sentence: str) -> None:
     print(f"replay: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
-
-
-class Bag:
-    """A rosbag2 as read by `rosbags`; everything in it is checked before it is used."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self._reader = None
-
-    def __enter__(self):
-        try:
-            from rosbags.rosbag2 import Reader
-        except ImportError:
-            raise ReplayError("rosbags, which reads bags, is not installed: pip install rosbags") from None
-        if not self.path.exists():
-            raise ReplayError(f"{self.path}: there is no such bag")
-        metadata = self.path / "metadata.yaml"
-        if self.path.is_dir() and not metadata.is_file():
-            raise ReplayError(
-                f"{self.path}: a folder without metadata.yaml is no bag: name its .mcap or .db3 file"
-            )
-        if self.path.is_dir() and metadata.stat().st_size > METADATA_LIMIT:
-            raise ReplayError(f"{metadata}: over {METADATA_LIMIT >> 20} MB, not the description of a bag")
-        try:
-            self._reader = Reader(self.path)
-            self._reader.open()
-        except (
-            Exception
-        ) as error:  # rosbags, ruamel.yaml, zstd and sqlite each have their own for a broken file
-            raise self._broken(error) from None
-        return self
-
-    def __exit__(self, *exception):
-        self._reader.close()
-
-    def _broken(self, error: Exception) -> ReplayError:
-        return ReplayError(f"{self.path}: not a readable bag ({type(error).__name__}: {str(error)[:200]})")
-
-    def topics(self, wanted: list[str] | None) -> dict[int, Topic]:
-        """What can be played, by connection; each that cannot is named in a sentence."""
-        names = {c.topic for c in self._reader.connections}
-        for name in wanted or ():
-            if name not in names:
-                raise ReplayError(
-                    f"{self.path}: no topic {name} in it; it has {', '.join(sorted(map(repr, names)))}"
-                )
-        topics = {}
-        for c in self._reader.connections:
-            if c.topic == "/clock" or (wanted and c.topic not in wanted):
-                continue
-            try:
-                topics[c.id] = _topic(c)
-            except ReplayError as error:
-                _say(f"{self.path}: {c.topic!r} is left out: {error}")
-        if not topics:
-            raise ReplayError(f"{self.path}: there is nothing in it to play")
-        return topics
-
-    def messages(self, topics: dict[int, Topic]):
-        """(topic, log time in ns, bytes) in the bag's order; ReplayError where the file breaks off."""
-        connections = [c for c in self._reader.connections if c.id in topics]
-        messages = self._reader.messages(connections)
-        while True:
-            try:
-                connection, log_ns, data = next(messages)
-            except StopIteration:
-                return
-            except Exception as error:
-                raise self._broken(error) from None
-            if not 0 <= log_ns <= LAST_NS:
-                raise ReplayError(
-                    f"{self.path}: a message of {connection.topic} was logged at {log_ns} ns, no time until 2038"
-                )
-            yield topics[connection.id], log_ns, bytes(data)
-
-
-def _topic(connection) -> Topic:
-    """A connection with the type of this workspace; ReplayError where there is none, or another of the same name."""
-    from rclpy.exceptions import InvalidTopicNameException
-    from rclpy.validate_full_topic_name import validate_full_topic_name
-
-    try:
-        validate_full_topic_name(connection.topic)
-    except (InvalidTopicNameException, ValueError, TypeError):
-        raise ReplayError("it is no topic's name") from None
-    kind = _message_class(connection.msgtype)
-    known = _type_hash(connection.msgtype)
-    if connection.digest.startswith("RIHS01_") and known and connection.digest != known:
-        raise ReplayError(
-            f"its {connection.msgtype} differs from the one installed here: use the version it was recorded with"
-        )
-    durabilities = [q.durability.name for q in connection.ext.offered_qos_profiles]
-    latched = bool(durabilities) and all(name == "TRANSIENT_LOCAL" for name in durabilities)
-    return Topic(connection.topic, kind, connection.msgtype, latched)
-
-
-def _message_class(name: str) -> type:
-    """The class of an installed message type; nothing is imported that is not one."""
-    from importlib import import_module
-
-    from ament_index_python.resources import get_resource
-
-    match = TYPE_NAME.fullmatch(name)
-    try:
-        package, message = match.groups()
-        if f"msg/{message}.msg" not in get_resource("rosidl_interfaces", package)[0].split():
-            raise LookupError
-        return getattr(import_module(f"{package}.msg"), message)
-    except (AttributeError, LookupError, ImportError):
-        raise ReplayError(f"the message type {name!r} is not installed here") from None
-
-
-def _type_hash(name: str) -> str:
-    """The hash of an installed type's description; '' where it was installed without."""
-    import json
-
-    from ament_index_python.packages import get_package_share_directory
-
-    package, message = TYPE_NAME.fullmatch(name).groups()
-    try:
-        path = Path(get_package_share_directory(package)) / "msg" / f"{message}.json"
-        hashes = json.loads(path.read_text())["type_hashes"]
-        return next(h["hash_string"] for h in hashes if h["type_name"] == name)
-    except (LookupError, OSError, ValueError, StopIteration):
-        return ""
 
 
 def _play(bag: Bag, topics: dict[int, Topic], options, ros: list[str], stopped: list) -> int:
