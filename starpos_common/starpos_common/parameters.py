@@ -13,6 +13,8 @@ from rclpy.parameter import Parameter as RosParameter
 from starpos.errors import StarposError
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+# what rclpy itself takes, some of it only after the node is made
+OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
 class ParameterError(StarposError):
@@ -157,7 +159,8 @@ def declare(
 
     apply: called with the names that were set, after a successful change at run time (not here).
     check: called with all values as they would be; a sentence where they do not fit together, or None.
-    Raises ParameterError where a value given at start-up (command line, YAML) is not allowed.
+    Raises ParameterError where a value given at start-up (command line, YAML) is not allowed; a name given there that
+    nobody knows is a warning in the log.
     """
     table = {p.name: p for p in parameters}
     values = Values(node, table)
@@ -170,6 +173,7 @@ def declare(
     complaint = check(values) if check else None
     if complaint:
         raise ParameterError(complaint)
+    _warn_of_unknown(node, table)
 
     def widen(changes: list[RosParameter]) -> list[RosParameter]:
         return [_widened(table[c.name], c) if c.name in table else c for c in changes]
@@ -192,6 +196,19 @@ def declare(
     if apply:
         node.add_post_set_parameters_callback(applied)
     return values
+
+
+def _warn_of_unknown(node: Node, table: Mapping[str, Parameter]):
+    """ROS drops them without a word, and a mistyped parameter would stay at its default."""
+    given = node._parameter_overrides  # rclpy has no public way to what was given
+    for name in sorted(given):
+        if name in table or node.has_parameter(name) or name.startswith(OF_ROS):
+            continue
+        from difflib import get_close_matches
+
+        near = get_close_matches(name, table, 1)
+        meant = f"did you mean {near[0]}?" if near else "see `ros2 param list` for those there are."
+        node.get_logger().warning(f"there is no parameter {name}, it is ignored: {meant}")
 
 
 def _widened(parameter: Parameter, change: RosParameter) -> RosParameter:

@@ -38,8 +38,9 @@ def context():
 def make(context):
     nodes = []
 
-    def make(*overrides, **options):
+    def make(*overrides, file=None, **options):
         arguments = ["--ros-args", *(word for o in overrides for word in ("-p", o))]
+        arguments += ["--params-file", str(file)] if file else []
         nodes.append(rclpy.create_node("params", context=context, cli_args=arguments))
         return nodes[-1], declare(nodes[-1], TABLE, **options)
 
@@ -89,6 +90,19 @@ def test_bad_start_values_are_refused_with_the_constraint(make, override, senten
     with pytest.raises(ParameterError) as error:
         make(override)
     assert sentence in str(error.value)
+
+
+def test_a_mistyped_name_is_a_warning_with_the_nearest_one(make, tmp_path, capfd):
+    make("noise:=2.0", "use_sim_time:=false", "qos_overrides./a.publisher.depth:=3")
+    assert capfd.readouterr().err == ""
+    file = tmp_path / "mine.yaml"
+    file.write_text("/**/params:\n  ros__parameters:\n    refraction: {presure: 95000.0}\n    bogus: 3\n")
+    _, values = make("nois:=2.0", file=file)
+    said = capfd.readouterr().err
+    assert values["refraction.pressure"] == 1.0e5 and said.count("is ignored") == 3
+    assert "no parameter refraction.presure, it is ignored: did you mean refraction.pressure?" in said
+    assert "no parameter nois, it is ignored: did you mean noise?" in said
+    assert "no parameter bogus, it is ignored: see `ros2 param list`" in said
 
 
 def test_descriptors_say_what_and_how_far(make):
