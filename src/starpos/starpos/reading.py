@@ -4,8 +4,10 @@
 import csv
 import json
 import re
+import stat
 import struct
 import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from starpos.stars import Stars
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff")
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
+PNG = b"\x89PNG\r\n\x1a\n"
 START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
 KEYS = (*START, "TIME-OBS", "TIMESYS", "EXPTIME", "EXPOSURE", "BAYERPAT", "FOCALLEN", "XPIXSZ")
 SCALES = ("utc", "tai", "tt", "tdb")  # of TIMESYS; UT1 would need tables
@@ -44,10 +47,31 @@ def read_frame(path) -> Frame | Stars:
     A missing time or exposure leaves mid_unix_s None. Raises FrameError for anything else not as above.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FrameError(f"{path}: there is no such file; check the path.")
-    if path.stat().st_size == 0:
+    try:
+        _check_file(path)
+        return _reader_of(path)(path)
+    except OSError as e:
+        reason = e.strerror or _one_line(e)
+        raise FrameError(f"{path}: it cannot be read ({reason}); check its permissions and the disk.") from e
+
+
+def _check_file(path):
+    """FrameError or OSError unless this is a file with something in it that opens."""
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a NUL in the name
+        raise FrameError(f"{_one_line(path)}: there is no such file; check the path.") from None
+    if stat.S_ISDIR(status.st_mode):
+        raise FrameError(f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}.")
+    if not stat.S_ISREG(status.st_mode):
+        raise FrameError(f"{path}: this is no regular file but a device or a pipe; give a frame's file.")
+    if status.st_size == 0:
         raise FrameError(f"{path}: the file is empty; take the frame again.")
+    path.open("rb").close()  # a refusal here is told as what it is, not as a damaged image
+
+
+def _reader_of(path):
+    """The function that reads files of this suffix."""
     suffix = path.suffix.lower()
     for suffixes, reader in (
         (FITS, _read_fits),
@@ -56,7 +80,7 @@ def read_frame(path) -> Frame | Stars:
         ((".csv",), _read_csv),
     ):
         if suffix in suffixes:
-            return reader(path)
+            return reader
     known = " ".join(FITS + PICTURE + RAW + (".csv",))
     raise FrameError(f"{path}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
 
@@ -134,7 +158,7 @@ def _times(header, path):
     if exposure is not None:
         try:
             exposure = float(exposure)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             exposure = np.nan
         if not 0 <= exposure <= MAX_EXPOSURE_S:
             raise FrameError(
@@ -180,7 +204,7 @@ def _focal_px(header):
     """FOCALLEN (mm) / XPIXSZ (um) in px; None where one is missing or senseless: it is but a hint."""
     try:
         focal = float(header["FOCALLEN"]) * 1000.0 / float(header["XPIXSZ"])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, ArithmeticError):
         return None
     return focal if np.isfinite(focal) and focal > 0 else None
 
@@ -195,10 +219,17 @@ def _read_picture(path):
         raise FrameError(
             f"{path}: its header claims {size[0]} x {size[1]} pixels; a frame has 1 to {MAX_PIXELS}."
         )
+    data = path.read_bytes()
+    if data.startswith(PNG):
+        data = _png_image(data)
+    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 4.6 has it at the top
+    level = log.setLogLevel(0)  # silent: what it would print is said below
     try:
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
+    finally:
+        log.setLogLevel(level)
     if pixels is None:
         raise FrameError(f"{path}: this is not a whole PNG or TIFF image; take or copy it again.")
     if pixels.ndim == 3:
@@ -217,7 +248,7 @@ def _picture_size(path):
     """(width, height) a PNG's or TIFF's header claims, before a decoder makes room for it; None: neither."""
     with open(path, "rb") as file:
         head = file.read(24)
-        if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 24:
+        if head.startswith(PNG) and len(head) == 24:
             return struct.unpack(">II", head[16:24])
         order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
         if order is None or len(head) < 8:
@@ -230,6 +261,25 @@ def _picture_size(path):
         if tag in (256, 257):  # ImageWidth, ImageLength: SHORT or LONG
             size[tag] = struct.unpack(order + ("H" if kind == 3 else "I"), value[: 2 if kind == 3 else 4])[0]
     return (size[256], size[257]) if len(size) == 2 else None
+
+
+def _png_image(data):
+    """The chunks of a PNG that make its image, b"" where one is damaged or the last is missing.
+
+    libpng prints on standard error about damage, and about such things as colour profiles: it gets neither.
+    """
+    kept, at = [PNG], len(PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        chunk = data[at : at + 12 + length]
+        at += 12 + length
+        if at > len(data) or struct.pack(">I", zlib.crc32(chunk[4:-4])) != chunk[-4:]:
+            return b""
+        if chunk[4:5].isupper():  # critical
+            kept.append(chunk)
+        if chunk[4:8] == b"IEND":
+            return b"".join(kept)
+    return b""
 
 
 def _read_raw(path):
@@ -269,7 +319,10 @@ def _read_csv(path):
         raise FrameError(
             f"{path}: its first line does not give the frame's size; write it like {line}."
         ) from None
-    rows = [row for row in csv.reader(rest.splitlines()) if row]
+    try:
+        rows = [row for row in csv.reader(rest.splitlines()) if row]
+    except csv.Error as e:
+        raise FrameError(f"{path}: this is not a CSV ({_one_line(e)}); write one star a line.") from None
     names = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "flux"} <= set(names):
         raise FrameError(

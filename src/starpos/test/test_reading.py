@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import contextlib
+import os
 import struct
 import sys
 import zlib
@@ -172,11 +173,16 @@ def huge_fits():
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux,sigma\n1,2,3,0\n'),
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9, "DATE-OBS": "now", "EXPTIME": 1}\nx,y,flux\n'),
         ("a.csv", b"# [1, 2]\nx,y,flux\n"),
+        ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n' + b"1" * 200_000),  # over csv's field limit
+        ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9, "EXPTIME": 1' + b"0" * 400 + b"}\nx,y,flux\n"),
+        (f"{'a' * 300}.fits", None),  # longer than a file system's names
+        ("a\0.fits", None),
     ],
 )
 def test_a_file_that_is_no_frame_is_refused_in_one_sentence(tmp_path, name, content):
     path = tmp_path / name
-    path.write_bytes(content)
+    if content is not None:
+        path.write_bytes(content)
     with pytest.raises(FrameError) as raised:
         read_frame(path)
     text = str(raised.value)
@@ -244,6 +250,56 @@ def test_nothing_but_a_frame_error_comes_of_damaged_bytes(tmp_path):
                 assert isinstance(read_frame(tmp_path / f"bad-{name}"), Frame)
 
 
-def test_no_such_file(tmp_path):
-    with pytest.raises(FrameError, match="no such file"):
-        read_frame(tmp_path / "missing.fits")
+def test_damaged_pictures_are_told_in_the_error_only(tmp_path, capfd):
+    """Neither libpng nor OpenCV prints of its own accord."""
+    pixels = np.random.default_rng(1).integers(0, 65535, (300, 300)).astype(np.uint16)
+    for name in ("a.png", "a.tif"):
+        path = tmp_path / name
+        cv2.imwrite(str(path), pixels)
+        whole = path.read_bytes()
+        flipped = bytearray(whole)
+        flipped[len(whole) // 2] ^= 255
+        for damaged in (whole[: len(whole) // 2], whole[:-1], flipped):
+            path.write_bytes(damaged)
+            with pytest.raises(FrameError, match="PNG or TIFF"):
+                read_frame(path)
+    assert capfd.readouterr().err == ""
+
+
+def test_what_a_png_says_besides_its_image_is_passed_over(tmp_path, capfd):
+    cv2.imwrite(str(tmp_path / "a.png"), PIXELS)
+    whole = (tmp_path / "a.png").read_bytes()
+    profile = b"iCCPnothing of the kind"
+    chunk = struct.pack(">I", len(profile) - 4) + profile + struct.pack(">I", zlib.crc32(profile))
+    (tmp_path / "a.png").write_bytes(whole[:33] + chunk + whole[33:])
+    assert np.array_equal(read_frame(tmp_path / "a.png").pixels, PIXELS)
+    assert capfd.readouterr().err == ""
+
+
+def test_what_is_no_file_is_told_as_what_it_is(tmp_path):
+    folder = tmp_path / "night.fits"
+    folder.mkdir()
+    for path, words in (
+        (tmp_path / "missing.fits", "no such file"),
+        (write_fits(tmp_path / "a.fits") / "b.fits", "no such file"),
+        (folder, r"folder.*night.fits/\*.fits"),
+        ("/dev/null", "no regular file"),
+    ):
+        with pytest.raises(FrameError, match=words):
+            read_frame(path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.parametrize("name", ["a.fits", "a.png", "a.csv"])
+def test_a_file_that_may_not_be_read(tmp_path, name):
+    (tmp_path / name).write_bytes(b"x")
+    (tmp_path / name).chmod(0)
+    with pytest.raises(FrameError, match="Permission denied"):
+        read_frame(tmp_path / name)
+
+
+def test_a_file_that_may_not_be_opened(tmp_path):
+    loop = tmp_path / "a.fits"
+    loop.symlink_to(loop)
+    with pytest.raises(FrameError, match="cannot be read"):
+        read_frame(loop)
