@@ -3,12 +3,15 @@
 
 if [ -n "${ZSH_VERSION:-}" ]; then
   eval '_starpos_env=${(%):-%x}' _starpos_shell=zsh
-else
+elif [ -n "${BASH_VERSION:-}" ]; then
   _starpos_env=${BASH_SOURCE[0]} _starpos_shell=bash
+else
+  echo "starpos: this shell is neither bash nor zsh, which ROS's set-up files are for: start bash and enter from there" >&2
+  return 1
 fi
 _starpos_root=$(cd "$(dirname "$_starpos_env")/.." >/dev/null && pwd)
-if [ ! -f "$_starpos_root/.underlay/stamp" ]; then
-  echo "starpos: nothing is set up in $_starpos_root yet: make -C $_starpos_root build" >&2
+if [ ! -f "$_starpos_root/.underlay/stamp" ] || [ ! -f "$_starpos_root/install/.built" ]; then
+  echo "starpos: nothing is built in $_starpos_root yet, or not to the end: make -C $_starpos_root build" >&2
   unset _starpos_env _starpos_shell _starpos_root
   return 1
 fi
@@ -24,9 +27,7 @@ else # over a ROS that is sourced already
     *) export PATH="$_starpos_root/.underlay/venv/bin:$PATH" ;;
   esac
 fi
-if [ -f "$_starpos_root/install/local_setup.$_starpos_shell" ]; then
-  . "$_starpos_root/install/local_setup.$_starpos_shell"
-fi
+. "$_starpos_root/install/local_setup.$_starpos_shell"
 case $_starpos_flags in *u*) set -u ;; esac
 case $_starpos_flags in *e*) set -e ;; esac
 unset _starpos_env _starpos_shell _starpos_root _starpos_flags
