@@ -62,13 +62,12 @@ class TiltBuffer:
             self._explain(mid_unix_s, span_s)
         # later ones must not matter: how many have come by now is chance
         near = [s for s in near if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + 1e-6] or near
-        noise = np.sqrt(np.mean([np.trace(s.covariance) / 2 for s in near]))
         log = TiltLog(
             np.array([s.utc_unix_s for s in near]),
             np.array([s.theta_x for s in near]),
             np.array([s.theta_y for s in near]),
             np.array([s.temperature_c for s in near]),
-            float(noise),
+            np.array([s.covariance for s in near]),
         )
         return log.average(mid_unix_s, span_s)
 

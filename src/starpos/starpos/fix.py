@@ -74,6 +74,9 @@ class Fix:
     refraction_arcsec: float
     diurnal_aberration_arcsec: float
     ut1_minus_utc_s: float
+    tilt_times: tuple[
+        float, ...
+    ] = ()  # of the inclinometer's readings: frames that share some share their errors
 
     @property
     def covariance(self) -> np.ndarray:
@@ -152,6 +155,7 @@ def solve_fix(
         refraction_arcsec=float(np.degrees(bent) * 3600),
         diurnal_aberration_arcsec=float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
         ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
+        tilt_times=tilt.times,
     )
 
 

@@ -3,6 +3,7 @@
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from starpos.errors import TiltError, TiltRangeError
 LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
 SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
+NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20  # readings close in time that tell the noise
+OUTLIER_SIGMA, REST = 6.0, 6.0  # readings further out are left out; more scatter than this is no rest
+SIGMA_PER_MAD = 1.4826
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
@@ -19,7 +23,8 @@ SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the pape
 class Tilt:
     """Elevation of S's X' and Y' axes above the horizon, averaged over `samples` readings.
 
-    theta_x, theta_y: rad.  covariance: (2, 2) rad2 of the average.  utc_unix_s: the middle of the readings.
+    theta_x, theta_y: rad.  covariance: (2, 2) rad2 of the average.  utc_unix_s: the middle of the readings; times: of
+    each, where they are known.
     """
 
     theta_x: float
@@ -28,6 +33,7 @@ class Tilt:
     utc_unix_s: float
     samples: int = 1
     temperature_c: float = float("nan")
+    times: tuple[float, ...] = ()
 
     def __post_init__(self):
         object.__setattr__(self, "covariance", np.asarray(self.covariance, float))
@@ -71,21 +77,78 @@ def sca100t_volts(angle, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_
 
 @dataclass(frozen=True)
 class TiltLog:
-    """Readings in time order: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,)."""
+    """Readings: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,), covariance (N, 2, 2) rad2 of each."""
 
     utc_unix_s: np.ndarray
     theta_x: np.ndarray
     theta_y: np.ndarray
     temperature_c: np.ndarray
-    noise_rad: float = SCA100T_NOISE_RAD
+    covariance: np.ndarray
+
+    @classmethod
+    def of(
+        cls, utc_unix_s, theta_x, theta_y, temperature_c, noise_rad: float = SCA100T_NOISE_RAD
+    ) -> "TiltLog":
+        """Readings of one white noise, 1 sigma."""
+        return cls(
+            utc_unix_s,
+            theta_x,
+            theta_y,
+            temperature_c,
+            np.tile(np.eye(2) * noise_rad**2, (len(utc_unix_s), 1, 1)),
+        )
+
+    @cached_property
+    def excess(self) -> float:
+        """How much larger the readings' noise is than stated, 1 or more: from what neighbours in time differ by."""
+        order = np.argsort(self.utc_unix_s, kind="stable")
+        apart = np.diff(self.utc_unix_s[order])
+        near = (apart > 0) & (apart < NEIGHBOURS_S)
+        if near.sum() < ENOUGH_NEIGHBOURS:
+            return 1.0
+        steps = np.diff(np.stack([self.theta_x, self.theta_y], -1)[order], axis=0)[near]
+        steps = steps[np.isfinite(steps).all(1)]
+        stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
+        found = float(SIGMA_PER_MAD * np.median(np.abs(steps), axis=0).max() / np.sqrt(2) / stated)
+        return found if found > 1 + 4 / np.sqrt(len(steps)) else 1.0  # three times the estimate's own error
 
     def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:
         """The mean tilt over an exposure; where no reading falls into it, the nearest within one second.
 
-        A single wild reading does not move it: readings further than 6 sigma from the median are left out.  Readings that
-        scatter clearly more than noise_rad (wind, footsteps) widen the covariance.
-        Raises TiltError with the distance in time where there is none.
+        A reading counts once.  One that lies far from the others is left out; where they scatter more than stated (wind,
+        footsteps), the covariance widens.  Raises TiltError with the distance in time where there is none.
         """
+        use = self._of_exposure(mid_unix_s, exposure_s)
+        theta = np.stack([self.theta_x[use], self.theta_y[use]], -1)
+        noise = self.excess * np.sqrt(np.trace(self.covariance[use], axis1=1, axis2=2).mean() / 2)
+        from_middle = np.abs(theta - np.median(theta, axis=0))
+        spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
+        if spread.max() > REST * noise:
+            raise TiltError(
+                f"the tilt moved by {np.degrees(np.ptp(theta, axis=0).max()):.3f} deg during the exposure: "
+                "the instrument was not at rest"
+            )
+        sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)
+        theta, use = theta[sane], use[sane]
+        n = len(use)
+        covariance = self.covariance[use].mean(0) * self.excess**2
+        if (
+            n > 1
+        ):  # a small sample's scatter is itself uncertain: only what clearly exceeds the noise widens it
+            scatter = theta.var(0, ddof=1) / np.diag(covariance)
+            widen = np.sqrt(np.where(scatter > 1 + 2 * np.sqrt(2 / (n - 1)), scatter * (1 + 2 / n), 1.0))
+            covariance = covariance * np.outer(widen, widen)
+        return Tilt(
+            *theta.mean(0).tolist(),
+            covariance / n,
+            float(self.utc_unix_s[use].mean()),
+            n,
+            float(self.temperature_c[use].mean()),
+            tuple(self.utc_unix_s[use].tolist()),
+        )
+
+    def _of_exposure(self, mid_unix_s: float, exposure_s: float) -> np.ndarray:
+        """Indices of the readings to take, one for each time."""
         apart = np.abs(self.utc_unix_s - mid_unix_s)
         finite = np.isfinite(self.theta_x) & np.isfinite(self.theta_y)
         half = max(exposure_s, 0.0) / 2 + 1e-6
@@ -98,48 +161,33 @@ class TiltLog:
                     f"(nearest {nearest:.1f} s off): check the clocks and the inclinometer"
                 )
             use = finite & (apart <= nearest + 1e-6)
-        theta = np.stack([self.theta_x[use], self.theta_y[use]], -1)
-        centre = np.median(theta, axis=0)
-        sane = (np.abs(theta - centre) <= 6 * max(self.noise_rad, 1e-9)).all(1)
-        if 2 * sane.sum() < len(sane) or not sane.any():
-            raise TiltError(
-                f"the tilt moved by {np.degrees(np.ptp(theta, axis=0).max()):.3f} deg during the exposure: "
-                "the instrument was not at rest"
-            )
-        mean = theta[sane].mean(0)
-        n = int(sane.sum())
-        variance = np.full(2, self.noise_rad**2)
-        if n > 1:
-            scatter = theta[sane].var(0, ddof=1)
-            variance = np.where(scatter > variance * (1 + 3 * np.sqrt(2 / (n - 1))), scatter, variance)
-        return Tilt(
-            float(mean[0]),
-            float(mean[1]),
-            np.diag(variance / n),
-            float(self.utc_unix_s[use][sane].mean()),
-            n,
-            float(self.temperature_c[use][sane].mean()),
-        )
+        index = np.flatnonzero(use)
+        return index[np.unique(self.utc_unix_s[index], return_index=True)[1]]
 
 
 def read_tilt_csv(path, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
     """A TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if it is none."""
     path = Path(path)
+    cure = "give a CSV with a line of names, utc_unix_s,theta_x_deg,theta_y_deg[,temperature_c], and readings"
     try:
-        with path.open() as f, warnings.catch_warnings():
+        with path.open(encoding="utf-8-sig") as f, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # 'empty input file' is said below
             names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
-            rows = np.genfromtxt(f, delimiter=",", ndmin=2)
+            rows = np.loadtxt(f, delimiter=",", ndmin=2)
+    except FileNotFoundError:
+        raise TiltError(f"{path}: there is no such file: {cure}") from None
     except (OSError, ValueError, UnicodeDecodeError) as e:
-        raise TiltError(f"{path}: not a readable table of tilts ({_first_line(e)})") from None
+        raise TiltError(f"{path}: not a readable table of tilts ({_first_line(e)}): {cure}") from None
     need = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
     if not set(need) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(set(names)):
-        raise TiltError(f"{path}: a tilt table needs the columns {', '.join(need)} and at least one row")
+        raise TiltError(
+            f"{path}: a tilt table needs the columns {', '.join(need)} and at least one row: {cure}"
+        )
     column = dict(zip(names, rows.T, strict=True))
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]
     temperature = column.get("temperature_c", np.full(len(rows), np.nan))
-    return TiltLog(
+    return TiltLog.of(
         column["utc_unix_s"][order],
         np.radians(column["theta_x_deg"][order]),
         np.radians(column["theta_y_deg"][order]),

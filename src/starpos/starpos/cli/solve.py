@@ -7,7 +7,7 @@ from starpos import catalogue
 from starpos.average import Average, average
 from starpos.cli import common
 from starpos.earth import utc_text
-from starpos.errors import FrameError
+from starpos.errors import FixError, FrameError
 from starpos.fix import Fix
 from starpos.inclinometer import read_tilt_csv
 from starpos.solve import Solution, Solver, Status
@@ -69,9 +69,21 @@ def run(args) -> int:
             common.print_json({"file": path} | _json_of(answer.fix, deflection) | _json_about(answer))
         else:
             print(_line(path, answer))
+    together = _combine(solved)
     if solved:
-        _print_combined(average([s.fix for s in solved]), solved, args, deflection)
-    return common.UNREADABLE if unreadable else 0 if solved else NO_FIX
+        _print_combined(together, solved, args, deflection)
+    return common.UNREADABLE if unreadable else 0 if together else NO_FIX
+
+
+def _combine(solved: list[Solution]) -> Average | None:
+    """All fixes as one; None, with a sentence, where they do not belong together."""
+    if not solved:
+        return None
+    try:
+        return average([s.fix for s in solved])
+    except FixError as e:
+        common.complain("solve", e)
+        return None
 
 
 def _deflection(args) -> Deflection:
@@ -144,21 +156,27 @@ def _where(fix: Fix | Average) -> str:
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
-def _print_combined(all_together: Average, solved: list[Solution], args, deflection: Deflection) -> None:
+def _print_combined(
+    all_together: Average | None, solved: list[Solution], args, deflection: Deflection
+) -> None:
     if args.json:
         about = {
             "stars_detected": sum(s.stars_detected for s in solved),
             "stars_matched": sum(len(s.names) for s in solved),
             "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved])),
             "log_odds": sum(s.attitude.log_odds for s in solved),
-            "status": Status.OK.value,
+            "status": (Status.OK if all_together else Status.POOR_FIT).value,
         }
         common.print_json(
-            {"combined": True, "frames": len(solved)} | _json_of(all_together, deflection) | about
+            {"combined": True, "frames": all_together.frames if all_together else 0}
+            | _json_of(all_together, deflection)
+            | about
         )
         return
+    if all_together is None:
+        return
     ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, deflection)
-    print(f"{len(solved)} frames together: {_where(all_together)} (astronomic)")
+    print(f"{all_together.frames} frames together: {_where(all_together)} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
