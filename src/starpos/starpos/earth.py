@@ -17,6 +17,7 @@ from starpos.errors import TimeError
 UNIX_EPOCH_JD = 2440587.5
 DAY_S = 86400.0
 TT_MINUS_TAI_S = 32.184
+TT_MINUS_UTC_S = 69.184  # since 2017; in 1900 it was 72 s less, which is 0.3 mas of aberration
 SPEED_OF_LIGHT = erfa.CMPS
 ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
 EQUATOR_RADIUS_M, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3  # WGS 84
@@ -79,6 +80,21 @@ def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) 
     spin = erfa.rz(erfa.era00(*ut1), np.eye(3))
     year = 2000.0 + (tt[0] - erfa.DJ00 + tt[1]) / erfa.DJY
     return EarthState(utc_unix_s, float(year), orientation, astrom, pole @ spin)
+
+
+def earth_motion(utc_unix_s: float) -> tuple[float, np.ndarray]:
+    """Julian year (TT) and the Earth's barycentric velocity in units of c (3,), ICRS axes: all that a pointing needs.
+
+    ERFA's eraEpv00, good for 1900 to 2100; no table, no leap seconds.  Raises TimeError outside those years.
+    """
+    days = (utc_unix_s + TT_MINUS_UTC_S) / DAY_S
+    year = 2000.0 + (UNIX_EPOCH_JD - erfa.DJ00 + days) / erfa.DJY
+    if not 1900 < year < 2100:  # NaN neither
+        raise TimeError(
+            f"{utc_text(utc_unix_s)} is not between 1900 and 2100: check the clock that stamps the frame"
+        )
+    _, barycentric = erfa.epv00(UNIX_EPOCH_JD, days)
+    return float(year), barycentric["v"] * (erfa.AULT / DAY_S)
 
 
 def earth_orientation(utc_unix_s: float) -> EarthOrientation:

@@ -200,6 +200,16 @@ def _middle(start, exposure_s, scale, what):
     return unix
 
 
+def why_no_time(source: str) -> str:
+    """What a frame lacks whose mid_unix_s is None, and what to do: by the suffix of the file it came from."""
+    suffix = Path(source).suffix.lower()
+    if suffix in PICTURE + RAW:
+        return f"a {suffix} file carries none in UTC: give FITS, or a CSV of centroids"
+    if suffix in (*FITS, ".csv"):
+        return "its header needs DATE-OBS with an hour, and EXPTIME: add them"
+    return "its header stamp is missing: set it to the middle of the exposure, UTC"
+
+
 def _focal_px(header):
     """FOCALLEN (mm) / XPIXSZ (um) in px; None where one is missing or senseless: it is but a hint."""
     try:

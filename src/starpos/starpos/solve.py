@@ -14,12 +14,13 @@ from starpos import triangles
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
-from starpos.earth import EarthState, earth_state
+from starpos.earth import EarthState, earth_motion, earth_state
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix import Fix, MatchedStars, solve_fix
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Instrument
 from starpos.progress import Progress, quiet
+from starpos.reading import why_no_time
 from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 
 J2000 = 2000.0
@@ -56,7 +57,10 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Solution:
-    """What became of one frame: status and a sentence, and as much of the answer as there is."""
+    """What became of one frame: status and a sentence, and as much of the answer as there is.
+
+    extrapolated_days: how far beyond the end of the IERS table the fix carried the Earth's rotation on; 0 within it.
+    """
 
     status: Status
     message: str
@@ -70,6 +74,7 @@ class Solution:
     tilt: Tilt | None = None
     identify_s: float = 0.0
     fix_s: float = 0.0
+    extrapolated_days: float = 0.0
 
     @classmethod
     def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
@@ -102,9 +107,10 @@ class Solver:
             camera = self._camera(stars.width, stars.height)
             year, velocity = J2000, (0.0, 0.0, 0.0)
             if stars.mid_unix_s is not None:
-                state = earth_state(stars.mid_unix_s)
-                year, velocity = state.year, tuple(state.velocity)
-            found, sky = self._identify(stars, camera, camera.directions(stars.x, stars.y), year, velocity)
+                year, velocity = earth_motion(stars.mid_unix_s)
+            found, sky = self._identify(
+                stars, camera, camera.directions(stars.x, stars.y), year, tuple(velocity)
+            )
         except StarposError as e:
             return _failure(stars, e)
         spent = time.perf_counter() - begin
@@ -125,9 +131,8 @@ class Solver:
         """
         try:
             if stars.mid_unix_s is None:
-                raise TimeError(
-                    f"{stars.source}: no time of exposure (DATE-OBS): a position needs it to a millisecond"
-                )
+                place = stars.source or "the frame"
+                raise TimeError(f"{place}: no time of exposure: {why_no_time(stars.source)}")
             state = earth_state(stars.mid_unix_s)
             if callable(tilt):
                 tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0)
@@ -152,6 +157,7 @@ class Solver:
             star=found.star[fix.used],
             fix=fix,
             fix_s=time.perf_counter() - identified,
+            extrapolated_days=state.orientation.extrapolated_days,
             **known,
         )
 

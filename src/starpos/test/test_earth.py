@@ -2,6 +2,8 @@
 """A1 against ERFA's and SOFA's published numbers and against astropy."""
 
 import calendar
+import subprocess
+import sys
 import warnings
 
 import erfa
@@ -15,6 +17,7 @@ from starpos.earth import (
     POLE_SIGMA_RAD,
     EarthOrientation,
     curvature_radii_m,
+    earth_motion,
     earth_orientation,
     earth_state,
     station_velocity,
@@ -246,6 +249,36 @@ def test_a_time_outside_the_tables_is_refused_with_one_sentence(utc):
         earth_state(utc)
     assert "\n" not in str(e.value)
     assert "check" in str(e.value)
+
+
+@pytest.mark.parametrize("year", [1973, 1999, 2017, 2026])
+def test_motion_is_that_of_the_whole_state(year):
+    utc = unix_of(year, 5, 17, 3)
+    (epoch, velocity), state = earth_motion(utc), earth_state(utc)
+    assert epoch == pytest.approx(state.year, abs=60 / 31557600)
+    np.testing.assert_allclose(velocity, state.velocity, rtol=0, atol=0.3 * MAS)
+
+
+def test_motion_needs_no_tables():
+    for year in (1901, 1950, 2035, 2099):
+        epoch, velocity = earth_motion(unix_of(year, 7, 1))
+        assert epoch == pytest.approx(year + 0.5, abs=0.01)
+        assert np.linalg.norm(velocity) * erfa.CMPS == pytest.approx(29780, rel=0.02)
+    program = "import sys; from starpos.earth import earth_motion; earth_motion(0.0); print('astropy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    "utc", [unix_of(1899, 12, 31), unix_of(2101, 1, 1), -1e18, 1e300, float("nan"), float("-inf")]
+)
+def test_motion_at_an_impossible_date_is_refused_with_one_sentence(utc):
+    with warnings.catch_warnings(), pytest.raises(TimeError, match="between 1900 and 2100: check") as e:
+        warnings.simplefilter("error")
+        earth_motion(utc)
+    assert "\n" not in str(e.value)
 
 
 def test_utc_text():

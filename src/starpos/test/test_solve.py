@@ -22,7 +22,7 @@ from scenes import (
 )
 
 from starpos.camera import Camera
-from starpos.earth import curvature_radii_m, earth_state, station_velocity
+from starpos.earth import curvature_radii_m, earth_state, station_velocity, utc_text
 from starpos.errors import TiltError
 from starpos.inclinometer import Tilt, TiltLog
 from starpos.instrument import Instrument
@@ -229,13 +229,51 @@ def test_tilt_out_of_range(night):
 def test_time_outside_the_tables(utc, night):
     _, stars, tilt, solver = night
     late = replace(stars, mid_unix_s=utc)
-    assert "tables" in refused(solver.solve(late, tilt), Status.TIME_OUTSIDE_TABLES)
-    assert solver.identify(late).status is Status.TIME_OUTSIDE_TABLES
+    message = refused(solver.solve(late, tilt), Status.TIME_OUTSIDE_TABLES)
+    assert f"{utc_text(utc)} lies outside the IERS tables (1973 to 20" in message
+    assert "check the frame's clock" in message
 
 
-def test_a_frame_without_a_time(night):
+@pytest.mark.parametrize("utc", [-6.3e8, 0.0, 2.05e9])  # 1950, 1970, 2034
+def test_a_pointing_needs_no_tables(utc, night):
+    _, stars, _, solver = night
+    s = solver.identify(replace(stars, mid_unix_s=utc))
+    assert s.ok, s.message
+    assert s.attitude.dec == pytest.approx(solver.identify(stars).attitude.dec, abs=60 * ARCSEC)
+
+
+@pytest.mark.parametrize("utc", [-3e9, 4.2e9, 1e300])
+def test_a_pointing_of_an_impossible_date(utc, night):
+    _, stars, _, solver = night
+    s = solver.identify(replace(stars, mid_unix_s=utc))
+    assert "between 1900 and 2100" in refused(s, Status.TIME_OUTSIDE_TABLES)
+
+
+def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng):
+    scene, stars, tilt, solver = night
+    assert solver.solve(stars, tilt).extrapolated_days == 0
+    later = START + 700 * 86400
+    s = solver.solve(stars_of(scene, catalogue, rng, later), tilt_of(scene, rng, later))
+    assert s.ok, s.message
+    assert s.extrapolated_days == earth_state(later + EXPOSURE / 2).orientation.extrapolated_days > 0
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("night/a.fits", "DATE-OBS with an hour, and EXPTIME"),
+        ("a.csv", "DATE-OBS with an hour, and EXPTIME"),
+        ("a.PNG", "a .png file carries none in UTC: give FITS"),
+        ("a.tiff", "give FITS"),
+        ("a.nef", "give FITS"),
+        ("stars", "stars: no time of exposure: its header stamp is missing"),
+        ("", "the frame: no time of exposure: its header stamp"),
+    ],
+)
+def test_a_frame_without_a_time_is_told_what_it_lacks(source, words, night):
     _, stars, tilt, solver = night
-    assert "DATE-OBS" in refused(solver.solve(replace(stars, mid_unix_s=None), tilt), Status.BAD_INPUT)
+    message = refused(solver.solve(replace(stars, mid_unix_s=None, source=source), tilt), Status.BAD_INPUT)
+    assert words in message
 
 
 def test_a_frame_of_another_size_than_the_intrinsics(night, catalogue):
