@@ -85,6 +85,8 @@ class CameraNode(Node):
         self._timer = None
         self._start_timer()
         self._worker.start()
+        if lack := self._source.lacking():
+            self._say(Level.WARN, lack)
 
     def destroy_node(self):
         self._worker.stop()
@@ -116,7 +118,9 @@ class CameraNode(Node):
         elif (
             self._source.waits_for_listener and not self._frames and not self._images.get_subscription_count()
         ):
-            self._say(Level.OK, f"waiting for a subscriber of {self._images.topic_name}.")
+            lack = self._source.lacking()  # comes first, for a subscriber would not help
+            waiting = f"waiting for a subscriber of {self._images.topic_name}."
+            self._say(Level.WARN if lack else Level.OK, lack or waiting)
         else:
             self._worker.offer(_settings(self._values))
 

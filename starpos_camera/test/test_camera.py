@@ -60,6 +60,17 @@ def test_plays_files_and_says_which_one_is_broken(start, listener, folder):
     assert out.count("1.fits") == 1 and len(out.splitlines()) <= 5
 
 
+def test_a_missing_folder_is_a_warning_before_anyone_listens(start, listener, tmp_path, folder):
+    later = tmp_path / "later"
+    node = start("camera", f"files.path:={later}", "cadence:=0.1")
+    listener.wait_for_state("camera: Capture", WARN, f"{later}: there are no frames here")
+    later.mkdir()
+    (folder / "0.fits").rename(later / "0.fits")
+    listener.wait_for_state("camera: Capture", OK, "waiting for a subscriber")
+    status, out = node.end(signal.SIGTERM)
+    assert status == 0 and out.count("no frames here") == 1
+
+
 def test_a_folder_that_comes_later(start, listener, tmp_path, folder):
     images, _, _ = hear_all(listener)
     later = tmp_path / "later"

@@ -58,6 +58,9 @@ class Source(Protocol):
     def refusal(values: Mapping, settings: Settings) -> str | None:
         """A sentence where a source with these parameters cannot be made, or cannot take such frames."""
 
+    def lacking(self) -> str | None:
+        """A sentence where `capture` would find nothing; asked before the first frame, each cadence."""
+
     def capture(self, settings: Settings) -> Exposure:
         """Take the next frame, in a thread of the node's; blocks until it is there.
 

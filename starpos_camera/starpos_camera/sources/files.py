@@ -2,7 +2,7 @@
 """Frames from files: a folder, or all that a pattern matches, in the order of their names."""
 
 import glob
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +45,14 @@ class Files:
         self._queue: list[Path] | None = None  # what this round has left, last first
         self._bad: set[Path] = set()
 
+    def lacking(self) -> str | None:
+        try:
+            if next(find_files(self._path), None) is None:
+                return f"{self._path}: there are no frames here; check files.path."
+        except (OSError, RuntimeError) as error:  # no permission, no such user's home
+            return f"{self._path}: it cannot be looked into ({error}); check files.path."
+        return None
+
     def capture(self, settings: Settings) -> Exposure:
         if not self._queue:
             self._queue = self._next_round()
@@ -76,20 +84,20 @@ class Files:
     def _next_round(self) -> list[Path]:
         if self._queue is not None and not self._loop:
             raise SourceEnded(f"all frames of {self._path} are played.")
-        files = list_files(self._path)
-        if not files:
-            raise FrameError(f"{self._path}: there are no frames here; check files.path.")
+        if lack := self.lacking():
+            raise FrameError(lack)
+        files = sorted(find_files(self._path))
         good = [file for file in files if file not in self._bad]
         if not good:
             raise FrameError(f"{self._path}: none of its {len(files)} files is a frame; give others.")
         return good[::-1]
 
 
-def list_files(path: str) -> list[Path]:
-    """The frames in a folder, or whatever files a pattern matches, by name; [] where there are none."""
+def find_files(path: str) -> Iterator[Path]:
+    """The frames in a folder, or whatever files a pattern matches, in no order; none where there is no such place."""
     place = Path(path).expanduser()
     if place.is_dir():
-        found = [file for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
+        found = (file for file in place.iterdir() if file.suffix.lower() in SUFFIXES)
     else:
-        found = [Path(name) for name in glob.glob(str(place), recursive=True)]
-    return sorted(file for file in found if file.is_file())
+        found = (Path(name) for name in glob.iglob(str(place), recursive=True))
+    return (file for file in found if file.is_file())

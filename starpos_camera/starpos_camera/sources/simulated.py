@@ -44,6 +44,9 @@ class Simulated:
         self._scene = scene_from(values)
         self.hardware_id = "simulated sky"
 
+    def lacking(self) -> None:
+        """Nothing: the sky is always there."""
+
     def capture(self, settings: Settings) -> Exposure:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s
