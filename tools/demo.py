@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole instrument under a simulated sky, live: four nodes as they are installed, an emulated inclinometer on a pty.
 
-The place is drawn at random; nothing tells it to the solver.  Exit status 0 if the truth lies within 4 sigma.
+The place is drawn at random; nothing tells it to the solver.  Exit status 0 if the truth lies within 4 sigma and no
+node took more memory than it may.  All of it runs in a ROS domain of its own: no other graph hears it.
 """
 
 import argparse
 import json
 import math
 import os
+import random
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +25,8 @@ import numpy as np
 
 FRAMES, CADENCE_S, EXPOSURE_S, PATIENCE_S = 10, 3.0, 0.5, 75.0
 ACCEPTED_SIGMA = 4.0
-METRES_A_DEGREE = 111_194.9
-INDEPENDENT = ("centroids", "tilt")  # terms of the budget that are new in every frame
+MEMORY_LIMIT_MB = 500  # of each node
+FRAMES_KEPT = 3  # of 42 MB; a frame's solution comes before the third one after it
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,23 @@ class Place:
             pointing_deg=pointing,
             misalignment_deg=self.misalignment,
         )
+
+
+@contextmanager
+def own_domain():
+    """A ROS_DOMAIN_ID that nobody has, least of all the graph of this shell, and only on this machine."""
+    others = [n for n in range(1, 100) if str(n) != os.environ.get("ROS_DOMAIN_ID")]
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.pop("ROS_STATIC_PEERS", None)
+    try:
+        from domain_coordinator import domain_id
+    except ImportError:  # a robot without ros-jazzy-domain-coordinator
+        os.environ["ROS_DOMAIN_ID"] = str(random.choice(others))
+        yield
+        return
+    with domain_id(lambda: random.choice(others)) as number:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        yield
 
 
 def executable(package: str, name: str) -> str:
@@ -104,11 +125,13 @@ class Instrument:
         return next((name for name, p in self.running.items() if p.poll() is not None), None)
 
     def peak_mb(self) -> dict[str, int]:
-        """Peak resident memory of each node."""
+        """Peak resident memory of each node, 10^6 bytes."""
         peak = {}
         for name, p in self.running.items():
             lines = Path(f"/proc/{p.pid}/status").read_text().splitlines()
-            peak[name] = next((int(line.split()[1]) // 1024 for line in lines if line.startswith("VmHWM")), 0)
+            peak[name] = next(
+                (round(int(n.split()[1]) * 1.024e-3) for n in lines if n.startswith("VmHWM")), 0
+            )
         return peak
 
     def stop(self) -> dict[str, int | str]:
@@ -131,7 +154,7 @@ def _parameters(values: dict) -> list[str]:
 
 
 class Watcher:
-    """Listens to the graph: solutions, the time each frame was published, and one frame with its stars."""
+    """Listens to the graph: solutions and publication times by the frame's stamp, and one solved frame, `pictured`."""
 
     def __init__(self, place: Place):
         import rclpy
@@ -141,7 +164,8 @@ class Watcher:
 
         rclpy.init()
         self.rclpy, self.node, self.place = rclpy, rclpy.create_node("demo"), place
-        self.solutions, self.seconds, self.published, self.stars, self.frame = [], [], {}, {}, None
+        self.solutions, self.seconds, self.published, self.stars = {}, [], {}, {}
+        self.frames, self.pictured = deque(maxlen=FRAMES_KEPT), None
         self.node.create_subscription(Solution, "solver/solution", self._on_solution, 10)
         self.node.create_subscription(Capture, "camera/capture", self._on_capture, 10)
         self.node.create_subscription(StarArray, "stars", lambda m: self.stars.update({_stamp(m): m}), 10)
@@ -151,11 +175,16 @@ class Watcher:
         self.published[_stamp(message)] = time.monotonic()
 
     def _on_image(self, message):
-        self.frame = message
+        self.frames.append(message)
 
     def _on_solution(self, message):
-        self.solutions.append(message)
-        self.seconds.append(time.monotonic() - self.published.get(_stamp(message), math.nan))
+        stamp = _stamp(message)
+        if stamp in self.solutions:  # a frame that is solved again is no other frame
+            return
+        self.solutions[stamp] = message
+        self.seconds.append(time.monotonic() - self.published.get(stamp, math.nan))
+        if self.pictured is None and message.status == message.OK:
+            self.pictured = next((frame for frame in self.frames if _stamp(frame) == stamp), None)
         print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
 
     def watch(self, frames: int, instrument: Instrument) -> str | None:
@@ -163,9 +192,10 @@ class Watcher:
         end = time.monotonic() + PATIENCE_S
         while len(self.solutions) < frames:
             self.rclpy.spin_once(self.node, timeout_sec=0.2)
-            if self.frame is not None and self.image is not None:  # one 42 MB frame is enough
+            if self.pictured is not None and self.image is not None:  # one 42 MB frame is enough
                 self.node.destroy_subscription(self.image)
                 self.image = None
+                self.frames.clear()
             if name := instrument.dead():
                 return f"{name} has stopped: see {instrument.folder / name}.log"
             if time.monotonic() > end:
@@ -183,9 +213,12 @@ def _stamp(message) -> tuple[int, int]:
 
 def _error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
     """East and north of the truth."""
-    turn = (longitude - place.longitude + 180) % 360 - 180
-    north = (latitude - place.latitude) * METRES_A_DEGREE
-    return turn * METRES_A_DEGREE * math.cos(math.radians(place.latitude)), north
+    from starpos.earth import curvature_radii_m
+
+    phi = math.radians(place.latitude)
+    prime_vertical, meridian = curvature_radii_m(phi)
+    turn = math.radians((longitude - place.longitude + 180) % 360 - 180)
+    return turn * prime_vertical * math.cos(phi), math.radians(latitude - place.latitude) * meridian
 
 
 HEADER = "frame  stars  matched    latitude    longitude     heading  sigma, m  error, m  seconds"
@@ -208,7 +241,7 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
     one = np.array(solutions[-1].covariance).reshape(3, 3)
     variance = np.zeros(2)
     for term in solutions[-1].budget:  # what is new in every frame averages, the rest stays
-        share = len(solutions) if term.name in INDEPENDENT else 1
+        share = 1 if term.common else len(solutions)
         variance += np.array([term.east, term.north]) ** 2 / share
     mean, sigma = errors.mean(0), np.sqrt(variance)
     headings = np.array([s.heading for s in solutions])
@@ -228,18 +261,21 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
     return summary, errors, one
 
 
-def picture(watcher: Watcher, errors: np.ndarray, covariance: np.ndarray, path: Path) -> None:
+def picture(watcher: Watcher, errors: np.ndarray, covariance: np.ndarray, path: Path) -> bool:
+    """Draw the fixes and the frame that was kept; False where none was, or its stars were not heard."""
     from starpos import picture
     from starpos_common.messages import message_to_frame
 
-    frame, place = watcher.frame, watcher.place
-    solution = next(s for s in watcher.solutions if _stamp(s) == _stamp(frame))
-    stars = watcher.stars[_stamp(frame)].stars
+    frame, place = watcher.pictured, watcher.place
+    if frame is None or _stamp(frame) not in watcher.stars:
+        return False
+    solution, stars = watcher.solutions[_stamp(frame)], watcher.stars[_stamp(frame)].stars
     xy = np.array([(stars[k].x, stars[k].y) for k in solution.indices])
     title = (
         f"starpos at {place.latitude:+.4f} {place.longitude:+.4f}: {len(errors)} frames of {EXPOSURE_S:g} s"
     )
     picture.draw(path, errors, covariance[:2, :2], title, message_to_frame(frame).pixels, xy, solution.ids)
+    return True
 
 
 def main() -> int:
@@ -247,19 +283,23 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--seed", type=int, help="another place and sky for another seed (default: by the clock)"
+        "--seed", type=int, help="another place and sky for another seed, 0 to 2147483647 (default: drawn)"
     )
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument(
         "--out", type=Path, default=Path("demo"), help="folder of the picture, the summary and the logs"
     )
     args = parser.parse_args()
-    seed = int(time.time()) % 100_000 if args.seed is None else args.seed
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault(
-        "ROS_DOMAIN_ID", str(20 + os.getpid() % 60)
-    )  # another graph on this machine is no business of ours
-    args.out.mkdir(parents=True, exist_ok=True)
+    seed = int.from_bytes(os.urandom(4), "big") >> 1 if args.seed is None else args.seed
+    if not 0 <= seed < 2**31:
+        parser.error(f"--seed {seed} is not from 0 to 2147483647")
+    with own_domain():
+        return run(seed, args.frames, args.out)
+
+
+def run(seed: int, frames: int, out: Path) -> int:
+    """The demo; its exit status."""
+    out.mkdir(parents=True, exist_ok=True)
     place = Place.drawn(np.random.default_rng(seed))
     air = f"{place.pressure / 100:.0f} hPa, {place.temperature:g} deg C"
     print(
@@ -274,19 +314,19 @@ def main() -> int:
         watcher = Watcher(place)
         instrument = Instrument(place, folder, seed)
         try:
-            trouble = watcher.watch(args.frames, instrument)
+            trouble = watcher.watch(frames, instrument)
             memory = {} if trouble else instrument.peak_mb()
         except KeyboardInterrupt:
             trouble, memory = "interrupted", {}
         codes = instrument.stop()
         for log in folder.glob("*.log"):
-            shutil.copy(log, args.out)
+            shutil.copy(log, out)
     watcher.close()
-    return conclude(watcher, codes, memory, trouble, args.out)
+    return conclude(watcher, codes, memory, trouble, out)
 
 
 def conclude(watcher: Watcher, codes: dict, memory: dict, trouble: str | None, out: Path) -> int:
-    good = [s for s in watcher.solutions if s.status == s.OK]
+    good = [s for s in watcher.solutions.values() if s.status == s.OK]
     unclean = {name: code for name, code in codes.items() if code != 0}
     if trouble or not good or unclean:
         print(
@@ -306,16 +346,18 @@ def conclude(watcher: Watcher, codes: dict, memory: dict, trouble: str | None, o
         f"frame published to fix received: median {np.nanmedian(watcher.seconds):.2f} s; peak memory "
         + ", ".join(f"{name} {mb} MB" for name, mb in memory.items() if name != "emulator")
     )
-    if watcher.frame is not None:
-        picture(watcher, errors, covariance, out / "demo.png")
-        print(f"picture: {out / 'demo.png'}")
+    drawn = picture(watcher, errors, covariance, out / "demo.png")
+    print(f"picture: {out / 'demo.png'}" if drawn else "no picture: no frame with a fix was heard whole")
     inside = summary["sigmas_off"] < ACCEPTED_SIGMA and len(good) == len(watcher.solutions)
     print(
         "the truth lies within 4 sigma"
         if inside
         else "the truth lies OUTSIDE 4 sigma, or a frame gave no fix"
     )
-    return 0 if inside else 1
+    heavy = {name: mb for name, mb in memory.items() if mb > MEMORY_LIMIT_MB}
+    for name, mb in heavy.items():
+        print(f"demo: {name} took {mb} MB, over the {MEMORY_LIMIT_MB} MB a node may take", file=sys.stderr)
+    return 0 if inside and not heavy else 1
 
 
 if __name__ == "__main__":
