@@ -20,6 +20,8 @@ from std_srvs.srv import Trigger
 from starpos import catalogue
 from starpos.camera import Camera
 from starpos.errors import StarposError
+from starpos.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument import Instrument
 from starpos.solve import Solution as Answer
 from starpos.solve import Solver, Status
 from starpos.stars import Stars
@@ -60,7 +62,10 @@ class SolverNode(Node):
 
     def __init__(self):
         super().__init__("solver")
+        self._known: Instrument | None = None
+        self._known_url = ""
         self._values = declare(self, parameters.PARAMETERS, apply=self._apply, check=self._check)
+        self._read_instrument()
         self._catalogue = catalogue.load()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tilts = TiltBuffer()
@@ -102,7 +107,10 @@ class SolverNode(Node):
     def _check(self, values) -> str | None:
         """Values that are each allowed but make no instrument together, such as a broken calibration file."""
         try:
-            parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0))
+            known = self._known
+            if values["calibration_url"] != self._known_url:
+                known = parameters.instrument_file(values["calibration_url"])
+            parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0), known)
             parameters.atmosphere_of(values)
             parameters.deflection_of(values)
         except StarposError as e:
@@ -110,12 +118,19 @@ class SolverNode(Node):
         return None
 
     def _apply(self, names: frozenset[str]):
+        if "calibration_url" in names:
+            self._read_instrument()
         if self._solver is not None and self._camera is not None:
             self._solver = self._make_solver(self._camera)
 
+    def _read_instrument(self):
+        """Read once for each value of calibration_url: a file that goes away later is no matter."""
+        self._known_url = self._values["calibration_url"]
+        self._known = parameters.instrument_file(self._known_url)
+
     def _make_solver(self, camera: Camera) -> Solver:
         return Solver(
-            parameters.instrument_of(self._values, camera),
+            parameters.instrument_of(self._values, camera, self._known),
             self._catalogue,
             parameters.atmosphere_of(self._values),
             self._values["min_stars"],
@@ -151,6 +166,10 @@ class SolverNode(Node):
                 self._made = Made(camera, solver, "")
             except StarposError as e:
                 self._made = Made(camera, None, str(e))
+            except Exception as e:  # or the node would wait for the triangles for ever
+                self._made = Made(
+                    camera, None, f"the triangles of this field cannot be made ({type(e).__name__}: {e})"
+                )
             self._prepared.trigger()
 
         self._preparing = threading.Thread(target=work, daemon=True)
@@ -171,11 +190,18 @@ class SolverNode(Node):
     def _on_tilt(self, message: Tilt):
         self._seen("tilt")
         try:
-            self._tilts.add(message, math.radians(self._values["tilt_stddev"]))
+            self._tilts.add(message, self._tilt_stddev())
         except StarposError as e:
             self._reject(str(e))
         if self._waiting:
             self._work()
+
+    def _tilt_stddev(self) -> float:
+        """Of a sample that states none, rad."""
+        stated = math.radians(self._values["tilt_stddev"])
+        if not math.isnan(stated):
+            return stated
+        return self._known.tilt_noise_rad if self._known else SCA100T_NOISE_RAD
 
     def _on_stars(self, message: StarArray):
         self._seen("stars")

@@ -110,7 +110,9 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
     message.heading_stddev = math.sqrt(message.covariance_geodetic[8])
     for term in fix.terms:
         east, north, heading = (np.sqrt(np.diag(term.covariance)[:3]) * degrees).tolist()
-        message.budget.append(ErrorTerm(name=term.name, east=east, north=north, heading=heading))
+        message.budget.append(
+            ErrorTerm(name=term.name, east=east, north=north, heading=heading, common=term.common)
+        )
     message.refraction = fix.refraction_arcsec
     message.diurnal_aberration = fix.diurnal_aberration_arcsec
     message.ut1_minus_utc = fix.ut1_minus_utc_s

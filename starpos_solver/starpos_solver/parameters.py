@@ -19,7 +19,7 @@ PARAMETERS = (
     Parameter(
         "calibration_url",
         "",
-        "Instrument file (YAML): misalignment and its error, mount, tilt noise, clock; '' uses the parameters below. "
+        "Instrument file (YAML): misalignment and its error, mount, tilt noise, clock; '' uses the next two parameters. "
         "A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km.",
     ),
     Parameter(
@@ -63,8 +63,9 @@ PARAMETERS = (
     Parameter("altitude_stddev", 100.0, "Its error.", "m", 0.0, 100000.0),
     Parameter(
         "clock_stddev",
-        0.01,
-        "Error of the frames' time stamps against UTC; 1 s is 464 m at the equator.",
+        NAN,
+        "Error of the frames' time stamps against UTC; unset takes the instrument file's, or 0.01. 1 s is 464 m at the "
+        "equator.",
         "s",
         0.0,
         3600.0,
@@ -96,24 +97,41 @@ PARAMETERS = (
         0.0,
         60.0,
     ),
-    Parameter("tilt_stddev", 0.0035, "Error of a tilt sample whose message states none.", "deg", 1e-7, 10.0),
+    Parameter(
+        "tilt_stddev",
+        NAN,
+        "Error of a tilt sample whose message states none; unset takes the instrument file's, or 0.0035.",
+        "deg",
+        1e-7,
+        10.0,
+    ),
 )
 
 
-def instrument_of(values: Mapping, camera: Camera) -> Instrument:
-    """The Instrument the parameters describe, with the camera of camera_info; InstrumentError for a bad file."""
-    url = values["calibration_url"]
-    if url:
-        known = instrument.read(url.removeprefix("file://"))
-        return replace(known, camera=camera, focal_px=camera.fx)
-    return Instrument(
-        camera.fx,
-        camera,
-        values["misalignment"],
-        (values["misalignment_stddev"],) * 3,
-        tilt_noise_rad=math.radians(values["tilt_stddev"]),
-        clock_stddev_s=values["clock_stddev"],
+def instrument_of(values: Mapping, camera: Camera, known: Instrument | None) -> Instrument:
+    """The Instrument of an instrument file (`known`, None without one) or of the parameters, with camera_info's camera.
+
+    clock_stddev and tilt_stddev win over the file where they are set.
+    """
+    if known is None:
+        known = Instrument(
+            camera.fx,
+            misalignment_deg=values["misalignment"],
+            calibration_stddev_arcsec=(values["misalignment_stddev"],) * 3,
+        )
+    clock, tilt = values["clock_stddev"], values["tilt_stddev"]
+    return replace(
+        known,
+        camera=camera,
+        focal_px=camera.fx,
+        clock_stddev_s=known.clock_stddev_s if math.isnan(clock) else clock,
+        tilt_noise_rad=known.tilt_noise_rad if math.isnan(tilt) else math.radians(tilt),
     )
+
+
+def instrument_file(url: str) -> Instrument | None:
+    """The Instrument that calibration_url names, None for ''; InstrumentError with the reason where it is broken."""
+    return instrument.read(url.removeprefix("file://")) if url else None
 
 
 def atmosphere_of(values: Mapping) -> Atmosphere:

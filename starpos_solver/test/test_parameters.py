@@ -8,7 +8,7 @@ import pytest
 
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
-from starpos_solver.parameters import PARAMETERS, atmosphere_of, deflection_of, instrument_of
+from starpos_solver.parameters import PARAMETERS, atmosphere_of, deflection_of, instrument_file, instrument_of
 
 CAMERA = Camera.from_focal(100, 80, 1000.0)
 
@@ -25,7 +25,7 @@ def test_unset_air_widens_the_refraction_and_measured_air_does_not():
 
 
 def test_the_cameras_intrinsics_come_from_camera_info():
-    instrument = instrument_of(values(misalignment=(0.1, 0.2, 0.3), misalignment_stddev=7.0), CAMERA)
+    instrument = instrument_of(values(misalignment=(0.1, 0.2, 0.3), misalignment_stddev=7.0), CAMERA, None)
     assert instrument.camera is CAMERA
     sigma = np.sqrt(np.diag(instrument.mounting.calibration_covariance))
     assert sigma == pytest.approx(np.radians(7.0 / 3600))
@@ -37,14 +37,21 @@ def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):
         "starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [1, 2, 3]\n"
         "calibration_stddev_arcsec: [1, 1, 1]\n"
     )
-    instrument = instrument_of(values(calibration_url=f"file://{path}"), CAMERA)
+    known = instrument_file(f"file://{path}")
+    instrument = instrument_of(values(), CAMERA, known)
     assert instrument.misalignment_deg == (1.0, 2.0, 3.0)
     assert instrument.camera is CAMERA
+    assert instrument.clock_stddev_s == known.clock_stddev_s
+    # a parameter that is set wins
+    assert instrument_of(values(clock_stddev=2.0), CAMERA, known).clock_stddev_s == 2.0
+    assert instrument_of(values(tilt_stddev=1.0), CAMERA, known).tilt_noise_rad == pytest.approx(
+        math.radians(1)
+    )
 
 
 def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):
     with pytest.raises(InstrumentError, match=r"missing\.yaml"):
-        instrument_of(values(calibration_url=str(tmp_path / "missing.yaml")), CAMERA)
+        instrument_file(str(tmp_path / "missing.yaml"))
 
 
 def test_the_deflection_defaults_to_knowing_nothing():
