@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the instrument is: optics, how its parts are fixed to each other, and how well that is known; its YAML file."""
 
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ FORMAT = 1
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 UNSTATED_CALIBRATION_ARCSEC = 5.0  # 1 sigma a axis of an A3 given without its error
 SIZE_LIMIT = 1 << 20
+LARGEST_SIDE = 1_000_000  # px of a frame
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,13 @@ class Instrument:
             )
         if len(self.misalignment_deg) != 3 or len(self.calibration_stddev_arcsec) != 3:
             raise InstrumentError("misalignment_deg and calibration_stddev_arcsec are three numbers each")
-        if min(*self.calibration_stddev_arcsec, self.tilt_noise_rad, self.clock_stddev_s) < 0:
+        if min(*self.calibration_stddev_arcsec, self.clock_stddev_s) < 0:
             raise InstrumentError("a standard deviation of the instrument is negative: it must be 0 or more")
+        if self.tilt_noise_rad <= 0:  # against 0 no instrument is ever at rest
+            raise InstrumentError(
+                f"the inclinometer's noise (tilt_noise_deg) is {np.degrees(self.tilt_noise_rad):g} deg: must be "
+                "positive (of one reading, SCA100T 0.0035)"
+            )
         link = np.asarray(self.link_to_camera, float)
         if (
             link.shape != (3, 3)
@@ -107,19 +114,18 @@ def read(path) -> Instrument:
 
     path = Path(path)
     try:
-        if path.stat().st_size > SIZE_LIMIT:
+        with path.open("rb") as file:
+            text = file.read(SIZE_LIMIT + 1)
+        if len(text) > SIZE_LIMIT:
             raise InstrumentError(f"{path}: over 1 MiB, no instrument file")
-        content = yaml.safe_load(path.read_text())
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        RecursionError,
-        yaml.YAMLError,
-    ) as e:  # what PyYAML is seen to raise
-        raise InstrumentError(
-            f"{path}: not a readable instrument file ({' '.join(str(e).split())[:120]})"
-        ) from None
+        content = yaml.safe_load(text)
+    except OSError as e:
+        raise InstrumentError(f"{path}: not a readable instrument file ({e.strerror})") from None
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, yaml.YAMLError) as e:
+        # what PyYAML is seen to raise
+        mark = getattr(e, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise InstrumentError(f"{path}: not a readable instrument file (it is no YAML{where})") from None
     if not isinstance(content, dict) or content.pop("starpos_instrument", None) != FORMAT:
         raise InstrumentError(
             f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`"
@@ -128,8 +134,6 @@ def read(path) -> Instrument:
         return _from_mapping(content)
     except InstrumentError as e:
         raise InstrumentError(f"{path}: {e}") from None
-    except (KeyError, TypeError, ValueError) as e:
-        raise InstrumentError(f"{path}: a key is missing or of the wrong kind ({e})") from None
 
 
 def _from_mapping(content: dict) -> Instrument:
@@ -142,43 +146,71 @@ def _from_mapping(content: dict) -> Instrument:
         "clock_stddev_s",
     )
     _refuse_others(content, known)
-    camera, given = content["camera"], {}
+    camera, given = content.get("camera"), {}
+    if not isinstance(camera, dict):
+        raise InstrumentError(
+            f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"
+        )
     if "focal_mm" in camera:
         _refuse_others(camera, ("focal_mm", "pixel_um"))
-        focal_px = focal_px_of(float(camera["focal_mm"]), float(camera["pixel_um"]))
+        focal_px = focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um"))
     else:
         axes = ("fx", "fy", "cx", "cy")
         _refuse_others(camera, ("width", "height", *axes, "distortion"))
         for side in ("width", "height"):
-            if not isinstance(camera[side], int):
+            if not isinstance(camera.get(side), int) or not 1 <= camera[side] <= LARGEST_SIDE:
                 raise InstrumentError(
-                    f"the camera's {side} is {camera[side]!r}: give a whole number of pixels"
+                    f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
                 )
         given["camera"] = Camera(
             camera["width"],
             camera["height"],
-            *(float(camera[k]) for k in axes),
-            _row(camera.get("distortion", [0.0] * 5)),
+            *(_number(camera, k) for k in axes),
+            _row(camera.get("distortion", [0.0] * 5), "distortion"),
         )
         focal_px = given["camera"].fx
     for key in ("misalignment_deg", "calibration_stddev_arcsec"):
         if key in content:
-            given[key] = _row(content[key])
+            given[key] = _row(content[key], key)
     if "link_to_camera" in content:
-        given["link_to_camera"] = tuple(_row(row) for row in content["link_to_camera"])
+        rows = content["link_to_camera"]
+        if not isinstance(rows, list) or len(rows) != 3:
+            raise InstrumentError(f"link_to_camera is {_short(rows)}: give three rows of three numbers")
+        given["link_to_camera"] = tuple(_row(row, "link_to_camera") for row in rows)
+        if {len(row) for row in given["link_to_camera"]} != {3}:
+            raise InstrumentError(
+                "link_to_camera has a row of another length: give three rows of three numbers"
+            )
     if "tilt_noise_deg" in content:
-        given["tilt_noise_rad"] = float(np.radians(float(content["tilt_noise_deg"])))
+        given["tilt_noise_rad"] = float(np.radians(_number(content, "tilt_noise_deg")))
     if "clock_stddev_s" in content:
-        given["clock_stddev_s"] = float(content["clock_stddev_s"])
+        given["clock_stddev_s"] = _number(content, "clock_stddev_s")
     return Instrument(focal_px, **given)
 
 
 def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
     if unknown := [key for key in mapping if key not in known]:
-        raise InstrumentError(f"unknown key {unknown[0]!r}: the keys here are {', '.join(known)}")
+        raise InstrumentError(f"unknown key {_short(unknown[0])}: the keys here are {', '.join(known)}")
 
 
-def _row(numbers: list) -> tuple[float, ...]:
+def _number(mapping: dict, key: str) -> float:
+    try:
+        return float(mapping[key])  # float reads 1e-3 too, which YAML takes for text
+    except KeyError:
+        raise InstrumentError(f"{key} is missing: give a number") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InstrumentError(f"{key} is {_short(mapping[key])}: give a number") from None
+
+
+def _row(numbers: list, key: str) -> tuple[float, ...]:
     if not isinstance(numbers, list):
-        raise InstrumentError(f"{numbers!r} stands where a list of numbers should")
-    return tuple(float(v) for v in numbers)  # float reads 1e-3 too, which YAML takes for text
+        raise InstrumentError(f"{key} is {_short(numbers)}: give a list of numbers, like [0.0, 0.0, 0.0]")
+    return tuple(_number({key: v}, key) for v in numbers)
+
+
+def _short(value) -> str:
+    """What a file gives for a value, in a sentence; however deep it is."""
+    if isinstance(value, int) and abs(value) > 1e18:
+        return "a number beyond any sense"
+    text = "missing" if value is None else reprlib.repr(value)
+    return text if len(text) < 60 else text[:57] + "..."

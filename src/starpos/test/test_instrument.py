@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -82,7 +84,7 @@ REFUSED = {
     "no format": ("camera: {focal_mm: 600, pixel_um: 6.4}\n", "first key"),
     "another format": (SIMPLE.replace(": 1", ": 2", 1), "first key"),
     "no camera": ("starpos_instrument: 1\n", "camera"),
-    "camera of nothing": ("starpos_instrument: 1\ncamera:\n", "wrong kind"),
+    "camera of nothing": ("starpos_instrument: 1\ncamera:\n", "camera is missing: give {focal_mm"),
     "half a camera": ("starpos_instrument: 1\ncamera: {focal_mm: 600}\n", "pixel_um"),
     "unknown key": (SIMPLE + "misaligment_deg: [0, 0, 0]\n", "unknown key 'misaligment_deg'"),
     "unknown camera key": (SIMPLE.replace("}", ", distorsion: [0, 0, 0, 0, 0]}"), "distorsion"),
@@ -99,8 +101,27 @@ REFUSED = {
     "a mirror": (SIMPLE + "link_to_camera: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]\n", "rotation"),
     "a ragged matrix": (SIMPLE + "link_to_camera: [[1, 0, 0], [0, 1], [0, 0, 1]]\n", ""),
     "zero focal length": (SIMPLE.replace("600", "0"), "positive"),
-    "words": (SIMPLE.replace("600", "long"), "wrong kind"),
+    "words": (SIMPLE.replace("600", "long"), "focal_mm is 'long': give a number"),
+    "a number for a camera": ("starpos_instrument: 1\ncamera: 5\n", "camera is 5: give {focal_mm"),
+    "a frame of terapixels": (FULL.replace("1392", "1" + "0" * 12), "width"),
+    "a number beyond floats": (SIMPLE.replace("600", "0x" + "f" * 5000), "focal_mm is a number beyond"),
+    "no noise at all": (SIMPLE + "tilt_noise_deg: 0\n", "tilt_noise_deg) is 0 deg: must be positive"),
+    "a list for the noise": (SIMPLE + "tilt_noise_deg: [1]\n", "tilt_noise_deg is [1]: give a number"),
+    "one error": (SIMPLE + "calibration_stddev_arcsec: 5\n", "calibration_stddev_arcsec is 5: give a list of numbers"),
+    "an error that is a word": (SIMPLE + "calibration_stddev_arcsec: [1, x, 1]\n", "calibration_stddev_arcsec is 'x'"),
+    "a matrix of nothing": (SIMPLE + "link_to_camera:\n", "link_to_camera is missing"),
+    "no distortion": (FULL.replace("[-0.1, 0.01, 1e-3, -2e-3, 0]", "none"), "distortion is 'none'"),
+    "a tag that lies": (SIMPLE + "clock_stddev_s: !!timestamp abc\n", "not a readable instrument file (it is no YAML)"),
+    "users of a machine": ("root:x:0:0:root:/root:/bin/bash\nbin:x:1:1\n", "first key"),
+    "an equals sign": ("a: [=]\n", "not a readable instrument file (it is no YAML, line 1)"),
+    "a value that starts with an equals sign": ("root: =\n", "instrument file"),
+    "laughs": ("a: &a [x, x]\n" + "".join(f"{b}: &{b} [{', '.join(f'*{a}' for _ in range(9))}]\n"
+               for a, b in pairwise("abcdefghijkl")) + "starpos_instrument: 1\ncamera: *l\n", "unknown key"),
+    "a camera of laughs": ("starpos_instrument: 1\ncamera:\n" + "".join(
+        ["  - &a [x, x]\n"] + [f"  - &{b} [{', '.join(f'*{a}' for _ in range(9))}]\n"
+                               for a, b in pairwise("abcdefghijkl")]), "camera is [["),
     "broken yaml": ("starpos_instrument: 1\ncamera: {focal_mm: [\n", "not a readable"),
+    "an empty file of tags": ("!!binary 5\n", "instrument file"),
     "tabs": ("starpos_instrument: 1\n\tcamera: 1\n", "not a readable"),
     "binary": (bytes(range(256)), "not a readable"),
     "two documents": (SIMPLE + "---\n" + SIMPLE, "not a readable"),
