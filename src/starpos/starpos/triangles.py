@@ -137,9 +137,8 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         keys.append(_triples_of_circles(tree, radius * half_diagonal, spacing, most - fewer))
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
     key = np.unique(np.concatenate(keys))
-    n = len(pool)
-    corner = brightest_first.astype(np.int32)[np.stack([key // (n * n), key // n % n, key % n], -1)]
-    corner, largest, smallest, longest, bin_start = _in_bins(v, corner, 2 * half_diagonal)
+    del keys
+    corner, largest, smallest, longest, bin_start = _in_bins(v, brightest_first, key, 2 * half_diagonal)
     progress("star triangles", 1.0)
     return TriangleCatalogue(
         pool.astype(np.int32),
@@ -160,7 +159,7 @@ def _triples_of_circles(tree: cKDTree, radius: float, spacing: float, most: int)
     centres = _spread(_circles(radius, spacing))
     n, chord = tree.n, 2 * np.sin(radius / 2)
     found = []
-    for block in np.array_split(centres, max(1, len(centres) // 4000)):
+    for block in np.array_split(centres, max(1, len(centres) // 1000)):
         lists = [near[:most] for near in tree.query_ball_point(block, chord, return_sorted=True)]
         size = np.array([len(near) for near in lists])
         for m in range(3, most + 1):
@@ -186,14 +185,19 @@ def _spread(n: int) -> np.ndarray:
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], -1)
 
 
-def _in_bins(v: np.ndarray, corner: np.ndarray, longest_side: float):
+def _in_bins(v: np.ndarray, brightest_first: np.ndarray, triples: np.ndarray, longest_side: float):
     """Usable triangles in order of their bins: corners (largest angle first), angles, longest side, bin starts."""
-    blocks = np.array_split(corner, len(corner) // BLOCK + 1)  # a whole sky of triangles at once is 500 MB
-    parts = [_measured(v, block, longest_side) for block in blocks]
+    n, parts = len(brightest_first), []
+    for key in np.array_split(
+        triples, len(triples) // BLOCK + 1
+    ):  # a whole sky of triangles at once is 500 MB
+        corner = brightest_first[np.stack([key // (n * n), key // n % n, key % n], -1)]
+        parts.append(_measured(v, corner, longest_side))
     corner, largest, smallest, longest = (np.concatenate(column) for column in zip(*parts, strict=True))
-    key = _bin_largest(largest) * SMALLEST_BINS + _bin_smallest(smallest)
-    order = np.argsort(key, kind="stable")
-    starts = np.searchsorted(key[order], np.arange(LARGEST_BINS * SMALLEST_BINS + 1))
+    del parts
+    bins = (_bin_largest(largest) * SMALLEST_BINS + _bin_smallest(smallest)).astype(np.int32)
+    order = np.argsort(bins, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(bins, minlength=LARGEST_BINS * SMALLEST_BINS))])
     return corner[order], largest[order], smallest[order], longest[order], starts
 
 
@@ -211,7 +215,11 @@ def _measured(v: np.ndarray, corner: np.ndarray, longest_side: float):
 
 def cache_folder() -> Path:
     """Where built triangle catalogues are kept: $XDG_CACHE_HOME/starpos, by default ~/.cache/starpos."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "starpos"
+    given = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return Path(given or Path.home() / ".cache") / "starpos"
+    except RuntimeError:  # a user without a home, as in some containers
+        return Path(tempfile.gettempdir()) / f"starpos-{os.getuid()}"
 
 
 def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> TriangleCatalogue:
@@ -246,8 +254,8 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
         _store(built, folder)
     except OSError as e:
         warnings.warn(
-            f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}) and is built at every start: "
-            "free the disk or set XDG_CACHE_HOME",
+            f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}), so that each start builds it "
+            "again: make the folder writable or set XDG_CACHE_HOME",
             stacklevel=2,
         )
         return built
