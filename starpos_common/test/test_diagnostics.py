@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What arrives on /diagnostics."""
 
-import os
 import time
 
 import pytest
@@ -9,12 +8,12 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.testing import take_domain
 
 
 @pytest.fixture
 def node():
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    take_domain()
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node("sensor", context=context, namespace="left")

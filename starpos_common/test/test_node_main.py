@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exit statuses of a node's process, whatever signal comes whenever."""
 
-import os
 import signal
 import subprocess
 import sys
 
 import pytest
+
+from starpos_common.testing import take_domain
 
 WAIT_S = 20.0
 PROGRAM = """
@@ -33,8 +34,7 @@ sys.exit(run(make_node))
 
 @pytest.fixture(scope="module", autouse=True)
 def domain():
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    take_domain()
 
 
 @pytest.fixture

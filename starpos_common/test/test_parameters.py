@@ -2,7 +2,6 @@
 """Declaring, refusing and changing parameters on a real node."""
 
 import math
-import os
 
 import pytest
 import rclpy
@@ -10,6 +9,7 @@ import yaml
 from rclpy.parameter import Parameter as RosParameter
 
 from starpos_common.parameters import Parameter, ParameterError, declare, to_yaml
+from starpos_common.testing import take_domain
 
 TABLE = (
     Parameter("rate", 10, "Samples a second.", "Hz", 1, 50),
@@ -26,8 +26,7 @@ TABLE = (
 
 @pytest.fixture(scope="module")
 def context():
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    take_domain()
     context = rclpy.Context()
     rclpy.init(context=context)
     yield context

@@ -2,92 +2,44 @@
 """The node as a process of its own, with the emulated device behind a real port."""
 
 import math
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters
 
+from starpos_common.testing import Listener, Process, take_domain
 from starpos_inclinometer import sensor
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
 from starpos_interfaces.msg import Tilt
 
-NODE = [
-    sys.executable,
-    "-c",
-    "import sys; from starpos_inclinometer.main import inclinometer; sys.exit(inclinometer())",
-]
-WAIT_S = 20.0
-
 
 @pytest.fixture(scope="module", autouse=True)
 def domain():
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    take_domain()
+
+
+class Ears(Listener):
+    """With the tilts and the states of the link, oldest first."""
+
+    def __init__(self):
+        super().__init__()
+        self.tilts = self.hear(Tilt, "tilt", 100)
+        self._reports = self.hear(DiagnosticArray, "/diagnostics")
+
+    @property
+    def links(self):
+        return [s for report in self._reports for s in report.status if s.name == "inclinometer: Link"]
 
 
 @pytest.fixture
 def listener():
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    listener = Listener(context)
+    listener = Ears()
     yield listener
-    listener.node.destroy_node()
-    rclpy.shutdown(context=context)
-
-
-class Listener:
-    def __init__(self, context):
-        self.node = rclpy.create_node("listener", context=context)
-        self.tilts, self.links = [], []
-        self.node.create_subscription(Tilt, "tilt", self.tilts.append, 100)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, 10)
-        self._executor = rclpy.executors.SingleThreadedExecutor(context=context)
-        self._executor.add_node(self.node)
-
-    def _diagnostics(self, message):
-        self.links += [s for s in message.status if s.name == "inclinometer: Link"]
-
-    def wait(self, condition):
-        end = time.monotonic() + WAIT_S
-        while not condition():
-            assert time.monotonic() < end, (len(self.tilts), self.links[-1:])
-            self._executor.spin_once(timeout_sec=0.5)
-
-    def call(self, kind, name, request):
-        client = self.node.create_client(kind, name)
-        self.wait(client.service_is_ready)
-        future = client.call_async(request)
-        self.wait(future.done)
-        return future.result()
-
-    def set(self, name, value):
-        request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=value)])
-        return self.call(SetParameters, "/inclinometer/set_parameters", request).results[0]
-
-
-class Process:
-    def __init__(self, *parameters):
-        options = [word for p in parameters for word in ("-p", p)]
-        self.process = subprocess.Popen(
-            [*NODE, "--ros-args", *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-
-    def end(self, *signals):
-        """Send the signals; the exit status and all output."""
-        for number in signals:
-            self.process.send_signal(number)
-        out, _ = self.process.communicate(timeout=WAIT_S)
-        return self.process.returncode, out
+    listener.close()
 
 
 @pytest.fixture
@@ -95,14 +47,12 @@ def start():
     processes = []
 
     def start(*parameters):
-        processes.append(Process(*parameters))
+        processes.append(Process("starpos_inclinometer.main", "inclinometer", parameters))
         return processes[-1]
 
     yield start
-    for p in processes:
-        if p.process.poll() is None:
-            p.process.kill()
-            p.process.communicate()
+    for process in processes:
+        process.kill()
 
 
 def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listener):
@@ -136,17 +86,13 @@ def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listene
     listener.wait(lambda: listener.links[-1].level == b"\x00")
     assert listener.links[-1].hardware_id == bench.path
 
-    integer = ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=50)
-    assert listener.set("rate", integer).successful
+    assert listener.set("inclinometer", rate=50).successful
     listener.wait(
         lambda: any(v.key == "rate (Hz)" and float(v.value) > 40 for v in listener.links[-1].values)
     )
-    integer.integer_value = 51
-    refusal = listener.set("rate", integer)
+    refusal = listener.set("inclinometer", rate=51)
     assert not refusal.successful and "50" in refusal.reason
-    assert not listener.set(
-        "baud", ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=9600)
-    ).successful
+    assert not listener.set("inclinometer", baud=9600).successful
     request = DescribeParameters.Request(names=["rate", "noise_stddev"])
     rate, noise = listener.call(DescribeParameters, "/inclinometer/describe_parameters", request).descriptors
     assert (rate.integer_range[0].from_value, rate.integer_range[0].to_value) == (1, 50)
