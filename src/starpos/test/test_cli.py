@@ -2,6 +2,7 @@
 """The command line: what it prints, what it returns, on a small night made by itself."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -372,6 +373,54 @@ def test_python_m_starpos(tmp_path):
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "none.fits" in done.stderr
+
+
+def starpos(*args, **environment):
+    """A whole process: its exit status and its lines of standard error."""
+    done = subprocess.run(
+        [sys.executable, "-m", "starpos", *map(str, args)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    return done.returncode, done.stderr.splitlines()
+
+
+def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_path):
+    rows = (lists / "stars_0001.csv").read_text()
+    other = tmp_path / "other.csv"  # of another size, so that two catalogues of triangles are wanted
+    other.write_text(rows.replace('"NAXIS1": 1000', '"NAXIS1": 1010'))
+    assert other.read_text() != rows
+    (tmp_path / "file").touch()
+    frames = (lists / "stars_0000.csv", other, lists / "stars_0002.csv")
+    status, errors = starpos("identify", *frames, *WIDE, XDG_CACHE_HOME=str(tmp_path / "file"))
+    assert (status, len(errors)) == (0, 1), errors
+    assert errors[0].startswith("starpos identify: ")
+    assert "XDG_CACHE_HOME" in errors[0]
+
+
+@pytest.mark.parametrize("command", ["solve", "identify"])
+def test_a_missing_catalogue_is_one_line(command, lists, tmp_path):
+    tilt = ("--tilt", lists / "tilt.csv") if command == "solve" else ()
+    none = str(tmp_path / "none.npz")
+    status, errors = starpos(command, lists / "stars_0000.csv", *tilt, *WIDE, STARPOS_CATALOGUE=none)
+    assert (status, len(errors)) == (2, 1), errors
+    assert errors[0].startswith(f"starpos {command}: {none}: no catalogue there")
+
+
+def test_identify_frames_of_any_year(lists, tmp_path, capsys):
+    """No Earth rotation is needed for where a camera looks."""
+    head, rows = (lists / "stars_0000.csv").read_text().split("\n", 1)
+    about = json.loads(head.lstrip("# "))
+    for year, expected in ((1950, 0), (2035, 0), (1850, 1)):
+        path = tmp_path / f"{year}.csv"
+        about["DATE-OBS"] = f"{year}-11-02T18:00:00"
+        path.write_text(f"# {json.dumps(about)}\n{rows}")
+        status, _, errors = run(capsys, "identify", path, *WIDE, "--json")
+        assert (status, len(errors)) == (expected, expected), errors
+    assert "between 1900 and 2100" in errors[0]
 
 
 def test_a_reader_that_goes_away_is_no_error(lists):

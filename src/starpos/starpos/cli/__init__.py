@@ -4,6 +4,7 @@
 import argparse
 import os
 import sys
+import warnings
 from importlib import import_module
 
 from starpos import __version__
@@ -27,6 +28,19 @@ class Parser(argparse.ArgumentParser):
         self.exit(BAD_CALL, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
+def _one_line_each(command: str):
+    """A warnings.showwarning that prints as any error is printed, and each sentence once."""
+    shown = set()
+
+    def show(message, *_about, **_more):
+        text = " ".join(str(message).split())
+        if text not in shown:
+            shown.add(text)
+            print(f"starpos {command}: {text}", file=sys.stderr)
+
+    return show
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
     parser = Parser(prog="starpos", description="Position and heading from the stars.")
@@ -39,7 +53,9 @@ def main(argv: list[str] | None = None) -> int:
             import_module(f"starpos.cli.{name}").define(sub)
     args = parser.parse_args(given)
     try:
-        status = args.run(args)
+        with warnings.catch_warnings():
+            warnings.showwarning = _one_line_each(args.command)
+            status = args.run(args)
         sys.stdout.flush()  # here, where a reader that has gone is expected, and not while the interpreter ends
         return status
     except StarposError as e:
