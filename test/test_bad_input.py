@@ -59,6 +59,15 @@ def test_without_intrinsics(graph, run):  # before the fixture `solver`: there m
     check_refused(graph, shot.stamp, Solution.NO_CAMERA, "not calibrated")
 
 
+def test_a_missing_catalogue_ends_the_node_with_one_line(graph, run, tmp_path, monkeypatch):
+    none = str(tmp_path / "none.npz")
+    monkeypatch.setenv("STARPOS_CATALOGUE", none)
+    process = run("starpos_solver", "solver", *SOLVER)
+    assert process.wait() == 1
+    (line,) = process.output.splitlines()
+    assert f"{none}: no catalogue there: run `starpos catalogue build" in line
+
+
 def with_star(index=0, **values):
     def change(shot):
         for name, value in values.items():
@@ -92,6 +101,7 @@ def swap(shot):
 
 def into_2037(shot):
     seconds = 2114380800 - shot.stars.header.stamp.sec  # 2037-01-01
+    shot.stars.header.stamp.nanosec = 0
     later([shot.stars, *shot.tilts], seconds)
 
 
@@ -106,8 +116,10 @@ def other_focal(shot):
 BAD = Solution.BAD_INPUT
 CASES = {
     "no stamp": (with_stars(lambda s: setattr(s.header.stamp, "sec", 0)
-                            or setattr(s.header.stamp, "nanosec", 0)), BAD, "no time of exposure"),
-    "beyond the tables": (into_2037, Solution.TIME_OUTSIDE_TABLES, "20"),
+                            or setattr(s.header.stamp, "nanosec", 0)), BAD,
+                 "stars: no time of exposure: its header stamp is missing"),
+    "beyond the tables": (into_2037, Solution.TIME_OUTSIDE_TABLES,
+                          "2037-01-01T00:00:00.000Z lies outside the IERS tables (1973 to 20"),
     "no stars": (with_stars(lambda s: setattr(s, "stars", [])), Solution.TOO_FEW_STARS, "0 stars"),
     "three stars": (with_stars(lambda s: setattr(s, "stars", s.stars[:3])), Solution.TOO_FEW_STARS, "3 stars"),
     "NaN in a star": (with_star(x=NAN), BAD, "NaN"),
@@ -118,6 +130,8 @@ CASES = {
     "unsorted stars": (swap, BAD, "brightest first"),
     "no size": (with_stars(lambda s: setattr(s, "width", 0)), BAD, "width"),
     "NaN exposure": (with_stars(lambda s: setattr(s, "exposure", NAN)), BAD, "exposure"),
+    "NaN error of the stamp": (with_stars(lambda s: setattr(s, "stamp_stddev", NAN)), BAD, "stamp_stddev"),
+    "negative error of the stamp": (with_stars(lambda s: setattr(s, "stamp_stddev", -1e-3)), BAD, "stamp_stddev"),
     "another frame size": (with_stars(lambda s: setattr(s, "width", 5000)), BAD, "5000 x 3744"),
     "no tilt at all": (lambda shot: shot.tilts.clear(), Solution.NO_TILT, "tilt"),
     "tilts of another minute": (lambda shot: later(shot.tilts, HALF_MINUTE_S), Solution.NO_TILT, "tilt"),

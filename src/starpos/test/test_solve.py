@@ -22,6 +22,7 @@ from scenes import (
 )
 
 from starpos.camera import Camera
+from starpos.cli.common import tell_extrapolation
 from starpos.earth import curvature_radii_m, earth_state, station_velocity, utc_text
 from starpos.errors import TiltError
 from starpos.inclinometer import Tilt, TiltLog
@@ -249,13 +250,24 @@ def test_a_pointing_of_an_impossible_date(utc, night):
     assert "between 1900 and 2100" in refused(s, Status.TIME_OUTSIDE_TABLES)
 
 
-def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng):
+def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng, capsys):
     scene, stars, tilt, solver = night
-    assert solver.solve(stars, tilt).extrapolated_days == 0
+    within = solver.solve(stars, tilt)
+    assert within.extrapolated_days == 0
     later = START + 700 * 86400
     s = solver.solve(stars_of(scene, catalogue, rng, later), tilt_of(scene, rng, later))
     assert s.ok, s.message
     assert s.extrapolated_days == earth_state(later + EXPOSURE / 2).orientation.extrapolated_days > 0
+    tell_extrapolation("solve", [within])
+    tell_extrapolation("solve", [])
+    assert capsys.readouterr().err == ""
+    tell_extrapolation("solve", [s, within, s])
+    (line,) = capsys.readouterr().err.splitlines()
+    east = 465.1 * np.cos(s.fix.latitude) * earth_state(later).orientation.ut1_sigma_s
+    assert line.startswith(
+        f"starpos solve: the Earth's rotation is extrapolated {s.extrapolated_days:.0f} days"
+    )
+    assert f"{east:.0f} m east" in line
 
 
 @pytest.mark.parametrize(

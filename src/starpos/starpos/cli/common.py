@@ -132,6 +132,18 @@ def complain(command: str, error: StarposError | str) -> None:
     print(f"starpos {command}: {error}", file=sys.stderr)
 
 
+def tell_extrapolation(command: str, solved: list) -> None:
+    """One line for all Solutions whose Earth rotation is beyond the table: the days and the error of the worst."""
+    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
+    if worst is not None and worst.extrapolated_days > 0:
+        (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
+        complain(
+            command,
+            f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
+            f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data",
+        )
+
+
 UNREADABLE = 2  # exit status
 
 
