@@ -53,7 +53,12 @@ class Stars:
         for name in ("x", "y", "flux", "snr"):
             self._set(name, np.float64, (n,), place)
         self._set("covariance", np.float64, (n, 2, 2), place)
-        self._set("flags", np.uint8, (n,), place)
+        self._set("flags", np.int64, (n,), place)
+        if np.any((self.flags < 0) | (self.flags > 255)):
+            raise FrameError(
+                f"{place}: the stars' flags are not numbers from 0 to 255; give sums of the flags."
+            )
+        object.__setattr__(self, "flags", self.flags.astype(np.uint8))
         c = self.covariance
         determinant = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] * c[:, 1, 0]
         if not np.all((c[:, 0, 0] > 0) & (c[:, 1, 1] > 0) & (determinant > 0)):
