@@ -206,9 +206,9 @@ def test_a_focal_length_that_is_none(night, catalogue):
 
 def test_no_tilt(night):
     _, stars, _, solver = night
-    far = TiltLog(np.array([START - 100]), np.zeros(1), np.zeros(1), np.zeros(1))
+    far = TiltLog.of(np.array([START - 100]), np.zeros(1), np.zeros(1), np.zeros(1))
     assert "no tilt reading" in refused(solver.solve(stars, far.average), Status.NO_TILT)
-    nan = TiltLog(np.array([START]), np.full(1, np.nan), np.zeros(1), np.zeros(1))
+    nan = TiltLog.of(np.array([START]), np.full(1, np.nan), np.zeros(1), np.zeros(1))
     assert "no tilt reading" in refused(solver.solve(stars, nan.average), Status.NO_TILT)
 
     def broken(mid, exposure):
