@@ -343,6 +343,9 @@ class SolverNode(Node):
                 "sigma north (m)": float(north),
                 "residual (arcsec)": a.fix.residual_arcsec,
             }
+        if a.extrapolated_days > 0:
+            old = f"UT1 is extrapolated by {a.extrapolated_days:.0f} days: upgrade astropy-iers-data"
+            return Report(Level.WARN, old if a.ok else a.message, values)
         return Report(Level.OK if a.ok else Level.WARN, a.message, values)
 
     def _report_inputs(self) -> Report:

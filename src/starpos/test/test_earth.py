@@ -108,6 +108,13 @@ def test_sofa_cookbook_observed():
     assert azimuth == pytest.approx(np.arctan2(east, north) % (2 * np.pi), abs=0.1 * MAS)
 
 
+def astropys_end() -> float:
+    """Unix time at which the Earth orientation that astropy itself uses ends."""
+    from astropy.utils import iers
+
+    return float(iers.earth_orientation_table.get()["MJD"][-1].to_value("d") - 40587) * 86400
+
+
 def test_astropy_altaz(rng):
     """Random stars, dates and places to 1 mas of astropy's AltAz, 20 deg and more above the horizon.
 
@@ -122,7 +129,7 @@ def test_astropy_altaz(rng):
     worst = 0.0
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
         for _ in range(12):
-            utc = rng.uniform(unix_of(1995, 1, 1), unix_of(2027, 1, 1))
+            utc = rng.uniform(unix_of(1995, 1, 1), min(unix_of(2027, 1, 1), astropys_end()))
             phi, lam = np.degrees(np.arcsin(rng.uniform(-1, 1))), rng.uniform(-180, 180)
             frame = AltAz(
                 obstime=Time(utc, format="unix"),
@@ -164,11 +171,13 @@ def test_ut1_is_astropys_even_on_days_of_leap_seconds(utc):
     from astropy.time import Time
     from astropy.utils import iers
 
+    moment = unix_of(*(int(p) for p in utc.replace("T", "-").replace(":", "-").split("-")))
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
+        if moment > astropys_end():
+            pytest.skip("the table that this astropy ships ends before")
         t = Time(utc, scale="utc")
         theirs = float(t.delta_ut1_utc)
         era = erfa.era00(t.ut1.jd1, t.ut1.jd2)
-    moment = unix_of(*(int(p) for p in utc.replace("T", "-").replace(":", "-").split("-")))
     # bulletin A here, bulletin B there: they differ by up to 1 ms in the first years
     tolerance = 1e-3 if utc < "1985" else 5e-5
     assert earth_orientation(moment).ut1_minus_utc_s == pytest.approx(theirs, abs=tolerance)

@@ -102,6 +102,8 @@ def test_a_night_made_by_others(night, catalogue):
     solver = Solver(Instrument(focal_px_of(600.0, 6.4)), catalogue, Atmosphere.measured(88000.0, 12.0, 0.3))
     solved = [solver.solve(read_frame(path), tilts.average) for path in sorted(night.glob("centroids_*.csv"))]
     assert [s.message for s in solved] == ["fix"] * 3
+    if solved[0].extrapolated_days > 0:
+        pytest.skip("the IERS table that is installed ends before this night")
     for s, frame in zip(solved, truth["frames"], strict=True):
         assert s.fix.latitude == pytest.approx(np.radians(site["lat_deg"]), abs=0.3 * ARCSEC)
         east = (s.fix.longitude - np.radians(site["lon_deg"])) * np.cos(s.fix.latitude)

@@ -69,6 +69,7 @@ def run(args) -> int:
             common.print_json({"file": path} | _json_of(answer.fix, deflection) | _json_about(answer))
         else:
             print(_line(path, answer))
+    common.tell_extrapolation("solve", solved)
     together = _combine(solved)
     if solved:
         _print_combined(together, solved, args, deflection)
