@@ -33,6 +33,7 @@ CHOICE = np.log(1 + len(SMALLER_PX))
 TRIANGLE_SIGMA = 3.0
 MATCH_SIGMA = 3.5
 FEWEST_STARS = 4
+SMALL_TABLE = 20_000  # detections times catalogue stars
 BLEND_PX = 2.5  # closer stars make one image
 MAX_VERIFIED = 25  # candidates a stage
 
@@ -341,9 +342,14 @@ def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) ->
 
 def _mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
-    there, here = cKDTree(predicted), cKDTree(xy)
-    distance, nearest = there.query(xy)
-    good = (distance < radius) & (here.query(predicted)[1][nearest] == np.arange(len(xy)))
+    if len(xy) * len(predicted) < SMALL_TABLE:  # all distances at once are quicker than two trees
+        apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
+        nearest, back = apart2.argmin(1), apart2.argmin(0)
+        distance = np.sqrt(apart2[np.arange(len(xy)), nearest])
+    else:
+        distance, nearest = cKDTree(predicted).query(xy)
+        back = cKDTree(xy).query(predicted)[1]
+    good = (distance < radius) & (back[nearest] == np.arange(len(xy)))
     return np.flatnonzero(good), nearest[good]
 
 
