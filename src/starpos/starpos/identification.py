@@ -149,7 +149,8 @@ class _Search:
         done = self._done.get(error_px, 0)
         triples = _triples(stars)[done:]
         self._done[error_px] = done + len(triples)
-        seen = _Seen.of(self.v, self.sigma, triples, error_px / self.camera.fx)
+        error = np.hypot(error_px, self.sigma[triples].max(1)) / self.camera.fx
+        seen = _Seen.of(self.v, triples, error)
         if not len(seen.star):
             return
         tri = self.sky.triangles
@@ -297,7 +298,7 @@ class _Seen:
     error: np.ndarray
 
     @classmethod
-    def of(cls, v: np.ndarray, sigma_px: np.ndarray, triples: np.ndarray, error: float) -> "_Seen":
+    def of(cls, v: np.ndarray, triples: np.ndarray, error: np.ndarray) -> "_Seen":
         p = v[triples]
         angle = angles(p[:, 0], p[:, 1], p[:, 2])
         order = np.argsort(-angle, axis=1, kind="stable")
@@ -307,7 +308,7 @@ class _Seen:
         b = sides(p[:, 0], p[:, 2])
         c = np.maximum(sides(p[:, 0], p[:, 1]), 1e-9)
         a, b = np.maximum(a, c), np.maximum(b, c)
-        error = np.full(len(triples), TRIANGLE_SIGMA * error)
+        error = TRIANGLE_SIGMA * error
         tol_largest = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
         tol_smallest = error * np.sqrt(1 / a**2 + 1 / b**2 + (c / (a * b)) ** 2)
         usable = (tol_smallest < 0.1) & (tol_largest < 0.2)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scenes import FOCAL_PX, SIZE, random_stars
 
-from starpos import triangles
+from starpos import identification, triangles
 from starpos.camera import Camera
 from starpos.identification import Sky, identify
 
@@ -154,3 +154,23 @@ def test_degenerate_lists_raise_nothing(kind, catalogue, rng):
     xy = DEGENERATE[kind](rng)
     answer = identify(xy, np.full(len(xy), 0.05), camera, sky_for(catalogue, camera))
     assert answer is None
+
+
+def test_coarse_centroids_are_searched_with_their_own_error(catalogue, rng):
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    error_px = 4.0
+    found = 0
+    for _ in range(8):
+        attitude = random_attitude(rng)
+        xy, _ = seen(sky, camera, attitude, limit, rng, sigma=error_px)
+        tight = [(stars, error) for stars, error in identification.STAGES if error < identification.LOOSE_PX]
+        with (
+            pytest.MonkeyPatch.context() as only
+        ):  # the loose stages, made for lenses that distort, would help out
+            only.setattr(identification, "STAGES", tight)
+            answer = identify(xy, np.full(len(xy), error_px), camera, sky)
+        if answer is not None:
+            assert np.arccos(np.clip(answer.attitude[2] @ attitude[2], -1, 1)) < 2 / camera.fx
+            found += 1
+    assert found >= 7
