@@ -66,12 +66,17 @@ def _sample(length, cell_px):
 
 
 def _clipped(sample):
-    """Mean and rms over the last axis of what lies within 3.5 sigma of the median; stars and defects do not."""
-    middle = sample.shape[-1] // 2
-    median = np.partition(sample, middle, axis=-1)[..., middle, None]
+    """Mean and rms over the last axis of what lies within 3.5 sigma of the median; stars and defects do not.
+
+    Where more than half the pixels are equal, as of a sky cut off at 0, the tenth brightest tells sigma.
+    """
+    middle, high = sample.shape[-1] // 2, sample.shape[-1] * 9 // 10
+    ordered = np.partition(sample, (middle, high), axis=-1)
+    median = ordered[..., middle, None]
     deviation = sample - median
-    spread = np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
-    limit = np.maximum(3.5 * 1.4826 * spread, 1.0)
+    spread = 1.4826 * np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
+    spread = np.where(spread > 0, spread, (ordered[..., high, None] - median) / 1.2816)
+    limit = np.maximum(3.5 * spread, 1.0)
     inside = np.abs(deviation) <= limit
     count = inside.sum(-1, keepdims=True)
     deviation *= inside

@@ -3,12 +3,12 @@
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from starpos.detection.background import measure_background
 from starpos.detection.finding import find_peaks, noise_correlation
 from starpos.detection.learn import learn
+from starpos.detection.plane import plane_of
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.stars import Stars, no_stars
@@ -59,11 +59,11 @@ class Detection:
 
 def detect(frame, settings=DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. A frame without any gives none; fwhm_px is NaN then."""
-    plane = _plane(frame)
+    plane, mosaic = plane_of(frame)
     about = {name: getattr(frame, name) for name in ABOUT}
     if min(plane.shape) < 2:
         return Detection(no_stars(**about), float(np.median(plane)), 0.0, float("nan"))
-    background = measure_background(plane, settings.mesh_px, _is_mosaic(frame))
+    background = measure_background(plane, settings.mesh_px, mosaic)
     background = replace(background, correlation=noise_correlation(plane, background))
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
     x, y, height = find_peaks(plane, background, settings.threshold, settings.max_stars)
@@ -76,21 +76,6 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     stars = Stars(**resolve(columns, lesson.psf), **about)
     return Detection(stars, level, noise, lesson.psf.fwhm_px if len(stars) else float("nan"))
-
-
-def _plane(frame):
-    """One number a pixel: as it is, or the sum of blue, green and red as uint16."""
-    if frame.pixels.ndim == 2:
-        return frame.pixels
-    blue, green, red = cv2.split(frame.pixels)
-    return cv2.add(cv2.add(blue, green, dtype=cv2.CV_16U), red, dtype=cv2.CV_16U)
-
-
-def _is_mosaic(frame):
-    """True, False, or None where only the pixels can tell: files often do not say."""
-    if frame.pixels.ndim == 3:
-        return False
-    return True if frame.pattern else None
 
 
 def _saturation(plane, x, y, settings):

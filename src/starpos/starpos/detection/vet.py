@@ -65,14 +65,15 @@ def _core(stamps, fit, psf, widths):
 
 
 def _is_dot(stamps, fit, response):
-    """Hot pixels and sharp cosmic rays: what one pixel leaves unexplained is less than what the PSF does."""
+    """Hot pixels and sharp cosmic rays: one pixel and the sky make these pixels likelier than the PSF does."""
     c = slice(stamps.reach - 2, stamps.reach + 3)
     signal, noise, residual, model, good = (
         a[:, c, c] for a in (stamps.signal, stamps.noise, fit.residual, fit.model, stamps.good)
     )
     score = good * (signal / noise) ** 2
     one_pixel = score.sum((1, 2)) - (score * (signal > 0)).max((1, 2))
-    return one_pixel < (good * residual**2 / response.variance(noise, model)).sum((1, 2))
+    variance = response.variance(noise, model)
+    return one_pixel < (good * (residual**2 / variance + np.log(variance / noise**2))).sum((1, 2))
 
 
 def resolve(columns, psf):
