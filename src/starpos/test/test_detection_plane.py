@@ -8,7 +8,12 @@ from starpos.detection import detect
 from starpos.detection.plane import plane_of
 from starpos.frame import PATTERNS, Frame
 
-OF_MOSAIC = {"rggb": "BayerBG", "grbg": "BayerGB", "bggr": "BayerRG", "gbrg": "BayerGR"}  # OpenCV's names of them
+OF_MOSAIC = {
+    "rggb": "BayerBG",
+    "grbg": "BayerGB",
+    "bggr": "BayerRG",
+    "gbrg": "BayerGR",
+}  # OpenCV's names of them
 
 
 def mosaic(rng, size=(520, 520), electrons=12000.0, black=0.0):
