@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import CatalogueError
+from starpos.zones import ZONES, cell_starts, rows_near
 
 EPOCH = 2000.0  # of ra, dec, Julian year
 FORMAT = 3
-ZONES = 180  # of one degree of declination each
-MAS = np.radians(1 / 3.6e6)
+MAS_DEG = 1 / 3.6e6
+MAS = np.radians(MAS_DEG)
 EPOCH_ZERO = 1900.0
 SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = (
     1.0,
@@ -60,6 +61,11 @@ class Catalogue:
             digest.update(np.ascontiguousarray(column))
         return digest.hexdigest()[:16]
 
+    @cached_property
+    def cell_start(self) -> np.ndarray:
+        """`zones.cell_starts` of the stars."""
+        return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
+
     def vmag(self, index=slice(None)) -> np.ndarray:
         """Johnson V."""
         return self.vmag_centi[index] * 0.01
@@ -96,37 +102,11 @@ class Catalogue:
 
     def cone(self, centre, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Indices of the stars within radius_rad of the unit vector `centre` at J2000, brightest first."""
-        index = rows_near(self.ra_mas, self.zone_start, centre, radius_rad)
+        _, index = rows_near(self.cell_start, np.asarray(centre)[None], radius_rad)
         if np.isfinite(limit_mag):
             index = index[self.vmag_centi[index] < limit_mag * 100]
         index = index[self.directions(index) @ centre >= np.cos(radius_rad)]
         return index[np.argsort(self.vmag_centi[index], kind="stable")]
-
-
-def rows_near(ra_mas: np.ndarray, zone_start: np.ndarray, centre, radius_rad: float) -> np.ndarray:
-    """Rows of a table in zones (sorted by declination zone, then right ascension) that a cone may touch."""
-    dec0, ra0 = np.arcsin(np.clip(centre[2], -1, 1)), np.arctan2(centre[1], centre[0]) % (2 * np.pi)
-    low, high = np.degrees([dec0 - radius_rad, dec0 + radius_rad])
-    zones = range(max(0, int(np.floor(low)) + 90), min(ZONES - 1, int(np.floor(high)) + 90) + 1)
-    half = np.pi
-    if abs(dec0) + radius_rad < np.pi / 2 - 1e-9:
-        half = np.arcsin(min(1.0, np.sin(radius_rad) / np.cos(dec0))) + 1e-9
-    spans = [(0.0, 2 * np.pi)] if half >= np.pi else _wrapped(ra0 - half, ra0 + half)
-    edges = [(np.uint32(a / MAS), np.uint32(np.ceil(b / MAS))) for a, b in spans]
-    pieces = []
-    for z in zones:
-        first, last = zone_start[z], zone_start[z + 1]
-        for edge in edges:
-            i, j = ra_mas[first:last].searchsorted(edge)
-            pieces.append(np.arange(first + i, first + j))
-    return np.concatenate(pieces)
-
-
-def _wrapped(a: float, b: float) -> list[tuple[float, float]]:
-    turn = 2 * np.pi
-    if a < 0:
-        return [(a + turn, turn), (0.0, b)]
-    return [(a, turn), (0.0, b - turn)] if b > turn else [(a, b)]
 
 
 def pack(tyc, hip, vmag, ra_deg, dec_deg, pm_ra, pm_dec, sigma_mas, sigma_pm, epoch) -> Catalogue:

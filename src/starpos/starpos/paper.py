@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from starpos.catalogue import EPOCH, MAS, Catalogue
 from starpos.errors import CatalogueError
-from starpos.triangles import angles
+from starpos.triangles import angles, opposite_sides
 
 LIMIT_MAG = 7.0
 LONGEST_SIDE_DEG = 4.13  # the diagonal of 3.43 x 2.30 deg
@@ -68,7 +68,7 @@ def angles_of_printed(catalogue: Catalogue) -> np.ndarray:
     years = EPOCH - _A_EPOCH
     ra, dec = ra + _A_PM_RA * MAS * years / np.cos(dec), dec + _A_PM_DEC * MAS * years
     a = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    return angles(first, a, last)
+    return angles(opposite_sides(np.stack([first, a, last])))
 
 
 def _named(catalogue: Catalogue, hip: int) -> np.ndarray:

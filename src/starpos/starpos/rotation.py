@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small tools for rotation matrices (3, 3); angles in rad, rotations active."""
 
+import math
+
 import numpy as np
 
 
@@ -16,12 +18,18 @@ def about_axis(axis: int, angle: float) -> np.ndarray:
 
 def from_vector(v) -> np.ndarray:
     """Rotation by |v| rad about v (3,) (Rodrigues)."""
-    v = np.asarray(v, float)
-    angle = np.linalg.norm(v)
-    k = cross_matrix(v)
-    if angle < 1e-8:
-        return np.eye(3) + k + 0.5 * k @ k
-    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
+    x, y, z = (float(c) for c in v)
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    s = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    c = (1 - math.cos(angle)) / angle2 if angle > 1e-4 else 0.5 - angle2 / 24
+    return np.array(
+        [
+            [1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)],
+        ]
+    )
 
 
 def to_small_vector(r: np.ndarray) -> np.ndarray:
@@ -36,13 +44,15 @@ def cross_matrix(v) -> np.ndarray:
 
 
 def best_rotation(source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
-    """The proper rotation R (3, 3) that brings R source nearest to target, both (N, 3) unit vectors.
+    """The proper rotations R (..., 3, 3) that bring R source nearest to target, both (..., N, 3) unit vectors.
 
     Wahba's problem by singular values (Markley 1988, J. Astronaut. Sci. 36, 245).
     """
-    w = np.ones(len(source)) if weight is None else weight
-    u, _, vt = np.linalg.svd((target * w[:, None]).T @ source)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+    if weight is not None:
+        target = target * weight[..., None]
+    u, _, vt = np.linalg.svd(np.swapaxes(target, -1, -2) @ source)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
 
 
 def to_quaternion(r: np.ndarray) -> np.ndarray:

@@ -18,12 +18,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos.catalogue import Catalogue, rows_near
+from starpos.catalogue import EPOCH, Catalogue
 from starpos.progress import Progress, quiet
+from starpos.zones import CELLS, ZONES, cell_starts, ranges, rows_near
 
-FORMAT = 5
+FORMAT = 6
 SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
-LARGEST_BINS, SMALLEST_BINS = 2048, 1024  # of the largest angle, 60..180 deg, and of the smallest, 0..60 deg
+# of the largest angle, 60..180 deg; of the smallest, 0..60 deg; of the longest side, 0..the longest allowed
+BINS = LARGEST_BINS, SMALLEST_BINS, LONGEST_BINS = 256, 128, 64
 POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smaller kind
 # Circles laid over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken).
 # The first fits into a field of 3:2 or 4:3, the second is the whole field's own.
@@ -35,82 +37,84 @@ MAX_TRIANGLES = 6_000_000  # before those that several circles share are counted
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
     """Angular separation in rad of unit vectors (..., 3): equation 3, in the form that keeps small angles exact."""
-    return 2 * np.arcsin(np.minimum(1.0, 0.5 * np.linalg.norm(v1 - v2, axis=-1)))
+    apart = v1 - v2
+    return 2 * np.arcsin(np.minimum(1.0, 0.5 * np.sqrt(np.einsum("...i,...i->...", apart, apart))))
 
 
-def angles(v1: np.ndarray, v2: np.ndarray, v3: np.ndarray) -> np.ndarray:
-    """The three angles (..., 3) in rad at v1, v2, v3 of spherical triangles.
+def opposite_sides(v: np.ndarray) -> np.ndarray:
+    """The sides (..., 3) in rad opposite the corners v (..., 3, 3) of spherical triangles."""
+    return sides(v[..., [1, 0, 0], :], v[..., [2, 2, 1], :])
+
+
+def angles(side: np.ndarray) -> np.ndarray:
+    """The angles (..., 3) in rad of spherical triangles with sides (..., 3), each opposite its angle.
 
     Equation 4 by the half-angle formula, tan(A/2)^2 = sin(s-b) sin(s-c) / (sin s sin(s-a)): exact for small triangles.
     """
-    a, b, c = sides(v2, v3), sides(v1, v3), sides(v1, v2)
-    s = (a + b + c) / 2
-    sa, sb, sc = (np.sin(np.maximum(s - x, 0.0)) for x in (a, b, c))
-    ss = np.sin(s)
-    return np.stack(
-        [
-            2 * np.arctan2(np.sqrt(sb * sc), np.sqrt(ss * sa)),
-            2 * np.arctan2(np.sqrt(sa * sc), np.sqrt(ss * sb)),
-            2 * np.arctan2(np.sqrt(sa * sb), np.sqrt(ss * sc)),
-        ],
-        -1,
-    )
+    s = side.sum(-1, keepdims=True) / 2
+    rest = np.sin(np.maximum(s - side, 0.0))
+    return 2 * np.arctan2(np.sqrt(rest[..., [1, 0, 0]] * rest[..., [2, 2, 1]]), np.sqrt(np.sin(s) * rest))
 
 
 @dataclass(frozen=True)
 class TriangleCatalogue:
-    """Triangles of the sky's brightest stars in bins of (largest angle, smallest angle).
+    """Triangles of the sky's brightest stars in bins of (largest angle, smallest angle, longest side).
 
-    The stars, in zones as the catalogue's: star (S,) index into the star catalogue; ra_mas (S,), zone_start (181,);
-    rank (S,) in brightness over the sky; directions (S, 3) ICRS at J2000.
+    The stars, in zones as the catalogue's: star (S,) index into the star catalogue; cell_start as `zones` has it;
+    rank (S,) in brightness over the sky; directions (S, 3) ICRS at J2000; motion (S, 3) rad a year.
     The triangles: corners (T, 3) rows of `star`, the corner of the largest angle first, of the smallest last; largest,
-    smallest angle and longest side (T,) rad; bin_start (bins + 1,).
+    smallest angle and longest side (T,) rad; longest_allowed (1,) rad; bin_start (bins + 1,).
     """
 
     star: np.ndarray
-    ra_mas: np.ndarray
-    zone_start: np.ndarray
+    cell_start: np.ndarray
     rank: np.ndarray
     directions: np.ndarray
+    motion: np.ndarray
     corners: np.ndarray
     largest: np.ndarray
     smallest: np.ndarray
     longest: np.ndarray
+    longest_allowed: np.ndarray
     bin_start: np.ndarray
 
-    def cone(self, centre: np.ndarray, radius_rad: float) -> np.ndarray:
-        """Rows of `star` within radius_rad of the unit vector `centre`, brightest first."""
-        row = rows_near(self.ra_mas, self.zone_start, centre, radius_rad)
-        row = row[self.directions[row] @ centre >= np.cos(radius_rad)]
-        return row[np.argsort(self.rank[row])]
+    def places(self, row: np.ndarray, year: float) -> np.ndarray:
+        """ICRS directions (n, 3) of rows of `star` at a Julian year."""
+        v = self.directions[row] + self.motion[row] * (year - EPOCH)
+        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
 
-    def near(self, largest, smallest, tol_largest, tol_smallest) -> tuple[np.ndarray, np.ndarray]:
-        """Triangles within tolerances of Q pairs of angles (Q,): (query (M,), triangle (M,)), any order.
+    def stars_near(self, centre: np.ndarray, radius_rad: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `star` in and about the cones around centre (Q, 3): (cone (M,), row (M,))."""
+        return rows_near(self.cell_start, centre, radius_rad)
 
-        The work goes with the answers, not with the catalogue: each query reads the bins its rectangle touches.
+    def near(self, shape: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Triangles within tolerance (Q, 3) of shape (Q, 3), the largest angle, the smallest, the longest side.
+
+        Returns (query (M,), triangle (M,)) in any order.  The work goes with the answers, not with the catalogue: each
+        query reads the bins that its box touches.
         """
-        row0, row1 = (_bin_largest(largest + k * tol_largest) for k in (-1, 1))
-        col0, col1 = (_bin_smallest(smallest + k * tol_smallest) for k in (-1, 1))
-        rows = row1 - row0 + 1
-        query = np.repeat(np.arange(len(rows)), rows)
-        row = row0[query] + np.arange(len(query)) - np.repeat(np.cumsum(rows) - rows, rows)
-        first = self.bin_start[row * SMALLEST_BINS + col0[query]]
-        count = self.bin_start[row * SMALLEST_BINS + col1[query] + 1] - first
-        query = np.repeat(query, count)
-        triangle = np.arange(len(query)) + np.repeat(first - (np.cumsum(count) - count), count)
-        close = np.abs(self.largest[triangle] - largest[query]) <= tol_largest[query]
-        close &= np.abs(self.smallest[triangle] - smallest[query]) <= tol_smallest[query]
+        low, high = self._bins(np.concatenate([shape - tolerance, shape + tolerance])).reshape(2, -1, 3)
+        query, first = ranges(low[:, 0], high[:, 0] - low[:, 0] + 1)
+        row, second = ranges(low[query, 1], (high - low)[query, 1] + 1)
+        query, run = query[row], (first[row] * SMALLEST_BINS + second) * LONGEST_BINS
+        begin, end = self.bin_start[run + low[query, 2]], self.bin_start[run + high[query, 2] + 1]
+        row, triangle = ranges(begin, end - begin)
+        query = query[row]
+        close = np.abs(self.largest[triangle] - shape[query, 0]) <= tolerance[query, 0]
+        close &= np.abs(self.smallest[triangle] - shape[query, 1]) <= tolerance[query, 1]
+        close &= np.abs(self.longest[triangle] - shape[query, 2]) <= tolerance[query, 2]
         return query[close], triangle[close]
 
-
-def _bin_largest(angle):
-    return np.clip(
-        ((angle - np.pi / 3) * (LARGEST_BINS / (2 * np.pi / 3))).astype(np.int64), 0, LARGEST_BINS - 1
-    )
+    def _bins(self, shape: np.ndarray) -> np.ndarray:
+        return _bins(*shape.T, self.longest_allowed[0])
 
 
-def _bin_smallest(angle):
-    return np.clip((angle * (SMALLEST_BINS / (np.pi / 3))).astype(np.int64), 0, SMALLEST_BINS - 1)
+def _bins(largest, smallest, longest, longest_allowed) -> np.ndarray:
+    """The bin (n, 3) of triangles; what is outside belongs to the bin at the edge."""
+    part = np.stack([largest, smallest, longest], -1).astype(float)
+    part -= [np.pi / 3, 0, 0]
+    part /= [2 * np.pi / 3, np.pi / 3, longest_allowed]
+    return np.minimum(np.maximum(part * BINS, 0).astype(np.int64), np.array(BINS) - 1)
 
 
 def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet) -> TriangleCatalogue:
@@ -124,6 +128,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     pool = np.sort(by_light[: int(POOL_PER_CIRCLE * circles) + 1000])
     rank = np.argsort(np.argsort(catalogue.vmag_centi[pool], kind="stable"))
     v = catalogue.directions(pool)
+    motion = catalogue.directions(pool, EPOCH + 1) - v
     brightest_first = np.argsort(rank)
     tree = cKDTree(v[brightest_first])
     fewer = 0  # stars taken from each circle, so that a small field does not make too many triangles
@@ -142,14 +147,15 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     progress("star triangles", 1.0)
     return TriangleCatalogue(
         pool.astype(np.int32),
-        catalogue.ra_mas[pool],
-        np.searchsorted(pool, catalogue.zone_start),
+        cell_starts(np.searchsorted(pool, catalogue.zone_start), catalogue.ra_mas[pool] / 3.6e6),
         rank.astype(np.int32),
         v,
+        motion.astype(np.float32),
         corner,
         largest,
         smallest,
         longest,
+        np.array([2 * half_diagonal]),
         bin_start.astype(np.int32),
     )
 
@@ -188,29 +194,27 @@ def _spread(n: int) -> np.ndarray:
 def _in_bins(v: np.ndarray, brightest_first: np.ndarray, triples: np.ndarray, longest_side: float):
     """Usable triangles in order of their bins: corners (largest angle first), angles, longest side, bin starts."""
     n, parts = len(brightest_first), []
-    for key in np.array_split(
-        triples, len(triples) // BLOCK + 1
-    ):  # a whole sky of triangles at once is 500 MB
+    # a whole sky of triangles at once is 500 MB
+    for key in np.array_split(triples, len(triples) // BLOCK + 1):
         corner = brightest_first[np.stack([key // (n * n), key // n % n, key % n], -1)]
         parts.append(_measured(v, corner, longest_side))
-    corner, largest, smallest, longest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    corner, largest, smallest, longest, bins = (np.concatenate(c) for c in zip(*parts, strict=True))
     del parts
-    bins = (_bin_largest(largest) * SMALLEST_BINS + _bin_smallest(smallest)).astype(np.int32)
     order = np.argsort(bins, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(bins, minlength=LARGEST_BINS * SMALLEST_BINS))])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(bins, minlength=np.prod(BINS)))])
     return corner[order], largest[order], smallest[order], longest[order], starts
 
 
 def _measured(v: np.ndarray, corner: np.ndarray, longest_side: float):
-    """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; their angles and longest side."""
-    p = [v[corner[:, k]] for k in range(3)]
-    length = np.stack([sides(p[1], p[2]), sides(p[0], p[2]), sides(p[0], p[1])], -1)
+    """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; angles, longest side and bin."""
+    length = opposite_sides(v[corner])
     good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)
-    angle = angles(*(q[good] for q in p))
-    corner = np.take_along_axis(corner[good], np.argsort(-angle, axis=1, kind="stable"), 1)
-    return corner.astype(np.int32), *(
-        x.astype(np.float32) for x in (angle.max(1), angle.min(1), length[good].max(1))
-    )
+    corner, length = corner[good], length[good]
+    angle = angles(length)
+    corner = np.take_along_axis(corner, np.argsort(-angle, axis=1, kind="stable"), 1)
+    shape = [x.astype(np.float32) for x in (angle.max(1), angle.min(1), length.max(1))]
+    bins = np.ravel_multi_index(_bins(*shape, longest_side).T, BINS)
+    return corner.astype(np.int32), *shape, bins.astype(np.int32)
 
 
 def cache_folder() -> Path:
@@ -229,7 +233,7 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
     """
     half_diagonal = float(1.05 ** np.ceil(np.log(half_diagonal_rad) / np.log(1.05)))
     with _lock:
-        key = (catalogue.fingerprint, half_diagonal, cache_folder())
+        key = (catalogue.fingerprint, half_diagonal)
         if key not in _in_use:
             while len(_in_use) >= MOST_IN_USE:
                 _in_use.pop(next(iter(_in_use)))
@@ -291,12 +295,14 @@ def _map(folder: Path) -> TriangleCatalogue | None:
     t = TriangleCatalogue(**columns)
     stars, count = len(t.star), len(t.corners)
     fit = (
-        t.bin_start.shape == (LARGEST_BINS * SMALLEST_BINS + 1,)
+        t.bin_start.shape == (np.prod(BINS) + 1,)
         and t.bin_start[-1] == count
         and t.corners.shape == (count, 3)
         and len(t.largest) == len(t.smallest) == len(t.longest) == count
-        and t.directions.shape == (stars, 3)
-        and len(t.ra_mas) == len(t.rank) == t.zone_start[-1] == stars
+        and t.directions.shape == t.motion.shape == (stars, 3)
+        and t.cell_start.shape == (ZONES * CELLS + 1,)
+        and len(t.rank) == t.cell_start[-1] == stars
+        and t.longest_allowed.shape == (1,)
         and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
     )
     return t if fit else None

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scenes import FOCAL_PX, SIZE, random_stars
 
-from starpos import identification, triangles
+from starpos import triangles
 from starpos.camera import Camera
-from starpos.identification import Sky, identify
+from starpos.identification import Sky, identify, search
+from starpos.identification.lookup import LOOSE_PX
 
 ARCSEC = np.radians(1 / 3600)
 FIELDS = {
@@ -164,11 +165,11 @@ def test_coarse_centroids_are_searched_with_their_own_error(catalogue, rng):
     for _ in range(8):
         attitude = random_attitude(rng)
         xy, _ = seen(sky, camera, attitude, limit, rng, sigma=error_px)
-        tight = [(stars, error) for stars, error in identification.STAGES if error < identification.LOOSE_PX]
+        tight = [(stars, error) for stars, error in search.STAGES if error < LOOSE_PX]
         with (
             pytest.MonkeyPatch.context() as only
         ):  # the loose stages, made for lenses that distort, would help out
-            only.setattr(identification, "STAGES", tight)
+            only.setattr(search, "STAGES", tight)
             answer = identify(xy, np.full(len(xy), error_px), camera, sky)
         if answer is not None:
             assert np.arccos(np.clip(answer.attitude[2] @ attitude[2], -1, 1)) < 2 / camera.fx

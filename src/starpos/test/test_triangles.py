@@ -28,6 +28,10 @@ def own_cache(tmp_path, monkeypatch):
     triangles._in_use.clear()
 
 
+def angles(v):
+    return triangles.angles(triangles.opposite_sides(v))
+
+
 def unit(ra_deg, dec_deg):
     ra, dec = np.radians([ra_deg, dec_deg])
     return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
@@ -42,14 +46,14 @@ def test_the_papers_triangle(catalogue):
     first, last = (catalogue.directions(np.flatnonzero(catalogue.hip == hip))[0] for hip in (99002, 99145))
     mas, years = 1 / 3.6e6, 2000 - 1991.56
     a = unit(300.87250833 - 10.7 * years * mas / np.cos(np.radians(36.025)), 36.02515667 - 4.3 * years * mas)
-    assert triangles.angles(first, a, last) == pytest.approx([2.27327, 0.634202, 0.234213], abs=1.5e-5)
+    assert angles(np.stack([first, a, last])) == pytest.approx([2.27327, 0.634202, 0.234213], abs=1.5e-5)
     photocentre = catalogue.directions(np.flatnonzero(catalogue.hip == 98753))[0]
-    assert np.abs(triangles.angles(first, photocentre, last) - [2.27327, 0.634202, 0.234213]).max() > 1e-4
+    assert np.abs(angles(np.stack([first, photocentre, last])) - [2.27327, 0.634202, 0.234213]).max() > 1e-4
 
 
 def test_an_octant_has_three_right_angles():
     x, y, z = np.eye(3)
-    assert triangles.angles(x, y, z) == pytest.approx([np.pi / 2] * 3, abs=1e-15)
+    assert angles(np.stack([x, y, z])) == pytest.approx([np.pi / 2] * 3, abs=1e-15)
     assert triangles.sides(x, y) == pytest.approx(np.pi / 2)
 
 
@@ -57,13 +61,13 @@ def test_angles_by_the_law_of_cosines_and_the_excess(rng):
     """Equation 4 as the paper prints it; the sum exceeds pi by the area (Girard; L'Huilier by the triple product)."""
     v = rng.normal(size=(500, 3, 3))
     v /= np.linalg.norm(v, axis=2, keepdims=True)
-    angles = triangles.angles(*np.moveaxis(v, 1, 0))
+    found = angles(v)
     a, b, c = (triangles.sides(v[:, i], v[:, j]) for i, j in ((1, 2), (0, 2), (0, 1)))
     at_first = np.arccos((np.cos(a) - np.cos(b) * np.cos(c)) / (np.sin(b) * np.sin(c)))
-    np.testing.assert_allclose(angles[:, 0], at_first, atol=1e-7)
+    np.testing.assert_allclose(found[:, 0], at_first, atol=1e-7)
     product = np.abs(np.einsum("ni,ni->n", v[:, 0], np.cross(v[:, 1], v[:, 2])))
     area = 2 * np.arctan2(product, 1 + np.cos(a) + np.cos(b) + np.cos(c))
-    np.testing.assert_allclose(angles.sum(1) - np.pi, area % (2 * np.pi), atol=1e-9)
+    np.testing.assert_allclose(found.sum(1) - np.pi, area % (2 * np.pi), atol=1e-9)
 
 
 def test_small_triangles_keep_their_digits():
@@ -71,13 +75,13 @@ def test_small_triangles_keep_their_digits():
     s = np.radians(1 / 3600)
     v = np.array([[0, 0, 1.0], [3 * s, 0, 1], [0, 4 * s, 1]])
     v /= np.linalg.norm(v, axis=1, keepdims=True)
-    assert triangles.angles(*v) == pytest.approx([np.pi / 2, np.arctan(4 / 3), np.arctan(3 / 4)], abs=1e-9)
+    assert angles(np.stack(v)) == pytest.approx([np.pi / 2, np.arctan(4 / 3), np.arctan(3 / 4)], abs=1e-9)
 
 
 def test_degenerate_triangles_give_numbers():
     x, y, _ = np.eye(3)
     for v in ((x, x, x), (x, x, y), (x, y, (x + y) / 2**0.5)):
-        assert np.isfinite(triangles.angles(*v)).all()
+        assert np.isfinite(angles(np.stack(v))).all()
 
 
 def test_near_is_what_brute_force_finds(table, rng):
@@ -89,17 +93,20 @@ def test_near_is_what_brute_force_finds(table, rng):
         (0.0, np.pi / 3, 0.0, -0.01),
     )  # the table's edges
     tol_largest, tol_smallest = rng.uniform(1e-4, 5e-3, (2, 40))
-    query, found = table.near(largest, smallest, tol_largest, tol_smallest)
+    longest = table.longest[pick] * rng.uniform(0.98, 1.02, 40)
+    shape = np.stack([largest, smallest, longest], -1)
+    tolerance = np.stack([tol_largest, tol_smallest, 0.03 * longest], -1)
+    query, found = table.near(shape, tolerance)
     for q in range(40):
         close = np.abs(table.largest - largest[q]) <= tol_largest[q]
         close &= np.abs(table.smallest - smallest[q]) <= tol_smallest[q]
+        close &= np.abs(table.longest - longest[q]) <= tolerance[q, 2]
         assert set(found[query == q].tolist()) == set(np.flatnonzero(close).tolist())
     assert len(found) > 36
 
 
 def test_near_without_queries(table):
-    none = np.zeros(0)
-    query, found = table.near(none, none, none, none)
+    query, found = table.near(np.zeros((0, 3)), np.zeros((0, 3)))
     assert len(query) == len(found) == 0
 
 
@@ -109,10 +116,10 @@ def test_triangles_are_those_of_their_corners(table, catalogue, rng):
     np.testing.assert_array_equal(
         v, catalogue.directions(table.star[table.corners[pick]].ravel()).reshape(v.shape)
     )
-    angles = triangles.angles(*np.moveaxis(v, 1, 0))
-    assert np.all(np.diff(angles, axis=1) <= 1e-12)  # the largest's corner first, the smallest's last
-    np.testing.assert_allclose(table.largest[pick], angles[:, 0], atol=1e-6)
-    np.testing.assert_allclose(table.smallest[pick], angles[:, 2], atol=1e-6)
+    found = angles(v)
+    assert np.all(np.diff(found, axis=1) <= 1e-12)  # the largest's corner first, the smallest's last
+    np.testing.assert_allclose(table.largest[pick], found[:, 0], atol=1e-6)
+    np.testing.assert_allclose(table.smallest[pick], found[:, 2], atol=1e-6)
     longest = max(triangles.sides(v[:, i], v[:, j]).max() for i, j in ((0, 1), (0, 2), (1, 2)))
     assert longest < 2 * WIDE * 1.05
 

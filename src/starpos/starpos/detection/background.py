@@ -16,6 +16,7 @@ class Background:
     level, noise  (P, rows, columns); P is 1, or 4 on a colour mosaic: the phases (0, 0), (0, 1), (1, 0), (1, 1)
                   of (row, column) modulo 2, since each colour sees its own sky
     correlation   how many times noisier than independent pixels a smoothed frame is, 1 or more
+    streaks       Streaks of satellites that lie on it
     """
 
     level: np.ndarray
@@ -23,6 +24,7 @@ class Background:
     width: int
     height: int
     correlation: float = 1.0
+    streaks: tuple = ()
 
     @property
     def is_mosaic(self) -> bool:
@@ -37,6 +39,30 @@ class Background:
             np.stack([ndimage.map_coordinates(m, place, order=1, mode="nearest") for m in mesh], -1)
             for mesh in (self.level, self.noise)
         )
+
+    def of_pixels(self, x, y, rows, columns):
+        """level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
+
+        The noise is as large as sums over neighbouring pixels show it.
+        """
+        shape = np.broadcast_shapes(rows.shape, columns.shape)
+        level, noise = (v.astype(np.float32) for v in self.at(x, y))
+        noise *= np.float32(self.correlation)
+        if self.is_mosaic:
+            each = np.arange(len(x)).reshape(-1, *[1] * (len(shape) - 1))
+            phase = phase_of(rows, columns)
+            level, noise = level[each, phase], noise[each, phase]
+        else:
+            level, noise = (np.broadcast_to(v.reshape(-1, *[1] * (len(shape) - 1)), shape) for v in (level, noise))
+        for streak in self.streaks:
+            more, least = streak.at(rows, columns)
+            level, noise = level + more, np.maximum(noise, least)
+        return level, noise
+
+
+def phase_of(rows, columns):
+    """Which of a colour mosaic's 2 x 2 pixels, 0..3."""
+    return 2 * (rows & 1) + (columns & 1)
 
 
 def measure_background(plane, cell_px=64, mosaic=None) -> Background:

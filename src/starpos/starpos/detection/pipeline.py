@@ -9,6 +9,7 @@ from starpos.detection.background import measure_background
 from starpos.detection.finding import find_peaks, noise_correlation
 from starpos.detection.learn import learn
 from starpos.detection.plane import plane_of
+from starpos.detection.streak import find_streaks
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.stars import Stars, no_stars
@@ -69,6 +70,7 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     x, y, height = find_peaks(plane, background, settings.threshold, settings.max_stars)
     if len(x) == 0:
         return Detection(no_stars(**about), level, noise, float("nan"))
+    background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
     chunks = [slice(i, i + CHUNK) for i in range(0, len(x), CHUNK)]

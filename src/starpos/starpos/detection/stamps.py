@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.detection.background import phase_of
+
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
@@ -48,14 +50,8 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     columns, rows = x[:, None] + grid, y[:, None] + grid
     on = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
     pixels = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
-    level, noise = (v.astype(np.float32) for v in background.at(x, y))
-    noise *= np.float32(background.correlation)
-    if background.is_mosaic:
-        phase = 2 * (rows & 1)[:, :, None] + (columns & 1)[:, None, :]
-        each = np.arange(len(x))[:, None, None]
-        level, noise = level[each, phase], noise[each, phase]
-    else:
-        phase = np.zeros(pixels.shape, np.int8)
-        level, noise = (np.broadcast_to(v[:, :, None], pixels.shape) for v in (level, noise))
+    rows, columns = rows[:, :, None], columns[:, None, :]
+    level, noise = background.of_pixels(x, y, rows, columns)
+    phase = phase_of(rows, columns) if background.is_mosaic else np.zeros(pixels.shape, np.int8)
     full = on & (pixels >= saturation)
     return Stamps(x, y, pixels - level, noise, on & ~full, full, phase)

@@ -4,25 +4,29 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy import spatial
+from scipy import ndimage, spatial
 
-from starpos.detection.fit import fit_stars
+from starpos.detection.fit import OUTLIER, fit_stars
 from starpos.detection.learn import centroid, grey
 from starpos.detection.shape import moments, relative_widths, window_for
 from starpos.detection.stamps import cut
 from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
 SPECK = 3  # pixels
+SPIKE = 3  # times sharper than a star
+LOUD = 3  # times the quietest pixel's noise
 
 
 def measure(plane, background, x, y, lesson, saturation, min_snr):
     """Columns x, y, flux, snr, covariance, flags of the stars among the peaks x, y (N,) int, in no order."""
     psf = lesson.psf
     stamps = cut(plane, background, x, y, lesson.reach, saturation)
+    spike, around = _spikes(stamps, lesson)
+    stamps = replace(stamps, signal=np.where(spike, around, stamps.signal), good=stamps.good & ~spike)
     shape = psf.shape
     x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
-    smooth, blur = grey(_without_specks(stamps, fit), background)
+    smooth, blur = grey(_own_light(stamps, fit, spike), background)
     window = window_for(shape)
     _, _, seen = moments(smooth, fit.x, fit.y, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
@@ -31,7 +35,7 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         c = fit.covariance * _misfit(fit)[:, None, None]
         matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))  # SNR in the sky's noise
         sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
-        sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 4
+        sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
         sound &= (fit.flux > 0) & (matched >= min_snr)
         sound &= ~_is_dot(stamps, fit, lesson.response)
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
@@ -39,7 +43,7 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         slack = 3 / matched
         full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
         sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
-        edge = (~stamps.good & ~stamps.full & _core(stamps, fit, psf, 3)).any((1, 2))
+        edge = (~stamps.good & ~stamps.full & ~spike & _core(stamps, fit, psf, 3)).any((1, 2))
         foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
@@ -53,10 +57,26 @@ def _misfit(fit):
     return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
 
 
-def _without_specks(stamps, fit):
-    """Stamps whose stars have lost a hot pixel or a cosmic ray on them; more than a speck stays, to be judged."""
+def _spikes(stamps, lesson):
+    """Which pixels (N, S, S) tower over their neighbours as no star does, whatever they lie on, and those's mean."""
+    grid = np.arange(-1, 2, dtype=np.float32)
+    star = lesson.psf.evaluate(grid[None, None, :], grid[None, :, None])[0][0]
+    four = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
+    sharpest = star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1])
+    grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
+    around = ndimage.convolve(grey, four[None], mode="nearest")
+    spike = (grey > SPIKE * sharpest * around) & (stamps.signal > OUTLIER * stamps.noise)
+    return spike, around * lesson.response.gain.astype(np.float32)[stamps.phase]
+
+
+def _own_light(stamps, fit, spike):
+    """Stamps whose stars have lost a hot pixel or a cosmic ray on them; more than a speck stays, to be judged.
+
+    Where the noise is a streak's the pixels tell nothing of a star's shape, and the model stands in for them.
+    """
     speck = fit.outlier & (fit.outlier.sum((1, 2)) <= SPECK)[:, None, None]
-    return replace(stamps, signal=np.where(speck, fit.model, stamps.signal))
+    loud = stamps.noise > LOUD * stamps.noise.min((1, 2), keepdims=True)
+    return replace(stamps, signal=np.where(speck | loud | spike, fit.model, stamps.signal))
 
 
 def _core(stamps, fit, psf, widths):

@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which catalogue star is which: from a prior, or lost in space from a frame's brightest stars.
+
+Triangles of the brightest stars are looked up by their shape; candidates that share a side support each other (the
+paper's search); each is then held against the whole field by log-odds, so that a match is accepted by its probability
+and never by a count, and fitted by least squares to the faintest stars seen.
+"""
+
+from starpos.identification.prior import Plumb, Pointing
+from starpos.identification.search import FEWEST_STARS, identify
+from starpos.identification.sky import Sky
+from starpos.identification.full import Identification
+
+__all__ = ["FEWEST_STARS", "Identification", "Plumb", "Pointing", "Sky", "identify"]

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The accepted match carried to the faintest stars: all detections against all catalogue stars of the field."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from starpos.catalogue import Catalogue
+from starpos.identification.pose import Field, Pose
+from starpos.identification.sky import Sky
+from starpos.identification.verify import Match
+from starpos.zones import rows_near
+
+FAINTEST_FIT = 2000  # stars that take part
+SMALL_TABLE = 20_000  # detections times catalogue stars
+BLEND_PX = 2.5  # closer stars make one image
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Matched stars and the attitude they give.
+
+    star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): `Sky`'s directions
+    into C; blend_px (M,): how far unresolved neighbours may draw each star's image; focal_scale: factor on the camera's
+    focal length; residual_px: rms of one axis; log_odds: of the match against chance; mirrored: the frame's rows run
+    bottom-up, all of this holds for the frame flipped.
+    """
+
+    star: np.ndarray
+    catalogue: np.ndarray
+    blend_px: np.ndarray
+    attitude: np.ndarray
+    focal_scale: float
+    residual_px: float
+    log_odds: float
+    mirrored: bool
+
+
+def identified(field: Field, sky: Sky, match: Match) -> Identification:
+    """All stars of the field matched, one to one, and the pose fitted to them."""
+    pose = match.pose
+    xy, sigma = field.xy[int(pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
+    index, w, blend = _on_frame(field, sky, pose, len(xy))
+    residual = xy[match.star] - pose.project(match.directions)
+    for _ in range(2):
+        middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
+        spread = max(1.4826 * float(middling), 0.02)
+        star, near = _mutual_nearest(xy, pose.project(w), 4 * np.hypot(spread, sigma) + 0.2)
+        pose = pose.fitted(xy[star], w[near])
+        residual = xy[star] - pose.project(w[near])
+    return Identification(
+        star,
+        index[near],
+        blend[near],
+        pose.attitude,
+        pose.focal_px / field.focal_px,
+        float(np.sqrt(np.mean(residual * residual))),
+        match.log_odds,
+        pose.mirrored,
+    )
+
+
+def _on_frame(field: Field, sky: Sky, pose: Pose, stars: int):
+    """The catalogue's stars on the frame, brightest first and as many as `stars` detections may be: indices, directions,
+    and how far fainter ones that melt into them may draw them (px)."""
+    catalogue = sky.catalogue
+    axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
+    _, index = rows_near(catalogue.cell_start, (axis / np.sqrt(axis @ axis))[None], field.radius_rad)
+    light = catalogue.vmag_centi[index]
+    most = 12 * stars + 300  # three times too many, as the cells reach beyond the frame
+    if len(index) > most:
+        brightest = np.argpartition(light, most)[:most]
+        index, light = index[brightest], light[brightest]
+    order = np.argsort(light, kind="stable")
+    index = index[order]
+    w = sky.directions(index)
+    pixel = pose.project(w)
+    on = np.flatnonzero(field.holds(pixel))[: 3 * stars + 50]
+    single, drawn = _resolved(catalogue, index[on], pixel[on])
+    on = on[single]
+    return index[on], w[on], drawn[single]
+
+
+def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray):
+    """Which stars (brightest first) do not melt into a brighter one (N,), and how far these draw it (N,) px."""
+    single, drawn = np.ones(len(index), bool), np.zeros(len(index))
+    pair = cKDTree(pixel).query_pairs(BLEND_PX, output_type="ndarray")
+    if len(pair):
+        brighter, fainter = pair.T
+        ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
+        apart = np.hypot(*(pixel[fainter] - pixel[brighter]).T)
+        np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
+        single[fainter] = False
+    return single, drawn
+
+
+def _mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
+    if len(xy) * len(predicted) < SMALL_TABLE:  # all distances at once are quicker than two trees
+        apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
+        nearest, back = apart2.argmin(1), apart2.argmin(0)
+        distance = np.sqrt(apart2[np.arange(len(xy)), nearest])
+    else:
+        distance, nearest = cKDTree(predicted).query(xy)
+        back = cKDTree(xy).query(predicted)[1]
+    good = (distance < radius) & (back[nearest] == np.arange(len(xy)))
+    return np.flatnonzero(good), nearest[good]

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Candidates: triangles of a frame's brightest stars that have the shape of catalogue triangles."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+
+from starpos.identification.pose import Field, directions
+from starpos.triangles import TriangleCatalogue, angles, opposite_sides
+
+SCALE_TOLERANCE = 0.03  # of the focal length
+LOOSE_PX = 1.0  # above it a candidate must be supported by another
+TRIANGLE_SIGMA = 3.0
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Triangles, best supported first: star (K, 3), rows of the frame's; corner (K, 3), rows of the triangle catalogue's;
+    mirrored (K,): whether they turn the other way."""
+
+    star: np.ndarray
+    corner: np.ndarray
+    mirrored: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.mirrored)
+
+    def __getitem__(self, k) -> "Candidates":
+        return Candidates(self.star[k], self.corner[k], self.mirrored[k])
+
+
+class Lookup:
+    """One frame's triangles: which were looked up already, at which error."""
+
+    def __init__(self, field: Field, table: TriangleCatalogue):
+        self.field, self.table = field, table
+        self.v = directions(field.xy[:1], np.array([field.focal_px]))[0]
+        self._done: dict[float, int] = {}
+
+    def candidates(self, stars: int, error_px: float) -> tuple[Candidates, int]:
+        """Those of the `stars` brightest not yet tried at this error, and how many there were to choose from."""
+        done = self._done.get(error_px, 0)
+        triples = _triples(stars)[done:]
+        self._done[error_px] = done + len(triples)
+        error = np.hypot(error_px, self.field.sigma[triples].max(1)) / self.field.focal_px
+        star, shape, tolerance = _shapes(self.v, triples, error)
+        query, found = self.table.near(shape, tolerance)
+        star, corner = star[query], self.table.corners[found]
+        mirrored = _handedness(self.table.directions[corner]) != _handedness(self.v[star])
+        if not len(star):
+            return Candidates(star, corner, mirrored), 0
+        support = _shared_sides(star, corner, mirrored)
+        size = np.abs(np.log(self.table.longest[found] / shape[query, 2]))
+        order = np.lexsort((size, -support))
+        if error_px > LOOSE_PX:
+            order = order[support[order] > 0]
+        return Candidates(star[order], corner[order], mirrored[order]), len(star)
+
+
+@lru_cache(maxsize=32)
+def _triples(n: int) -> np.ndarray:
+    """All triples of 0..n-1 (T, 3), those of the brightest stars first."""
+    t = np.array(list(combinations(range(n), 3)), int).reshape(-1, 3)
+    return t[np.lexsort((t.sum(1), t.max(1)))]
+
+
+def _shapes(v: np.ndarray, triples: np.ndarray, error: np.ndarray):
+    """Triangles as they are looked up: star (Q, 3), the corner of the largest angle first, of the smallest last; shape
+    and tolerance (Q, 3) for `TriangleCatalogue.near`.
+
+    Where two angles are equal within the error both orders of corners are there.
+    """
+    side = opposite_sides(v[triples])
+    angle = angles(side)
+    order = np.argsort(-angle, axis=1, kind="stable")
+    triples, angle, side = (np.take_along_axis(x, order, 1) for x in (triples, angle, side))
+    a, b, c = np.maximum(side.T, 1e-9)
+    error = TRIANGLE_SIGMA * error
+    largest = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
+    smallest = error * np.sqrt(1 / a**2 + 1 / b**2 + (c / (a * b)) ** 2)
+    usable = (smallest < 0.1) & (largest < 0.2)
+    first = usable & (angle[:, 0] - angle[:, 1] < 2 * largest)
+    last = usable & (angle[:, 1] - angle[:, 2] < 2 * largest)
+    star = np.concatenate([triples[usable], triples[first][:, [1, 0, 2]], triples[last][:, [0, 2, 1]]])
+    row = np.concatenate([np.flatnonzero(k) for k in (usable, first, last)])
+    shape = np.stack([angle[:, 0], angle[:, 2], a], -1)[row]
+    tolerance = np.stack([largest, smallest, SCALE_TOLERANCE * a + error], -1)[row]
+    return star, shape, tolerance
+
+
+def _handedness(v: np.ndarray) -> np.ndarray:
+    """Whether triples of directions (M, 3, 3) turn one way or the other."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.moveaxis(v, 0, -1)
+    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) > 0
+
+
+def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) -> np.ndarray:
+    """How many other candidates share a side (two stars with the same two identities) with each (M,)."""
+    # a detection and its identity as one scrambled number; a side is the sum of two, whichever comes first
+    mixed = (star.astype(np.uint64) << np.uint64(40)) | corner.astype(np.uint64)
+    mixed = (mixed + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    mixed ^= mixed >> np.uint64(29)
+    mixed *= np.uint64(0xBF58476D1CE4E5B9)
+    key = mixed + mixed[:, [1, 2, 0]] + mirrored.astype(np.uint64)[:, None]
+    _, inverse, count = np.unique(key.ravel(), return_inverse=True, return_counts=True)
+    return (count[inverse].reshape(key.shape) - 1).sum(1)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pinhole camera among the stars, and the frame's stars as it sees them: pixels from the principal point."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos import rotation
+from starpos.camera import Camera
+from starpos.triangles import opposite_sides
+
+
+@dataclass(frozen=True)
+class Field:
+    """A frame's stars, brightest first.
+
+    xy (2, N, 2): px from the principal point, as they are and with the frame's rows flipped; sigma (N,): their errors;
+    middle (2,): the frame's centre; half (2,): half its size; focal_px: as the camera is believed to be.
+    """
+
+    xy: np.ndarray
+    sigma: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+    focal_px: float
+
+    @classmethod
+    def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera) -> "Field":
+        """From pixels (N, 2) of an ideal camera."""
+        principal = np.array([camera.cx, camera.cy])
+        flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
+        return cls(
+            np.stack([xy, flipped]) - principal,
+            sigma,
+            np.array(camera.centre_px) - principal,
+            np.array([camera.width, camera.height]) / 2,
+            camera.fx,
+        )
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    @property
+    def radius_rad(self) -> float:
+        """Of a cone about the frame's centre that holds the frame."""
+        return float(np.arctan(np.hypot(*self.half) / self.focal_px)) * 1.05 + 2e-4
+
+    def holds(self, pixel: np.ndarray) -> np.ndarray:
+        """Which of pixels (N, 2) are on the frame (N,)."""
+        return (np.abs(pixel - self.middle) < self.half + 2).all(-1)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """attitude (3, 3): Sky into C; focal length in px; whether the frame's rows run bottom-up."""
+
+    attitude: np.ndarray
+    focal_px: float
+    mirrored: bool
+
+    def project(self, w: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of directions w (N, 3); far away for what is behind the camera."""
+        u = w @ self.attitude.T
+        return u[:, :2] * (self.focal_px / np.maximum(u[:, 2:], 1e-6))
+
+    def fitted(self, xy: np.ndarray, w: np.ndarray) -> "Pose":
+        """Least squares for a small rotation and the focal length from pixels xy (N, 2) of directions w (N, 3)."""
+        u = w @ self.attitude.T
+        x, y = (u[:, :2] / u[:, 2:]).T
+        # d(x, y) for a rotation about the camera's axes, and for a relative change of the focal length
+        j = np.empty((2, len(x), 4))
+        j[0, :, 0], j[0, :, 1], j[0, :, 2], j[0, :, 3] = -x * y, 1 + x * x, -y, x
+        j[1, :, 0], j[1, :, 1], j[1, :, 2], j[1, :, 3] = -1 - y * y, x * y, x, y
+        j = j.reshape(-1, 4)
+        residual = xy.T.ravel() / self.focal_px - np.concatenate([x, y])
+        try:
+            d = np.linalg.solve(j.T @ j, j.T @ residual)
+        except np.linalg.LinAlgError:  # all stars in one place
+            return self
+        return Pose(rotation.from_vector(d[:3]) @ self.attitude, self.focal_px * (1 + d[3]), self.mirrored)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """K of them: attitude (K, 3, 3), focal_px (K,), mirrored (K,)."""
+
+    attitude: np.ndarray
+    focal_px: np.ndarray
+    mirrored: np.ndarray
+
+    def __getitem__(self, k: int) -> Pose:
+        return Pose(self.attitude[k], float(self.focal_px[k]), bool(self.mirrored[k]))
+
+    def __len__(self) -> int:
+        return len(self.focal_px)
+
+    @classmethod
+    def of_triangles(cls, xy: np.ndarray, w: np.ndarray, focal_px: float, mirrored: np.ndarray) -> "Poses":
+        """The focal lengths that give triangles at pixels xy (K, 3, 2) the size they have among the stars, w (K, 3, 3),
+        and the rotations that bring them into place."""
+        wanted = _perimeter(w)
+        focal = np.full(len(xy), float(focal_px))
+        for _ in range(2):
+            focal = focal * _perimeter(directions(xy, focal)) / wanted
+        return cls(rotation.best_rotation(w, directions(xy, focal)), focal, mirrored)
+
+
+def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
+    """Unit vectors (K, N, 3) in C of pixels (K, N, 2) from the principal point, focal lengths (K,)."""
+    v = np.empty((*xy.shape[:2], 3))
+    v[..., :2] = xy
+    v[..., 2] = focal_px[:, None]
+    return v / np.sqrt(np.einsum("kni,kni->kn", v, v))[..., None]
+
+
+def _perimeter(v: np.ndarray) -> np.ndarray:
+    return opposite_sides(v).sum(-1)

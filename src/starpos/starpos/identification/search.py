@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search: priors first, then lost in space, from few bright stars to more, from good centroids to poor ones."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from starpos.camera import Camera
+from starpos.identification import prior
+from starpos.identification.full import Identification, identified
+from starpos.identification.lookup import Candidates, Lookup
+from starpos.identification.pose import Field, Poses
+from starpos.identification.sky import Sky
+from starpos.identification.verify import TEST_STARS, Hypotheses, matches
+
+ACCEPT_LOG_ODDS = np.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
+FEWEST_STARS = 4
+# (brightest stars, their error in px): the second kind is for lenses that distort
+STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0))
+MAX_VERIFIED = 25  # candidates a stage
+
+
+def identify(
+    xy: np.ndarray,
+    sigma_px: np.ndarray,
+    camera: Camera,
+    sky: Sky,
+    priors: Sequence[prior.Pointing | prior.Plumb] = (),
+) -> Identification | None:
+    """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction taken off).
+
+    sigma_px (N,): their errors, one axis.  The focal length may be off by SCALE_TOLERANCE.  Priors only say where to look
+    first.  None: no part of the sky is these stars beyond doubt.
+    """
+    if len(xy) < FEWEST_STARS:
+        return None
+    field = Field.of(xy, sigma_px, camera)
+    tried = 1
+    for hypotheses, error_px, count in _attempts(field, sky, priors):
+        tried += count
+        enough = ACCEPT_LOG_ODDS + np.log(tried)
+        for match in matches(field, sky, hypotheses, error_px, enough):
+            if match.log_odds > enough:
+                return identified(field, sky, match)
+    return None
+
+
+def _attempts(field: Field, sky: Sky, priors) -> Iterator[tuple[Hypotheses, float, int]]:
+    """What to try, in this order: hypotheses, the stars' error in px, and among how many these were chosen."""
+    for given in priors:
+        hypotheses, count = given.hypotheses(field, sky)
+        yield hypotheses, prior.ERROR_PX, count
+    lookup = Lookup(field, sky.triangles)
+    for stars, error_px in STAGES:
+        found, count = lookup.candidates(min(stars, len(field)), error_px)
+        # mostly the first one is right, and the others together cost little more
+        for k in (slice(0, 1), slice(1, MAX_VERIFIED)):
+            if len(some := found[k]):
+                yield _of_triangles(field, sky, some, error_px), error_px, count
+                count = 0
+
+
+def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> Hypotheses:
+    xy = field.xy[c.mirrored.astype(int), : min(len(field), TEST_STARS)]
+    each = np.arange(len(c))[:, None]
+    corners = xy[each, c.star]
+    w = sky.bright(c.corner.ravel()).reshape(-1, 3, 3)
+    poses = Poses.of_triangles(corners, w, field.focal_px, c.mirrored)
+    # a triangle's error grows with the distance from it
+    middle = corners.mean(1, keepdims=True)
+    size2 = np.maximum(np.square(corners - middle).sum((1, 2)) / 3, 1.0)[:, None]
+    away2 = np.square(xy - middle).sum(2)
+    sigma = np.hypot(field.sigma[: xy.shape[1]], error_px) * np.sqrt(1 + away2 / size2)
+    own = np.zeros(xy.shape[:2], bool)
+    own[each, c.star] = True
+    return Hypotheses(poses, own, sigma)

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stars of the catalogue where they are seen at a date."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.catalogue import Catalogue
+from starpos.triangles import TriangleCatalogue
+
+
+@dataclass(frozen=True)
+class Sky:
+    """The catalogue as it looks at a date: proper motion to `year`, aberration by `velocity` (3,) in units of c."""
+
+    catalogue: Catalogue
+    triangles: TriangleCatalogue
+    year: float = 2000.0
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def directions(self, index: np.ndarray) -> np.ndarray:
+        """Unit vectors (n, 3) of the catalogue's stars."""
+        return self._aberrated(self.catalogue.directions(index, self.year))
+
+    def bright(self, row: np.ndarray) -> np.ndarray:
+        """Unit vectors (n, 3) of rows of the triangle catalogue's stars."""
+        return self._aberrated(self.triangles.places(row, self.year))
+
+    def unaberrated(self, v: np.ndarray) -> np.ndarray:
+        """ICRS direction (3,) of one seen at v (3,)."""
+        v = v - np.asarray(self.velocity)
+        return v / np.linalg.norm(v)
+
+    def _aberrated(self, v: np.ndarray) -> np.ndarray:
+        v = v + np.asarray(self.velocity)
+        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]

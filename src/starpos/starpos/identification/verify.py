@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is a pose right?  The log-odds of all bright stars of the frame against chance, for many poses at once."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from starpos.identification.pose import Field, Pose, Poses
+from starpos.identification.sky import Sky
+
+WORTH_A_FIT = 3.0  # log-odds of a raw hypothesis below which it is not looked at again
+FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
+EXPECTED_RANK = (10, 2)  # a + b n: how deep among the catalogue stars the n-th brightest detection may be
+TEST_STARS = 50  # the brightest of a frame, which decide
+MATCH_SIGMA = 3.5
+SMALLER_PX = (0.7, 1.5)
+CHOICE = np.log(1 + len(SMALLER_PX))
+FAR = 1e7  # px, where no star is
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """K poses to be tried: own (K, n) which stars they were made from, sigma_px (K, n) how far off each star may be,
+    for the n = min(N, TEST_STARS) brightest."""
+
+    poses: Poses
+    own: np.ndarray
+    sigma_px: np.ndarray
+
+    def __getitem__(self, k: slice) -> "Hypotheses":
+        p = self.poses
+        return Hypotheses(
+            Poses(p.attitude[k], p.focal_px[k], p.mirrored[k]), self.own[k], self.sigma_px[k]
+        )
+
+    @classmethod
+    def joined(cls, parts: "list[Hypotheses]", tested: int) -> "Hypotheses":
+        """All of them, none included, of one field of which `tested` stars are."""
+        none = cls(
+            Poses(np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, bool)), np.zeros((0, tested), bool), np.zeros((0, tested))
+        )
+        parts = [none, *parts]
+        poses = Poses(*(np.concatenate([getattr(h.poses, f.name) for h in parts]) for f in fields(Poses)))
+        return cls(poses, *(np.concatenate([getattr(h, name) for h in parts]) for name in ("own", "sigma_px")))
+
+
+@dataclass(frozen=True)
+class Match:
+    """A pose, its log-odds, and the stars that agree: rows of the field's (M,) and their directions (M, 3)."""
+
+    pose: Pose
+    log_odds: float
+    star: np.ndarray
+    directions: np.ndarray
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Catalogue stars on K frames, brightest first: pixel (K, S, 2), FAR beyond a frame's count (K,); place (K, S) of
+    each in directions (M, 3)."""
+
+    pixel: np.ndarray
+    count: np.ndarray
+    place: np.ndarray
+    directions: np.ndarray
+
+    @classmethod
+    def on(cls, field: Field, sky: Sky, poses: Poses) -> "Expected":
+        tested = min(len(field), TEST_STARS)
+        axis = np.append(field.middle / field.focal_px, 1.0)
+        centre = np.einsum("i,kij->kj", axis / np.sqrt(axis @ axis), poses.attitude)
+        frame, row = sky.triangles.stars_near(centre, field.radius_rad)
+        w = sky.bright(row)
+        u = np.einsum("mij,mj->mi", poses.attitude[frame], w)
+        pixel = u[:, :2] * (poses.focal_px[frame] / np.maximum(u[:, 2], 1e-6))[:, None]
+        on = np.flatnonzero(field.holds(pixel))
+        on = on[np.lexsort((sky.triangles.rank[row[on]], frame[on]))]
+        frame = frame[on]
+        count = np.bincount(frame, minlength=len(poses))
+        place = np.arange(len(on)) - (np.cumsum(count) - count)[frame]
+        most = 2 * tested + 10
+        keep = place < most
+        on, frame, place, count = on[keep], frame[keep], place[keep], np.minimum(count, most)
+        shape = len(poses), max(1, int(count.max(initial=0)))
+        pixels, places = np.full((*shape, 2), FAR), np.zeros(shape, int)
+        pixels[frame, place], places[frame, place] = pixel[on], on
+        return cls(pixels, count, places, w)
+
+
+def matches(field: Field, sky: Sky, h: Hypotheses, error_px: float, enough: float) -> Iterator[Match]:
+    """The hypotheses that are worth it, best first, fitted to the stars that agree unless their log-odds are `enough`."""
+    if not len(h.poses):
+        return
+    tested = h.own.shape[1]
+    expected = Expected.on(field, sky, h.poses)
+    xy = field.xy[h.poses.mirrored.astype(int), :tested]
+    log_odds, hit, nearest = _log_odds(field, xy, expected.pixel, expected.count, h.sigma_px, h.own)
+    for k in np.argsort(-log_odds, kind="stable").tolist():
+        if log_odds[k] < WORTH_A_FIT:
+            return
+        w = expected.directions[expected.place[k, : expected.count[k]]]
+        match = Match(h.poses[k], float(log_odds[k]), np.flatnonzero(hit[k]), w[nearest[k][hit[k]]])
+        yield match if match.log_odds > enough else _fitted(field, match, w, xy[k], h.own[k], error_px)
+
+
+def _fitted(field: Field, match: Match, w, xy, own, error_px: float) -> Match:
+    pose = match.pose.fitted(xy[match.star], match.directions)
+    pixel, count, sigma = pose.project(w), np.array([len(w)]), field.sigma[: len(xy)]
+
+    def judged(error):
+        each = (part[None] for part in (xy, pixel))
+        log_odds, hit, nearest = _log_odds(field, *each, count, np.hypot(sigma, error)[None], own[None])
+        return float(log_odds[0]), hit[0], nearest[0]
+
+    log_odds, hit, nearest = judged(error_px)
+    # a looser error than the fit needs hides what the match is worth; to choose among errors costs their number
+    for smaller in (e for e in SMALLER_PX if e < error_px):
+        tighter = judged(smaller)
+        if tighter[0] - CHOICE > log_odds:
+            log_odds, hit, nearest = tighter[0] - CHOICE, *tighter[1:]
+    return Match(pose, log_odds, np.flatnonzero(hit), w[nearest[hit]])
+
+
+def _log_odds(field: Field, xy, predicted, count, sigma, own):
+    """Of the stars (K, n) that are not `own`: log-odds (K,); which of all agree, and the catalogue star nearest to each."""
+    apart2 = np.square(xy[:, :, None, 0] - predicted[:, None, :, 0])
+    apart2 += np.square(xy[:, :, None, 1] - predicted[:, None, :, 1])
+    nearest = apart2.argmin(2)
+    distance2 = np.take_along_axis(apart2, nearest[..., None], 2)[..., 0]
+    n = np.arange(xy.shape[1])
+    # one catalogue star answers one detection: the one nearest to it
+    mutual = np.take_along_axis(apart2.argmin(1), nearest, 1) == n
+    variance = sigma * sigma
+    hit = mutual & (distance2 < MATCH_SIGMA**2 * variance)
+    # the n-th brightest detection is expected among the brightest catalogue stars
+    expected = np.minimum(EXPECTED_RANK[0] + EXPECTED_RANK[1] * n, np.maximum(count, 1)[:, None])
+    area = 4 * field.half[0] * field.half[1]
+    chance = area * (1 - FALSE_FRACTION) / (expected * (2 * np.pi * variance))
+    likely = np.where(hit & (nearest < expected), chance * np.exp(-0.5 * distance2 / variance), 0.0)
+    odds = np.where(own, 0.0, np.log(FALSE_FRACTION + likely))
+    # the best from the brightest down to any: under chance a likelihood ratio seldom rises high (Ville's inequality)
+    return np.cumsum(odds, 1).max(1), hit, nearest
