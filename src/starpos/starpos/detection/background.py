@@ -11,9 +11,9 @@ QUANTISATION = 12**-0.5  # DN rms of rounding to whole numbers: no pixel is quie
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """The sky's level and noise, DN, in cells spread evenly over a frame of width x height px.
+    """The sky's level and noise, DN, in cells spread evenly over a frame of width x height px and one beyond each edge.
 
-    level, noise  (P, rows, columns); P is 1, or 4 on a colour mosaic: the phases (0, 0), (0, 1), (1, 0), (1, 1)
+    level, noise  (P, rows + 2, columns + 2); P is 1, or 4 on a colour mosaic: the phases (0, 0), (0, 1), (1, 0), (1, 1)
                   of (row, column) modulo 2, since each colour sees its own sky
     correlation   how many times noisier than independent pixels a smoothed frame is, 1 or more
     streaks       Streaks of satellites that lie on it
@@ -32,13 +32,17 @@ class Background:
 
     def at(self, x, y):
         """level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
-        row = (np.asarray(y) + 0.5) * self.level.shape[1] / self.height - 0.5
-        column = (np.asarray(x) + 0.5) * self.level.shape[2] / self.width - 0.5
-        place = np.stack([row, column])
+        place = self.cell(x, y)
         return tuple(
             np.stack([ndimage.map_coordinates(m, place, order=1, mode="nearest") for m in mesh], -1)
             for mesh in (self.level, self.noise)
         )
+
+    def cell(self, x, y):
+        """(row, column), fractions allowed, of pixels in the meshes."""
+        row = (np.asarray(y) + 0.5) * (self.level.shape[1] - 2) / self.height + 0.5
+        column = (np.asarray(x) + 0.5) * (self.level.shape[2] - 2) / self.width + 0.5
+        return row, column
 
     def of_pixels(self, x, y, rows, columns):
         """level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
@@ -53,7 +57,9 @@ class Background:
             phase = phase_of(rows, columns)
             level, noise = level[each, phase], noise[each, phase]
         else:
-            level, noise = (np.broadcast_to(v.reshape(-1, *[1] * (len(shape) - 1)), shape) for v in (level, noise))
+            level, noise = (
+                np.broadcast_to(v.reshape(-1, *[1] * (len(shape) - 1)), shape) for v in (level, noise)
+            )
         for streak in self.streaks:
             more, least = streak.at(rows, columns)
             level, noise = level + more, np.maximum(noise, least)
@@ -78,7 +84,9 @@ def measure_background(plane, cell_px=64, mosaic=None) -> Background:
     if not mosaic:
         level, noise = level.mean(0, keepdims=True), np.sqrt((noise**2).mean(0, keepdims=True))
     level, noise = (np.stack([_smooth(m) for m in mesh]) for mesh in (level, noise))
-    return Background(level, np.maximum(noise, QUANTISATION), plane.shape[1], plane.shape[0])
+    noise = np.maximum(noise, QUANTISATION)
+    level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
+    return Background(level, noise, plane.shape[1], plane.shape[0])
 
 
 def _sample(length, cell_px):
@@ -94,14 +102,15 @@ def _sample(length, cell_px):
 def _clipped(sample):
     """Mean and rms over the last axis of what lies within 3.5 sigma of the median; stars and defects do not.
 
-    Where more than half the pixels are equal, as of a sky cut off at 0, the tenth brightest tells sigma.
+    Where more than half the pixels are equal, as of a sky cut off at 0, the slope of the brighter ones tells sigma.
     """
-    middle, high = sample.shape[-1] // 2, sample.shape[-1] * 9 // 10
-    ordered = np.partition(sample, (middle, high), axis=-1)
+    count = sample.shape[-1]
+    middle, upper, high = count // 2, count * 3 // 4, count * 9 // 10
+    ordered = np.partition(sample, (middle, upper, high), axis=-1)
     median = ordered[..., middle, None]
     deviation = sample - median
     spread = 1.4826 * np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
-    spread = np.where(spread > 0, spread, (ordered[..., high, None] - median) / 1.2816)
+    spread = np.where(spread > 0, spread, (ordered[..., high, None] - ordered[..., upper, None]) / 0.607)
     limit = np.maximum(3.5 * spread, 1.0)
     inside = np.abs(deviation) <= limit
     count = inside.sum(-1, keepdims=True)
@@ -114,11 +123,22 @@ def _clipped(sample):
 
 
 def _phases_differ(level, noise, samples):
-    """Whether the 2 x 2 phases see different skies, as behind a colour mosaic that nobody declared."""
-    means, error = np.median(level, axis=(1, 2)), np.median(noise) / np.sqrt(samples * level[0].size)
-    return bool(np.ptp(means) > max(0.03 * np.median(noise), 6 * error, 0.1))
+    """Whether the 2 x 2 phases see different skies, as behind a colour mosaic that nobody declared.
+
+    One diagonal against the other, which a gradient of the sky leaves equal.
+    """
+    contrast = np.median(level[0] + level[3] - level[1] - level[2]) / 2
+    error = np.median(noise) / np.sqrt(samples * level[0].size)
+    return bool(abs(contrast) > max(0.03 * np.median(noise), 6 * error, 0.1))
 
 
 def _smooth(mesh):
     """A cell mostly covered by something bright takes its neighbours' value; then the cells' noise evens out."""
-    return ndimage.uniform_filter(ndimage.median_filter(mesh, 3, mode="nearest"), 3, mode="nearest")
+    wide = _beyond(mesh, 2, "reflect")
+    return ndimage.uniform_filter(ndimage.median_filter(wide, 3), 3)[2:-2, 2:-2]
+
+
+def _beyond(mesh, cells, mode):
+    """A mesh (..., rows, columns) continued beyond its edges: a gradient goes on ("reflect") or ends ("edge")."""
+    around = [(0, 0)] * (mesh.ndim - 2) + [(cells, cells)] * 2
+    return np.pad(mesh, around, mode, **({"reflect_type": "odd"} if mode == "reflect" else {}))

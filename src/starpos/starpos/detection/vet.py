@@ -65,7 +65,7 @@ def _spikes(stamps, lesson):
     sharpest = star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1])
     grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
     around = ndimage.convolve(grey, four[None], mode="nearest")
-    spike = (grey > SPIKE * sharpest * around) & (stamps.signal > OUTLIER * stamps.noise)
+    spike = (grey > SPIKE * sharpest * (around + stamps.noise)) & (stamps.signal > OUTLIER * stamps.noise)
     return spike, around * lesson.response.gain.astype(np.float32)[stamps.phase]
 
 

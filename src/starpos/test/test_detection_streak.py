@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from rendered import bound, field, grid, match, noisy
+
+from starpos.detection import detect
+from starpos.frame import Frame
+from starpos.stars import ELONGATED
+
+SIZE = (700, 900)
+
+
+def trail(start, end, electrons_per_px, width=1.3):
+    """Electrons of a satellite's trail on SIZE: a Gaussian across, sharp at its ends."""
+    y, x = np.indices(SIZE)
+    way = np.subtract(end, start)
+    length = np.hypot(*way)
+    along = ((x - start[0]) * way[0] + (y - start[1]) * way[1]) / length
+    across = ((y - start[1]) * way[0] - (x - start[0]) * way[1]) / length
+    profile = np.exp(-0.5 * (across / width) ** 2) / (width * np.sqrt(2 * np.pi))
+    return electrons_per_px * profile * ((along > 0) & (along < length))
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ((-50, 40), (950, 780)),
+        ((400.3, -20), (431.0, 720)),
+        ((-9, 333.4), (909, 333.4)),
+        ((210, 120), (640, 560)),
+    ],
+)
+@pytest.mark.parametrize("electrons", [150, 2000])
+def test_a_trail_makes_no_star_and_costs_none_beside_it(start, end, electrons, rng):
+    stars = grid(SIZE, 50, 9000, rng)
+    light = field(SIZE, stars)
+    found = detect(Frame(noisy(light + trail(start, end, electrons), rng))).stars
+    plain = trail(start, end, 1.0, width=1.0)
+    far = plain[np.rint(stars[:, 1]).astype(int), np.rint(stars[:, 0]).astype(int)] < 1e-6
+    index = match(found, stars)
+    assert np.all(index[far] >= 0)
+    assert len(found) == np.sum(index >= 0)
+    error = np.stack([found.x[index], found.y[index]], 1)[far] - stars[far, :2]
+    assert np.sqrt(np.mean(error**2)) < 1.15 * np.sqrt(np.mean(bound(9000) ** 2))
+    assert np.all((found.flags[index[far]] & ELONGATED) == 0)
+
+
+def test_stars_under_a_trail_are_measured_as_well_as_they_say(rng):
+    start, end = (-50, 40), (950, 780)
+    slope = (end[1] - start[1]) / (end[0] - start[0])
+    x = np.arange(40, 800, 30) + rng.uniform(-1, 1, 26)
+    under = np.stack([x, start[1] + slope * (x - start[0]) + rng.uniform(-4, 4, 26), np.full(26, 12000.0)], 1)
+    stars = np.concatenate(
+        [
+            under,
+            [s for s in grid(SIZE, 60, 12000, rng) if trail(start, end, 1, 9)[int(s[1]), int(s[0])] < 1e-3],
+        ]
+    )
+    found = detect(Frame(noisy(field(SIZE, stars) + trail(start, end, 1500), rng))).stars
+    index = match(found, under)
+    assert np.mean(index >= 0) > 0.9
+    index, under = index[index >= 0], under[index >= 0]
+    error = np.stack([found.x[index], found.y[index]], 1) - under[:, :2]
+    pull = error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))
+    assert np.sqrt(np.mean(pull**2)) < 1.4
+    assert np.sqrt(np.mean(error**2)) < 0.1
+
+
+def test_a_row_of_stars_is_no_trail(rng):
+    x = np.arange(20, 880, 12) + rng.uniform(-1, 1, 72)
+    row = np.stack([x, 50 + 0.6 * x, np.full(72, 12000.0)], 1)
+    found = detect(Frame(noisy(field(SIZE, row), rng))).stars
+    index = match(found, row)
+    assert np.all(index >= 0) and len(found) == len(row)
+    assert not np.any(found.flags[index] & ELONGATED)
