@@ -105,11 +105,13 @@ def _measured(plane, background, point, direction):
     level, noise = background.of_pixels(*centre, row, column)
     signal, sigma = plane[row, column] - level, np.median(noise, axis=-1)
     middle = np.median(signal, axis=-1)
-    scatter = np.quantile(np.abs(signal - middle[..., None]), 0.9, axis=-1) / 1.645
+    scatter, most = np.quantile(np.abs(signal - middle[..., None]), (0.9, 0.97), axis=-1)
     lit = middle > SIGNIFICANT * sigma
     on = lit[:, HALF_WIDTH - 2 : HALF_WIDTH + 3].any(1) & ~lit[:, 0] & ~lit[:, -1]
     if on.sum() * BLOCK < SHORTEST:
         return None
-    # its edges lie between the offsets, and its ends somewhere in the next blocks
-    lit = ndimage.binary_dilation(on[:, None] & lit, np.ones((3, 3)))
-    return Streak(start, direction, last - first, middle * lit, scatter * lit)
+    # its edges lie between the offsets; at its ends it may fill a part of a block
+    lit, whole = on[:, None] & lit, ndimage.binary_erosion(on)[:, None]
+    level = middle * ndimage.binary_dilation(lit, np.ones((1, 3)))
+    noise = np.where(whole, scatter / 1.645, most) * ndimage.binary_dilation(lit, np.ones((3, 3)))
+    return Streak(start, direction, last - first, level, noise)
