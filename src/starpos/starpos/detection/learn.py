@@ -37,9 +37,10 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
     bright = np.flatnonzero(height > BRIGHT)
     if len(bright) == 0:
         bright = np.arange(min(len(x), TEACHERS))
-    bright = bright[_isolated(x, y, height, bright)][:TEACHERS]
+    bright = bright[_isolated(x, y, height, bright)]
+    bright = bright[~_is_dot(cut(plane, background, x[bright], y[bright], 1, saturation))][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(~_is_dot(stamps) & ~stamps.full.any((1, 2)))
+    stamps = stamps.take(~stamps.full.any((1, 2)))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     if shape is None:
         return Lesson(psf, response, reach_of(psf))
@@ -109,9 +110,8 @@ def _isolated(x, y, height, index):
 
 
 def _is_dot(stamps):
-    """Hot pixels: less light in the eight neighbours together than in half the brightest pixel."""
-    c = stamps.reach
-    core = stamps.signal[:, c - 1 : c + 2, c - 1 : c + 2].reshape(-1, 9)
+    """Hot pixels in stamps of 3 x 3: less light in the neighbours together than in half the brightest pixel."""
+    core = stamps.signal.reshape(-1, 9)
     peak = core.max(1)
     return core.sum(1) - peak < 0.5 * peak
 
