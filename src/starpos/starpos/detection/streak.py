@@ -89,8 +89,8 @@ def _through(points, ends):
 def _measured(plane, background, point, direction):
     """The Streak along a line from edge to edge of the frame, None where there is none."""
     size = np.array([background.width, background.height])
-    with np.errstate(divide="ignore"):
-        walls = np.stack([-point / direction, (size - 1 - point) / direction])
+    slope = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
+    walls = np.stack([-point / slope, (size - 1 - point) / slope])
     first, last = walls.min(0).max(), walls.max(0).min()
     if last - first < SHORTEST:
         return None

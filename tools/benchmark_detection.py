@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CPU time and memory of detection against the frame's size and against the number of stars: two tables.
+
+`benchmark_detection.py [--repeat N]`.  sep with windowed positions answers the same frames where it can be imported
+(`pip install sep`).  Memory is what the process grows by at its peak, over the frame's own bytes (Linux only).
+"""
+
+import argparse
+import importlib.util
+import multiprocessing
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # CPU time is compared, not cleverness at sharing
+
+import numpy as np
+
+from starpos.detection import detect
+from starpos.frame import Frame
+
+SIZES = {
+    0.5: (866, 577),
+    2: (1732, 1155),
+    8: (3464, 2309),
+    21: (5616, 3744),
+    60: (9488, 6324),
+}  # Mpx: columns, rows
+STARS_PER_MPX, STAR_COUNTS = 15, (10, 100, 1000, 5000)
+SKY, SIGMA, TRAIL = 600, 1.02, np.array([2.6, -2.2])  # DN; px; px: half a second of the sky
+
+
+def exposure(size, count, rng):
+    """A 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, faint ones commonest."""
+    columns, rows = size
+    pixels = rng.normal(SKY, 7.0, (rows, columns)).astype(np.float32)
+    grid, steps = np.arange(-14, 15), (np.arange(12) + 0.5) / 12 - 0.5
+    place = rng.uniform(20, np.array(size) - 20, (count, 2))
+    for (x, y), flux in zip(place, np.minimum(500 * (1 + rng.pareto(1, count)), 1e5), strict=True):
+        u, v = (grid - (p % 1) - steps[:, None] * t for p, t in zip((x, y), TRAIL, strict=True))
+        star = np.exp(-0.5 * (v / SIGMA) ** 2).T @ np.exp(-0.5 * (u / SIGMA) ** 2)
+        stamp = np.s_[int(y) - 14 : int(y) + 15, int(x) - 14 : int(x) + 15]
+        pixels[stamp] += rng.poisson(star * (flux / star.sum()))
+    return np.clip(np.rint(pixels), 0, 65535).astype(np.uint16)
+
+
+def with_starpos(pixels):
+    return len(detect(Frame(pixels)).stars)
+
+
+def with_sep(pixels):
+    import sep
+
+    plane = pixels.astype(np.float32)
+    background = sep.Background(plane)
+    plane -= background
+    found = sep.extract(plane, 5, err=background.globalrms)
+    sep.winpos(plane, found["x"], found["y"], np.full(len(found), 2.0))
+    return len(found)
+
+
+def memory_kb(name):
+    return int(Path("/proc/self/status").read_text().split(name + ":")[1].split()[0])
+
+
+def measured(work, path, repeat):
+    """Stars found, CPU ms (the quickest of `repeat`), and the peak of memory over the frame's bytes."""
+    work(exposure(SIZES[0.5], 100, np.random.default_rng(1)))  # what the first call loads is no frame's work
+    pixels = np.load(path)
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    before, times = memory_kb("VmRSS"), []
+    for _ in range(repeat):
+        begin = time.process_time()
+        count = work(pixels)
+        times.append(time.process_time() - begin)
+    return count, 1e3 * min(times), 1024 * (memory_kb("VmHWM") - before) / pixels.nbytes
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeat", type=int, default=3)
+    repeat = parser.parse_args().repeat
+    programs = {"starpos": with_starpos}
+    if importlib.util.find_spec("sep"):
+        programs["sep"] = with_sep
+    print(
+        f"{'Mpx':>6} {'stars':>6}"
+        + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs)
+    )
+    rng = np.random.default_rng(1)
+    cases = [(mpx, round(STARS_PER_MPX * mpx)) for mpx in SIZES] + [(21, count) for count in STAR_COUNTS]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool,
+    ):
+        path = Path(folder) / "frame.npy"
+        for mpx, count in cases:
+            np.save(path, exposure(SIZES[mpx], count, rng))
+            line = f"{mpx:6g} {count:6d}"
+            for work in programs.values():
+                found, ms, memory = pool.apply(measured, (work, path, repeat))
+                line += f" | {found:14d} {ms:7.1f} {ms / mpx:6.1f} {memory:6.2f}"
+            print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
