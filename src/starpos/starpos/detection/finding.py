@@ -56,25 +56,31 @@ def _smooth(plane, top, bottom):
     return smooth[start - first : min(last, bottom + FLAT) - first], top - start
 
 
-def noise_correlation(plane, background):
-    """How many times more noise a smoothed frame has than if its pixels' noise were independent, 1 or more.
+def noise_of_smooth(plane, background):
+    """How many times more noise a smoothed frame has than if its pixels' noise were independent: two factors >= 1.
 
-    Demosaicing, resampling and lossy compression tie neighbours together; a star then has less SNR than its pixels
-    claim.
+    The first is of pixels tied to their neighbours, by demosaicing, resampling or lossy compression: a star then has
+    less SNR than its pixels claim. The second is of a sky less even than its cells, as with clouds: a peak then means
+    less.
     """
     height = plane.shape[0]
-    scores = []
+    scores, steps = [], []
     for top in np.linspace(0, max(0, height - 16), 8).astype(int):
         smooth, offset = _smooth(plane, top, min(top + 16, height))
         y, x = np.mgrid[offset : len(smooth) : 4, 0 : smooth.shape[1] : 4]
         level, noise = background.at(x.ravel(), y.ravel() - offset + top)
-        score = (smooth[y, x].ravel() - level.mean(1)) / np.sqrt((noise**2).mean(1))
-        scores.append(score)
-    score = np.concatenate(scores)
-    low, sigma_below, median = np.quantile(score, (0.0228, 0.1587, 0.5))
+        score = (smooth[y, x] - level.mean(1).reshape(y.shape)) / np.sqrt((noise**2).mean(1)).reshape(y.shape)
+        scores.append(score.ravel())
+        steps.append((score[:, 2:-2] - 0.5 * (score[:, :-4] + score[:, 4:])).ravel() / 1.5**0.5)
     # stars widen the scatter upwards; where they are many, only the far side is free of them
-    ratio = float(min(median - sigma_below, sigma_below - low)) / KERNEL_NORM
-    return ratio if ratio > 1.1 else 1.0
+    low, sigma_below, median = np.quantile(np.concatenate(scores), (0.0228, 0.1587, 0.5))
+    whole = tied = min(median - sigma_below, sigma_below - low) / KERNEL_NORM
+    # clouds hardly change from a pixel to those 8 px to its left and right
+    steps = np.concatenate(steps)
+    if len(steps):
+        tied = min(whole, 1.4826 * np.median(np.abs(steps)) / KERNEL_NORM)
+    tied = float(tied) if tied > 1.1 else 1.0
+    return tied, max(1.0, float(whole) / tied)
 
 
 def _above_tail(height, threshold):
