@@ -93,7 +93,8 @@ def _is_dot(stamps, fit, response):
     score = good * (signal / noise) ** 2
     one_pixel = score.sum((1, 2)) - (score * (signal > 0)).max((1, 2))
     variance = response.variance(noise, model)
-    return one_pixel < (good * (residual**2 / variance + np.log(variance / noise**2))).sum((1, 2))
+    star = (good * (residual**2 / variance + np.log(variance / noise**2))).sum((1, 2))
+    return (one_pixel < star) & (stamps.full[:, c, c].sum((1, 2)) < SPECK)
 
 
 def resolve(columns, psf):
