@@ -95,7 +95,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         for p in range(extra):
             normal[:, 3 + p, 3 + p] += response.colour_spread**-2
             right[:, 3 + p] -= colour[:, p] * response.colour_spread**-2
-        covariance = _inverse(normal)
+        covariance = inverse(normal)
         if last:
             break
         if round_ >= 1:
@@ -131,7 +131,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     )
 
 
-def _inverse(normal):
+def inverse(normal):
     """Inverses of (N, K, K), NaN where singular; scaled first, since fluxes and pixels differ by a millionfold."""
     scale = np.sqrt(np.einsum("nii->ni", normal))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage, spatial
 
+from starpos.detection.blend import with_companions
 from starpos.detection.fit import OUTLIER, fit_stars
 from starpos.detection.learn import centroid, grey
 from starpos.detection.shape import moments, relative_widths, window_for
@@ -14,18 +15,25 @@ from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
 SPECK = 3  # pixels
 SPIKE = 3  # times sharper than a star
+RESOLVED = 3.0  # widths, 1.3 FWHM: nearer ones are measured, but each leans on the other
 LOUD = 3  # times the quietest pixel's noise
 
 
 def measure(plane, background, x, y, lesson, saturation, min_snr):
     """Columns x, y, flux, snr, covariance, flags of the stars among the peaks x, y (N,) int, in no order."""
     psf = lesson.psf
-    stamps = cut(plane, background, x, y, lesson.reach, saturation)
-    spike, around = _spikes(stamps, lesson)
-    stamps = replace(stamps, signal=np.where(spike, around, stamps.signal), good=stamps.good & ~spike)
+
+    def cut_at(x, y):
+        stamps = cut(plane, background, x, y, lesson.reach, saturation)
+        spike, around = _spikes(stamps, lesson)
+        signal = np.where(spike, around, stamps.signal)
+        return replace(stamps, signal=signal, good=stamps.good & ~spike), spike
+
+    stamps, spike = cut_at(x, y)
     shape = psf.shape
     x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
+    stamps, spike, fit = with_companions(stamps, spike, fit, psf, lesson.response, cut_at)
     smooth, blur = grey(_own_light(stamps, fit, spike), background)
     window = window_for(shape)
     _, _, seen = moments(smooth, fit.x, fit.y, window)
@@ -111,9 +119,9 @@ def resolve(columns, psf):
     ratio = columns["flux"][pairs[:, 1]] / columns["flux"][pairs[:, 0]]
     keep = np.ones(n, bool)
     keep[pairs[(apart < 1.5) | (ratio < 0.01), 1]] = False
-    real = keep[pairs].all(1)
+    near = keep[pairs].all(1) & (apart < RESOLVED)
     flags = columns["flags"].copy()
-    flags[pairs[real, 1]] |= BLENDED
-    flags[pairs[real & (ratio > 0.03), 0]] |= BLENDED
+    flags[pairs[near, 1]] |= BLENDED
+    flags[pairs[near & (ratio > 0.03), 0]] |= BLENDED
     columns["flags"] = flags.astype(np.uint8)
     return {name: column[keep] for name, column in columns.items()}
