@@ -23,6 +23,9 @@ EXCEPTIONS = Path(__file__).with_name("data") / "paper_stars.csv"
 # and the pair's motion
 _A_RA_DEG, _A_DEC_DEG, _A_EPOCH = 300.87250833, 36.02515667, 1991.6
 _A_PM_RA, _A_PM_DEC = -10.7, -4.3  # mas/yr, the first times cos(dec)
+_A_SIGMA_MAS = np.hypot(
+    4.0, 2.6 * (EPOCH - _A_EPOCH)
+)  # its place's and the motion's, which is the pair's, not A's own
 
 
 def plain_cut(catalogue: Catalogue) -> np.ndarray:
@@ -61,14 +64,22 @@ def count_triangles(v: np.ndarray, longest_side_rad: float) -> int:
     return int(((near @ near) * near).sum())
 
 
-def angles_of_printed(catalogue: Catalogue) -> np.ndarray:
-    """The angles (3,) in rad of the triangle whose angles the paper prints, at CORNERS."""
+def angles_of_printed(catalogue: Catalogue) -> tuple[np.ndarray, np.ndarray]:
+    """The angles (3,) in rad of the triangle whose angles the paper prints, at CORNERS, and their sigma (3,).
+
+    The sigma is that of component A's place at J2000, 22 mas.
+    """
     first, last = (_named(catalogue, int(CORNERS[k].split()[1])) for k in (0, 2))
     ra, dec = np.radians([_A_RA_DEG, _A_DEC_DEG])
     years = EPOCH - _A_EPOCH
     ra, dec = ra + _A_PM_RA * MAS * years / np.cos(dec), dec + _A_PM_DEC * MAS * years
-    a = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    return angles(opposite_sides(np.stack([first, a, last])))
+
+    def at(ra, dec):
+        a = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+        return angles(opposite_sides(np.stack([first, a, last])))
+
+    here, step = at(ra, dec), _A_SIGMA_MAS * MAS
+    return here, np.hypot(at(ra + step / np.cos(dec), dec) - here, at(ra, dec + step) - here)
 
 
 def _named(catalogue: Catalogue, hip: int) -> np.ndarray:

@@ -18,18 +18,22 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos.catalogue import EPOCH, Catalogue
+from starpos.catalogue import Catalogue
 from starpos.progress import Progress, quiet
-from starpos.zones import CELLS, ZONES, cell_starts, ranges, rows_near
+from starpos.zones import CELLS, ZONES, cell_starts, ranges
 
-FORMAT = 6
+FORMAT = 8
 SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
-# of the largest angle, 60..180 deg; of the smallest, 0..60 deg; of the longest side, 0..the longest allowed
-BINS = LARGEST_BINS, SMALLEST_BINS, LONGEST_BINS = 256, 128, 64
-POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smaller kind
+# Shapes (largest angle 60..180 deg, smallest 0..60 deg, longest side 0..the longest allowed) are kept to 1/65536 of
+# these ranges; the highest bits of the three are a triangle's bin.
+CODES = 1 << 16
+BIN_BITS = (8, 7, 6)
+BINS = tuple(1 << bits for bits in BIN_BITS)
+POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smallest kind
+BEACONS = 0.25  # of them, the brightest over the whole sky
 # Circles laid over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken).
-# The first fits into a field of 3:2 or 4:3, the second is the whole field's own.
-CIRCLES = ((0.6, 0.7, 7), (1.0, 0.7, 9))
+# The first fits into a field of 3:2 or 4:3, the last is the whole field's own.
+CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
 MOST_IN_USE = 4
 BLOCK = 100_000
 MAX_TRIANGLES = 6_000_000  # before those that several circles share are counted once
@@ -58,63 +62,66 @@ def angles(side: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TriangleCatalogue:
-    """Triangles of the sky's brightest stars in bins of (largest angle, smallest angle, longest side).
+    """Triangles of the sky's brightest stars in bins of their shape.
 
     The stars, in zones as the catalogue's: star (S,) index into the star catalogue; cell_start as `zones` has it;
-    rank (S,) in brightness over the sky; directions (S, 3) ICRS at J2000; motion (S, 3) rad a year.
-    The triangles: corners (T, 3) rows of `star`, the corner of the largest angle first, of the smallest last; largest,
-    smallest angle and longest side (T,) rad; longest_allowed (1,) rad; bin_start (bins + 1,).
+    rank (S,) in brightness over the sky; beacon (B,) rows of the brightest, beacons (B, 3) their directions at J2000.
+    The triangles: corners (T, 3) rows of `star`, the corner of the largest angle first, of the smallest last; whether
+    they turn counter-clockwise seen from within (T,); shape (T, 3) in CODES; longest_allowed (1,) rad; bin_start
+    (bins + 1,).
     """
 
     star: np.ndarray
     cell_start: np.ndarray
     rank: np.ndarray
-    directions: np.ndarray
-    motion: np.ndarray
+    beacon: np.ndarray
+    beacons: np.ndarray
     corners: np.ndarray
-    largest: np.ndarray
-    smallest: np.ndarray
-    longest: np.ndarray
+    counter_clockwise: np.ndarray
+    shape: np.ndarray
     longest_allowed: np.ndarray
     bin_start: np.ndarray
 
-    def places(self, row: np.ndarray, year: float) -> np.ndarray:
-        """ICRS directions (n, 3) of rows of `star` at a Julian year."""
-        v = self.directions[row] + self.motion[row] * (year - EPOCH)
-        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
-
-    def stars_near(self, centre: np.ndarray, radius_rad: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of `star` in and about the cones around centre (Q, 3): (cone (M,), row (M,))."""
-        return rows_near(self.cell_start, centre, radius_rad)
-
     def near(self, shape: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Triangles within tolerance (Q, 3) of shape (Q, 3), the largest angle, the smallest, the longest side.
+        """Triangles within tolerance (Q, 3) of shape (Q, 3), the largest angle, the smallest, the longest side, rad.
 
         Returns (query (M,), triangle (M,)) in any order.  The work goes with the answers, not with the catalogue: each
         query reads the bins that its box touches.
         """
-        low, high = self._bins(np.concatenate([shape - tolerance, shape + tolerance])).reshape(2, -1, 3)
-        query, first = ranges(low[:, 0], high[:, 0] - low[:, 0] + 1)
-        row, second = ranges(low[query, 1], (high - low)[query, 1] + 1)
-        query, run = query[row], (first[row] * SMALLEST_BINS + second) * LONGEST_BINS
-        begin, end = self.bin_start[run + low[query, 2]], self.bin_start[run + high[query, 2] + 1]
-        row, triangle = ranges(begin, end - begin)
-        query = query[row]
-        close = np.abs(self.largest[triangle] - shape[query, 0]) <= tolerance[query, 0]
-        close &= np.abs(self.smallest[triangle] - shape[query, 1]) <= tolerance[query, 1]
-        close &= np.abs(self.longest[triangle] - shape[query, 2]) <= tolerance[query, 2]
+        box = np.concatenate([shape - tolerance, shape + tolerance])
+        low, high = _coded(box, self.longest_allowed[0]).reshape(2, -1, 3)
+        first, last = _bins(low), _bins(high)
+        query, row = ranges(first[:, 0], last[:, 0] - first[:, 0] + 1)
+        of, column = ranges(first[query, 1], (last - first)[query, 1] + 1)
+        query, run = query[of], (row[of] * BINS[1] + column) * BINS[2]
+        begin, end = self.bin_start[run + first[query, 2]], self.bin_start[run + last[query, 2] + 1]
+        of, triangle = ranges(begin, end - begin)
+        query = query[of]
+        code = self.shape[triangle]
+        close = ((code >= low[query]) & (code <= high[query])).all(1)
         return query[close], triangle[close]
 
-    def _bins(self, shape: np.ndarray) -> np.ndarray:
-        return _bins(*shape.T, self.longest_allowed[0])
+    def longest(self, triangle: np.ndarray) -> np.ndarray:
+        """Longest sides (M,) of triangles, rad."""
+        return (self.shape[triangle, 2] + 0.5) * (self.longest_allowed[0] / CODES)
 
 
-def _bins(largest, smallest, longest, longest_allowed) -> np.ndarray:
-    """The bin (n, 3) of triangles; what is outside belongs to the bin at the edge."""
-    part = np.stack([largest, smallest, longest], -1).astype(float)
-    part -= [np.pi / 3, 0, 0]
-    part /= [2 * np.pi / 3, np.pi / 3, longest_allowed]
-    return np.minimum(np.maximum(part * BINS, 0).astype(np.int64), np.array(BINS) - 1)
+def _coded(shape: np.ndarray, longest_allowed: float) -> np.ndarray:
+    """Shapes (n, 3) in CODES; what is outside the ranges belongs to their edge."""
+    part = shape - [np.pi / 3, 0.0, 0.0]
+    part *= CODES / np.array([2 * np.pi / 3, np.pi / 3, longest_allowed])
+    return np.minimum(np.maximum(part, 0).astype(np.int32), CODES - 1)
+
+
+def _bins(code: np.ndarray) -> np.ndarray:
+    """The bin (n, 3) of shapes (n, 3) in CODES."""
+    return code >> (16 - np.array(BIN_BITS))
+
+
+def counter_clockwise(v: np.ndarray) -> np.ndarray:
+    """Whether triangles (M, 3, 3) turn counter-clockwise seen from within the sphere."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.moveaxis(v, 0, -1)
+    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) < 0
 
 
 def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet) -> TriangleCatalogue:
@@ -128,36 +135,46 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     pool = np.sort(by_light[: int(POOL_PER_CIRCLE * circles) + 1000])
     rank = np.argsort(np.argsort(catalogue.vmag_centi[pool], kind="stable"))
     v = catalogue.directions(pool)
-    motion = catalogue.directions(pool, EPOCH + 1) - v
     brightest_first = np.argsort(rank)
-    tree = cKDTree(v[brightest_first])
-    fewer = 0  # stars taken from each circle, so that a small field does not make too many triangles
-    while (
-        sum(_circles(r * half_diagonal, s) * comb(n - fewer, 3) for r, s, n in CIRCLES) > MAX_TRIANGLES
-        and fewer < 3
-    ):
-        fewer += 1
+    beacon = np.sort(brightest_first[: int(BEACONS * len(pool))])
+    apart = brightest_first[_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
+    tree = cKDTree(v[apart])
     keys = []
-    for k, (radius, spacing, most) in enumerate(CIRCLES):
-        keys.append(_triples_of_circles(tree, radius * half_diagonal, spacing, most - fewer))
+    for k, (radius, spacing, most) in enumerate(_affordable(half_diagonal)):
+        keys.append(_triples_of_circles(tree, radius * half_diagonal, spacing, most))
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
     key = np.unique(np.concatenate(keys))
     del keys
-    corner, largest, smallest, longest, bin_start = _in_bins(v, brightest_first, key, 2 * half_diagonal)
+    triangles = _in_bins(v, apart, key, 2 * half_diagonal)
     progress("star triangles", 1.0)
     return TriangleCatalogue(
         pool.astype(np.int32),
         cell_starts(np.searchsorted(pool, catalogue.zone_start), catalogue.ra_mas[pool] / 3.6e6),
         rank.astype(np.int32),
-        v,
-        motion.astype(np.float32),
-        corner,
-        largest,
-        smallest,
-        longest,
-        np.array([2 * half_diagonal]),
-        bin_start.astype(np.int32),
+        beacon.astype(np.int32),
+        v[beacon],
+        *triangles,
     )
+
+
+def _apart(v: np.ndarray, nearest: float) -> np.ndarray:
+    """Which of the stars v (N, 3), brightest first, have no brighter one within `nearest` rad.
+
+    Close groups, which make no triangles among themselves, would take the places of a circle.
+    """
+    pair = cKDTree(v).query_pairs(2 * np.sin(nearest / 2), output_type="ndarray")
+    alone = np.ones(len(v), bool)
+    alone[pair.max(1, initial=0)] = False
+    return np.flatnonzero(alone)
+
+
+def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
+    """CIRCLES with as many stars less as a small field needs to keep MAX_TRIANGLES."""
+    taken = [most for _, _, most in CIRCLES]
+    circles = np.array([_circles(radius * half_diagonal, spacing) for radius, spacing, _ in CIRCLES])
+    while (made := circles * [comb(n, 3) for n in taken]).sum() > MAX_TRIANGLES:
+        taken[int(made.argmax())] -= 1
+    return [(radius, spacing, n) for (radius, spacing, _), n in zip(CIRCLES, taken, strict=True)]
 
 
 def _triples_of_circles(tree: cKDTree, radius: float, spacing: float, most: int) -> np.ndarray:
@@ -191,30 +208,35 @@ def _spread(n: int) -> np.ndarray:
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], -1)
 
 
-def _in_bins(v: np.ndarray, brightest_first: np.ndarray, triples: np.ndarray, longest_side: float):
-    """Usable triangles in order of their bins: corners (largest angle first), angles, longest side, bin starts."""
-    n, parts = len(brightest_first), []
+def _in_bins(v: np.ndarray, rows: np.ndarray, triples: np.ndarray, longest_side: float):
+    """Usable triangles in order of their bins: the columns of `TriangleCatalogue` from `corners` on."""
+    n, parts = len(rows), []
     # a whole sky of triangles at once is 500 MB
     for key in np.array_split(triples, len(triples) // BLOCK + 1):
-        corner = brightest_first[np.stack([key // (n * n), key // n % n, key % n], -1)]
+        corner = rows[np.stack([key // (n * n), key // n % n, key % n], -1)]
         parts.append(_measured(v, corner, longest_side))
-    corner, largest, smallest, longest, bins = (np.concatenate(c) for c in zip(*parts, strict=True))
+    corner, turn, code, bins = (np.concatenate(column) for column in zip(*parts, strict=True))
     del parts
     order = np.argsort(bins, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(bins, minlength=np.prod(BINS)))])
-    return corner[order], largest[order], smallest[order], longest[order], starts
+    return corner[order], turn[order], code[order], np.array([longest_side]), starts.astype(np.int32)
 
 
 def _measured(v: np.ndarray, corner: np.ndarray, longest_side: float):
-    """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; angles, longest side and bin."""
+    """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; their turn, shape and bin."""
     length = opposite_sides(v[corner])
     good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)
     corner, length = corner[good], length[good]
     angle = angles(length)
     corner = np.take_along_axis(corner, np.argsort(-angle, axis=1, kind="stable"), 1)
-    shape = [x.astype(np.float32) for x in (angle.max(1), angle.min(1), length.max(1))]
-    bins = np.ravel_multi_index(_bins(*shape, longest_side).T, BINS)
-    return corner.astype(np.int32), *shape, bins.astype(np.int32)
+    code = _coded(np.stack([angle.max(1), angle.min(1), length.max(1)], -1), longest_side)
+    bins = np.ravel_multi_index(_bins(code).T, BINS)
+    return (
+        corner.astype(np.int32),
+        counter_clockwise(v[corner]),
+        code.astype(np.uint16),
+        bins.astype(np.int32),
+    )
 
 
 def cache_folder() -> Path:
@@ -247,9 +269,15 @@ _in_use: dict[tuple, TriangleCatalogue] = {}
 
 def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
     settings = (
-        f"{FORMAT} {catalogue.fingerprint} {half_diagonal:.6f} {CIRCLES} {POOL_PER_CIRCLE} {SHORTEST_SIDE}"
+        FORMAT,
+        catalogue.fingerprint,
+        f"{half_diagonal:.6f}",
+        CIRCLES,
+        POOL_PER_CIRCLE,
+        BEACONS,
+        SHORTEST_SIDE,
     )
-    digest = hashlib.sha256(settings.encode()).hexdigest()[:16]
+    digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
     folder = cache_folder() / f"triangles-{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
     if (stored := _map(folder)) is not None:
         return stored
@@ -297,11 +325,11 @@ def _map(folder: Path) -> TriangleCatalogue | None:
     fit = (
         t.bin_start.shape == (np.prod(BINS) + 1,)
         and t.bin_start[-1] == count
-        and t.corners.shape == (count, 3)
-        and len(t.largest) == len(t.smallest) == len(t.longest) == count
-        and t.directions.shape == t.motion.shape == (stars, 3)
+        and t.corners.shape == t.shape.shape == (count, 3)
+        and t.counter_clockwise.shape == (count,)
         and t.cell_start.shape == (ZONES * CELLS + 1,)
         and len(t.rank) == t.cell_start[-1] == stars
+        and t.beacons.shape == (len(t.beacon), 3)
         and t.longest_allowed.shape == (1,)
         and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
     )

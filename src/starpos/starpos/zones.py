@@ -4,6 +4,8 @@
 A table in declination zones, each sorted by right ascension, has every cell in one run of rows.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 ZONES = 180  # of declination
@@ -13,10 +15,7 @@ CELLS = 360  # of right ascension in each
 def cell_starts(zone_start: np.ndarray, ra_deg: np.ndarray) -> np.ndarray:
     """First row of every cell and the end (ZONES * CELLS + 1,) of a table whose zones start at zone_start (181,)."""
     edges = np.arange(CELLS)
-    starts = [
-        first + np.searchsorted(ra_deg[first:last], edges)
-        for first, last in zip(zone_start[:-1], zone_start[1:], strict=True)
-    ]
+    starts = [first + np.searchsorted(ra_deg[first:last], edges) for first, last in pairwise(zone_start)]
     return np.append(np.concatenate(starts), zone_start[-1]).astype(np.int32)
 
 

@@ -90,10 +90,14 @@ def show_paper() -> int:
         ("by its errata", paper.TRIANGLES),
     ):
         print(f"    {number} {whose}: {100 * (count / number - 1):+.2f} %")
-    print("angles of its triangle, rad:  here       paper     difference")
-    for name, here, printed in zip(paper.CORNERS, paper.angles_of_printed(c), paper.ANGLES, strict=True):
-        print(f"    at {name:12s}       {here:9.6f}  {printed:9.6f}  {here - printed:+.1e}")
-    print("    (Tycho-2 knows no motion of component A but the pair's: 27 mas in its place are 1.4e-05 rad)")
+    print("angles of its triangle, rad:  here      +-        paper     difference")
+    for name, here, sigma, printed in zip(
+        paper.CORNERS, *paper.angles_of_printed(c), paper.ANGLES, strict=True
+    ):
+        print(f"    at {name:12s}       {here:9.6f}  {sigma:.6f}  {printed:9.6f}  {here - printed:+.1e}")
+    print(
+        "    (+- is Tycho-2's: of component A's motion it knows only that of the pair; the paper rounds to 0.000005)"
+    )
     return 0
 
 
@@ -114,7 +118,7 @@ def show_field(camera) -> int:
     print(
         f"{len(table.corners)} triangles of {len(used)} stars, V to {c.vmag(table.star[used]).max():.2f}; {size:.0f} MB"
     )
-    on_frame = _stars_on_frames(camera, table.directions[used])
+    on_frame = _stars_on_frames(camera, c.directions(table.star[used]))
     shares = np.percentile(on_frame, (0, 1, 10, 50, 90, 99, 100)).astype(int)
     print("of these a frame holds at least, in 1 %, 10 %, the median, 90 %, 99 %, at most:", *shares)
     return 0

@@ -6,9 +6,9 @@ paper's search); each is then held against the whole field by log-odds, so that 
 and never by a count, and fitted by least squares to the faintest stars seen.
 """
 
+from starpos.identification.full import Identification
 from starpos.identification.prior import Plumb, Pointing
 from starpos.identification.search import FEWEST_STARS, identify
 from starpos.identification.sky import Sky
-from starpos.identification.full import Identification
 
 __all__ = ["FEWEST_STARS", "Identification", "Plumb", "Pointing", "Sky", "identify"]

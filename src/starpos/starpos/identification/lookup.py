@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from starpos.identification.pose import Field, directions
-from starpos.triangles import TriangleCatalogue, angles, opposite_sides
+from starpos.triangles import TriangleCatalogue, angles, counter_clockwise, opposite_sides
 
 SCALE_TOLERANCE = 0.03  # of the focal length
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
@@ -48,11 +48,11 @@ class Lookup:
         star, shape, tolerance = _shapes(self.v, triples, error)
         query, found = self.table.near(shape, tolerance)
         star, corner = star[query], self.table.corners[found]
-        mirrored = _handedness(self.table.directions[corner]) != _handedness(self.v[star])
+        mirrored = self.table.counter_clockwise[found] != counter_clockwise(self.v[star])
         if not len(star):
             return Candidates(star, corner, mirrored), 0
         support = _shared_sides(star, corner, mirrored)
-        size = np.abs(np.log(self.table.longest[found] / shape[query, 2]))
+        size = np.abs(np.log(self.table.longest(found) / shape[query, 2]))
         order = np.lexsort((size, -support))
         if error_px > LOOSE_PX:
             order = order[support[order] > 0]
@@ -88,12 +88,6 @@ def _shapes(v: np.ndarray, triples: np.ndarray, error: np.ndarray):
     shape = np.stack([angle[:, 0], angle[:, 2], a], -1)[row]
     tolerance = np.stack([largest, smallest, SCALE_TOLERANCE * a + error], -1)[row]
     return star, shape, tolerance
-
-
-def _handedness(v: np.ndarray) -> np.ndarray:
-    """Whether triples of directions (M, 3, 3) turn one way or the other."""
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.moveaxis(v, 0, -1)
-    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) > 0
 
 
 def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) -> np.ndarray:

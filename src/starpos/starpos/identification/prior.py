@@ -8,7 +8,7 @@ import numpy as np
 from starpos import rotation
 from starpos.identification.pose import Field, Poses, directions
 from starpos.identification.sky import Sky
-from starpos.identification.verify import TEST_STARS, Expected, Hypotheses
+from starpos.identification.verify import TEST_STARS, Expected, Hypotheses, own_stars
 
 ERROR_PX = 0.3
 BRIGHTEST = 15  # stars of the frame that vote for a shift
@@ -40,11 +40,10 @@ class Pointing:
         poses = Poses(
             np.array(turned).reshape(-1, 3, 3), np.full(len(pick), self.focal_px), np.zeros(len(pick), bool)
         )
-        own = np.zeros((len(pick), len(xy)), bool)
-        own[np.arange(len(pick)), star[pick]] = True
         away = np.sqrt(np.square(xy - xy[star[pick], None]).sum(-1))
-        sigma = np.sqrt(field.sigma[: len(xy)] ** 2 + ERROR_PX**2 + (ROLL_RAD * away) ** 2)
-        return Hypotheses(poses, own, sigma), len(shift)
+        sigma = np.hypot(field.sigma[: len(xy)], ERROR_PX)
+        own = own_stars(np.broadcast_to(xy, (len(pick), *xy.shape)), star[pick][:, None], sigma)
+        return Hypotheses(poses, own, np.hypot(sigma, ROLL_RAD * away)), len(shift)
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,10 @@ class Plumb:
         seen, to_camera = _about(
             directions(field.xy[:1, :RING_STARS], np.array([field.focal_px]))[0], self.zenith_camera
         )
-        ring = sky.triangles.directions @ self.zenith_sky
+        ring = sky.triangles.beacons @ self.zenith_sky
         margin = self.tolerance_rad + 2e-4  # aberration and proper motion are not in it
         low, high = np.cos(seen[:, 0].max() + margin), np.cos(max(seen[:, 0].min() - margin, 0.0))
-        w = sky.bright(np.flatnonzero((ring > low) & (ring < high)))
+        w = sky.bright(sky.triangles.beacon[(ring > low) & (ring < high)])
         known, to_sky = _about(w, self.zenith_sky)
         star, near = np.nonzero(np.abs(seen[:, None, 0] - known[:, 0]) < self.tolerance_rad)
         turn = np.sort((seen[star, 1] - known[near, 1]) % (2 * np.pi))

@@ -11,7 +11,7 @@ from starpos.identification.full import Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
 from starpos.identification.pose import Field, Poses
 from starpos.identification.sky import Sky
-from starpos.identification.verify import TEST_STARS, Hypotheses, matches
+from starpos.identification.verify import TEST_STARS, Hypotheses, matches, own_stars
 
 ACCEPT_LOG_ODDS = np.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
 FEWEST_STARS = 4
@@ -40,7 +40,7 @@ def identify(
         tried += count
         enough = ACCEPT_LOG_ODDS + np.log(tried)
         for match in matches(field, sky, hypotheses, error_px, enough):
-            if match.log_odds > enough:
+            if match.log_odds > enough and len(match.star) >= FEWEST_STARS:
                 return identified(field, sky, match)
     return None
 
@@ -70,7 +70,5 @@ def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> Hyp
     middle = corners.mean(1, keepdims=True)
     size2 = np.maximum(np.square(corners - middle).sum((1, 2)) / 3, 1.0)[:, None]
     away2 = np.square(xy - middle).sum(2)
-    sigma = np.hypot(field.sigma[: xy.shape[1]], error_px) * np.sqrt(1 + away2 / size2)
-    own = np.zeros(xy.shape[:2], bool)
-    own[each, c.star] = True
-    return Hypotheses(poses, own, sigma)
+    sigma = np.hypot(field.sigma[: xy.shape[1]], error_px)
+    return Hypotheses(poses, own_stars(xy, c.star, sigma), sigma * np.sqrt(1 + away2 / size2))

@@ -20,17 +20,14 @@ class Sky:
 
     def directions(self, index: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of the catalogue's stars."""
-        return self._aberrated(self.catalogue.directions(index, self.year))
+        v = self.catalogue.directions(index, self.year) + np.asarray(self.velocity)
+        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
 
     def bright(self, row: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of rows of the triangle catalogue's stars."""
-        return self._aberrated(self.triangles.places(row, self.year))
+        return self.directions(self.triangles.star[row])
 
     def unaberrated(self, v: np.ndarray) -> np.ndarray:
         """ICRS direction (3,) of one seen at v (3,)."""
         v = v - np.asarray(self.velocity)
         return v / np.linalg.norm(v)
-
-    def _aberrated(self, v: np.ndarray) -> np.ndarray:
-        v = v + np.asarray(self.velocity)
-        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]

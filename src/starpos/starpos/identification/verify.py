@@ -8,21 +8,23 @@ import numpy as np
 
 from starpos.identification.pose import Field, Pose, Poses
 from starpos.identification.sky import Sky
+from starpos.zones import rows_near
 
 WORTH_A_FIT = 3.0  # log-odds of a raw hypothesis below which it is not looked at again
 FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
 EXPECTED_RANK = (10, 2)  # a + b n: how deep among the catalogue stars the n-th brightest detection may be
 TEST_STARS = 50  # the brightest of a frame, which decide
 MATCH_SIGMA = 3.5
-SMALLER_PX = (0.7, 1.5)
+SMALLER_PX = (0.0, 0.7, 1.5)  # errors besides the centroids' own at which a fitted match is judged as well
 CHOICE = np.log(1 + len(SMALLER_PX))
+DOUBLE_PX = 3.0  # detections this close may be one star
 FAR = 1e7  # px, where no star is
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """K poses to be tried: own (K, n) which stars they were made from, sigma_px (K, n) how far off each star may be,
-    for the n = min(N, TEST_STARS) brightest."""
+    """K poses to be tried, for the n = min(N, TEST_STARS) brightest stars: own (K, n) which of them they were made from
+    (`own_stars`), sigma_px (K, n) how far off each may be."""
 
     poses: Poses
     own: np.ndarray
@@ -30,19 +32,28 @@ class Hypotheses:
 
     def __getitem__(self, k: slice) -> "Hypotheses":
         p = self.poses
-        return Hypotheses(
-            Poses(p.attitude[k], p.focal_px[k], p.mirrored[k]), self.own[k], self.sigma_px[k]
-        )
+        return Hypotheses(Poses(p.attitude[k], p.focal_px[k], p.mirrored[k]), self.own[k], self.sigma_px[k])
 
     @classmethod
     def joined(cls, parts: "list[Hypotheses]", tested: int) -> "Hypotheses":
         """All of them, none included, of one field of which `tested` stars are."""
         none = cls(
-            Poses(np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, bool)), np.zeros((0, tested), bool), np.zeros((0, tested))
+            Poses(np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, bool)),
+            np.zeros((0, tested), bool),
+            np.zeros((0, tested)),
         )
         parts = [none, *parts]
         poses = Poses(*(np.concatenate([getattr(h.poses, f.name) for h in parts]) for f in fields(Poses)))
-        return cls(poses, *(np.concatenate([getattr(h, name) for h in parts]) for name in ("own", "sigma_px")))
+        return cls(
+            poses, *(np.concatenate([getattr(h, name) for h in parts]) for name in ("own", "sigma_px"))
+        )
+
+
+def own_stars(xy: np.ndarray, star: np.ndarray, sigma_px: np.ndarray) -> np.ndarray:
+    """Which of xy (K, n, 2) say nothing new of poses made from star (K, m): these, and their doubles (K, n)."""
+    made = np.take_along_axis(xy, star[..., None], 1)
+    apart2 = np.square(xy[:, :, None] - made[:, None]).sum(-1).min(2)
+    return apart2 < np.square(MATCH_SIGMA * sigma_px + DOUBLE_PX)
 
 
 @dataclass(frozen=True)
@@ -70,7 +81,7 @@ class Expected:
         tested = min(len(field), TEST_STARS)
         axis = np.append(field.middle / field.focal_px, 1.0)
         centre = np.einsum("i,kij->kj", axis / np.sqrt(axis @ axis), poses.attitude)
-        frame, row = sky.triangles.stars_near(centre, field.radius_rad)
+        frame, row = rows_near(sky.triangles.cell_start, centre, field.radius_rad)
         w = sky.bright(row)
         u = np.einsum("mij,mj->mi", poses.attitude[frame], w)
         pixel = u[:, :2] * (poses.focal_px[frame] / np.maximum(u[:, 2], 1e-6))[:, None]
@@ -123,7 +134,7 @@ def _fitted(field: Field, match: Match, w, xy, own, error_px: float) -> Match:
 
 
 def _log_odds(field: Field, xy, predicted, count, sigma, own):
-    """Of the stars (K, n) that are not `own`: log-odds (K,); which of all agree, and the catalogue star nearest to each."""
+    """Log-odds (K,) of all the stars; which agree and the catalogue star nearest to each (K, n)."""
     apart2 = np.square(xy[:, :, None, 0] - predicted[:, None, :, 0])
     apart2 += np.square(xy[:, :, None, 1] - predicted[:, None, :, 1])
     nearest = apart2.argmin(2)
@@ -138,6 +149,8 @@ def _log_odds(field: Field, xy, predicted, count, sigma, own):
     area = 4 * field.half[0] * field.half[1]
     chance = area * (1 - FALSE_FRACTION) / (expected * (2 * np.pi * variance))
     likely = np.where(hit & (nearest < expected), chance * np.exp(-0.5 * distance2 / variance), 0.0)
-    odds = np.where(own, 0.0, np.log(FALSE_FRACTION + likely))
+    # what a pose was made from cannot speak for it, only against
+    against = -0.5 * np.minimum(distance2 / variance, MATCH_SIGMA**2)
+    odds = np.where(own, against, np.log(FALSE_FRACTION + likely))
     # the best from the brightest down to any: under chance a likelihood ratio seldom rises high (Ville's inequality)
     return np.cumsum(odds, 1).max(1), hit, nearest
