@@ -50,16 +50,17 @@ def test_undersampled_and_defocused_stars_keep_near_the_bound(fwhm, electrons):
     assert 0.9 < rms(pull.ravel()) < 1.1
 
 
-def test_error_does_not_depend_on_where_in_a_pixel_a_star_falls():
+@pytest.mark.parametrize("fwhm", [1.2, 1.3])
+def test_error_does_not_depend_on_where_in_a_pixel_a_star_falls(fwhm):
     rng = np.random.default_rng(3)
     stars = grid((700, 700), 28, 60000, rng)
-    found = detect(Frame(noisy(field((700, 700), stars, fwhm=1.3), rng))).stars
+    found = detect(Frame(noisy(field((700, 700), stars, fwhm=fwhm), rng))).stars
     index = match(found, stars)
     error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
     phase = 2 * np.pi * stars[:, :2]
     for wave in (np.sin(phase), np.cos(phase), np.sin(2 * phase)):
         amplitude = 2 * np.mean(error * wave, axis=0)
-        assert np.all(np.abs(amplitude) < 0.002)
+        assert np.all(np.abs(amplitude) < (0.004 if fwhm < 1.3 else 0.002))
 
 
 @pytest.mark.parametrize("pattern", ["rggb", ""])

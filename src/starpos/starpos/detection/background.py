@@ -105,12 +105,12 @@ def _clipped(sample):
     Where more than half the pixels are equal, as of a sky cut off at 0, the slope of the brighter ones tells sigma.
     """
     count = sample.shape[-1]
-    middle, upper, high = count // 2, count * 3 // 4, count * 9 // 10
-    ordered = np.partition(sample, (middle, upper, high), axis=-1)
-    median = ordered[..., middle, None]
+    median = np.partition(sample, count // 2, axis=-1)[..., count // 2, None]
     deviation = sample - median
-    spread = 1.4826 * np.partition(np.abs(deviation), middle, axis=-1)[..., middle, None]
-    spread = np.where(spread > 0, spread, (ordered[..., high, None] - ordered[..., upper, None]) / 0.607)
+    spread = 1.4826 * np.partition(np.abs(deviation), count // 2, axis=-1)[..., count // 2, None]
+    if np.any(spread == 0):
+        upper, high = np.quantile(sample, (0.75, 0.9), axis=-1)[..., None]
+        spread = np.where(spread > 0, spread, (high - upper) / 0.607)
     limit = np.maximum(3.5 * spread, 1.0)
     inside = np.abs(deviation) <= limit
     count = inside.sum(-1, keepdims=True)

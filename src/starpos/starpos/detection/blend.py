@@ -12,7 +12,8 @@ from starpos.detection.stamps import Stamps
 SURPRISING = 4.0  # sigma of chi-square: from here on one star is not enough
 CLOSEST = 1.5  # widths: nearer ones are not told apart
 FAINTEST = 5.0  # sigma of a companion's flux
-GAIN = 30.0  # a companion's three numbers must take so much off the sum of squares
+GAIN = 30.0  # a companion's three numbers must take so much off the sum of squares, of chi-square per pixel
+DIMMEST = 0.03  # of the other's flux: below it the PSF's own faults look like companions
 ROUNDS = 10
 
 
@@ -34,7 +35,8 @@ def with_companions(stamps, spike, fit, psf, response, cut_at):
     with np.errstate(invalid="ignore"):
         real = (flux > FAINTEST * sigma).all(0) & np.isfinite(chi2) & (apart > CLOSEST)
         real &= (away[0] < stamps.reach - 1) & (away[1] < stamps.reach + 2)
-        real &= (before * used).sum((1, 2)) - chi2 > GAIN
+        real &= (before * used).sum((1, 2)) - chi2 > GAIN * np.maximum(chi2 / freedom, 1)
+        real &= flux[1] > DIMMEST * flux[0]
     if not real.any():
         return stamps, spike, fit
     odd, used, whole = odd[real], used[real], away[1, real] < stamps.reach - 1

@@ -24,7 +24,7 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
     psf = lesson.psf
 
     def cut_at(x, y):
-        stamps = cut(plane, background, x, y, lesson.reach, saturation)
+        stamps = _levelled(cut(plane, background, x, y, lesson.reach, saturation))
         spike, around = _spikes(stamps, lesson)
         signal = np.where(spike, around, stamps.signal)
         return replace(stamps, signal=signal, good=stamps.good & ~spike), spike
@@ -63,6 +63,16 @@ def _misfit(fit):
     """(N,) factors on the covariance: chi2 where it is above what chance allows, else 1."""
     freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
     return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
+
+
+def _levelled(stamps):
+    """Stamps whose rims are not above 0: beside a roof or under a cloud the sky is brighter than the mesh says."""
+    rim = np.ones(stamps.signal.shape[1:], bool)
+    rim[1:-1, 1:-1] = False
+    level = np.median(stamps.signal[:, rim], axis=1)
+    # the rim of a very bright star is its own light
+    above = level > np.maximum(np.median(stamps.noise[:, rim], axis=1), 0.01 * stamps.signal.max((1, 2)))
+    return replace(stamps, signal=stamps.signal - np.where(above, level, 0).astype(np.float32)[:, None, None])
 
 
 def _spikes(stamps, lesson):

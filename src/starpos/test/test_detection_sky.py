@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Skies and sensors that are not clean: what is in the way costs only what it covers."""
+
+import numpy as np
+import pytest
+from rendered import bound, field, grid, match, noisy
+from scipy import ndimage
+
+from starpos.detection import detect
+from starpos.frame import Frame
+from starpos.stars import SATURATED
+
+SIZE = (600, 900)
+ELECTRONS = 12000
+
+
+@pytest.fixture
+def stars(rng):
+    return grid(SIZE, 50, ELECTRONS, rng)
+
+
+def found_in(light, rng, **more):
+    return detect(Frame(noisy(light, rng, **more))).stars
+
+
+def errors(found, stars):
+    """Errors (N, 2) px of stars that must all be found, and these over their sigmas."""
+    index = match(found, stars)
+    assert np.all(index >= 0)
+    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
+    return error, error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+def test_vignetting_shifts_no_star(stars, rng):
+    y, x = np.indices(SIZE)
+    light = field(SIZE, stars, sky=600) * (1 - 0.7 * np.hypot((x - 450) / 450, (y - 300) / 300) ** 2 / 2)
+    found = found_in(light, rng)
+    error, pull = errors(found, stars)
+    assert len(found) == len(stars)
+    assert 0.9 < rms(pull) < 1.1
+    assert np.all(np.abs(error.mean(0)) < 0.006)
+
+
+@pytest.mark.parametrize("size_px", [12, 40])
+def test_clouds_make_no_star_and_their_stars_keep_their_errors(size_px, stars, rng):
+    cloud = ndimage.gaussian_filter(rng.normal(0, 1, SIZE), size_px)
+    cloud = (cloud - cloud.min()) / np.ptp(cloud)
+    light = field(SIZE, stars, sky=0) * (1 - 0.7 * cloud) + 60 + 300 * cloud
+    found = found_in(light, rng)
+    _, pull = errors(found, stars)
+    assert len(found) == len(stars)
+    assert 0.5 < rms(pull) < 1.1
+
+
+@pytest.mark.parametrize("brightness", [0, 1500])
+def test_a_roof_hides_what_it_covers_and_adds_little(brightness, stars, rng):
+    y, x = np.indices(SIZE)
+    roof = y > 420 + 0.1 * x
+    tiles = brightness * (1 + 0.2 * rng.random((60, 90))).repeat(10, 0).repeat(10, 1)
+    found = found_in(np.where(roof, tiles, field(SIZE, stars, sky=60)), rng)
+    clear = stars[stars[:, 1] < 420 + 0.1 * stars[:, 0] - 128]  # two cells of the background's mesh
+    index = match(found, stars)
+    errors(found, clear)
+    extra = len(found) - len(set(index[index >= 0]))
+    assert extra <= 10  # along its edge, fainter than the stars
+    assert set(range(len(clear))) <= set(index)
+
+
+def test_dead_rows_and_columns_cost_only_the_stars_on_them(stars, rng):
+    pixels = noisy(field(SIZE, stars), rng)
+    rows, columns = np.arange(30, SIZE[0], 97), np.array([130, 131, 333])
+    pixels[rows], pixels[:, columns[:2]], pixels[:, columns[2]] = 0, 0, 65535
+    near = np.abs(stars[:, 1, None] - rows).min(1) < 6
+    near |= np.abs(stars[:, 0, None] - columns).min(1) < 6
+    found = detect(Frame(pixels)).stars
+    error, _ = errors(found, stars[~near])
+    assert rms(error) < 1.1 * rms(bound(ELECTRONS))
+    assert len(found) <= len(stars)
+
+
+def test_stars_far_over_the_full_well_are_found_where_they_are(rng):
+    stars = grid(SIZE, 60, lambda n: np.geomspace(3000, 3e6, n), rng)
+    found = found_in(field(SIZE, stars), rng, top=4095)
+    error, _ = errors(found, stars)
+    full = stars[:, 2] > 6e4
+    assert len(found) == len(stars)
+    assert np.all(found.flags[match(found, stars[full])] & SATURATED)
+    assert np.all(np.abs(error[full]) < 0.1)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.3])
+@pytest.mark.parametrize("fwhms", [1.6, 2.0, 2.7])
+def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, rng):
+    stars = grid(SIZE, 50, 20000, rng)
+    first = stars[::6]
+    angle = rng.uniform(0, 2 * np.pi, len(first))
+    second = first + fwhms * 2.4 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    second[:, 2] = 20000 * ratio
+    found = found_in(field(SIZE, np.concatenate([stars, second])), rng)
+    assert len(found) == len(stars) + len(second)
+    for some in (first, second):
+        error, pull = errors(found, some)
+        assert rms(error) < 1.4 * rms(bound(some[0, 2]))
+        assert 0.7 < rms(pull) < 1.3
