@@ -24,6 +24,7 @@ from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
 from starpos.solve import Solution as Answer
 from starpos.solve import Solver, Status
+from starpos.standing import Standing
 from starpos.stars import Stars
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
@@ -77,6 +78,7 @@ class SolverNode(Node):
         self._trouble = ""  # why there is no solver
         self._latest: Waiting | None = None
         self._answer: Answer | None = None
+        self._standing: Standing | None = None  # of the last fix
         self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0, "broken messages": 0}
         self._last_seen_ns: dict[str, int] = {}
         self._logged: object = None
@@ -152,7 +154,7 @@ class SolverNode(Node):
             return
         if camera == self._camera:
             return
-        self._camera, self._solver, self._trouble = camera, None, ""
+        self._camera, self._solver, self._trouble, self._standing = camera, None, "", None
         if self._preparing is None:
             self._prepare(camera)
 
@@ -268,7 +270,9 @@ class SolverNode(Node):
             clock = math.hypot(solver.instrument.clock_stddev_s, stamp_stddev)
             solver = replace(solver, instrument=replace(solver.instrument, clock_stddev_s=clock))
         try:
-            return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)))
+            return solver.solve(
+                stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), self._standing
+            )
         except Exception as e:  # a defect costs this frame, not the night
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
             return Answer.failed(
@@ -281,6 +285,7 @@ class SolverNode(Node):
         self._answer = answer
         self._counts["frames"] += 1
         self._counts["fixes"] += answer.ok
+        self._standing = answer.standing or self._standing
         header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
         message, fix, imu = self._messages(header, answer)
         self._fix.publish(fix)
@@ -323,8 +328,8 @@ class SolverNode(Node):
     def _on_reset(self, request, response):
         self._tilts.clear()
         self._waiting.clear()
-        self._latest = self._answer = None
-        response.success, response.message = True, "tilts and frames that wait are forgotten"
+        self._latest = self._answer = self._standing = None
+        response.success, response.message = True, "tilts, frames that wait and the last fix are forgotten"
         return response
 
     # diagnostics -----------------------------------------------------------------------------------------------------

@@ -59,6 +59,11 @@ class EarthState:
         """The Earth's barycentric velocity in units of c (3,), ICRS axes."""
         return np.array(self.astrom["v"], float)
 
+    @property
+    def gcrs_to_itrs(self) -> np.ndarray:
+        """(3, 3): apparent directions, with aberration in them, from the axes of ICRS into ITRS."""
+        return self.cirs_to_itrs @ np.asarray(self.astrom["bpn"]).reshape(3, 3)
+
     def to_itrs(self, v: np.ndarray) -> np.ndarray:
         """Geocentric apparent directions (N, 3) in ITRS of ICRS directions (N, 3) at this date (ERFA eraAtciqz)."""
         ra, dec = erfa.c2s(v)

@@ -43,10 +43,9 @@ class Site:
         itrs = self.atmosphere.refraction().unbend(toward) @ self.enu
         # aberration and precession of the direction itself are far below the margin
         ra, dec = np.arctan2(itrs[1], itrs[0]), np.arcsin(np.clip(itrs[2], -1, 1))
-        cirs = (
-            np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]) @ state.cirs_to_itrs
+        icrs = (
+            np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]) @ state.gcrs_to_itrs
         )
-        icrs = cirs @ np.asarray(state.astrom["bpn"]).reshape(3, 3)
         return catalogue.cone(icrs, radius + np.radians(0.05), limit_mag)
 
 

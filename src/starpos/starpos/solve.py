@@ -21,6 +21,7 @@ from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.reading import why_no_time
+from starpos.standing import Standing
 from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 
 J2000 = 2000.0
@@ -60,6 +61,7 @@ class Solution:
     """What became of one frame: status and a sentence, and as much of the answer as there is.
 
     extrapolated_days: how far beyond the end of the IERS table the fix carried the Earth's rotation on; 0 within it.
+    standing: what helps to identify the next frame.
     """
 
     status: Status
@@ -75,6 +77,7 @@ class Solution:
     identify_s: float = 0.0
     fix_s: float = 0.0
     extrapolated_days: float = 0.0
+    standing: Standing | None = None
 
     @classmethod
     def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
@@ -124,10 +127,13 @@ class Solver:
             identify_s=spent,
         )
 
-    def solve(self, stars: Stars, tilt: Tilt | Callable[[float, float], Tilt]) -> Solution:
+    def solve(
+        self, stars: Stars, tilt: Tilt | Callable[[float, float], Tilt], standing: Standing | None = None
+    ) -> Solution:
         """The fix of one frame; never raises for what the frame, the tilt or the time does wrong.
 
-        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.
+        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.  standing: of an
+        earlier solution; where it no longer holds nothing is lost but its half millisecond.
         """
         try:
             if stars.mid_unix_s is None:
@@ -140,7 +146,8 @@ class Solver:
             g = a2_matrix(tilt.theta_x, tilt.theta_y) @ self.instrument.mounting.a3
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(camera.directions(stars.x, stars.y) @ g.T) @ g
-            found, sky = self._identify(stars, camera, directions, state.year, tuple(state.velocity))
+            priors = standing.priors(state, g[2]) if standing else ()
+            found, sky = self._identify(stars, camera, directions, state.year, tuple(state.velocity), priors)
         except StarposError as e:
             return _failure(stars, e)
         identified = time.perf_counter()
@@ -158,6 +165,7 @@ class Solver:
             fix=fix,
             fix_s=time.perf_counter() - identified,
             extrapolated_days=state.orientation.extrapolated_days,
+            standing=Standing.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
             **known,
         )
 
@@ -201,13 +209,13 @@ class Solver:
             )
         return camera
 
-    def _identify(self, stars: Stars, camera: Camera, directions, year, velocity):
+    def _identify(self, stars: Stars, camera: Camera, directions, year, velocity, priors=()):
         # of square pixels, which is what identify fits
         ideal = Camera(camera.width, camera.height, camera.fx, camera.fx, camera.cx, camera.cy)
         table = triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
         sky = ident.Sky(self.catalogue, table, year, velocity)
         sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
-        return ident.identify(ideal.project(directions), sigma, ideal, sky), sky
+        return ident.identify(ideal.project(directions), sigma, ideal, sky, priors), sky
 
     def _unidentified(self, stars: Stars) -> Solution:
         place, n = stars.source or "the frame", len(stars)

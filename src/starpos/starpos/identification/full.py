@@ -37,49 +37,56 @@ class Identification:
     mirrored: bool
 
 
-def identified(field: Field, sky: Sky, match: Match) -> Identification:
+@dataclass(frozen=True)
+class OnFrame:
+    """The catalogue's stars on a frame, brightest first: index (S,), directions (S, 3), and how far fainter ones that melt
+    into them may draw them, blend_px (S,)."""
+
+    index: np.ndarray
+    directions: np.ndarray
+    blend_px: np.ndarray
+
+    @classmethod
+    def of(cls, field: Field, sky: Sky, pose: Pose) -> "OnFrame":
+        """As many as the field's stars may be."""
+        catalogue, stars = sky.catalogue, min(len(field), FAINTEST_FIT)
+        axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
+        _, index = rows_near(catalogue.cell_start, (axis / np.sqrt(axis @ axis))[None], field.radius_rad)
+        light = catalogue.vmag_centi[index]
+        most = 12 * stars + 300  # three times too many, as the cells reach beyond the frame
+        if len(index) > most:
+            brightest = np.argpartition(light, most)[:most]
+            index, light = index[brightest], light[brightest]
+        index = index[np.argsort(light, kind="stable")]
+        w = sky.directions(index)
+        pixel = pose.project(w)
+        on = np.flatnonzero(field.holds(pixel))[: 3 * stars + 50]
+        single, drawn = _resolved(catalogue, index[on], pixel[on])
+        on = on[single]
+        return cls(index[on], w[on], drawn[single])
+
+
+def identified(field: Field, match: Match, stars: OnFrame) -> Identification:
     """All stars of the field matched, one to one, and the pose fitted to them."""
     pose = match.pose
     xy, sigma = field.xy[int(pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
-    index, w, blend = _on_frame(field, sky, pose, len(xy))
     residual = xy[match.star] - pose.project(match.directions)
     for _ in range(2):
         middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
         spread = max(1.4826 * float(middling), 0.02)
-        star, near = _mutual_nearest(xy, pose.project(w), 4 * np.hypot(spread, sigma) + 0.2)
-        pose = pose.fitted(xy[star], w[near])
-        residual = xy[star] - pose.project(w[near])
+        star, near = _mutual_nearest(xy, pose.project(stars.directions), 4 * np.hypot(spread, sigma) + 0.2)
+        pose = pose.fitted(xy[star], stars.directions[near])
+        residual = xy[star] - pose.project(stars.directions[near])
     return Identification(
         star,
-        index[near],
-        blend[near],
+        stars.index[near],
+        stars.blend_px[near],
         pose.attitude,
         pose.focal_px / field.focal_px,
         float(np.sqrt(np.mean(residual * residual))),
         match.log_odds,
         pose.mirrored,
     )
-
-
-def _on_frame(field: Field, sky: Sky, pose: Pose, stars: int):
-    """The catalogue's stars on the frame, brightest first and as many as `stars` detections may be: indices, directions,
-    and how far fainter ones that melt into them may draw them (px)."""
-    catalogue = sky.catalogue
-    axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
-    _, index = rows_near(catalogue.cell_start, (axis / np.sqrt(axis @ axis))[None], field.radius_rad)
-    light = catalogue.vmag_centi[index]
-    most = 12 * stars + 300  # three times too many, as the cells reach beyond the frame
-    if len(index) > most:
-        brightest = np.argpartition(light, most)[:most]
-        index, light = index[brightest], light[brightest]
-    order = np.argsort(light, kind="stable")
-    index = index[order]
-    w = sky.directions(index)
-    pixel = pose.project(w)
-    on = np.flatnonzero(field.holds(pixel))[: 3 * stars + 50]
-    single, drawn = _resolved(catalogue, index[on], pixel[on])
-    on = on[single]
-    return index[on], w[on], drawn[single]
 
 
 def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray):

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search: priors first, then lost in space, from few bright stars to more, from good centroids to poor ones."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from starpos.camera import Camera
-from starpos.identification import prior
-from starpos.identification.full import Identification, identified
+from starpos.identification.full import Identification, OnFrame, identified
 from starpos.identification.lookup import Candidates, Lookup
 from starpos.identification.pose import Field, Poses
+from starpos.identification.prior import Plumb, Pointing
 from starpos.identification.sky import Sky
-from starpos.identification.verify import TEST_STARS, Hypotheses, matches, own_stars
+from starpos.identification.verify import TEST_STARS, Hypotheses, Match, matches, own_stars
 
-ACCEPT_LOG_ODDS = np.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
+ACCEPT_LOG_ODDS = math.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
 FEWEST_STARS = 4
 # (brightest stars, their error in px): the second kind is for lenses that distort
 STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0))
@@ -25,7 +26,7 @@ def identify(
     sigma_px: np.ndarray,
     camera: Camera,
     sky: Sky,
-    priors: Sequence[prior.Pointing | prior.Plumb] = (),
+    priors: Sequence[Pointing | Plumb] = (),
 ) -> Identification | None:
     """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction taken off).
 
@@ -36,20 +37,30 @@ def identify(
         return None
     field = Field.of(xy, sigma_px, camera)
     tried = 1
-    for hypotheses, error_px, count in _attempts(field, sky, priors):
+    for proposal in (p for given in priors for p in given.proposals(field, sky)):
+        tried += proposal.chosen_from
+        match = proposal.match(field, _enough(tried))
+        if _sound(match, tried):
+            stands = match.pose is proposal.pose
+            return identified(field, match, proposal.stars if stands else OnFrame.of(field, sky, match.pose))
+    for hypotheses, error_px, count in _attempts(field, sky):
         tried += count
-        enough = ACCEPT_LOG_ODDS + np.log(tried)
-        for match in matches(field, sky, hypotheses, error_px, enough):
-            if match.log_odds > enough and len(match.star) >= FEWEST_STARS:
-                return identified(field, sky, match)
+        for match in matches(field, sky, hypotheses, error_px, _enough(tried)):
+            if _sound(match, tried):
+                return identified(field, match, OnFrame.of(field, sky, match.pose))
     return None
 
 
-def _attempts(field: Field, sky: Sky, priors) -> Iterator[tuple[Hypotheses, float, int]]:
+def _enough(tried: int) -> float:
+    return ACCEPT_LOG_ODDS + math.log(tried)
+
+
+def _sound(match: Match, tried: int) -> bool:
+    return match.log_odds > _enough(tried) and len(match.star) >= FEWEST_STARS
+
+
+def _attempts(field: Field, sky: Sky) -> Iterator[tuple[Hypotheses, float, int]]:
     """What to try, in this order: hypotheses, the stars' error in px, and among how many these were chosen."""
-    for given in priors:
-        hypotheses, count = given.hypotheses(field, sky)
-        yield hypotheses, prior.ERROR_PX, count
     lookup = Lookup(field, sky.triangles)
     for stars, error_px in STAGES:
         found, count = lookup.candidates(min(stars, len(field)), error_px)

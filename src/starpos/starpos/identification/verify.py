@@ -2,7 +2,7 @@
 """Is a pose right?  The log-odds of all bright stars of the frame against chance, for many poses at once."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,20 +33,6 @@ class Hypotheses:
     def __getitem__(self, k: slice) -> "Hypotheses":
         p = self.poses
         return Hypotheses(Poses(p.attitude[k], p.focal_px[k], p.mirrored[k]), self.own[k], self.sigma_px[k])
-
-    @classmethod
-    def joined(cls, parts: "list[Hypotheses]", tested: int) -> "Hypotheses":
-        """All of them, none included, of one field of which `tested` stars are."""
-        none = cls(
-            Poses(np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, bool)),
-            np.zeros((0, tested), bool),
-            np.zeros((0, tested)),
-        )
-        parts = [none, *parts]
-        poses = Poses(*(np.concatenate([getattr(h.poses, f.name) for h in parts]) for f in fields(Poses)))
-        return cls(
-            poses, *(np.concatenate([getattr(h, name) for h in parts]) for name in ("own", "sigma_px"))
-        )
 
 
 def own_stars(xy: np.ndarray, star: np.ndarray, sigma_px: np.ndarray) -> np.ndarray:
@@ -112,25 +98,32 @@ def matches(field: Field, sky: Sky, h: Hypotheses, error_px: float, enough: floa
             return
         w = expected.directions[expected.place[k, : expected.count[k]]]
         match = Match(h.poses[k], float(log_odds[k]), np.flatnonzero(hit[k]), w[nearest[k][hit[k]]])
-        yield match if match.log_odds > enough else _fitted(field, match, w, xy[k], h.own[k], error_px)
+        if match.log_odds <= enough:
+            pose = match.pose.fitted(xy[k, match.star], match.directions)
+            match = judged(field, pose, w, h.own[k], error_px, enough)
+        yield match
 
 
-def _fitted(field: Field, match: Match, w, xy, own, error_px: float) -> Match:
-    pose = match.pose.fitted(xy[match.star], match.directions)
-    pixel, count, sigma = pose.project(w), np.array([len(w)]), field.sigma[: len(xy)]
+def judged(field: Field, pose: Pose, w: np.ndarray, own: np.ndarray, error_px: float, enough: float) -> Match:
+    """A pose's match with stars w (S, 3), brightest first, at error_px or a smaller one; own (n,) as Hypotheses has it.
 
-    def judged(error):
-        each = (part[None] for part in (xy, pixel))
-        log_odds, hit, nearest = _log_odds(field, *each, count, np.hypot(sigma, error)[None], own[None])
-        return float(log_odds[0]), hit[0], nearest[0]
-
-    log_odds, hit, nearest = judged(error_px)
-    # a looser error than the fit needs hides what the match is worth; to choose among errors costs their number
-    for smaller in (e for e in SMALLER_PX if e < error_px):
-        tighter = judged(smaller)
-        if tighter[0] - CHOICE > log_odds:
-            log_odds, hit, nearest = tighter[0] - CHOICE, *tighter[1:]
-    return Match(pose, log_odds, np.flatnonzero(hit), w[nearest[hit]])
+    A looser error than the pose needs hides what the match is worth, so that smaller ones are judged until the log-odds
+    are `enough`; to choose among errors costs their number.
+    """
+    tested = len(own)
+    xy, pixel = field.xy[int(pose.mirrored), :tested], pose.project(w)
+    best = None
+    for error in (error_px, *(e for e in SMALLER_PX if e < error_px)):
+        sigma = np.hypot(field.sigma[:tested], error)
+        log_odds, hit, nearest = _log_odds(
+            field, xy[None], pixel[None], np.array([len(w)]), sigma[None], own[None]
+        )
+        worth = float(log_odds[0]) - (CHOICE if best else 0.0)
+        if best is None or worth > best.log_odds:
+            best = Match(pose, worth, np.flatnonzero(hit[0]), w[nearest[0][hit[0]]])
+        if best.log_odds > enough:
+            break
+    return best
 
 
 def _log_odds(field: Field, xy, predicted, count, sigma, own):

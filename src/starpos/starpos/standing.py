@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fix says of the next frame: the camera stands where it stood, or was only turned, or driven some way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.earth import EarthState
+from starpos.identification import Identification, Plumb, Pointing
+
+PLUMB_TOLERANCE_RAD = np.radians(90 / 3600)  # 2.8 km of travel, or as much error of the tilt
+
+
+@dataclass(frozen=True)
+class Standing:
+    """itrs_to_camera (3, 3), up_itrs (3,): how the camera stood on the Earth, and where; focal_px: what it had then."""
+
+    itrs_to_camera: np.ndarray
+    up_itrs: np.ndarray
+    focal_px: float
+
+    @classmethod
+    def at(
+        cls, found: Identification, state: EarthState, focal_px: float, latitude: float, longitude: float
+    ) -> "Standing":
+        """From an identification and the astronomic place (rad) that came of it; focal_px is the fitted one."""
+        up = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
+        return cls(found.attitude @ state.gcrs_to_itrs.T, np.array(up), focal_px)
+
+    def priors(self, state: EarthState, zenith_camera: np.ndarray) -> tuple[Pointing, Plumb]:
+        """For identify at another instant: the attitude if nothing moved, else the plumb line zenith_camera (3,), in C."""
+        return (
+            Pointing(self.itrs_to_camera @ state.gcrs_to_itrs, self.focal_px),
+            Plumb(self.up_itrs @ state.gcrs_to_itrs, zenith_camera, PLUMB_TOLERANCE_RAD),
+        )
