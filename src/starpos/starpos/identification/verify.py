@@ -2,7 +2,7 @@
 """Is a pose right?  The log-odds of all bright stars of the frame against chance, for many poses at once."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,10 @@ from starpos.identification.pose import Field, Pose, Poses
 from starpos.identification.sky import Sky
 from starpos.zones import rows_near
 
-WORTH_A_FIT = 3.0  # log-odds of a raw hypothesis below which it is not looked at again
+# A triangle was looked up within 3 sigma of two angles; one that fits better is worth that much more, what it lacks is in
+# the odds of its own stars
+SHAPE = 2 * np.log(6 / np.sqrt(2 * np.pi))
+WORTH_A_FIT = 4.0  # log-odds of a raw hypothesis below which it is not looked at again
 FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
 EXPECTED_RANK = (10, 2)  # a + b n: how deep among the catalogue stars the n-th brightest detection may be
 TEST_STARS = 50  # the brightest of a frame, which decide
@@ -93,6 +96,7 @@ def matches(field: Field, sky: Sky, h: Hypotheses, error_px: float, enough: floa
     expected = Expected.on(field, sky, h.poses)
     xy = field.xy[h.poses.mirrored.astype(int), :tested]
     log_odds, hit, nearest = _log_odds(field, xy, expected.pixel, expected.count, h.sigma_px, h.own)
+    log_odds += SHAPE
     for k in np.argsort(-log_odds, kind="stable").tolist():
         if log_odds[k] < WORTH_A_FIT:
             return
@@ -100,7 +104,8 @@ def matches(field: Field, sky: Sky, h: Hypotheses, error_px: float, enough: floa
         match = Match(h.poses[k], float(log_odds[k]), np.flatnonzero(hit[k]), w[nearest[k][hit[k]]])
         if match.log_odds <= enough:
             pose = match.pose.fitted(xy[k, match.star], match.directions)
-            match = judged(field, pose, w, h.own[k], error_px, enough)
+            match = judged(field, pose, w, h.own[k], error_px, enough - SHAPE)
+            match = replace(match, log_odds=match.log_odds + SHAPE)
         yield match
 
 
