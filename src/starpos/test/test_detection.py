@@ -2,6 +2,7 @@
 import numpy as np
 import pytest
 from rendered import BIAS, bound, field, grid, match, noisy
+from scipy import ndimage
 
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError
@@ -48,6 +49,33 @@ def test_undersampled_and_defocused_stars_keep_near_the_bound(fwhm, electrons):
     assert (missed, invented) == (0, 0)
     assert np.all(rms(error) < 1.12 * bound(electrons, fwhm))
     assert 0.9 < rms(pull.ravel()) < 1.1
+
+
+@pytest.mark.parametrize(
+    ("diameter", "electrons"), [(8, 8000), (8, 30000), (11, 30000), (14, 8000), (14, 30000)]
+)
+def test_defocused_stars_with_a_hole_are_one_star_each(diameter, electrons, rng):
+    size = (500, 500)
+    y, x = np.mgrid[: 5 * size[0], : 5 * size[1]] / 5 - 0.4  # px, of five dots a pixel
+    light, stars = np.zeros(size), grid(size, 45, electrons, rng)
+    for star in stars:
+        near = np.s_[
+            5 * int(star[1]) - 75 : 5 * int(star[1]) + 80, 5 * int(star[0]) - 75 : 5 * int(star[0]) + 80
+        ]
+        r = np.hypot(x[near] - star[0], y[near] - star[1])
+        ring = ndimage.gaussian_filter(1.0 * ((r < diameter / 2) & (r > 0.2 * diameter)), 4)
+        ring = ring.reshape(31, 5, 31, 5).sum((1, 3))
+        light[int(star[1]) - 15 : int(star[1]) + 16, int(star[0]) - 15 : int(star[0]) + 16] += electrons * (
+            ring / ring.sum()
+        )
+    found = detect(Frame(noisy(light + 20, rng))).stars
+    index = match(found, stars)
+    assert np.all(index >= 0) and len(found) == len(stars)
+    assert np.all(found.flags == 0)
+    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
+    assert np.all(np.abs(error.mean(0)) < 4 * rms(error) / np.sqrt(len(stars)))
+    assert np.all(rms(error) < (0.03 if electrons > 10000 else 0.07))
+    assert 0.5 < rms((error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))).ravel()) < 1.2
 
 
 @pytest.mark.parametrize("fwhm", [1.2, 1.3])

@@ -7,8 +7,9 @@ from scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos import triangles
 from starpos.camera import Camera
-from starpos.identification import Sky, identify, search
+from starpos.identification import Sky, identify, search, verify
 from starpos.identification.lookup import LOOSE_PX
+from starpos.identification.pose import Field
 
 ARCSEC = np.radians(1 / 3600)
 FIELDS = {
@@ -116,6 +117,52 @@ def test_random_points_are_nothing(catalogue, rng):
         for _ in range(2):
             s = random_stars(n, rng)
             assert identify(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky) is None
+
+
+def test_log_odds_rise_over_random_points_no_further_than_chance_allows(catalogue, rng):
+    """Ville: a likelihood ratio exceeds x by chance at most once in x.  On frames of so few pixels chance has a chance."""
+    camera = Camera.from_focal(300, 225, 375 / 2 / np.tan(np.radians(5.5)))
+    sky = sky_for(catalogue, camera)
+    best = []
+    for _ in range(50):
+        xy = rng.uniform(0, [299, 224], (int(rng.integers(6, 10)), 2))
+        field, tried, highest = Field.of(xy, np.full(len(xy), 0.05), camera), 1, -99.0
+        for hypotheses, error_px, count in search._attempts(field, sky):
+            if error_px > LOOSE_PX:
+                break
+            tried += count
+            for match in verify.matches(field, sky, hypotheses, error_px, 1e9):
+                if len(match.star) >= search.FEWEST_STARS:
+                    highest = max(highest, match.log_odds - np.log(tried))
+        best.append(highest)
+    assert np.mean(np.array(best) > 2) < np.exp(-2) + 0.1
+    assert np.mean(np.array(best) > 4) < np.exp(-4) + 0.04
+    assert max(best) < 12
+    assert max(best) > 0  # or the test would not see anything
+
+
+def test_a_star_seen_double_does_not_speak_for_itself(catalogue, rng):
+    """Every point twice: any triangle has three twins that agree with it."""
+    camera, _ = FIELDS["15 deg"]
+    for apart_px in (0.0, 0.1, 1.0):
+        for _ in range(5):
+            xy = np.repeat(rng.uniform(0, [999, 699], (12, 2)), 2, 0)
+            xy += rng.normal(0, apart_px, xy.shape)
+            assert identify(xy, np.full(24, 0.05), camera, sky_for(catalogue, camera)) is None
+
+
+def test_brightness_out_of_order_by_more_than_expected(catalogue, rng):
+    camera, limit = FIELDS["4 deg"]
+    sky, found = sky_for(catalogue, camera), 0
+    for _ in range(10):
+        attitude = random_attitude(rng)
+        xy, index = seen(sky, camera, attitude, limit, rng)
+        order = np.argsort(np.arange(len(xy)) + rng.exponential(4.0, len(xy)) * (rng.random(len(xy)) < 0.3))
+        answer = identify(xy[order], np.full(len(xy), 0.05), camera, sky)
+        if answer is not None:
+            found += 1
+            check(answer, attitude, index[order], camera, sky)
+    assert found >= 9
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])

@@ -1,62 +1,125 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where something starlike stands out of the noise: a smoothed frame's peaks. One pass, strip by strip."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
 STRIP = 64  # rows: small enough to stay in the processor's cache
-SIGMA = 1.2  # px of the smoothing Gaussian: near the best for FWHM 1.2 to 5 px, within 40 % of it at 8 px
-REACH = 3  # px: half the kernel
-KERNEL_NORM = 1 / (4 * np.pi * SIGMA**2) ** 0.5  # what smoothing leaves of white noise
-FLAT = 2  # px: a peak is the highest within this
+CROWD = 14  # px: the widest defocused star
+LEADERS = 100  # peaks that tell whether the frame's stars are rings
 
 
-def find_peaks(plane, background, threshold, limit):
-    """x, y (N,) int and height (N,) in sigma of the smoothed noise, highest first, at most `limit`.
+@dataclass(frozen=True)
+class Kernel:
+    """A Gaussian of sigma px that smooths the frame, cut off at reach px; a peak is the highest within flat px."""
 
-    The kernel's response vanishes at the Nyquist frequency, so a colour mosaic, a pattern of exactly that
-    frequency, leaves no trace in the smoothed frame; being odd it is centred on its pixel.
+    sigma: float
+    reach: int
+    flat: int
+
+    @property
+    def norm(self) -> float:
+        """What smoothing leaves of white noise."""
+        return 1 / (4 * np.pi * self.sigma**2) ** 0.5
+
+
+SHARP = Kernel(1.2, 3, 2)  # near the best for FWHM 1.2 to 5 px, within 40 % of it at 8 px
+WIDE = Kernel(4.0, 10, 7)  # fills the hole of a defocused star
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """x, y (N,) int and height (N,) in sigma of the smoothed noise, highest first.
+
+    correlation  how many times noisier than independent pixels the smoothed frame is, 1 or more
     """
+
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+    correlation: float
+
+
+def find_peaks(plane, background, threshold, limit) -> Peaks:
+    """At most `limit` Peaks that stand out by `threshold` sigma.
+
+    The light of a telescope out of focus, with an obstruction in its middle, is a ring, on which several peaks crowd:
+    where most bright ones do, the frame is smoothed more widely, if that leaves them alone. A streak or a tree
+    is as crowded then as before.
+    """
+    sharp = _peaks_of(plane, background, SHARP, threshold, limit)
+    if not _crowded(sharp):
+        return sharp
+    wide = _peaks_of(plane, background, WIDE, threshold, limit)
+    return sharp if _crowded(wide) else wide
+
+
+def _crowded(peaks):
+    """Whether most of the brightest peaks have one like them within CROWD px."""
+    points = np.stack([peaks.x, peaks.y], 1)
+    leaders = points[:LEADERS]
+    if len(leaders) < 2:
+        return False
+    alike = points[peaks.height > 0.5 * peaks.height[len(leaders) - 1]]
+    nearest = spatial.cKDTree(alike).query(leaders, 2)[0][:, 1]
+    return bool(np.median(nearest) < CROWD)
+
+
+def _peaks_of(plane, background, kernel, threshold, limit):
+    """The Peaks of the frame smoothed by a Kernel.
+
+    Its response vanishes at the Nyquist frequency, so a colour mosaic, a pattern of exactly that frequency, leaves
+    no trace in the smoothed frame; being odd it is centred on its pixel.
+    """
+    correlation, unevenness = _noise_of_smooth(plane, background, kernel)
+    threshold = threshold * unevenness
     level, noise = background.level.mean(0), np.sqrt((background.noise**2).mean(0))
-    noise = noise * KERNEL_NORM * background.correlation
+    noise = noise * kernel.norm * correlation
     wanted = (level + threshold * noise).astype(np.float32)
     lowest = _columns(wanted, background)
+    neighbours = np.ones((2 * kernel.flat + 1,) * 2, np.uint8)
     found = []
     for top in range(0, plane.shape[0], STRIP):
         bottom = min(top + STRIP, plane.shape[0])
-        smooth, offset = _smooth(plane, top, bottom)
+        smooth, offset = _smooth(plane, kernel, top, bottom)
         # every row of the strip against the lowest threshold of the mesh rows it touches; exactly further down
         (first, last), _ = background.cell(0, np.array([top, bottom - 1]))
         above = smooth > lowest[int(first) : int(last) + 2].min(0)
         if not above.any():
             continue
-        above &= smooth == cv2.dilate(smooth, np.ones((2 * FLAT + 1, 2 * FLAT + 1), np.uint8))
+        above &= smooth == cv2.dilate(smooth, neighbours)
         place = np.flatnonzero(above[offset : offset + bottom - top])  # faster than nonzero in two dimensions
         y, x = np.divmod(place, plane.shape[1])
         found.append(np.stack([x, y + top, smooth[y + offset, x]]))
     if not found:
-        return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
+        return Peaks(np.zeros(0, int), np.zeros(0, int), np.zeros(0), correlation)
     x, y, value = np.concatenate(found, 1)
     local, sigma = (ndimage.map_coordinates(m, background.cell(x, y), order=1) for m in (level, noise))
     height = (value - local) / sigma
     keep = np.flatnonzero(height > _above_tail(height, threshold))
     keep = keep[np.argsort(-height[keep], kind="stable")][: 4 * limit]
-    x, y, height = _join_plateaus(x[keep], y[keep], height[keep])
-    return x[:limit], y[:limit], height[:limit]
+    x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
+    return Peaks(x[:limit], y[:limit], height[:limit], correlation)
 
 
-def _smooth(plane, top, bottom):
-    """Rows top-FLAT .. bottom+FLAT of the smoothed frame, and the index of row `top` in them."""
-    first, last = max(0, top - FLAT - REACH), min(plane.shape[0], bottom + FLAT + REACH)
+def _smooth(plane, kernel, top, bottom):
+    """Rows top-flat .. bottom+flat of the smoothed frame, and the index of row `top` in them."""
+    around = kernel.flat + kernel.reach
+    first, last = max(0, top - around), min(plane.shape[0], bottom + around)
     smooth = cv2.GaussianBlur(
-        plane[first:last].astype(np.float32), (2 * REACH + 1,) * 2, SIGMA, borderType=cv2.BORDER_REFLECT_101
+        plane[first:last].astype(np.float32),
+        (2 * kernel.reach + 1,) * 2,
+        kernel.sigma,
+        borderType=cv2.BORDER_REFLECT_101,
     )
-    start = max(first, top - FLAT)
-    return smooth[start - first : min(last, bottom + FLAT) - first], top - start
+    start = max(first, top - kernel.flat)
+    return smooth[start - first : min(last, bottom + kernel.flat) - first], top - start
 
 
-def noise_of_smooth(plane, background):
+def _noise_of_smooth(plane, background, kernel):
     """How many times more noise a smoothed frame has than if its pixels' noise were independent: two factors >= 1.
 
     The first is of pixels tied to their neighbours, by demosaicing, resampling or lossy compression: a star then has
@@ -64,21 +127,24 @@ def noise_of_smooth(plane, background):
     less.
     """
     height = plane.shape[0]
+    lag = round(1.7 * kernel.sigma)  # four times as many px: from there on smoothed noise is independent
     scores, steps = [], []
     for top in np.linspace(0, max(0, height - 16), 8).astype(int):
-        smooth, offset = _smooth(plane, top, min(top + 16, height))
+        smooth, offset = _smooth(plane, kernel, top, min(top + 16, height))
         y, x = np.mgrid[offset : len(smooth) : 4, 0 : smooth.shape[1] : 4]
         level, noise = background.at(x.ravel(), y.ravel() - offset + top)
         score = (smooth[y, x] - level.mean(1).reshape(y.shape)) / np.sqrt((noise**2).mean(1)).reshape(y.shape)
         scores.append(score.ravel())
-        steps.append((score[:, 2:-2] - 0.5 * (score[:, :-4] + score[:, 4:])).ravel() / 1.5**0.5)
+        steps.append(
+            (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])).ravel() / 1.5**0.5
+        )
     # stars widen the scatter upwards; where they are many, only the far side is free of them
     low, sigma_below, median = np.quantile(np.concatenate(scores), (0.0228, 0.1587, 0.5))
-    whole = tied = min(median - sigma_below, sigma_below - low) / KERNEL_NORM
-    # clouds hardly change from a pixel to those 8 px to its left and right
+    whole = tied = min(median - sigma_below, sigma_below - low) / kernel.norm
+    # clouds hardly change from a pixel to those `lag` to its left and right
     steps = np.concatenate(steps)
     if len(steps):
-        tied = min(whole, 1.4826 * np.median(np.abs(steps)) / KERNEL_NORM)
+        tied = min(whole, 1.4826 * np.median(np.abs(steps)) / kernel.norm)
     tied = float(tied) if tied > 1.1 else 1.0
     return tied, max(1.0, float(whole) / tied)
 
@@ -101,9 +167,9 @@ def _columns(mesh, background):
     return np.stack([np.interp(place, np.arange(mesh.shape[1]), row) for row in mesh]).astype(np.float32)
 
 
-def _join_plateaus(x, y, height):
+def _join_plateaus(x, y, height, flat):
     """A saturated star is a plateau of equal peaks: one peak at its middle stands for it."""
-    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(FLAT + 0.5, output_type="ndarray")
+    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(flat + 0.5, output_type="ndarray")
     if len(pairs) == 0:
         return x.astype(int), y.astype(int), height
     n = len(x)

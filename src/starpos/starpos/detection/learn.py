@@ -15,7 +15,12 @@ DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
 TEACHERS = 250
 TEACHING_PIXELS = 12000  # of wide stars fewer are enough
-ROUNDS = 2
+ROUNDS = 2  # of fits and refinements
+RING_FWHM = (
+    5.0  # px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more than
+)
+POOR = 0.1  # of a pixel's light
+RING_ROUNDS, RING_ORDER = 6, 14  # so many more rounds then, and terms of that order
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
 SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
@@ -55,7 +60,7 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
     stamps, x, y = stamps.take(alike), x[alike], y[alike]
     most = max(TEACHING_PIXELS // stamps.signal[0].size, 40) if len(x) else 0
     stamps, x, y = stamps.take(slice(most)), x[:most], y[:most]
-    for _ in range(ROUNDS):
+    for round_ in range(ROUNDS + RING_ROUNDS):
         if len(x) == 0:
             break
         fit = fit_stars(stamps, psf, x, y, response, rounds=3)
@@ -66,7 +71,11 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         sound &= fit.chi2 < 6 * np.median(fit.chi2[sound]) + 1
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = _respond(stamps, psf, x, y, fit, sound, response)
-        order = min(MAX_ORDER, 2 * int(np.log2(len(x)) / 1.2))  # 4 from 6 stars, 6 from 13, 8 from 28
+        ring = round_ >= ROUNDS
+        if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
+            break
+        enough = int(np.log2(len(x)) / 1.2)  # 2 from 6 stars, 3 from 13, 4 from 28
+        order = min(RING_ORDER, 4 * enough) if ring else min(MAX_ORDER, 2 * enough)
         if order > 0:
             psf = _shape_up(stamps, psf, x, y, fit.flux[sound], response, order)
     return Lesson(psf, response, reach_of(psf))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.detection.background import measure_background
-from starpos.detection.finding import find_peaks, noise_of_smooth
+from starpos.detection.finding import find_peaks
 from starpos.detection.learn import learn
 from starpos.detection.plane import plane_of
 from starpos.detection.streak import find_streaks
@@ -65,12 +65,12 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     if min(plane.shape) < 2:
         return Detection(no_stars(**about), float(np.median(plane)), 0.0, float("nan"))
     background = measure_background(plane, settings.mesh_px, mosaic)
-    correlation, unevenness = noise_of_smooth(plane, background)
-    background = replace(background, correlation=correlation)
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
-    x, y, height = find_peaks(plane, background, settings.threshold * unevenness, settings.max_stars)
+    peaks = find_peaks(plane, background, settings.threshold, settings.max_stars)
+    x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return Detection(no_stars(**about), level, noise, float("nan"))
+    background = replace(background, correlation=peaks.correlation)
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)

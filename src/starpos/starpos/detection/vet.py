@@ -80,7 +80,9 @@ def _spikes(stamps, lesson):
     grid = np.arange(-1, 2, dtype=np.float32)
     star = lesson.psf.evaluate(grid[None, None, :], grid[None, :, None])[0][0]
     four = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
-    sharpest = star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1])
+    sharpest = max(
+        1.0, star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1])
+    )  # 1: a ring has a dark middle
     grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
     around = ndimage.convolve(grey, four[None], mode="nearest")
     spike = (grey > SPIKE * sharpest * (around + stamps.noise)) & (stamps.signal > OUTLIER * stamps.noise)
@@ -104,7 +106,8 @@ def _core(stamps, fit, psf, widths):
 
 def _is_dot(stamps, fit, response):
     """Hot pixels and sharp cosmic rays: one pixel and the sky make these pixels likelier than the PSF does."""
-    c = slice(stamps.reach - 2, stamps.reach + 3)
+    half = max(2, stamps.reach // 2 - 1)
+    c = slice(stamps.reach - half, stamps.reach + half + 1)
     signal, noise, residual, model, good = (
         a[:, c, c] for a in (stamps.signal, stamps.noise, fit.residual, fit.model, stamps.good)
     )

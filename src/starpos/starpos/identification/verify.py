@@ -15,7 +15,9 @@ from starpos.zones import rows_near
 SHAPE = 2 * np.log(6 / np.sqrt(2 * np.pi))
 WORTH_A_FIT = 4.0  # log-odds of a raw hypothesis below which it is not looked at again
 FALSE_FRACTION = 0.35  # of the detections that may be no catalogue star
-EXPECTED_RANK = (10, 2)  # a + b n: how deep among the catalogue stars the n-th brightest detection may be
+# The n-th brightest detection is among the a + b n brightest catalogue stars, but for a share of surprises (colours,
+# errors of brightness among many alike) that reach so many times deeper.
+EXPECTED_RANK, SURPRISES, DEEPER = (10, 2), 0.15, 4
 TEST_STARS = 50  # the brightest of a frame, which decide
 MATCH_SIGMA = 3.5
 SMALLER_PX = (0.0, 0.7, 1.5)  # errors besides the centroids' own at which a fitted match is judged as well
@@ -79,7 +81,7 @@ class Expected:
         frame = frame[on]
         count = np.bincount(frame, minlength=len(poses))
         place = np.arange(len(on)) - (np.cumsum(count) - count)[frame]
-        most = 2 * tested + 10
+        most = DEEPER * (EXPECTED_RANK[0] + EXPECTED_RANK[1] * tested)
         keep = place < most
         on, frame, place, count = on[keep], frame[keep], place[keep], np.minimum(count, most)
         shape = len(poses), max(1, int(count.max(initial=0)))
@@ -142,11 +144,13 @@ def _log_odds(field: Field, xy, predicted, count, sigma, own):
     mutual = np.take_along_axis(apart2.argmin(1), nearest, 1) == n
     variance = sigma * sigma
     hit = mutual & (distance2 < MATCH_SIGMA**2 * variance)
-    # the n-th brightest detection is expected among the brightest catalogue stars
-    expected = np.minimum(EXPECTED_RANK[0] + EXPECTED_RANK[1] * n, np.maximum(count, 1)[:, None])
+    rank, there = EXPECTED_RANK[0] + EXPECTED_RANK[1] * n, np.maximum(count, 1)[:, None]
+    expected, deepest = np.minimum(rank, there), np.minimum(DEEPER * rank, there)
+    share = np.where(nearest < expected, (1 - SURPRISES) / expected, 0.0)
+    share += np.where(nearest < deepest, SURPRISES / deepest, 0.0)
     area = 4 * field.half[0] * field.half[1]
-    chance = area * (1 - FALSE_FRACTION) / (expected * (2 * np.pi * variance))
-    likely = np.where(hit & (nearest < expected), chance * np.exp(-0.5 * distance2 / variance), 0.0)
+    density = np.exp(-0.5 * distance2 / variance) / (2 * np.pi * variance)
+    likely = np.where(hit, area * (1 - FALSE_FRACTION) * share * density, 0.0)
     # what a pose was made from cannot speak for it, only against
     against = -0.5 * np.minimum(distance2 / variance, MATCH_SIGMA**2)
     odds = np.where(own, against, np.log(FALSE_FRACTION + likely))
