@@ -28,7 +28,7 @@ class Standing:
         return cls(found.attitude @ state.gcrs_to_itrs.T, np.array(up), focal_px)
 
     def priors(self, state: EarthState, zenith_camera: np.ndarray) -> tuple[Pointing, Plumb]:
-        """For identify at another instant: the attitude if nothing moved, else the plumb line zenith_camera (3,), in C."""
+        """For `identify` at another time: the attitude if nothing moved, else the plumb line zenith_camera (3,), in C."""
         return (
             Pointing(self.itrs_to_camera @ state.gcrs_to_itrs, self.focal_px),
             Plumb(self.up_itrs @ state.gcrs_to_itrs, zenith_camera, PLUMB_TOLERANCE_RAD),

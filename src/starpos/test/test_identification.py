@@ -120,7 +120,7 @@ def test_random_points_are_nothing(catalogue, rng):
 
 
 def test_log_odds_rise_over_random_points_no_further_than_chance_allows(catalogue, rng):
-    """Ville: a likelihood ratio exceeds x by chance at most once in x.  On frames of so few pixels chance has a chance."""
+    """Ville: a likelihood ratio exceeds x by chance at most once in x.  With so few pixels chance has a chance."""
     camera = Camera.from_focal(300, 225, 375 / 2 / np.tan(np.radians(5.5)))
     sky = sky_for(catalogue, camera)
     best = []

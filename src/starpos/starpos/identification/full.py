@@ -39,8 +39,8 @@ class Identification:
 
 @dataclass(frozen=True)
 class OnFrame:
-    """The catalogue's stars on a frame, brightest first: index (S,), directions (S, 3), and how far fainter ones that melt
-    into them may draw them, blend_px (S,)."""
+    """The catalogue's stars on a frame, brightest first: index (S,), directions (S, 3), and how far fainter ones that
+    melt into them may draw them, blend_px (S,)."""
 
     index: np.ndarray
     directions: np.ndarray
