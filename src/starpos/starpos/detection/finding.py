@@ -47,14 +47,17 @@ def find_peaks(plane, background, threshold, limit) -> Peaks:
     """At most `limit` Peaks that stand out by `threshold` sigma.
 
     The light of a telescope out of focus, with an obstruction in its middle, is a ring, on which several peaks crowd:
-    where most bright ones do, the frame is smoothed more widely, if that leaves them alone. A streak or a tree
-    is as crowded then as before.
+    where most bright ones do, the frame is smoothed more widely, if that leaves them alone and makes them stand out
+    more. A streak or a tree stays a crowd; the two stars of a pair stand out less.
     """
     sharp = _peaks_of(plane, background, SHARP, threshold, limit)
     if not _crowded(sharp):
         return sharp
     wide = _peaks_of(plane, background, WIDE, threshold, limit)
-    return sharp if _crowded(wide) else wide
+    if len(wide.x) == 0 or _crowded(wide):
+        return sharp
+    better = np.median(wide.height[:LEADERS]) > np.median(sharp.height[:LEADERS])
+    return wide if better else sharp
 
 
 def _crowded(peaks):

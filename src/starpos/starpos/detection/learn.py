@@ -19,7 +19,7 @@ ROUNDS = 2  # of fits and refinements
 RING_FWHM = (
     5.0  # px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more than
 )
-POOR = 0.1  # of a pixel's light
+POOR = 0.05  # of a pixel's light
 RING_ROUNDS, RING_ORDER = 6, 14  # so many more rounds then, and terms of that order
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
