@@ -106,3 +106,17 @@ def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, rng):
         error, pull = errors(found, some)
         assert rms(error) < 1.4 * rms(bound(some[0, 2]))
         assert 0.7 < rms(pull) < 1.3
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.3])
+def test_many_pairs_teach_no_false_errors(ratio, rng):
+    stars, trail = grid(SIZE, 50, 20000, rng), (2.6, -2.2)
+    first = stars[::3]
+    angle = rng.uniform(0, 2 * np.pi, len(first))
+    second = first + 2 * 2.4 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    second[:, 2] = 20000 * ratio
+    found = found_in(field(SIZE, np.concatenate([stars, second]), trail=trail), rng)
+    for some in (stars, second):
+        error, pull = errors(found, some)
+        assert rms(error) < 1.2 * rms(bound(some[0, 2], trail=trail))
+        assert 0.85 < rms(pull) < 1.15

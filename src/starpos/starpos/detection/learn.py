@@ -15,6 +15,9 @@ DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
 TEACHERS = 250
 TEACHING_PIXELS = 12000  # of wide stars fewer are enough
+UNLIKE = (
+    0.005  # of a star's squared light: beyond it, three times what others leave and noise, it does not teach
+)
 ROUNDS = 2  # of fits and refinements
 RING_FWHM = (
     5.0  # px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more than
@@ -68,7 +71,9 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
         if not sound.any():
             break
-        sound &= fit.chi2 < 6 * np.median(fit.chi2[sound]) + 1
+        # the best three tenths are the measure: pairs are bright, and may be most of the brightest
+        strange, error = _strangeness(stamps, fit)
+        sound &= strange < 3 * max(0, np.quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = _respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= ROUNDS
@@ -123,6 +128,17 @@ def _is_dot(stamps):
     core = stamps.signal.reshape(-1, 9)
     peak = core.max(1)
     return core.sum(1) - peak < 0.5 * peak
+
+
+def _strangeness(stamps, fit):
+    """(N,) what the PSF leaves of each star, beyond the sky's noise, over what it holds, both squared; and its error.
+
+    Two stars in one image leave much: they would teach a wrong PSF, and what they leave would pass for noise of light.
+    """
+    noise2 = fit.used * stamps.noise**2
+    light2 = np.maximum((fit.used * fit.model**2).sum((1, 2)), 1e-9)
+    left = (fit.used * fit.residual**2 - noise2 * (1 - fit.leverage)).sum((1, 2))
+    return left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
 
 
 def _respond(stamps, psf, x, y, fit, sound, before):
