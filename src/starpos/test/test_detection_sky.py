@@ -53,21 +53,24 @@ def test_clouds_make_no_star_and_their_stars_keep_their_errors(size_px, stars, r
     found = found_in(light, rng)
     _, pull = errors(found, stars)
     assert len(found) == len(stars)
-    assert 0.5 < rms(pull) < 1.1
+    assert 0.7 < rms(pull) < 1.1
 
 
-@pytest.mark.parametrize("brightness", [0, 1500])
-def test_a_roof_hides_what_it_covers_and_adds_little(brightness, stars, rng):
+@pytest.mark.parametrize("brightness", [0, 1500, 6000])
+def test_a_roof_hides_what_it_covers_and_adds_nothing(brightness, rng):
+    stars = grid(SIZE, 30, ELECTRONS, rng)
     y, x = np.indices(SIZE)
     roof = y > 420 + 0.1 * x
     tiles = brightness * (1 + 0.2 * rng.random((60, 90))).repeat(10, 0).repeat(10, 1)
     found = found_in(np.where(roof, tiles, field(SIZE, stars, sky=60)), rng)
-    clear = stars[stars[:, 1] < 420 + 0.1 * stars[:, 0] - 128]  # two cells of the background's mesh
+    below = stars[:, 1] - 420 - 0.1 * stars[:, 0]
+    error, pull = errors(
+        found, stars[below < (-64 if brightness else -15)]
+    )  # a cell of the background's mesh
+    assert rms(error) < 1.15 * rms(bound(ELECTRONS, sky=60))
+    assert 0.75 < rms(pull) < 1.15
     index = match(found, stars)
-    errors(found, clear)
-    extra = len(found) - len(set(index[index >= 0]))
-    assert extra <= 10  # along its edge, fainter than the stars
-    assert set(range(len(clear))) <= set(index)
+    assert len(found) - len(set(index[index >= 0])) <= 3
 
 
 def test_dead_rows_and_columns_cost_only_the_stars_on_them(stars, rng):

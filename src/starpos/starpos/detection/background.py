@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+STEEP = 5  # times a cell's error: a step between cells, no gradient of the sky
 QUANTISATION = 12**-0.5  # DN rms of rounding to whole numbers: no pixel is quieter
 
 
@@ -83,7 +84,10 @@ def measure_background(plane, cell_px=64, mosaic=None) -> Background:
         mosaic = _phases_differ(level, noise, sample.shape[-1])
     if not mosaic:
         level, noise = level.mean(0, keepdims=True), np.sqrt((noise**2).mean(0, keepdims=True))
-    level, noise = (np.stack([_smooth(m) for m in mesh]) for mesh in (level, noise))
+    error = np.maximum(noise, QUANTISATION) * sample.shape[-1] ** -0.5
+    level, noise = (
+        np.stack([_smooth(m, e) for m, e in zip(mesh, error, strict=True)]) for mesh in (level, noise)
+    )
     noise = np.maximum(noise, QUANTISATION)
     level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
     return Background(level, noise, plane.shape[1], plane.shape[0])
@@ -132,10 +136,14 @@ def _phases_differ(level, noise, samples):
     return bool(abs(contrast) > max(0.03 * np.median(noise), 6 * error, 0.1))
 
 
-def _smooth(mesh):
-    """A cell mostly covered by something bright takes its neighbours' value; then the cells' noise evens out."""
-    wide = _beyond(mesh, 2, "reflect")
-    return ndimage.uniform_filter(ndimage.median_filter(wide, 3), 3)[2:-2, 2:-2]
+def _smooth(mesh, error):
+    """A cell mostly covered by something bright takes its neighbours' value; then the cells' noise evens out.
+
+    But not across the edge of a roof, where the cells differ by more than their errors tell.
+    """
+    typical = ndimage.median_filter(_beyond(mesh, 2, "reflect"), 3)
+    even, typical = ndimage.uniform_filter(typical, 3)[2:-2, 2:-2], typical[2:-2, 2:-2]
+    return np.where(np.abs(even - typical) < STEEP * np.median(error), even, typical)
 
 
 def _beyond(mesh, cells, mode):

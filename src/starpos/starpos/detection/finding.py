@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
+from starpos.detection.stamps import surroundings
+
 STRIP = 64  # rows: small enough to stay in the processor's cache
 CROWD = 14  # px: the widest defocused star
 LEADERS = 100  # peaks that tell whether the frame's stars are rings
@@ -102,8 +104,12 @@ def _peaks_of(plane, background, kernel, threshold, limit):
     x, y, value = np.concatenate(found, 1)
     local, sigma = (ndimage.map_coordinates(m, background.cell(x, y), order=1) for m in (level, noise))
     height = (value - local) / sigma
+    keep = np.argsort(-height, kind="stable")[: 4 * limit]
+    x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
+    raised, uneven = surroundings(plane, background, x, y, round(6.7 * kernel.sigma))
+    height = (height - raised / (kernel.norm * correlation)) / uneven
     keep = np.flatnonzero(height > _above_tail(height, threshold))
-    keep = keep[np.argsort(-height[keep], kind="stable")][: 4 * limit]
+    keep = keep[np.argsort(-height[keep], kind="stable")]
     x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
     return Peaks(x[:limit], y[:limit], height[:limit], correlation)
 

@@ -7,6 +7,11 @@ import numpy as np
 
 from starpos.detection.background import phase_of
 
+RAISED = 0.6  # of a pixel's noise, and
+UNEVEN = (
+    1.6  # times it: what about 50 pixels must show, four times the errors, to count for more than the mesh
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
@@ -55,3 +60,24 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     phase = phase_of(rows, columns) if background.is_mosaic else np.zeros(pixels.shape, np.int8)
     full = on & (pixels >= saturation)
     return Stamps(x, y, pixels - level, noise, on & ~full, full, phase)
+
+
+def surroundings(plane, background, x, y, reach):
+    """What `uneven` says of the squares reach px around the pixels x, y (N,) int."""
+    side, end = np.arange(-reach, reach), np.full(2 * reach, reach)
+    columns = np.clip(x[:, None] + np.concatenate([side, end, -side, -end]), 0, plane.shape[1] - 1)
+    rows = np.clip(y[:, None] + np.concatenate([-end, side, end, -side]), 0, plane.shape[0] - 1)
+    level, noise = background.of_pixels(x, y, rows, columns)
+    return uneven(plane[rows, columns] - level, noise)
+
+
+def uneven(signal, noise):
+    """How far (N,) the pixels (N, K) around stars lie above 0, and how much more they scatter than their noise.
+
+    Both in units of the noise; 0 and 1 where it may be chance. Beside a roof, among twigs or under a cloud the sky is
+    brighter and less even than the mesh knows.
+    """
+    score = signal / noise
+    level = np.median(score, axis=1)
+    scatter = 1.4826 * np.median(np.abs(score - level[:, None]), axis=1)
+    return np.where(level > RAISED, level, 0), np.where(scatter > UNEVEN, scatter, 1)

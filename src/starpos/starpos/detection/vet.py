@@ -10,7 +10,7 @@ from starpos.detection.blend import with_companions
 from starpos.detection.fit import OUTLIER, fit_stars
 from starpos.detection.learn import centroid, grey
 from starpos.detection.shape import moments, relative_widths, window_for
-from starpos.detection.stamps import cut
+from starpos.detection.stamps import cut, uneven
 from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
 SPECK = 3  # pixels
@@ -66,13 +66,15 @@ def _misfit(fit):
 
 
 def _levelled(stamps):
-    """Stamps whose rims are not above 0: beside a roof or under a cloud the sky is brighter than the mesh says."""
+    """Stamps whose rims are not above 0, nor noisier than they say."""
     rim = np.ones(stamps.signal.shape[1:], bool)
     rim[1:-1, 1:-1] = False
-    level = np.median(stamps.signal[:, rim], axis=1)
+    level, noise = uneven(stamps.signal[:, rim], stamps.noise[:, rim])
     # the rim of a very bright star is its own light
-    above = level > np.maximum(np.median(stamps.noise[:, rim], axis=1), 0.01 * stamps.signal.max((1, 2)))
-    return replace(stamps, signal=stamps.signal - np.where(above, level, 0).astype(np.float32)[:, None, None])
+    own = 0.01 * stamps.signal.max((1, 2)) / np.median(stamps.noise[:, rim], axis=1)
+    level, noise = (np.where(v > own, v, least)[:, None, None] for v, least in ((level, 0), (noise, 1)))
+    level, noise = (v.astype(np.float32) for v in (level, noise))
+    return replace(stamps, signal=stamps.signal - level * stamps.noise, noise=stamps.noise * noise)
 
 
 def _spikes(stamps, lesson):
