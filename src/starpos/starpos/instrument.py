@@ -2,7 +2,7 @@
 """What the instrument is: optics, how its parts are fixed to each other, and how well that is known; its YAML file."""
 
 import reprlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +88,12 @@ class Instrument:
         a3 = rotation.about_axis(2, rz) @ rotation.about_axis(1, ry) @ rotation.about_axis(0, rx)
         sigma = np.radians(np.asarray(self.calibration_stddev_arcsec) / 3600)
         return Mounting(a3, np.asarray(self.link_to_camera, float), np.diag(sigma**2))
+
+    def turned_to(self, a3: np.ndarray) -> "Instrument":
+        """The same with another A3 (3, 3)."""
+        rx, ry = np.arctan2(a3[2, 1], a3[2, 2]), np.arcsin(np.clip(-a3[2, 0], -1, 1))
+        rz = np.arctan2(a3[1, 0], a3[0, 0])
+        return replace(self, misalignment_deg=tuple(float(x) for x in np.degrees([rx, ry, rz])))
 
 
 def focal_px_of(focal_mm: float, pixel_um: float) -> float:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos solve`: position and heading of frames with their tilts, each and all together."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from starpos import catalogue
@@ -9,8 +11,10 @@ from starpos.cli import common
 from starpos.earth import utc_text
 from starpos.errors import FixError, FrameError
 from starpos.fix import Fix
-from starpos.inclinometer import read_tilt_csv
+from starpos.inclinometer import TiltLog, read_tilt_csv
 from starpos.solve import Solution, Solver, Status
+from starpos.stars import Stars
+from starpos.turning import turn
 from starpos.vertical import Deflection, geodetic
 
 NO_FIX = 1
@@ -42,29 +46,25 @@ def define(parser) -> None:
     parser.add_argument(
         "--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)"
     )
+    parser.add_argument(
+        "--self-calibrate",
+        action="store_true",
+        help="frames of one place at several headings: find A3 too, whatever it is",
+    )
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
     deflection = _deflection(args)
-    tilts, solver, solved, unreadable = None, None, [], False
-    for path, item in common.frames_of(args.frames):
-        if isinstance(item, FrameError):
-            common.complain("solve", item)
+    solved, unreadable = [], False
+    for path, answer in (_turned if args.self_calibrate else _one_by_one)(args):
+        if isinstance(answer, FrameError):
             unreadable = True
-            answer = Solution(Status.BAD_INPUT, str(item), path, None, 0)
+            answer = Solution(Status.BAD_INPUT, str(answer), path, None, 0)
+        if answer.fix:
+            solved.append(answer)
         else:
-            if solver is None:
-                instrument = common.instrument_of(args, item)
-                tilts = read_tilt_csv(args.tilt, instrument.tilt_noise_rad)
-                solver = Solver(
-                    instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar()
-                )
-            answer = solver.solve(common.stars_of(item), tilts.average)
-            if answer.fix:
-                solved.append(answer)
-            else:
-                common.complain("solve", answer.message)
+            common.complain("solve", answer.message)
         if args.json:
             common.print_json({"file": path} | _json_of(answer.fix, deflection) | _json_about(answer))
         else:
@@ -74,6 +74,50 @@ def run(args) -> int:
     if solved:
         _print_combined(together, solved, args, deflection)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
+
+
+def _one_by_one(args):
+    """(path, Solution or FrameError) of each frame as it is solved."""
+    solver = tilts = None
+    for path, item in common.frames_of(args.frames):
+        if not isinstance(item, FrameError):
+            if solver is None:
+                solver, tilts = _solver(args, item)
+            item = solver.solve(common.stars_of(item), tilts.average)
+        yield path, item
+
+
+def _turned(args):
+    """The same of all frames together, solved with the A3 that they tell."""
+    solver, rows = None, []
+    for path, item in common.frames_of(args.frames):
+        if not isinstance(item, FrameError):
+            if solver is None:
+                solver, tilts = _solver(args, item)
+            item = common.stars_of(item)
+        rows.append((path, item))
+    frames = [stars for _, stars in rows if isinstance(stars, Stars)]
+    answers = iter(_of_turn(solver, frames, tilts) if frames else ())
+    for path, item in rows:
+        yield path, next(answers) if isinstance(item, Stars) else item
+
+
+def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[Solution]:
+    try:
+        turned = turn(solver, frames, tilts.average, solver.progress)
+    except FixError as e:
+        return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames]
+    angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.misalignment_deg)
+    error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
+    common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
+    return turned.solutions
+
+
+def _solver(args, first) -> tuple[Solver, TiltLog]:
+    instrument = common.instrument_of(args, first)
+    tilts = read_tilt_csv(args.tilt, instrument.tilt_noise_rad)
+    solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar())
+    return solver, tilts
 
 
 def _combine(solved: list[Solution]) -> Average | None:

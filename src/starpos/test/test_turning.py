@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turning on the spot: the place without a calibration, or an error that says there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
+
+from starpos import rotation
+from starpos.average import average
+from starpos.earth import curvature_radii_m
+from starpos.errors import FixError
+from starpos.inclinometer import Tilt, a2_matrix
+from starpos.instrument import Instrument
+from starpos.solve import Solver, Status
+from starpos.stars import no_stars
+from starpos.turning import turn
+
+
+def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(0.2, -0.1), lean=0.0):
+    """Frames at these azimuths of an instrument that is told nothing of its A3, its tilts, and the scene.
+
+    lean: by how many deg the axis of the turn is off the plumb line.
+    """
+    frames, tilts = [], {}
+    for n, azimuth in enumerate(headings):
+        scene = wide_scene(pointing_deg=(azimuth, 78.0 + lean * np.cos(np.radians(azimuth)), 15.0))
+        instrument = replace(scene.instrument, misalignment_deg=misalignment)
+        scene = replace(scene, instrument=instrument)
+        begin = START + 60.0 * n
+        stars, tilt = stars_of(scene, catalogue, rng, begin), tilt_of(scene, rng, begin)
+        frames.append(stars)
+        zero = np.radians(zero_deg)
+        tilts[stars.mid_unix_s] = Tilt(
+            tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, stars.mid_unix_s
+        )
+    solver = Solver(Instrument(FOCAL_PX), catalogue, scene.site.atmosphere)
+    return turn(solver, frames, lambda mid, _: tilts[mid]), scene
+
+
+def miss(place, scene):
+    """Distance (m) and how many of its own sigma that is."""
+    phi = np.radians(scene.site.latitude_deg)
+    prime, meridian = curvature_radii_m(phi)
+    east = (place.longitude - np.radians(scene.site.longitude_deg) + np.pi) % (2 * np.pi) - np.pi
+    moved = np.array([east * prime * np.cos(phi), (place.latitude - phi) * meridian])
+    return np.linalg.norm(moved), np.sqrt(moved @ np.linalg.solve(place.covariance[:2, :2], moved))
+
+
+@pytest.mark.parametrize("headings", [(0, 180), (10, 100, 190, 280), (0, 60, 120, 180, 240, 300, 0, 60)])
+@pytest.mark.parametrize("lean", [0.0, 0.02, 0.7])
+def test_the_place_of_an_instrument_whose_a3_nobody_knows(catalogue, rng, headings, lean):
+    if len(headings) == 2 and lean > 0:
+        with pytest.raises(FixError, match="leans by"):  # which way does the inclinometer face?
+            turned(catalogue, rng, headings, lean=lean)
+        return
+    answer, scene = turned(catalogue, rng, headings, lean=lean)
+    place = average(answer.fixes)
+    metres, sigmas = miss(place, scene)
+    sigma = np.sqrt(np.linalg.eigvalsh(place.covariance[:2, :2])[-1])
+    assert sigmas < 4
+    # one reading has 12.6 arcsec, 390 m; two opposite headings share it
+    assert 150 / np.sqrt(len(headings)) < sigma < 900 / np.sqrt(len(headings)) * 2
+    assert metres < 4 * sigma
+    assert answer.plumb_stddev_arcsec < 40
+
+
+def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
+    misalignment, zero = (1.5, -2.0, 130.0), (0.2, -0.1)
+    answer, scene = turned(catalogue, rng, range(0, 360, 30), misalignment, zero)
+    s = answer.solutions[-1].tilt  # what the inclinometer says, its zero off, and what is so
+    read = a2_matrix(s.theta_x, s.theta_y)[2]
+    true = a2_matrix(*(np.array([s.theta_x, s.theta_y]) - np.radians(zero)))[2]
+    truth = replace(scene.instrument, misalignment_deg=misalignment).mounting.a3.T @ true
+    found = answer.instrument.mounting.a3.T @ read
+    off_arcsec = np.degrees(np.arccos(np.clip(truth @ found, -1, 1))) * 3600
+    assert off_arcsec < 4 * 12.6  # one reading's noise is in both
+    assert answer.plumb_stddev_arcsec < 10
+
+
+@pytest.mark.parametrize("headings", [(20, 20, 20), (20,)])
+def test_without_a_turn_the_error_is_wide(catalogue, rng, headings):
+    answer, scene = turned(catalogue, rng, headings)
+    place = average(answer.fixes)
+    assert np.sqrt(np.diag(place.covariance)[:2]).min() > 100e3
+    assert miss(place, scene)[1] < 4
+    assert answer.plumb_stddev_arcsec > 3600
+
+
+def test_a_small_turn_tells_little_and_says_so(catalogue, rng):
+    answer, scene = turned(catalogue, rng, (0, 10))
+    place = average(answer.fixes)
+    assert miss(place, scene)[1] < 4
+    assert np.sqrt(np.diag(place.covariance)[:2]).max() > 1500
+
+
+def test_frames_without_stars_stay_without_a_fix(catalogue):
+    solver = Solver(Instrument(FOCAL_PX), catalogue)
+    empty = no_stars(1000, 700, START, 0.5)
+    answer = turn(solver, [empty, empty], lambda *_: Tilt(0.0, 0.0, np.eye(2) * 1e-10, START))
+    assert [s.status for s in answer.solutions] == [Status.TOO_FEW_STARS] * 2
+    assert answer.instrument.misalignment_deg == (0.0, 0.0, 0.0)
+
+
+def test_a_rotation_becomes_the_three_angles_of_a3(rng):
+    for _ in range(20):
+        a3 = rotation.from_vector(rng.normal(size=3) * [0.3, 0.3, 2.0])
+        np.testing.assert_allclose(Instrument(1000.0).turned_to(a3).mounting.a3, a3, atol=1e-12)
