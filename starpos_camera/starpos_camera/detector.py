@@ -3,7 +3,7 @@
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rclpy.node import Node
@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frame import Frame
+from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
 from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
@@ -39,8 +40,9 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a frame: its stars, ready to be published, and what it took."""
+    """What became of a frame: its stars, ready to be published, and what it took. The frame goes once they are."""
 
+    frame: Frame | None
     message: StarArray
     detection: Detection
     cpu_ms: float
@@ -48,7 +50,7 @@ class Outcome:
 
 
 class DetectorNode(Node):
-    """Publishes starpos_interfaces/StarArray on `stars`; see README.md."""
+    """Publishes starpos_interfaces/StarArray on `stars`, and what is seen on `~/image_annotated`; see README.md."""
 
     def __init__(self, **options):
         """options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
@@ -81,6 +83,7 @@ class DetectorNode(Node):
             QoSProfile(depth=IMAGE_DEPTH),
             qos_overriding_options=overriding,
         )
+        self._annotator = Annotator(self)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
         self._diagnostics = Diagnostics(self, {"Stars": self._report})
@@ -89,6 +92,7 @@ class DetectorNode(Node):
 
     def destroy_node(self):
         self._worker.stop()
+        self._annotator.stop()
         super().destroy_node()
 
     def submit(self, frame: Frame, header: Header, stamp_stddev: float = 0.0):
@@ -153,18 +157,20 @@ class DetectorNode(Node):
 
     def _detect(self, job: Job) -> Outcome:
         """In the worker's thread."""
-        begin, cpu = time.monotonic(), time.process_time()
+        begin, cpu = time.monotonic(), time.thread_time()  # other threads may be drawing, or rendering
         detection = detect(job.frame, self._settings)
         message = stars_to_message(detection.stars, job.header.frame_id, job.stamp_stddev)
         message.header = job.header  # to the nanosecond: it is what goes with a frame finds it by
-        return Outcome(message, detection, (time.process_time() - cpu) * 1e3, time.monotonic() - begin)
+        cpu_ms = (time.thread_time() - cpu) * 1e3
+        return Outcome(job.frame, message, detection, cpu_ms, time.monotonic() - begin)
 
     def _on_wake(self):
         for result in self._worker.fetch():
             if isinstance(result, Outcome):
                 self._publisher.publish(result.message)
                 self._frames += 1
-                self._last = result
+                self._annotator.take(result.frame, result.detection.stars, result.message.header)
+                self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
                 self._complain(str(result))
             else:

@@ -80,6 +80,7 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
     message.ids = list(answer.names)
     message.indices = [] if answer.star is None else answer.star.tolist()
+    message.magnitudes = [] if answer.magnitudes is None else answer.magnitudes.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
     message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
     a, fix = answer.attitude, answer.fix

@@ -32,7 +32,15 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
 
 def answer_facing(azimuth_deg: float) -> Answer:
     return Answer(
-        Status.OK, "fix", "stars", 1.8e9, 3, ("a", "b", "c"), np.arange(3), fix=fix_facing(azimuth_deg)
+        Status.OK,
+        "fix",
+        "stars",
+        1.8e9,
+        5,
+        ("a", "b", "c"),
+        np.array([0, 2, 4]),
+        np.array([5.25, 7.5, 10.0]),
+        fix=fix_facing(azimuth_deg),
     )
 
 
@@ -53,6 +61,17 @@ def test_heading_north_is_not_taken_for_none():
     message = outputs.solution(Header(), answer, outputs.on_ground(answer, EXACT), EXACT)
     assert message.heading == 0.0
     assert message.status == Solution.OK
+
+
+def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
+    answer = answer_facing(0.0)
+    message = outputs.solution(Header(), answer, outputs.on_ground(answer, EXACT), EXACT)
+    assert (message.stars_detected, message.stars_matched) == (5, 3)
+    assert (message.ids, list(message.indices), list(message.magnitudes)) == (
+        ["a", "b", "c"],
+        [0, 2, 4],
+        [5.25, 7.5, 10.0],
+    )
 
 
 def test_rates_and_accelerations_are_declared_unmeasured():
@@ -104,9 +123,16 @@ def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
 
 def test_without_a_fix_every_number_that_is_missing_is_nan():
     answer = replace(
-        answer_facing(10.0), status=Status.NOT_IDENTIFIED, fix=None, names=(), star=None, message="why"
+        answer_facing(10.0),
+        status=Status.NOT_IDENTIFIED,
+        fix=None,
+        names=(),
+        star=None,
+        magnitudes=None,
+        message="why",
     )
     message = outputs.solution(Header(), answer, None, EXACT)
+    assert not message.ids and not message.indices and not message.magnitudes
     assert message.status == Solution.NOT_IDENTIFIED
     assert message.status_text == "why"
     for name in ("latitude", "longitude", "heading", "heading_stddev", "focal_px", "log_odds", "residual"):

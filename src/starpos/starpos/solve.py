@@ -71,6 +71,7 @@ class Solution:
     stars_detected: int
     names: tuple[str, ...] = ()
     star: np.ndarray | None = None  # (M,) rows of the input's stars, one per name
+    magnitudes: np.ndarray | None = None  # (M,) V of the catalogue, one per name
     attitude: Attitude | None = None
     fix: Fix | None = None
     tilt: Tilt | None = None
@@ -123,6 +124,7 @@ class Solver:
             Solution.failed(stars, Status.OK, "identified"),
             names=tuple(self.catalogue.names(found.catalogue)),
             star=found.star,
+            magnitudes=self.catalogue.vmag(found.catalogue),
             attitude=_attitude(found, sky, camera),
             identify_s=spent,
         )
@@ -162,6 +164,7 @@ class Solver:
             Solution.failed(stars, Status.OK, "fix"),
             names=tuple(self.catalogue.names(found.catalogue[fix.used])),
             star=found.star[fix.used],
+            magnitudes=self.catalogue.vmag(found.catalogue[fix.used]),
             fix=fix,
             fix_s=time.perf_counter() - identified,
             extrapolated_days=state.orientation.extrapolated_days,

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The detector's annotated image: made only while somebody subscribes, one frame at a time."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+from starpos.annotate import Identified, annotate
+from starpos.frame import Frame
+from starpos.stars import Stars
+from starpos_camera.worker import Worker
+from starpos_common.messages import frame_to_message
+from starpos_interfaces.msg import Solution
+
+PATIENCE_S = 2.0  # for a frame's solution; then it is shown without
+COMPLAINT_PERIOD_S = 5.0
+NAME_LETTERS, SENTENCE_LETTERS = 24, 300  # of a text from outside, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A frame to be annotated, the stars found in it, and the header of both."""
+
+    frame: Frame
+    stars: Stars
+    header: Header
+
+
+class Annotator:
+    """Publishes sensor_msgs/Image on `~/image_annotated` for a node that detects stars.
+
+    The frame waits for its solver/solution, where there is a solver; frames that come meanwhile pass by, so that one
+    is kept at most, and none while nobody subscribes. The node calls `take` and `stop` in its executor.
+    """
+
+    def __init__(self, node: Node):
+        self._node = node
+        self._override = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
+        self._publisher = node.create_publisher(
+            Image, "~/image_annotated", QoSProfile(depth=1), **self._override
+        )
+        self._solutions = None  # the subscription, while somebody looks
+        self._waiting: Subject | None = None
+        self._drawing = False
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._patience = node.create_timer(PATIENCE_S, self._give_up, clock=steady, autostart=False)
+        self._worker = Worker(_draw, node.create_guard_condition(self._on_wake).trigger, "annotation")
+        self._worker.start()
+
+    def stop(self):
+        self._worker.stop()
+
+    def take(self, frame: Frame, stars: Stars, header: Header):
+        """Offer a frame whose stars have just been published under `header`."""
+        if not self._publisher.get_subscription_count():
+            self._forget()
+            return
+        if self._solutions is None:
+            self._solutions = self._node.create_subscription(
+                Solution, "solver/solution", self._on_solution, QoSProfile(depth=10), **self._override
+            )
+        if self._waiting or self._drawing:
+            return
+        self._waiting = Subject(frame, stars, header)
+        if self._solutions.get_publisher_count():
+            self._patience.reset()
+        else:
+            self._begin(Identified(), ["no solver"])
+
+    def _forget(self):
+        self._patience.cancel()
+        self._waiting = None
+        if self._solutions is not None:
+            self._node.destroy_subscription(self._solutions)
+            self._solutions = None
+
+    def _on_solution(self, message: Solution):
+        if self._waiting and message.header.stamp == self._waiting.header.stamp:
+            self._begin(_identified(message, len(self._waiting.stars)), _remarks(message))
+
+    def _give_up(self):
+        if self._waiting:  # the solution may have come in the same turn of the executor
+            self._begin(Identified(), [f"no solution within {PATIENCE_S:g} s"])
+
+    def _begin(self, identified: Identified, remarks: list[str]):
+        """Draw the frame that waits."""
+        self._patience.cancel()
+        subject, self._waiting = self._waiting, None
+        if self._publisher.get_subscription_count():
+            self._drawing = True
+            self._worker.offer((subject, identified, remarks))
+
+    def _on_wake(self):
+        for result in self._worker.fetch():
+            self._drawing = False
+            if isinstance(result, Image):
+                self._publisher.publish(result)
+            else:
+                kind = type(result).__name__
+                self._node.get_logger().warning(
+                    f"a frame could not be annotated ({kind}: {result}); keep it and report this.",
+                    throttle_duration_sec=COMPLAINT_PERIOD_S,
+                )
+
+
+def _draw(job: tuple[Subject, Identified, list[str]]) -> Image:
+    """In the worker's thread."""
+    subject, identified, remarks = job
+    picture = annotate(subject.frame, subject.stars, identified, remarks)
+    message = frame_to_message(Frame(picture), "")
+    message.header = subject.header
+    return message
+
+
+def _identified(message: Solution, count: int) -> Identified:
+    """What a solution says of `count` stars; nobody where it does not hold together."""
+    rows = np.array(message.indices, int)
+    if not len(rows) == len(message.ids) == len(message.magnitudes) or np.any(rows >= count):
+        return Identified()
+    return Identified(rows.tolist(), [name[:NAME_LETTERS] for name in message.ids], message.magnitudes)
+
+
+def _remarks(message: Solution) -> list[str]:
+    """Fix and heading, or why there are none."""
+    if message.status != Solution.OK:
+        return [message.status_text[:SENTENCE_LETTERS]]
+    north, east = message.latitude_geodetic, message.longitude_geodetic
+    sigma_m = math.sqrt(max(message.covariance_geodetic[0], message.covariance_geodetic[4]))
+    place = f"{abs(north):.5f} {'NS'[north < 0]}  {abs(east):.5f} {'EW'[east < 0]}"
+    return [
+        f"{place}  +- {sigma_m:.0f} m",
+        f"heading {message.heading:.3f} +- {message.heading_stddev:.3f} deg",
+    ]

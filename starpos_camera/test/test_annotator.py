@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The detector's annotated image: for whom, of what, and what it costs where nobody looks."""
+
+import gc
+import weakref
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+from test_detector import Feed
+
+from starpos.annotate import DETECTED, IDENTIFIED
+from starpos_camera.detector import DetectorNode
+from starpos_common.messages import message_to_frame
+from starpos_interfaces.msg import Solution, StarArray
+
+TOPIC = "detector/image_annotated"
+
+
+def has(picture, star, colour) -> bool:
+    """Whether a circle of this colour is around a star of a frame that is shown as it is."""
+    rows, columns = np.nonzero(np.abs(picture.astype(int) - colour).max(2) < 40)
+    away = np.hypot(columns - star.x, rows - star.y)
+    return np.count_nonzero((away > 4) & (away < 10)) > 8
+
+
+class Viewer:
+    """Somebody who looks at the annotated images of a feed."""
+
+    def __init__(self, feed):
+        self.feed = feed
+        self.images = feed.listener.hear(Image, TOPIC)
+        self.solver = None
+        feed.listener.wait(lambda: feed.listener.node.count_publishers(TOPIC))
+
+    def start_solver(self):
+        """A topic of solutions that the detector listens to; it does so from the first frame that is looked at."""
+        self.solver = self.feed.listener.node.create_publisher(Solution, "solver/solution", 10)
+        self.feed.show(self.feed.frame)
+        self.feed.listener.wait(self.solver.get_subscription_count)
+
+    def see(self, changes=None):
+        """The picture and the stars of a frame; changes: of the solution, None for no solution at all.
+
+        Frames pass by while an earlier one waits or is drawn, so it is shown until its picture comes.
+        """
+        shown = []
+
+        def show():
+            message = self.feed.message(self.feed.frame)
+            shown.append(message.header)
+            self.feed.images.publish(message)
+            self.feed.wait_for(message)
+            if changes is not None:
+                said = {"ids": ["HIP 11"], "indices": [0], "magnitudes": [4.5], "status": Solution.NO_TILT}
+                self.solver.publish(Solution(**{"header": message.header, **said, **changes}))
+
+        def seen():
+            return [image for image in self.images if image.header in shown]
+
+        self.feed.listener.wait(lambda: seen() or show())
+        image = seen()[-1]
+        stars = next(s.stars for s in self.feed.stars if s.header == image.header)
+        return message_to_frame(image).pixels, stars
+
+
+@pytest.fixture
+def feed(listener, start, frame):
+    feed = Feed(listener, start)
+    feed.frame = frame
+    return feed
+
+
+@pytest.fixture
+def viewer(feed):
+    viewer = Viewer(feed)
+    # images are made from when the detector knows of the viewer
+    feed.listener.wait(lambda: feed.show(feed.frame) and viewer.images)
+    return viewer
+
+
+def test_without_a_solver_every_star_is_circled_under_the_header_of_the_frame(viewer):
+    picture, stars = viewer.see()
+    assert picture.shape[1] == 640 and picture.shape[0] > 480
+    clean = [s for s in stars if not s.flags]
+    assert len(clean) > 10 and all(has(picture[:480], s, DETECTED) for s in clean)
+
+
+def test_the_solution_of_the_frame_names_its_stars(viewer):
+    viewer.start_solver()
+    plain, stars = viewer.see({"ids": [], "indices": [], "magnitudes": []})
+    row = next(k for k, s in enumerate(stars) if not s.flags and 100 < s.x < 500 and 50 < s.y < 430)
+    named, _ = viewer.see({"indices": [row]})
+    assert has(plain[:480], stars[row], DETECTED) and has(named[:480], stars[row], IDENTIFIED)
+    rows, columns = np.nonzero((named[:480] != plain[:480]).any(2))
+    away = np.hypot(columns - stars[row].x, rows - stars[row].y)
+    assert 30 < away.max() < 150  # a text beside it, and nothing elsewhere
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"indices": [4_000_000_000]},
+        {"indices": [0, 1]},
+        {"magnitudes": []},
+        {"ids": ["HIP 1"] * 50_000},
+    ],
+)
+def test_a_solution_that_does_not_hold_together_names_nobody(viewer, changes):
+    viewer.start_solver()
+    picture, stars = viewer.see(changes)
+    assert not has(picture[:480], stars[0], IDENTIFIED)
+
+
+def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer):
+    viewer.start_solver()
+    picture, stars = viewer.see(
+        {
+            "ids": ["\N{SNOWMAN}\n%s" * 10_000],
+            "magnitudes": [float("inf")],
+            "status": Solution.OK,
+            "status_text": "x" * 100_000,
+            "heading": float("nan"),
+            "covariance_geodetic": [float("nan")] * 9,
+        }
+    )
+    assert stars[0].flags or has(picture[:480], stars[0], IDENTIFIED)
+
+
+def test_a_solver_that_stays_silent_or_speaks_of_other_frames_holds_nothing_up(viewer):
+    viewer.start_solver()
+    picture, stars = viewer.see({"header": Header()})
+    assert not has(picture[:480], stars[0], IDENTIFIED)
+
+
+class Inside:
+    """A detector in this process, to see what it keeps."""
+
+    def __init__(self, frame):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.detector = DetectorNode(context=self.context)
+        self.viewer = rclpy.create_node("viewer", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.detector)
+        self.executor.add_node(self.viewer)
+        self.stars, self.images, self.alive, self.frame = [], [], weakref.WeakSet(), frame
+        self.viewer.create_subscription(StarArray, "stars", self.stars.append, 10)
+        self.wait(lambda: self.viewer.count_publishers("stars"))
+
+    def close(self):
+        self.executor.shutdown()
+        self.detector.destroy_node()
+        self.viewer.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def wait(self, condition):
+        for _ in range(300):
+            if condition():
+                return
+            self.executor.spin_once(timeout_sec=0.1)
+        raise AssertionError("waited in vain")
+
+    def show(self):
+        """Have a frame's stars published; it is this process's to keep or to let go."""
+        count, frame = len(self.stars), replace(self.frame, pixels=self.frame.pixels.copy())
+        self.alive.add(frame)
+        header = Header()
+        header.stamp.sec = 1793642400 + count
+        self.detector.submit(frame, header)
+        del frame
+        self.wait(lambda: len(self.stars) > count)
+
+    def kept(self) -> int:
+        gc.collect()
+        return len(self.alive)
+
+
+@pytest.fixture
+def inside(frame):
+    inside = Inside(frame)
+    yield inside
+    inside.close()
+
+
+def test_where_nobody_looks_nothing_is_kept_drawn_or_listened_to(inside):
+    solver = inside.viewer.create_publisher(Solution, "solver/solution", 10)
+    inside.show()
+    inside.show()
+    assert inside.kept() == 0
+    assert solver.get_subscription_count() == 0
+    assert inside.viewer.count_subscribers("solver/solution") == 0
+
+
+def test_one_frame_waits_for_its_solution_and_none_once_the_viewer_has_gone(inside):
+    solver = inside.viewer.create_publisher(Solution, "solver/solution", 10)
+    eye = inside.viewer.create_subscription(Image, TOPIC, inside.images.append, 10)
+    inside.wait(lambda: inside.show() or inside.images)
+    inside.wait(solver.get_subscription_count)
+    inside.wait(lambda: inside.show() or inside.kept() == 1)  # it waits, the others pass by
+    for _ in range(5):
+        inside.show()
+        assert inside.kept() <= 1
+    inside.viewer.destroy_subscription(eye)
+    inside.wait(lambda: inside.show() or solver.get_subscription_count() == 0)
+    inside.show()
+    assert inside.kept() == 0
