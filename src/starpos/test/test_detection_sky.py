@@ -73,6 +73,16 @@ def test_a_roof_hides_what_it_covers_and_adds_nothing(brightness, rng):
     assert len(found) - len(set(index[index >= 0])) <= 3
 
 
+@pytest.mark.parametrize("sky", [60, 300, 1000])
+def test_a_dark_roof_makes_no_star_and_hides_none_above_it(sky, rng):
+    stars = grid(SIZE, 50, ELECTRONS, rng)
+    y, x = np.indices(SIZE)
+    found = found_in(np.where(y > 300 + 0.1 * x, 10, field(SIZE, stars, sky=sky)), rng)
+    errors(found, stars[stars[:, 1] < 285 + 0.1 * stars[:, 0]])
+    index = match(found, stars, within=3)
+    assert len(found) == len(set(index[index >= 0]))
+
+
 def test_dead_rows_and_columns_cost_only_the_stars_on_them(stars, rng):
     pixels = noisy(field(SIZE, stars), rng)
     rows, columns = np.arange(30, SIZE[0], 97), np.array([130, 131, 333])
@@ -123,3 +133,29 @@ def test_many_pairs_teach_no_false_errors(ratio, rng):
         error, pull = errors(found, some)
         assert rms(error) < 1.2 * rms(bound(some[0, 2], trail=trail))
         assert 0.85 < rms(pull) < 1.15
+
+
+def test_coma_costs_little_though_one_psf_serves_the_whole_field(rng):
+    size, tail_px = (1000, 1400), 1.0  # at a corner
+    stars = grid(size, 60, lambda n: np.where(np.arange(n) % 2, 3000.0, 60000.0), rng)
+    outwards = (stars[:, :2] - [size[1] / 2, size[0] / 2]) / (np.hypot(*size) / 2)
+    steps = (np.arange(9) + 0.5) / 3
+    share = np.exp(-steps) / np.exp(-steps).sum()
+    tails = [
+        np.c_[stars[:, :2] + s * tail_px * outwards, stars[:, 2] * w]
+        for s, w in zip(steps, share, strict=True)
+    ]
+    found = found_in(field(size, np.concatenate(tails)), rng)
+    error, _ = errors(found, stars)
+    # a shift that grows outwards is distortion, which a camera's calibration holds; what depends on brightness is not
+    far = np.hypot(*outwards.T)
+    along = np.einsum("ni,ni->n", error, outwards) / far
+    terms = np.stack([far, far**3], 1)
+    shifts = []
+    for electrons in (3000, 60000):
+        own = stars[:, 2] == electrons
+        fit = np.linalg.lstsq(terms[own], along[own], rcond=None)[0]
+        rest = error[own] - (terms[own] @ fit / far[own])[:, None] * outwards[own]
+        assert rms(rest) < 1.2 * rms(bound(electrons))  # of a star without a tail
+        shifts.append(fit.sum())
+    assert abs(shifts[1] - shifts[0]) < 0.04

@@ -135,24 +135,20 @@ def _noise_of_smooth(plane, background, kernel):
     less SNR than its pixels claim. The second is of a sky less even than its cells, as with clouds: a peak then means
     less.
     """
-    height = plane.shape[0]
-    lag = round(1.7 * kernel.sigma)  # four times as many px: from there on smoothed noise is independent
-    scores, steps = [], []
-    for top in np.linspace(0, max(0, height - 16), 8).astype(int):
-        smooth, offset = _smooth(plane, kernel, top, min(top + 16, height))
-        y, x = np.mgrid[offset : len(smooth) : 4, 0 : smooth.shape[1] : 4]
-        level, noise = background.at(x.ravel(), y.ravel() - offset + top)
-        score = (smooth[y, x] - level.mean(1).reshape(y.shape)) / np.sqrt((noise**2).mean(1)).reshape(y.shape)
-        scores.append(score.ravel())
-        steps.append(
-            (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])).ravel() / 1.5**0.5
-        )
+    tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
+    strips = [_smooth(plane, kernel, top, min(top + 16, len(plane))) for top in tops]
+    value = np.concatenate([smooth[offset : offset + 16 : 4, ::4] for smooth, offset in strips])
+    rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
+    x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
+    level, noise = background.at(x.ravel(), y.ravel())
+    score = (value - level.mean(1).reshape(x.shape)) / np.sqrt((noise**2).mean(1)).reshape(x.shape)
     # stars widen the scatter upwards; where they are many, only the far side is free of them
-    low, sigma_below, median = np.quantile(np.concatenate(scores), (0.0228, 0.1587, 0.5))
+    low, sigma_below, median = np.quantile(score, (0.0228, 0.1587, 0.5))
     whole = tied = min(median - sigma_below, sigma_below - low) / kernel.norm
-    # clouds hardly change from a pixel to those `lag` to its left and right
-    steps = np.concatenate(steps)
-    if len(steps):
+    # clouds hardly change from a pixel to those 4 lag px to its left and right, where smoothed noise is independent
+    lag = round(1.7 * kernel.sigma)
+    if score.shape[1] > 2 * lag:
+        steps = (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])) / 1.5**0.5
         tied = min(whole, 1.4826 * np.median(np.abs(steps)) / kernel.norm)
     tied = float(tied) if tied > 1.1 else 1.0
     return tied, max(1.0, float(whole) / tied)

@@ -15,14 +15,11 @@ DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
 TEACHERS = 250
 TEACHING_PIXELS = 12000  # of wide stars fewer are enough
-UNLIKE = (
-    0.005  # of a star's squared light: beyond it, three times what others leave and noise, it does not teach
-)
+# a star does not teach if the PSF leaves more of its squared light than this, three times what others do, and noise
+UNLIKE = 0.005
 ROUNDS = 2  # of fits and refinements
-RING_FWHM = (
-    5.0  # px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more than
-)
-POOR = 0.05  # of a pixel's light
+# px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more of a pixel's light
+RING_FWHM, POOR = 5.0, 0.05
 RING_ROUNDS, RING_ORDER = 6, 14  # so many more rounds then, and terms of that order
 MAX_REACH = 20
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
@@ -78,7 +75,7 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         response = _respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= ROUNDS
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
-            break
+            break  # the response was learnt once more: with the last PSF, of the stars that are like it
         enough = int(np.log2(len(x)) / 1.2)  # 2 from 6 stars, 3 from 13, 4 from 28
         order = min(RING_ORDER, 4 * enough) if ring else min(MAX_ORDER, 2 * enough)
         if order > 0:

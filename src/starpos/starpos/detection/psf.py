@@ -5,6 +5,11 @@ As Anderson & King (2000, PASP 112, 1360) it is a smooth function of the offset 
 trail and the pixel's own square, learnt from the frame's stars; here as Gauss-Hermite series (Refregier 2003,
 MNRAS 338, 35) along the principal axes of the mean star: u along, v across the trail, in units of its widths.
 Only even terms are kept, so the centre is the centre of symmetry whatever the fit makes of the rest.
+
+One PSF serves the whole field. Coma whose tail reaches 1 px at the corners, of stars of FWHM 2.4 px, costs 1 to 3 % of
+the Cramer-Rao bound; a star of 3000 and one of 60000 electrons then differ there by 0.02 px (what both shift belongs
+to the camera's distortion), and the errors, fearing the misfit, say twice too much. Below that a PSF that varies
+gains nothing.
 """
 
 from dataclasses import dataclass
@@ -44,16 +49,15 @@ class Psf:
         fu, fv = (_hermites(w, n) for w, n in zip((u, v), self.series.shape, strict=True))
         norm = np.float32(abs(np.linalg.det(self.axes)) / (2 * np.pi))
         gauss = np.exp(-0.5 * (u * u + v * v)) * norm
-        value, du, dv = (np.zeros_like(gauss) for _ in range(3))
-        for i, row in enumerate(self.series.astype(np.float32)):
-            terms = np.flatnonzero(row)
-            if len(terms) == 0:
-                continue
-            across = sum(row[j] * fv[j] for j in terms)
-            value += fu[i] * across
-            # -d/du of h_i exp(-u^2 / 2) is sqrt(i + 1) h_i+1 exp(-u^2 / 2)
-            du += np.float32((i + 1) ** 0.5) * fu[i + 1] * across
-            dv += fu[i] * sum(row[j] * np.float32((j + 1) ** 0.5) * fv[j + 1] for j in terms)
+        # -d/du of h_i exp(-u^2 / 2) is sqrt(i + 1) h_i+1 exp(-u^2 / 2)
+        series = self.series.astype(np.float32)
+        by_u, by_v = (np.sqrt(np.arange(1, n + 1, dtype=np.float32)) for n in series.shape)
+        flat = fv.reshape(len(fv), -1)
+        across = (series @ flat[:-2]).reshape(-1, *u.shape)
+        value = np.einsum("i...,i...->...", fu[:-2], across)
+        du = np.einsum("i,i...,i...->...", by_u, fu[1:-1], across)
+        across = ((series * by_v) @ flat[1:-1]).reshape(-1, *u.shape)
+        dv = np.einsum("i...,i...->...", fu[:-2], across)
         (ax, ay), (bx, by) = self.axes.astype(np.float32)
         du, dv = du * gauss, dv * gauss
         return value * gauss, ax * du + bx * dv, ay * du + by * dv
@@ -101,7 +105,8 @@ def refine(psf, dx, dy, brightness, weight, order) -> Psf:
 
 def _hermites(u, order):
     """h_0(u) .. h_order+1(u): the probabilists' Hermite polynomials over sqrt(n!), which keeps them of order 1."""
-    values = [np.ones_like(u), u]
+    values = np.empty((order + 2, *u.shape), u.dtype)
+    values[0], values[1] = 1, u
     for n in range(1, order + 1):
-        values.append((u * values[n] - np.float32(n**0.5) * values[n - 1]) * np.float32((n + 1) ** -0.5))
+        values[n + 1] = (u * values[n] - np.float32(n**0.5) * values[n - 1]) * np.float32((n + 1) ** -0.5)
     return values
