@@ -37,29 +37,8 @@ class Lesson:
 
 def learn(plane, background, x, y, height, saturation) -> Lesson:
     """What the peaks x, y (N,) of that height, highest first, teach; defaults where they teach nothing."""
-    psf = gaussian(np.eye(2) * DEFAULT_SIGMA**2)
     response = Response(np.ones(len(background.level)), 0.3, 0.0, 0.0)
-    bright = np.flatnonzero(height > BRIGHT)
-    if len(bright) == 0:
-        bright = np.arange(min(len(x), TEACHERS))
-    bright = bright[_isolated(x, y, height, bright)]
-    bright = bright[~_is_dot(cut(plane, background, x[bright], y[bright], 1, saturation))][:TEACHERS]
-    stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(~stamps.full.any((1, 2)))
-    shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
-    if shape is None:
-        return Lesson(psf, response, reach_of(psf))
-    psf = gaussian(shape)
-    stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
-    smooth, blur = grey(stamps, background)
-    x, y = centroid(smooth, shape)
-    window = window_for(shape)
-    _, _, seen = moments(smooth, x, y, window)
-    widths = relative_widths(seen, shape + blur * np.eye(2), window)
-    alike = (widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)
-    stamps, x, y = stamps.take(alike), x[alike], y[alike]
-    most = max(TEACHING_PIXELS // stamps.signal[0].size, 40) if len(x) else 0
-    stamps, x, y = stamps.take(slice(most)), x[:most], y[:most]
+    psf, stamps, x, y = _teachers(plane, background, x, y, height, saturation)
     for round_ in range(ROUNDS + RING_ROUNDS):
         if len(x) == 0:
             break
@@ -81,6 +60,30 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         if order > 0:
             psf = _shape_up(stamps, psf, x, y, fit.flux[sound], response, order)
     return Lesson(psf, response, reach_of(psf))
+
+
+def _teachers(plane, background, x, y, height, saturation):
+    """The Gaussian most like the bright stars alone in their surroundings, these stars' Stamps, and x, y (N,) of each."""
+    bright = np.flatnonzero(height > BRIGHT)
+    if len(bright) == 0:
+        bright = np.arange(min(len(x), TEACHERS))
+    bright = bright[_isolated(x, y, height, bright)]
+    bright = bright[~_is_dot(cut(plane, background, x[bright], y[bright], 1, saturation))][:TEACHERS]
+    stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
+    stamps = stamps.take(~stamps.full.any((1, 2)))
+    shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
+    if shape is None:
+        return gaussian(np.eye(2) * DEFAULT_SIGMA**2), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
+    psf = gaussian(shape)
+    stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
+    smooth, blur = grey(stamps, background)
+    x, y = centroid(smooth, shape)
+    window = window_for(shape)
+    _, _, seen = moments(smooth, x, y, window)
+    widths = relative_widths(seen, shape + blur * np.eye(2), window)
+    alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
+    alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
+    return psf, stamps.take(alike), x[alike], y[alike]
 
 
 def reach_of(psf) -> int:
