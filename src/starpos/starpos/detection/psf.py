@@ -8,8 +8,8 @@ Only even terms are kept, so the centre is the centre of symmetry whatever the f
 
 One PSF serves the whole field. Coma whose tail reaches 1 px at the corners, of stars of FWHM 2.4 px, costs 1 to 3 % of
 the Cramer-Rao bound; a star of 3000 and one of 60000 electrons then differ there by 0.02 px (what both shift belongs
-to the camera's distortion), and the errors, fearing the misfit, say twice too much. Below that a PSF that varies
-gains nothing.
+to the camera's distortion). That is too little for a PSF that varies; but what it fails to describe passes for noise,
+and the errors then say twice too much.
 """
 
 from dataclasses import dataclass

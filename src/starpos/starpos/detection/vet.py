@@ -82,9 +82,8 @@ def _spikes(stamps, lesson):
     grid = np.arange(-1, 2, dtype=np.float32)
     star = lesson.psf.evaluate(grid[None, None, :], grid[None, :, None])[0][0]
     four = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
-    sharpest = max(
-        1.0, star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1])
-    )  # 1: a ring has a dark middle
+    # 1 at least: a ring has a dark middle
+    sharpest = max(1.0, star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1]))
     grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
     around = ndimage.convolve(grey, four[None], mode="nearest")
     spike = (grey > SPIKE * sharpest * (around + stamps.noise)) & (stamps.signal > OUTLIER * stamps.noise)
