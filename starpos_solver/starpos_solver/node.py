@@ -257,9 +257,11 @@ class SolverNode(Node):
     def _answer_to(self, frame: Waiting) -> Answer:
         stars = frame.stars
         if self._solver is None:
-            reason = self._trouble or (
-                f"{self.resolve_topic_name('camera/camera_info')}: no camera calibration has arrived: start the camera"
-            )
+            topic = self.resolve_topic_name("camera/camera_info")
+            waiting = f"{topic}: no camera calibration has arrived: start the camera"
+            if self._preparing:
+                waiting = "the triangles of this field are being built"
+            reason = self._trouble or waiting
             return Answer.failed(stars, Status.BAD_INPUT, reason)
         solver = self._solver
         stamp_stddev = frame.message.stamp_stddev

@@ -27,6 +27,7 @@ from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 J2000 = 2000.0
 UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED
 ENOUGH_SOUND = 8
+EDGE_PX = 2.0  # a star whose centroid is further outside its frame is none
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
 
 
@@ -106,6 +107,8 @@ class Solver:
 
     def identify(self, stars: Stars) -> Solution:
         """Which stars these are and where the camera looked.  Without a time: J2000 places, no aberration."""
+        if (inside := _inside(stars)) is not None:
+            return _of_all(stars, inside, self.identify(stars.take(inside)))
         begin = time.perf_counter()
         try:
             camera = self._camera(stars.width, stars.height)
@@ -137,6 +140,8 @@ class Solver:
         tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.  standing: of an
         earlier solution; where it no longer holds nothing is lost but its half millisecond.
         """
+        if (inside := _inside(stars)) is not None:
+            return _of_all(stars, inside, self.solve(stars.take(inside), tilt, standing))
         try:
             if stars.mid_unix_s is None:
                 place = stars.source or "the frame"
@@ -155,21 +160,30 @@ class Solver:
         identified = time.perf_counter()
         if found is None:
             return replace(self._unidentified(stars), tilt=tilt, identify_s=identified - begin)
-        known = {"attitude": _attitude(found, sky, camera), "tilt": tilt, "identify_s": identified - begin}
+        known = {
+            "attitude": _attitude(found, sky, camera),
+            "tilt": tilt,
+            "identify_s": identified - begin,
+            "names": tuple(self.catalogue.names(found.catalogue)),
+            "star": found.star,
+            "magnitudes": self.catalogue.vmag(found.catalogue),
+        }
         try:
             fix = self._fix(stars, found, camera, tilt, state)
         except StarposError as e:
             return replace(_failure(stars, e), **known)
         return replace(
             Solution.failed(stars, Status.OK, "fix"),
-            names=tuple(self.catalogue.names(found.catalogue[fix.used])),
-            star=found.star[fix.used],
-            magnitudes=self.catalogue.vmag(found.catalogue[fix.used]),
             fix=fix,
             fix_s=time.perf_counter() - identified,
             extrapolated_days=state.orientation.extrapolated_days,
             standing=Standing.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
-            **known,
+            **known
+            | {
+                "names": tuple(known["names"][k] for k in fix.used),
+                "star": found.star[fix.used],
+                "magnitudes": known["magnitudes"][fix.used],
+            },
         )
 
     def _fix(
@@ -214,7 +228,9 @@ class Solver:
 
     def _identify(self, stars: Stars, camera: Camera, directions, year, velocity, priors=()):
         # of square pixels, which is what identify fits
-        ideal = Camera(camera.width, camera.height, camera.fx, camera.fx, camera.cx, camera.cy)
+        squeeze = camera.fx / camera.fy
+        height = max(1, round(camera.height * squeeze))
+        ideal = Camera(camera.width, height, camera.fx, camera.fx, camera.cx, camera.cy * squeeze)
         table = triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
         sky = ident.Sky(self.catalogue, table, year, velocity)
         sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
@@ -233,6 +249,19 @@ class Solver:
             f"({self.instrument.focal_px:.0f} px given, 3 % is allowed), clouds and exposure"
         )
         return Solution.failed(stars, Status.NOT_IDENTIFIED, message)
+
+
+def _inside(stars: Stars) -> np.ndarray | None:
+    """Rows of the stars that are on their frame; None where all are, as is usual."""
+    on = (stars.x > -EDGE_PX) & (stars.x < stars.width - 1 + EDGE_PX)
+    on &= (stars.y > -EDGE_PX) & (stars.y < stars.height - 1 + EDGE_PX)
+    return None if on.all() else np.flatnonzero(on)
+
+
+def _of_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
+    """What was found of the stars inside, said of all of them."""
+    star = None if s.star is None else inside[s.star]
+    return replace(s, star=star, stars_detected=len(stars))
 
 
 def _failure(stars: Stars, error: StarposError) -> Solution:

@@ -7,9 +7,12 @@ every circle of the field's size gives its own brightest stars, so that every fi
 
 import hashlib
 import os
+import shutil
 import tempfile
 import threading
+import time
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import combinations
 from math import comb
@@ -22,11 +25,13 @@ from starpos.catalogue import Catalogue
 from starpos.progress import Progress, quiet
 from starpos.zones import CELLS, ZONES, cell_starts, ranges
 
-FORMAT = 8
+PREFIX = "triangles-9-"  # of the folders in the cache; the number is the format's
+SCRATCH = "unfinished-"
 SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
 # Shapes (largest angle 60..180 deg, smallest 0..60 deg, longest side 0..the longest allowed) are kept to 1/65536 of
 # these ranges; the highest bits of the three are a triangle's bin.
 CODES = 1 << 16
+CROWDED = 5.0  # how much denser than on average shapes lie where they are looked up
 BIN_BITS = (8, 7, 6)
 BINS = tuple(1 << bits for bits in BIN_BITS)
 POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smallest kind
@@ -100,6 +105,11 @@ class TriangleCatalogue:
         code = self.shape[triangle]
         close = ((code >= low[query]) & (code <= high[query])).all(1)
         return query[close], triangle[close]
+
+    def expected(self, tolerance: np.ndarray) -> np.ndarray:
+        """About how many triangles (Q,) are within tolerance (Q, 3) of a shape."""
+        ranges_rad = np.array([2 * np.pi / 3, np.pi / 3, self.longest_allowed[0]])
+        return CROWDED * len(self.corners) * np.prod(np.minimum(2 * tolerance / ranges_rad, 1.0), axis=1)
 
     def longest(self, triangle: np.ndarray) -> np.ndarray:
         """Longest sides (M,) of triangles, rad."""
@@ -269,17 +279,17 @@ _in_use: dict[tuple, TriangleCatalogue] = {}
 
 def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
     settings = (
-        FORMAT,
         catalogue.fingerprint,
-        f"{half_diagonal:.6f}",
+        half_diagonal,
         CIRCLES,
         POOL_PER_CIRCLE,
         BEACONS,
         SHORTEST_SIDE,
+        MAX_TRIANGLES,
     )
     digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
-    folder = cache_folder() / f"triangles-{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
-    if (stored := _map(folder)) is not None:
+    folder = cache_folder() / f"{PREFIX}{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
+    if (stored := _map(folder, len(catalogue))) is not None:
         return stored
     built = build(catalogue, half_diagonal, progress)
     try:
@@ -291,17 +301,21 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
             stacklevel=2,
         )
         return built
-    return _map(folder) or built
+    return _map(folder, len(catalogue)) or built
 
 
 def _store(triangles: TriangleCatalogue, folder: Path) -> None:
-    """Write all columns into a new folder, then name it: another process sees all of it or nothing."""
+    """Write all columns into a new folder, then name it: others, and those after a power cut, see all of it or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+    _clear(folder.parent)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=SCRATCH) as scratch:
         whole = Path(scratch) / "whole"
         whole.mkdir()
         for f in fields(triangles):
-            np.save(whole / f"{f.name}.npy", getattr(triangles, f.name))
+            with open(whole / f"{f.name}.npy", "wb") as file:
+                np.save(file, getattr(triangles, f.name))
+                file.flush()
+                os.fsync(file.fileno())
         if folder.exists():  # it was broken, or it would have been used
             folder.rename(Path(scratch) / "broken")
         try:
@@ -311,7 +325,18 @@ def _store(triangles: TriangleCatalogue, folder: Path) -> None:
                 raise
 
 
-def _map(folder: Path) -> TriangleCatalogue | None:
+def _clear(cache: Path) -> None:
+    """Remove what earlier versions of this program left there, and what was interrupted more than a day ago."""
+    for old in cache.glob("triangles-*"):
+        if not old.name.startswith(PREFIX):
+            shutil.rmtree(old, ignore_errors=True)
+    for left in cache.glob(f"{SCRATCH}*"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > 86400:
+                shutil.rmtree(left, ignore_errors=True)
+
+
+def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
     """The stored catalogue; None where there is none or its parts do not fit together."""
     try:
         columns = {
@@ -322,15 +347,26 @@ def _map(folder: Path) -> TriangleCatalogue | None:
         return None
     t = TriangleCatalogue(**columns)
     stars, count = len(t.star), len(t.corners)
+    kinds = "iiiifibufi"  # of the columns' numbers, in their order
     fit = (
-        t.bin_start.shape == (np.prod(BINS) + 1,)
-        and t.bin_start[-1] == count
+        [column.dtype.kind for column in columns.values()] == list(kinds)
+        and t.bin_start.shape == (np.prod(BINS) + 1,)
+        and t.cell_start.shape == (ZONES * CELLS + 1,)
         and t.corners.shape == t.shape.shape == (count, 3)
         and t.counter_clockwise.shape == (count,)
-        and t.cell_start.shape == (ZONES * CELLS + 1,)
-        and len(t.rank) == t.cell_start[-1] == stars
+        and t.rank.shape == t.star.shape == (stars,)
         and t.beacons.shape == (len(t.beacon), 3)
         and t.longest_allowed.shape == (1,)
+        and t.longest_allowed[0] > 0
+        and _rising(t.bin_start, count)
+        and _rising(t.cell_start, stars)
+        and bool(np.all(np.diff(t.star) > 0))  # so that 0 to the last is what all are between
+        and (stars == 0 or 0 <= t.star[0] <= t.star[-1] < catalogue_stars)
         and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
+        and bool(np.all(t.corners[:, 0] != t.corners[:, 1]))
     )
     return t if fit else None
+
+
+def _rising(start: np.ndarray, end: int) -> bool:
+    return bool(start[0] == 0 and start[-1] == end and np.all(np.diff(start) >= 0))

@@ -372,3 +372,42 @@ def test_an_error_of_the_tilts_source_is_the_frames(night):
         raise TiltError("the port is gone: plug it in")
 
     assert refused(solver.solve(stars, gone), Status.NO_TILT) == "the port is gone: plug it in"
+
+
+def test_a_star_outside_its_frame_costs_nothing_but_itself(catalogue, rng):
+    """Where a lens distorts, a pixel far outside has no direction at all."""
+    scene = wide_scene()
+    stars = stars_of(scene, catalogue, rng)
+    camera = replace(Camera.from_focal(*SIZE, FOCAL_PX), distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
+    solver = replace(solver_of(scene, catalogue), instrument=Instrument(FOCAL_PX, camera))
+    inside = solver.identify(stars)
+    strange = with_false_stars(stars, np.array([[60000.0, 40000.0], [-900.0, 20.0]]))
+    answer = solver.identify(strange)
+    assert answer.ok
+    assert answer.stars_detected == len(stars) + 2
+    np.testing.assert_array_equal(answer.star, inside.star + 2)
+    tilt = tilt_of(scene, rng)
+    assert solver.solve(strange, tilt).names == solver.solve(stars, tilt).names
+
+
+def test_pixels_that_are_not_square(catalogue, rng):
+    """The corners of a frame whose focal lengths differ hold stars too."""
+    scene = wide_scene()
+    stars = stars_of(scene, catalogue, rng)
+    half = Stars(
+        stars.x, (stars.y + 0.5) * 0.5 - 0.5, stars.flux, stars.snr, stars.covariance, stars.flags,
+        SIZE[0], SIZE[1] // 2, stars.mid_unix_s, stars.exposure_s,
+    )  # fmt: skip
+    square = solver_of(scene, catalogue).identify(stars)
+    camera = Camera(SIZE[0], SIZE[1] // 2, FOCAL_PX, FOCAL_PX / 2, (SIZE[0] - 1) / 2, (SIZE[1] / 2 - 1) / 2)
+    solver = replace(solver_of(scene, catalogue), instrument=Instrument(FOCAL_PX, camera))
+    answer = solver.identify(half)
+    assert answer.ok
+    assert len(answer.names) > 0.97 * len(square.names)
+
+
+def test_a_poor_fit_still_says_which_stars_it_saw(night):
+    _, stars, tilt, solver = night
+    answer = replace(solver, min_stars=10_000).solve(stars, tilt)
+    refused(answer, Status.POOR_FIT)
+    assert len(answer.names) == len(answer.star) == len(answer.magnitudes) > 50

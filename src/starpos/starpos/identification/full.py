@@ -12,6 +12,12 @@ from starpos.identification.sky import Sky
 from starpos.identification.verify import Match
 from starpos.zones import rows_near
 
+FEWEST_STARS = 4  # an identification has
+LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = (
+    0.02,
+    4.0,
+    0.2,
+)  # how near a star must be to its place: sigma, and always
 FAINTEST_FIT = 2000  # stars that take part
 SMALL_TABLE = 20_000  # detections times catalogue stars
 BLEND_PX = 2.5  # closer stars make one image
@@ -66,15 +72,18 @@ class OnFrame:
         return cls(index[on], w[on], drawn[single])
 
 
-def identified(field: Field, match: Match, stars: OnFrame) -> Identification:
-    """All stars of the field matched, one to one, and the pose fitted to them."""
+def identified(field: Field, match: Match, stars: OnFrame) -> Identification | None:
+    """All stars of the field matched, one to one, and the pose fitted to them; None where fewer than FEWEST_STARS are."""
     pose = match.pose
     xy, sigma = field.xy[int(pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
     residual = xy[match.star] - pose.project(match.directions)
     for _ in range(2):
         middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
-        spread = max(1.4826 * float(middling), 0.02)
-        star, near = _mutual_nearest(xy, pose.project(stars.directions), 4 * np.hypot(spread, sigma) + 0.2)
+        spread = max(1.4826 * float(middling), LEAST_SPREAD_PX)
+        radius = GATE_SIGMA * np.hypot(spread, sigma) + GATE_PX
+        star, near = _mutual_nearest(xy, pose.project(stars.directions), radius)
+        if len(star) < FEWEST_STARS:
+            return None
         pose = pose.fitted(xy[star], stars.directions[near])
         residual = xy[star] - pose.project(stars.directions[near])
     return Identification(

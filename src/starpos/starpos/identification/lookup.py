@@ -13,6 +13,7 @@ from starpos.triangles import TriangleCatalogue, angles, counter_clockwise, oppo
 SCALE_TOLERANCE = 0.03  # of the focal length
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
 TRIANGLE_SIGMA = 3.0
+MOST_CANDIDATES = 25_000  # to be expected of one look-up
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,9 @@ class Lookup:
         self._done[error_px] = done + len(triples)
         error = np.hypot(error_px, self.field.sigma[triples].max(1)) / self.field.focal_px
         star, shape, tolerance = _shapes(self.v, triples, error)
+        # poor centroids fit so many triangles that the brightest stars' are all that can be looked at
+        few = np.cumsum(self.table.expected(tolerance)) < MOST_CANDIDATES
+        star, shape, tolerance = star[few], shape[few], tolerance[few]
         query, found = self.table.near(shape, tolerance)
         star, corner = star[query], self.table.corners[found]
         mirrored = self.table.counter_clockwise[found] != counter_clockwise(self.v[star])

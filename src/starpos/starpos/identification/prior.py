@@ -38,7 +38,9 @@ class Proposal:
         if raw.log_odds > enough or len(raw.star) < 2:
             return raw
         pose = self.pose.fitted(field.xy[0, raw.star], raw.directions)
-        return judged(field, pose, w, self.own, ERROR_PX, enough)
+        own = self.own.copy()
+        own[raw.star[:2]] = True  # two stars pay for the four parameters of the fit
+        return judged(field, pose, w, own, ERROR_PX, enough)
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,10 @@ class Pointing:
 
     attitude: np.ndarray
     focal_px: float
+
+    def __post_init__(self):
+        if not (np.isfinite(self.attitude).all() and 0 < self.focal_px < np.inf):
+            raise ValueError("a Pointing needs a finite attitude and a positive focal length")
 
     def proposals(self, field: Field, sky: Sky) -> Iterator[Proposal]:
         """That nothing has moved; then the shifts that most stars agree on."""
@@ -74,6 +80,10 @@ class Plumb:
     zenith_camera: np.ndarray
     tolerance_rad: float
 
+    def __post_init__(self):
+        if not np.isfinite([*self.zenith_sky, *self.zenith_camera, self.tolerance_rad]).all():
+            raise ValueError("a Plumb needs finite directions and a finite tolerance")
+
     def proposals(self, field: Field, sky: Sky) -> Iterator[Proposal]:
         """`Pointing`s to the azimuths at which most stars are as far from the zenith as the catalogue's."""
         camera, world = _frame_about(self.zenith_camera), _frame_about(self.zenith_sky)
@@ -88,6 +98,7 @@ class Plumb:
         turn = np.arctan2(seen[star, 1], seen[star, 0]) - np.arctan2(known[:, 1], known[:, 0])
         turn = np.sort(turn % (2 * np.pi))
         window = 2 * tolerance / max(np.sin(np.median(distance)), tolerance)
+        turn = np.concatenate([turn, turn[turn < window] + 2 * np.pi])  # the circle closes
         votes = np.searchsorted(turn, turn + window) - np.arange(len(turn))
         pick: list[int] = []
         for k in np.argsort(-votes, kind="stable")[: 10 * MOST].tolist():

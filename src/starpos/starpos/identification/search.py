@@ -7,17 +7,25 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from starpos.camera import Camera
-from starpos.identification.full import Identification, OnFrame, identified
+from starpos.identification.full import FEWEST_STARS, Identification, OnFrame, identified
 from starpos.identification.lookup import Candidates, Lookup
 from starpos.identification.pose import Field, Poses
 from starpos.identification.prior import Plumb, Pointing
 from starpos.identification.sky import Sky
 from starpos.identification.verify import TEST_STARS, Hypotheses, Match, matches, own_stars
 
-ACCEPT_LOG_ODDS = math.log(1e9)  # a wrong match among all hypotheses of a frame at most once in 1e9
-FEWEST_STARS = 4
-# (brightest stars, their error in px): the second kind is for lenses that distort
-STAGES = ((5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0))
+FALSE_ACCEPT = 1e-9  # probability that a frame of nothing is taken for some part of the sky
+PRIOR_SHARES = 0.05, 0.05 / 25  # of that: for a camera that stands, for each other proposal
+# (brightest stars, their error in px, share of FALSE_ACCEPT); the second kind is for lenses that distort
+STAGES = (
+    (5, 0.3, 0.7),
+    (7, 0.3, 0.1),
+    (10, 0.3, 0.04),
+    (14, 0.3, 0.02),
+    (20, 0.3, 0.02),
+    (9, 2.5, 0.01),
+    (8, 6.0, 0.01),
+)
 MAX_VERIFIED = 25  # candidates a stage
 
 
@@ -36,39 +44,38 @@ def identify(
     if len(xy) < FEWEST_STARS:
         return None
     field = Field.of(xy, sigma_px, camera)
-    tried = 1
-    for proposal in (p for given in priors for p in given.proposals(field, sky)):
-        tried += proposal.chosen_from
-        match = proposal.match(field, _enough(tried))
-        if _sound(match, tried):
-            stands = match.pose is proposal.pose
-            return identified(field, match, proposal.stars if stands else OnFrame.of(field, sky, match.pose))
-    for hypotheses, error_px, count in _attempts(field, sky):
-        tried += count
-        for match in matches(field, sky, hypotheses, error_px, _enough(tried)):
-            if _sound(match, tried):
-                return identified(field, match, OnFrame.of(field, sky, match.pose))
+    for k, proposal in enumerate(p for given in priors for p in given.proposals(field, sky)):
+        enough = _enough(proposal.chosen_from, PRIOR_SHARES[min(k, 1)])
+        match = proposal.match(field, enough)
+        if _sound(match, enough) and (found := identified(field, match, OnFrame.of(field, sky, match.pose))):
+            return found
+    for hypotheses, error_px, enough in _attempts(field, sky):
+        for match in matches(field, sky, hypotheses, error_px, enough):
+            if _sound(match, enough) and (
+                found := identified(field, match, OnFrame.of(field, sky, match.pose))
+            ):
+                return found
     return None
 
 
-def _enough(tried: int) -> float:
-    return ACCEPT_LOG_ODDS + math.log(tried)
+def _enough(hypotheses: int, share: float) -> float:
+    """Log-odds that the best of so many hypotheses must have: wrong ones reach them with share * FALSE_ACCEPT (Ville)."""
+    return math.log(max(hypotheses, 1) / (share * FALSE_ACCEPT))
 
 
-def _sound(match: Match, tried: int) -> bool:
-    return match.log_odds > _enough(tried) and len(match.star) >= FEWEST_STARS
+def _sound(match: Match, enough: float) -> bool:
+    return match.log_odds > enough and len(match.star) >= FEWEST_STARS
 
 
-def _attempts(field: Field, sky: Sky) -> Iterator[tuple[Hypotheses, float, int]]:
-    """What to try, in this order: hypotheses, the stars' error in px, and among how many these were chosen."""
+def _attempts(field: Field, sky: Sky) -> Iterator[tuple[Hypotheses, float, float]]:
+    """What to try, in this order: hypotheses, the stars' error in px, and the log-odds that are enough."""
     lookup = Lookup(field, sky.triangles)
-    for stars, error_px in STAGES:
-        found, count = lookup.candidates(min(stars, len(field)), error_px)
+    for stars, error_px, share in STAGES:
+        candidates, count = lookup.candidates(min(stars, len(field)), error_px)
         # mostly the first one is right, and the others together cost little more
         for k in (slice(0, 1), slice(1, MAX_VERIFIED)):
-            if len(some := found[k]):
-                yield _of_triangles(field, sky, some, error_px), error_px, count
-                count = 0
+            if len(some := candidates[k]):
+                yield _of_triangles(field, sky, some, error_px), error_px, _enough(count, share)
 
 
 def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> Hypotheses:
