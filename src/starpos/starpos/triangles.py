@@ -305,7 +305,7 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
 
 
 def _store(triangles: TriangleCatalogue, folder: Path) -> None:
-    """Write all columns into a new folder, then name it: others, and those after a power cut, see all of it or nothing."""
+    """Write all columns into a new folder, then name it: others, and a power cut, find all of it or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     _clear(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=SCRATCH) as scratch:

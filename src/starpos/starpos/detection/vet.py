@@ -106,7 +106,10 @@ def _core(stamps, fit, psf, widths):
 
 
 def _is_dot(stamps, fit, response):
-    """Hot pixels and sharp cosmic rays: one pixel and the sky make these pixels likelier than the PSF does."""
+    """Hot pixels and sharp cosmic rays: one pixel and the sky make these pixels likelier than the PSF does.
+
+    Where neither makes them likely, as on coarse pixels, the PSF must do so much worse.
+    """
     half = max(2, stamps.reach // 2 - 1)
     c = slice(stamps.reach - half, stamps.reach + half + 1)
     signal, noise, residual, model, good = (
@@ -116,7 +119,10 @@ def _is_dot(stamps, fit, response):
     one_pixel = score.sum((1, 2)) - (score * (signal > 0)).max((1, 2))
     variance = response.variance(noise, model)
     star = (good * (residual**2 / variance + np.log(variance / noise**2))).sum((1, 2))
-    return (one_pixel < star) & (stamps.full[:, c, c].sum((1, 2)) < SPECK)
+    pixels = good.sum((1, 2))
+    likely = one_pixel < pixels + 4 * np.sqrt(2 * pixels)
+    dot = (one_pixel < star) & (likely | (one_pixel < 0.5 * star))
+    return dot & (stamps.full[:, c, c].sum((1, 2)) < SPECK)
 
 
 def resolve(columns, psf):
