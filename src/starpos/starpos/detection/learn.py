@@ -161,7 +161,8 @@ def _respond(stamps, psf, x, y, fit, sound, before):
 def _two_terms(light, excess, variance):
     """a, b >= 0 for which a * light + b * light^2 is the least-squares fit of excess, of that variance."""
     terms = np.stack([light, light * light]).astype(np.float64) / variance
-    normal, right = terms @ terms.T, terms @ (excess / variance)
+    normal = np.einsum("ik,jk->ij", terms, terms)
+    right = np.einsum("ik,k->i", terms, excess / variance)
     if normal[0, 0] <= 0:
         return 0.0, 0.0
     both = np.linalg.lstsq(normal, right, rcond=1e-12)[0]

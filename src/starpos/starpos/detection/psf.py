@@ -53,10 +53,11 @@ class Psf:
         series = self.series.astype(np.float32)
         by_u, by_v = (np.sqrt(np.arange(1, n + 1, dtype=np.float32)) for n in series.shape)
         flat = fv.reshape(len(fv), -1)
-        across = (series @ flat[:-2]).reshape(-1, *u.shape)
+        # einsum: a product by BLAS wakes its threads, which spin on for longer than it takes
+        across = np.einsum("ij,jk->ik", series, flat[:-2]).reshape(-1, *u.shape)
         value = np.einsum("i...,i...->...", fu[:-2], across)
         du = np.einsum("i,i...,i...->...", by_u, fu[1:-1], across)
-        across = ((series * by_v) @ flat[1:-1]).reshape(-1, *u.shape)
+        across = np.einsum("ij,jk->ik", series * by_v, flat[1:-1]).reshape(-1, *u.shape)
         dv = np.einsum("i...,i...->...", fu[:-2], across)
         (ax, ay), (bx, by) = self.axes.astype(np.float32)
         du, dv = du * gauss, dv * gauss
@@ -92,10 +93,10 @@ def refine(psf, dx, dy, brightness, weight, order) -> Psf:
     ]
     design = np.stack([fu[i] * fv[j] * gauss for i, j in terms])
     weighted = design * weight.astype(np.float32)
-    normal = (weighted @ design.T).astype(np.float64)
+    normal = np.einsum("ik,jk->ij", weighted, design).astype(np.float64)
     # a weak pull of the corrections to zero keeps thin data sound
     pull = np.array([0.0] + [1.0] * (len(terms) - 1)) * np.trace(normal) / len(terms) * 1e-4
-    found = np.linalg.solve(normal + np.diag(pull), weighted @ brightness)
+    found = np.linalg.solve(normal + np.diag(pull), np.einsum("ik,k->i", weighted, brightness))
     series = np.zeros((along + 1, order + 1))
     series[tuple(np.transpose(terms))] = found
     if not np.all(np.isfinite(series)) or series[0, 0] <= 0:

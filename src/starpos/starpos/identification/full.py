@@ -77,13 +77,17 @@ def identified(field: Field, match: Match, stars: OnFrame) -> Identification | N
     pose = match.pose
     xy, sigma = field.xy[int(pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
     residual = xy[match.star] - pose.project(match.directions)
-    for _ in range(2):
+    before = None
+    for _ in range(3):
         middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
         spread = max(1.4826 * float(middling), LEAST_SPREAD_PX)
         radius = GATE_SIGMA * np.hypot(spread, sigma) + GATE_PX
         star, near = _mutual_nearest(xy, pose.project(stars.directions), radius)
         if len(star) < FEWEST_STARS:
             return None
+        if before is not None and np.array_equal(near, before):
+            break
+        before = near
         pose = pose.fitted(xy[star], stars.directions[near])
         residual = xy[star] - pose.project(stars.directions[near])
     return Identification(

@@ -42,7 +42,7 @@ class Hypotheses:
 
 def own_stars(xy: np.ndarray, star: np.ndarray, sigma_px: np.ndarray) -> np.ndarray:
     """Which of xy (K, n, 2) say nothing new of poses made from star (K, m): these, and their doubles (K, n)."""
-    made = np.take_along_axis(xy, star[..., None], 1)
+    made = xy[np.arange(len(xy))[:, None], star]
     apart2 = np.square(xy[:, :, None] - made[:, None]).sum(-1).min(2)
     return apart2 < np.square(MATCH_SIGMA * sigma_px + DOUBLE_PX)
 
@@ -138,10 +138,10 @@ def _log_odds(field: Field, xy, predicted, count, sigma, own):
     apart2 = np.square(xy[:, :, None, 0] - predicted[:, None, :, 0])
     apart2 += np.square(xy[:, :, None, 1] - predicted[:, None, :, 1])
     nearest = apart2.argmin(2)
-    distance2 = np.take_along_axis(apart2, nearest[..., None], 2)[..., 0]
-    n = np.arange(xy.shape[1])
+    each, n = np.arange(len(xy))[:, None], np.arange(xy.shape[1])
+    distance2 = apart2[each, n, nearest]
     # one catalogue star answers one detection: the one nearest to it
-    mutual = np.take_along_axis(apart2.argmin(1), nearest, 1) == n
+    mutual = apart2.argmin(1)[each, nearest] == n
     variance = sigma * sigma
     hit = mutual & (distance2 < MATCH_SIGMA**2 * variance)
     rank, there = EXPECTED_RANK[0] + EXPECTED_RANK[1] * n, np.maximum(count, 1)[:, None]
