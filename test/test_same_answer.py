@@ -69,7 +69,9 @@ def test_the_graph_and_the_command_line_agree(graph, run, night):
     for want, solution, frame in zip(expected, got, truth["frames"], strict=True):
         assert (solution.status, want["status"]) == (Solution.OK, "ok"), solution.status_text
         for name in ("latitude", "longitude", "heading"):
-            assert getattr(solution, name) == pytest.approx(want[name], abs=1e-9), name
+            assert getattr(solution, name) == pytest.approx(want[name], abs=1e-8), (
+                name
+            )  # a millimetre: the solver starts from its last fix
         assert list(solution.covariance) == pytest.approx(
             [v for row in want["covariance"] for v in row], rel=1e-6
         )

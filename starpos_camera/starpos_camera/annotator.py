@@ -133,9 +133,10 @@ def _remarks(message: Solution) -> list[str]:
     if message.status != Solution.OK:
         return [message.status_text[:SENTENCE_LETTERS]]
     north, east = message.latitude_geodetic, message.longitude_geodetic
-    sigma_m = math.sqrt(max(message.covariance_geodetic[0], message.covariance_geodetic[4]))
+    variance = max(message.covariance_geodetic[0], message.covariance_geodetic[4])
+    error = f"{math.sqrt(variance):.0f} m" if variance >= 0 else "unknown"
     place = f"{abs(north):.5f} {'NS'[north < 0]}  {abs(east):.5f} {'EW'[east < 0]}"
     return [
-        f"{place}  +- {sigma_m:.0f} m",
+        f"{place}  +- {error}",
         f"heading {message.heading:.3f} +- {message.heading_stddev:.3f} deg",
     ]

@@ -116,7 +116,8 @@ def test_a_solution_that_does_not_hold_together_names_nobody(viewer, changes):
     assert not has(picture[:480], stars[0], IDENTIFIED)
 
 
-def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer):
+@pytest.mark.parametrize("unknown", [float("nan"), -1.0])
+def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer, unknown):
     viewer.start_solver()
     picture, stars = viewer.see(
         {
@@ -125,7 +126,7 @@ def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer):
             "status": Solution.OK,
             "status_text": "x" * 100_000,
             "heading": float("nan"),
-            "covariance_geodetic": [float("nan")] * 9,
+            "covariance_geodetic": [unknown] * 9,
         }
     )
     assert stars[0].flags or has(picture[:480], stars[0], IDENTIFIED)

@@ -252,9 +252,9 @@ class SolverNode(Node):
 
     def _solve(self, frame: Waiting):
         self._latest = frame
-        self._publish(frame.message.header, self._answer_to(frame))
+        self._publish(frame.message.header, self._answer_to(frame, self._standing))
 
-    def _answer_to(self, frame: Waiting) -> Answer:
+    def _answer_to(self, frame: Waiting, standing: Standing | None) -> Answer:
         stars = frame.stars
         if self._solver is None:
             topic = self.resolve_topic_name("camera/camera_info")
@@ -272,9 +272,7 @@ class SolverNode(Node):
             clock = math.hypot(solver.instrument.clock_stddev_s, stamp_stddev)
             solver = replace(solver, instrument=replace(solver.instrument, clock_stddev_s=clock))
         try:
-            return solver.solve(
-                stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), self._standing
-            )
+            return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing)
         except Exception as e:  # a defect costs this frame, not the night
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
             return Answer.failed(
@@ -321,7 +319,7 @@ class SolverNode(Node):
             response.message = "no frame has arrived yet: start the camera and the detector"
             response.solution = Solution(status=Solution.BAD_INPUT, status_text=response.message)
             return response
-        answer = self._answer_to(self._latest)
+        answer = self._answer_to(self._latest, None)  # from scratch: what was before has no say
         header = Header(stamp=self._latest.message.header.stamp, frame_id=self._values["frame_id"])
         response.solution = self._messages(header, answer)[0]
         response.success, response.message = answer.ok, answer.message

@@ -59,7 +59,9 @@ def test_a_prior_gives_the_same_answer_as_none(field):
     lost, led = (identify(xy, sigma, camera, sky, priors) for priors in ([], [Pointing(attitude, camera.fx)]))
     np.testing.assert_array_equal(lost.star, led.star)
     np.testing.assert_array_equal(lost.catalogue, led.catalogue)
-    np.testing.assert_allclose(lost.attitude, led.attitude, atol=1e-9)
+    np.testing.assert_array_equal(lost.attitude, led.attitude)
+    assert (lost.focal_scale, lost.residual_px) == (led.focal_scale, led.residual_px)
+    np.testing.assert_array_equal(lost.blend_px, led.blend_px)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,10 @@ from starpos.instrument import Instrument
 from starpos.reading import read_frame
 from starpos.solve import Solver, Status
 
-LARGEST_RMS_PX = 0.35  # many more and fainter stars than theirs: most frames stay below theirs nevertheless
+# Where ours, over many more and fainter stars, is above theirs
+LARGER_RMS_PX = {"2019-07-29T204726_Alt40_Azi-135_Try1.tiff": 0.16, "2019-07-29T204726_Alt40_Azi-45_Try1.tiff": 0.15,
+                 "2019-07-29T204726_Alt60_Azi-135_Try1.tiff": 0.16, "2019-07-29T204726_Alt60_Azi-45_Try1.tiff": 0.17,
+                 "img0.png": 0.25, "img3.png": 0.32}  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=["openstartracker", "tetra3", "panoptes"])
@@ -43,12 +46,14 @@ def test_all_are_identified_and_look_where_they_look(answers):
             assert abs(roll) < 0.5, row["file"]
 
 
-def test_as_many_stars_as_astrometry_net_and_residuals_no_larger(answers):
+def test_as_many_stars_as_astrometry_net_and_residuals_no_larger_but_for_the_faint(answers):
     for row, s, scale in solved(answers):
         assert len(s.names) >= int(row["nmatch"]), row["file"]
-        assert s.attitude.residual_arcsec / scale < max(float(row["rms_px"]), LARGEST_RMS_PX), row["file"]
+        limit = LARGER_RMS_PX.get(row["file"], float(row["rms_px"]) + 0.005)  # theirs is rounded
+        assert s.attitude.residual_arcsec / scale < limit, row["file"]
 
 
+@pytest.mark.parametrize("answers", ["openstartracker"], indirect=True)  # the others have none
 def test_nothing_is_invented_for_the_rest(answers):
     """What astrometry.net could not solve is refused, or answered with stars as bright as they should be."""
     rows, solutions, _ = answers

@@ -15,7 +15,8 @@ from starpos.errors import FrameError
 from starpos.stars import Stars, no_stars
 
 ABOUT = ("width", "height", "mid_unix_s", "exposure_s", "source", "focal_px")
-CHUNK = 1000  # stars fitted at once: a few tens of megabytes
+CHUNK_PIXELS = 200_000  # of stars fitted at once: a few tens of megabytes
+PEAKS = 10_000  # looked at; at least twice as many as stars are wanted, as hot pixels are peaks too
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,14 @@ class DetectionSettings:
 
     def __post_init__(self):
         for name, low in (("threshold", 3), ("min_snr", 0), ("max_stars", 1), ("mesh_px", 16)):
-            if not low <= getattr(self, name) < np.inf:
+            if isinstance(getattr(self, name), str) or not low <= getattr(self, name) < np.inf:
                 raise FrameError(
                     f"The detection setting {name} is {getattr(self, name)}; it must be {low} or more."
                 )
+        for name in ("max_stars", "mesh_px"):
+            if getattr(self, name) != int(getattr(self, name)):
+                raise FrameError(f"The detection setting {name} is {getattr(self, name)}; it must be whole.")
+            object.__setattr__(self, name, int(getattr(self, name)))
         if self.saturation_dn is not None and not self.saturation_dn > 0:
             raise FrameError(
                 f"The detection setting saturation_dn is {self.saturation_dn}; it must be positive."
@@ -66,7 +71,7 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
         return Detection(no_stars(**about), float(np.median(plane)), 0.0, float("nan"))
     background = measure_background(plane, settings.mesh_px, mosaic)
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
-    peaks = find_peaks(plane, background, settings.threshold, settings.max_stars)
+    peaks = find_peaks(plane, background, settings.threshold, max(PEAKS, 2 * settings.max_stars))
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return Detection(no_stars(**about), level, noise, float("nan"))
@@ -74,21 +79,24 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
-    chunks = [slice(i, i + CHUNK) for i in range(0, len(x), CHUNK)]
+    chunk = max(1, CHUNK_PIXELS // (2 * lesson.reach + 1) ** 2)
+    chunks = [slice(i, i + chunk) for i in range(0, len(x), chunk)]
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    stars = Stars(**resolve(columns, lesson.psf), **about)
+    columns = {name: column[: settings.max_stars] for name, column in resolve(columns, lesson.psf).items()}
+    stars = Stars(**columns, **about)
     return Detection(stars, level, noise, lesson.psf.fwhm_px if len(stars) else float("nan"))
 
 
 def _saturation(plane, x, y, settings):
     if settings.saturation_dn is not None:
         return settings.saturation_dn
-    highest = plane.max()
     near = np.arange(-2, 3)
-    rows, columns = (
-        np.clip(v[:, None] + near, 0, n - 1) for v, n in ((y, plane.shape[0]), (x, plane.shape[1]))
-    )
-    full = plane[rows[:, :, None], columns[:, None, :]] == highest
-    # one pixel is always the highest; noise does not make three of one star's equal to it
-    return int(highest) if full.sum((1, 2)).max() >= 3 else np.iinfo(plane.dtype).max
+    rows, columns = y[:, None] + near, x[:, None] + near
+    height, width = plane.shape
+    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
+    patch = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
+    patch = np.where(inside, patch, 0).reshape(len(x), -1)
+    # of one star's pixels, since a hot one may exceed what light can reach; noise does not make three of them equal
+    highest = np.partition(patch, -3, axis=1)[:, -3].max()
+    return int(highest) if (patch == highest).sum(1).max() >= 3 else np.iinfo(plane.dtype).max

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from starpos import rotation
 from starpos.catalogue import Catalogue
-from starpos.identification.pose import Field, Pose
+from starpos.identification.pose import Field, Pose, directions
 from starpos.identification.sky import Sky
 from starpos.identification.verify import Match
 from starpos.zones import rows_near
@@ -67,17 +68,17 @@ class OnFrame:
         w = sky.directions(index)
         pixel = pose.project(w)
         on = np.flatnonzero(field.holds(pixel))[: 3 * stars + 50]
-        single, drawn = _resolved(catalogue, index[on], pixel[on])
+        single, drawn = _resolved(catalogue, index[on], pixel[on], w[on] * field.focal_px)
         on = on[single]
         return cls(index[on], w[on], drawn[single])
 
 
-def identified(field: Field, match: Match, stars: OnFrame) -> Identification | None:
+def identified(field: Field, sky: Sky, match: Match, stars: OnFrame) -> Identification | None:
     """All stars of the field matched, one to one, and the pose fitted to them; None where fewer than FEWEST_STARS are."""
     pose = match.pose
     xy, sigma = field.xy[int(pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
     residual = xy[match.star] - pose.project(match.directions)
-    before = None
+    before = np.zeros(0, int)
     for _ in range(3):
         middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
         spread = max(1.4826 * float(middling), LEAST_SPREAD_PX)
@@ -85,11 +86,12 @@ def identified(field: Field, match: Match, stars: OnFrame) -> Identification | N
         star, near = _mutual_nearest(xy, pose.project(stars.directions), radius)
         if len(star) < FEWEST_STARS:
             return None
-        if before is not None and np.array_equal(near, before):
+        if np.array_equal(near, before):
             break
         before = near
-        pose = pose.fitted(xy[star], stars.directions[near])
-        residual = xy[star] - pose.project(stars.directions[near])
+        w = sky.directions(stars.index[near])
+        pose = _of_these(field.focal_px, pose.mirrored, xy[star], w)
+        residual = xy[star] - pose.project(w)
     return Identification(
         star,
         stars.index[near],
@@ -102,14 +104,24 @@ def identified(field: Field, match: Match, stars: OnFrame) -> Identification | N
     )
 
 
-def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray):
+def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray) -> Pose:
+    """The pose of matched stars from them alone: to the last bit the same, from wherever the search came to them."""
+    v = directions(xy[None], np.array([focal_px]))[0]
+    pose = Pose(rotation.best_rotation(w, v), focal_px, mirrored)
+    for _ in range(2):
+        pose = pose.fitted(xy, w)
+    return pose
+
+
+def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, place: np.ndarray):
     """Which stars (brightest first) do not melt into a brighter one (N,), and how far these draw it (N,) px."""
     single, drawn = np.ones(len(index), bool), np.zeros(len(index))
     pair = cKDTree(pixel).query_pairs(BLEND_PX, output_type="ndarray")
     if len(pair):
         brighter, fainter = pair.T
         ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
-        apart = np.hypot(*(pixel[fainter] - pixel[brighter]).T)
+        # from the sky and rounded, so that it is the same at every pose
+        apart = np.round(np.linalg.norm(place[fainter] - place[brighter], axis=1), 6)
         np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
         single[fainter] = False
     return single, drawn

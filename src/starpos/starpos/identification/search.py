@@ -47,12 +47,14 @@ def identify(
     for k, proposal in enumerate(p for given in priors for p in given.proposals(field, sky)):
         enough = _enough(proposal.chosen_from, PRIOR_SHARES[min(k, 1)])
         match = proposal.match(field, enough)
-        if _sound(match, enough) and (found := identified(field, match, OnFrame.of(field, sky, match.pose))):
+        if _sound(match, enough) and (
+            found := identified(field, sky, match, OnFrame.of(field, sky, match.pose))
+        ):
             return found
     for hypotheses, error_px, enough in _attempts(field, sky):
         for match in matches(field, sky, hypotheses, error_px, enough):
             if _sound(match, enough) and (
-                found := identified(field, match, OnFrame.of(field, sky, match.pose))
+                found := identified(field, sky, match, OnFrame.of(field, sky, match.pose))
             ):
                 return found
     return None
