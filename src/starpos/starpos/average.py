@@ -15,6 +15,7 @@ from starpos.budget import ErrorTerm, symmetric_root
 from starpos.earth import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix import Fix
+from starpos.rotation import full_turn
 
 SAME_HEADING_SIGMA = 5.0
 IMPROBABLE = 1e-9  # of frames that differ as much by chance: they are not of one place
@@ -83,7 +84,7 @@ def average(fixes: Sequence[Fix]) -> Average:
     )
     heading = float("nan")
     if not turned:
-        heading = float((mean[2] + plane.heading - plane.convergence(latitude, longitude)) % (2 * np.pi))
+        heading = full_turn(mean[2] + plane.heading - plane.convergence(latitude, longitude))
     return Average(
         float(np.mean([f.utc_unix_s for f in fixes])), latitude, longitude, heading, terms, len(fixes)
     )

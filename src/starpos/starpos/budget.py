@@ -89,7 +89,7 @@ class Sensitivity:
 
 def heading_of(link_to_enu: np.ndarray) -> float:
     """Azimuth (rad, 0 to 2 pi) of the base link's x axis."""
-    return float(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]) % (2 * np.pi))
+    return rotation.full_turn(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]))
 
 
 def _heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:

@@ -6,6 +6,12 @@ import math
 import numpy as np
 
 
+def full_turn(angle: float) -> float:
+    """An angle in rad from 0 to below 2 pi; a modulo alone takes the smallest negative one to 2 pi."""
+    turned = float(angle % (2 * np.pi))
+    return 0.0 if turned >= 2 * np.pi else turned
+
+
 def about_axis(axis: int, angle: float) -> np.ndarray:
     """Rotation about coordinate axis 0, 1 or 2."""
     c, s = np.cos(angle), np.sin(angle)

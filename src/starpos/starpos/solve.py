@@ -21,6 +21,7 @@ from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.reading import why_no_time
+from starpos.rotation import full_turn
 from starpos.standing import Standing
 from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 
@@ -287,9 +288,9 @@ def _attitude(found: ident.Identification, sky: ident.Sky, camera: Camera) -> At
     if found.mirrored:
         up = -up
     return Attitude(
-        float(ra % (2 * np.pi)),
+        full_turn(ra),
         float(dec),
-        float(np.arctan2(up @ east, up @ north) % (2 * np.pi)),
+        full_turn(np.arctan2(up @ east, up @ north)),
         float(seen.fx),
         float(found.residual_px * seen.scale_arcsec),
         found.log_odds,

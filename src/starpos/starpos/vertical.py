@@ -7,6 +7,7 @@ import numpy as np
 
 from starpos.earth import curvature_radii_m
 from starpos.errors import InstrumentError
+from starpos.rotation import full_turn
 
 ARCSEC = np.radians(1 / 3600)
 UNKNOWN_STDDEV_ARCSEC = (
@@ -50,10 +51,10 @@ def geodetic(
     eta = d.eta_arcsec * ARCSEC
     cos_phi = max(np.cos(phi), 1e-9)
     lam = (longitude - eta / cos_phi + np.pi) % (2 * np.pi) - np.pi
-    azimuth = (heading - eta * np.tan(phi)) % (2 * np.pi)
+    azimuth = heading - eta * np.tan(phi)
     prime, meridian = curvature_radii_m(phi)
     xi_moves = np.array([0.0, meridian, 0.0])
     eta_moves = np.array([prime, 0.0, np.sin(phi) / cos_phi])
     sigma = d.stddev_arcsec * ARCSEC
     extra = (np.outer(xi_moves, xi_moves) + np.outer(eta_moves, eta_moves)) * sigma**2
-    return Geodetic(float(phi), float(lam), float(azimuth), covariance + extra)
+    return Geodetic(float(phi), float(lam), full_turn(azimuth), covariance + extra)

@@ -47,3 +47,11 @@ def test_quaternion_is_x_y_z_w_with_w_not_negative(rng):
         q = rotation.to_quaternion(r)
         assert q[3] >= 0
         np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), r, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [-1e-17, -1e-300, 0.0, 2 * np.pi, -2 * np.pi, 7.0, -7.0])
+def test_a_full_turn_is_never_reached(angle):
+    turned = rotation.full_turn(angle)
+    assert 0 <= turned < 2 * np.pi
+    assert np.degrees(turned) < 360
+    assert np.cos(turned - angle) == pytest.approx(1)
