@@ -149,12 +149,11 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     beacon = np.sort(brightest_first[: int(BEACONS * len(pool))])
     apart = brightest_first[_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
     tree = cKDTree(v[apart])
-    keys = []
+    key = np.zeros(0, np.int64)
     for k, (radius, spacing, most) in enumerate(_affordable(half_diagonal)):
-        keys.append(_triples_of_circles(tree, radius * half_diagonal, spacing, most))
+        key = np.union1d(key, _triples_of_circles(tree, radius * half_diagonal, spacing, most))
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
-    key = np.unique(np.concatenate(keys))
-    del keys
+    del tree
     triangles = _in_bins(v, apart, key, 2 * half_diagonal)
     progress("star triangles", 1.0)
     return TriangleCatalogue(
