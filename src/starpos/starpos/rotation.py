@@ -43,13 +43,6 @@ def to_small_vector(r: np.ndarray) -> np.ndarray:
     return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
 
 
-def to_vector(r: np.ndarray) -> np.ndarray:
-    """The rotation vector (3,) of any rotation matrix (3, 3), rad."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(r).as_rotvec()
-
-
 def cross_matrix(v) -> np.ndarray:
     """[v]x, so that cross_matrix(v) @ w = v x w."""
     x, y, z = v

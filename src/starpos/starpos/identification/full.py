@@ -14,11 +14,8 @@ from starpos.identification.verify import Match
 from starpos.zones import rows_near
 
 FEWEST_STARS = 4  # an identification has
-LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = (
-    0.02,
-    4.0,
-    0.2,
-)  # how near a star must be to its place: sigma, and always
+# a star is within GATE_SIGMA of its place, and GATE_PX more
+LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 FAINTEST_FIT = 2000  # stars that take part
 SMALL_TABLE = 20_000  # detections times catalogue stars
 BLEND_PX = 2.5  # closer stars make one image
