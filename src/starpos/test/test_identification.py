@@ -11,7 +11,6 @@ from starpos.identification import Pointing, Sky, identify, search, verify
 from starpos.identification.lookup import LOOSE_PX
 from starpos.identification.pose import Field
 
-ARCSEC = np.radians(1 / 3600)
 FIELDS = {
     "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),
     "4 deg": (Camera.from_focal(1404, 936, 23437.5), 9.5),  # the paper's field, pixels binned by four

@@ -8,6 +8,7 @@ from test_identification import FIELDS, check, random_attitude, seen, sky_for
 
 from starpos import rotation
 from starpos.identification import Plumb, Pointing, identify, search
+from starpos.identification.pose import Field
 
 ARCSEC = np.radians(1 / 3600)
 
@@ -109,3 +110,11 @@ def test_the_next_frame_of_a_fix_is_not_lost(catalogue, rng, monkeypatch):
         assert answer.ok
         north = abs(answer.fix.latitude - np.radians(scene.site.latitude_deg))
         assert north < 5 * np.sqrt(answer.fix.covariance[1, 1]) / 6.36e6
+
+
+def test_two_stars_that_a_fit_has_brought_to_their_places_prove_nothing(field):
+    """Rotation and focal length take any two stars to where they should be."""
+    sky, camera, attitude, xy, sigma, _ = field
+    two = xy[[0, 7]] + [[1.0, -0.8], [-1.1, 0.7]]
+    for proposal in Pointing(attitude, camera.fx).proposals(Field.of(two, sigma[:2], camera), sky):
+        assert proposal.match(Field.of(two, sigma[:2], camera), 1e9).log_odds < 5
