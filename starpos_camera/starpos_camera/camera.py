@@ -14,11 +14,11 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 
+from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.instrument import focal_px_of
-from starpos_camera import calibration
-from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.camera_parameters import PARAMETERS, path_of
 from starpos_camera.sources import Settings, Source, SourceEnded, source_class
 from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
@@ -51,9 +51,9 @@ class CameraNode(Node):
         self._calibration_path = None
         self._calibration: Camera | None = None
         if self._values["calibration_url"]:
-            self._calibration_path = calibration.path_of(self._values["calibration_url"])
+            self._calibration_path = path_of(self._values["calibration_url"])
             if self._calibration_path.exists():
-                self._calibration = calibration.read(self._calibration_path)
+                self._calibration = camera_yaml.read(self._calibration_path)
             else:
                 self.get_logger().warning(
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
@@ -203,7 +203,7 @@ class CameraNode(Node):
             # What cannot be kept is still right: it holds for this session, and the answer says so.
             self._calibration = camera
             if self._calibration_path is not None:
-                calibration.write(self._calibration_path, camera, self.get_name())
+                self._keep(camera)
                 response.status_message = f"written to {self._calibration_path}."
             else:
                 response.status_message = "holds for this session; set calibration_url to keep it."
@@ -213,6 +213,12 @@ class CameraNode(Node):
             response.status_message = str(error)
         self.get_logger().info(f"set_camera_info: {response.status_message}")
         return response
+
+    def _keep(self, camera: Camera):
+        try:
+            camera_yaml.write(self._calibration_path, camera, self.get_name())
+        except InstrumentError as error:
+            raise InstrumentError(f"{error}; the calibration holds for this session only.") from None
 
     def _on_set_capture(self, request, response):
         wanted = {"gain": request.gain, "exposure": request.exposure, "cadence": request.cadence}

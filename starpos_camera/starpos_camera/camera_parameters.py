@@ -2,7 +2,10 @@
 """The parameters of the node `camera`."""
 
 import math
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
+from starpos.errors import InstrumentError
 from starpos_common.parameters import Parameter
 
 PARAMETERS = (
@@ -144,3 +147,13 @@ PARAMETERS = (
     Parameter("simulated.height", 3744, "Height of the simulated frames.", "px", 16, 20000),
     Parameter("simulated.seed", 1, "Seed of the simulated noise.", "", 0, 2**31 - 1, read_only=True),
 )
+
+
+def path_of(url: str) -> Path:
+    """The file a `calibration_url` names: file:///a/b.yaml or a path; InstrumentError for anything else."""
+    parts = urlsplit(url)
+    if not parts.scheme:
+        return Path(url).expanduser()
+    if parts.scheme != "file" or parts.netloc not in ("", "localhost") or not parts.path:
+        raise InstrumentError(f"calibration_url {url!r}: give file:///path/to/camera.yaml, or a path.")
+    return Path(unquote(parts.path))

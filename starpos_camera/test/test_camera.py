@@ -10,12 +10,14 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 
+from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
+from starpos.errors import InstrumentError
 from starpos.reading import read_frame
 from starpos.simulate import expose
-from starpos_camera import calibration
+from starpos_camera.camera_parameters import path_of
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
@@ -143,6 +145,14 @@ def test_a_cadence_that_is_too_short_is_reported(start, listener):
     assert node.end(signal.SIGINT)[0] == 0
 
 
+def test_urls():
+    assert str(path_of("file:///a/b%20c.yaml")) == "/a/b c.yaml"
+    assert str(path_of("/a/b.yaml")) == "/a/b.yaml"
+    for url in ("http://a/b.yaml", "package://a/b.yaml", "file://host/b.yaml"):
+        with pytest.raises(InstrumentError, match="file:///"):
+            path_of(url)
+
+
 def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, listener, tmp_path):
     path = tmp_path / "config" / "camera.yaml"
     options = (*SMALL, "cadence:=0.5", f"calibration_url:=file://{path}")
@@ -163,7 +173,7 @@ def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, list
     answer = listener.call(SetCameraInfo, "camera/set_camera_info", request)
     assert answer.success and str(path) in answer.status_message
     listener.wait(lambda: message_to_camera(infos[-1]) == camera)
-    assert calibration.read(path) == camera
+    assert camera_yaml.read(path) == camera
     assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
     status, out = node.end(signal.SIGINT)
     assert status == 0 and "there is no calibration yet" in out
@@ -183,6 +193,7 @@ def test_a_calibration_that_cannot_be_written_holds_for_the_session(start, liste
     request = SetCameraInfo.Request(camera_info=camera_to_message(camera, ""))
     answer = listener.call(SetCameraInfo, "camera/set_camera_info", request)
     assert not answer.success and "cannot be written" in answer.status_message
+    assert "this session only" in answer.status_message
     listener.wait(lambda: infos and message_to_camera(infos[-1]) == camera)
     assert node.end(signal.SIGINT)[0] == 0
 

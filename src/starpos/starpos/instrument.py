@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import rotation
+from starpos import camera_yaml, rotation, yaml_file
 from starpos.camera import Camera
+from starpos.camera_yaml import LARGEST_SIDE
 from starpos.errors import InstrumentError
 from starpos.fix import Mounting
 from starpos.inclinometer import SCA100T_NOISE_RAD
@@ -17,8 +18,6 @@ FORMAT = 1
 # x of the base link is the top of the frame (-y of C), z the optical axis (DESIGN section 2)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 UNSTATED_CALIBRATION_ARCSEC = 5.0  # 1 sigma a axis of an A3 given without its error
-SIZE_LIMIT = 1 << 20
-LARGEST_SIDE = 1_000_000  # px of a frame
 
 
 @dataclass(frozen=True)
@@ -110,39 +109,26 @@ def read(path) -> Instrument:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
+            or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path
     misalignment_deg: [rx, ry, rz]
     calibration_stddev_arcsec: [x, y, z]
     link_to_camera: [[..], [..], [..]]
     tilt_noise_deg: 0.0035
     clock_stddev_s: 0.01
     """
-    import yaml
-
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            text = file.read(SIZE_LIMIT + 1)
-        if len(text) > SIZE_LIMIT:
-            raise InstrumentError(f"{path}: over 1 MiB, no instrument file")
-        content = yaml.safe_load(text)
-    except OSError as e:
-        raise InstrumentError(f"{path}: not a readable instrument file ({e.strerror})") from None
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, yaml.YAMLError) as e:
-        # what PyYAML is seen to raise
-        mark = getattr(e, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise InstrumentError(f"{path}: not a readable instrument file (it is no YAML{where})") from None
+    content = yaml_file.load(path, "instrument file")
     if not isinstance(content, dict) or content.pop("starpos_instrument", None) != FORMAT:
         raise InstrumentError(
             f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`"
         )
     try:
-        return _from_mapping(content)
+        return _from_mapping(content, path.parent)
     except InstrumentError as e:
         raise InstrumentError(f"{path}: {e}") from None
 
 
-def _from_mapping(content: dict) -> Instrument:
+def _from_mapping(content: dict, folder: Path) -> Instrument:
     known = (
         "camera",
         "misalignment_deg",
@@ -160,6 +146,14 @@ def _from_mapping(content: dict) -> Instrument:
     if "focal_mm" in camera:
         _refuse_others(camera, ("focal_mm", "pixel_um"))
         focal_px = focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um"))
+    elif "calibration" in camera:
+        _refuse_others(camera, ("calibration",))
+        if not isinstance(camera["calibration"], str):
+            raise InstrumentError(
+                f"the camera's calibration is {_short(camera['calibration'])}: give the name of a file"
+            )
+        given["camera"] = camera_yaml.read(folder / camera["calibration"])
+        focal_px = given["camera"].fx
     else:
         axes = ("fx", "fy", "cx", "cy")
         _refuse_others(camera, ("width", "height", *axes, "distortion"))

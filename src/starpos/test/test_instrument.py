@@ -4,6 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
 from starpos.instrument import Instrument, focal_px_of, read
@@ -78,6 +79,14 @@ def test_intrinsics_of_another_frame_size(reads):
         reads(FULL).camera_for(1392, 1041)
 
 
+def test_the_camera_of_a_calibration_file_beside_it_or_elsewhere(reads, tmp_path):
+    camera = Camera(1392, 1040, 5200.5, 5201.5, 700.25, 520.0, (-0.1, 0.01, 1e-3, -2e-3, 0.0))
+    camera_yaml.write(tmp_path / "optics" / "camera.yaml", camera, "camera")
+    for name in ("optics/camera.yaml", tmp_path / "optics" / "camera.yaml"):
+        i = reads(f"starpos_instrument: 1\ncamera: {{calibration: {name}}}\n")
+        assert (i.camera, i.focal_px) == (camera, 5200.5)
+
+
 REFUSED = {
     "empty": ("", "first key"),
     "no mapping": ("- 1\n- 2\n", "first key"),
@@ -89,6 +98,10 @@ REFUSED = {
     "unknown key": (SIMPLE + "misaligment_deg: [0, 0, 0]\n", "unknown key 'misaligment_deg'"),
     "unknown camera key": (SIMPLE.replace("}", ", distorsion: [0, 0, 0, 0, 0]}"), "distorsion"),
     "two cameras": (FULL.replace("width", "focal_mm: 600, pixel_um: 6.4, width"), "unknown key 'width'"),
+    "no calibration": ("starpos_instrument: 1\ncamera: {calibration: none.yaml}\n", "none.yaml: not a readable calib"),
+    "a calibration of nothing": ("starpos_instrument: 1\ncamera: {calibration: }\n", "calibration is missing: give"),
+    "a calibration and more": ("starpos_instrument: 1\ncamera: {calibration: a, width: 5}\n", "unknown key 'width'"),
+    "itself for a calibration": ("starpos_instrument: 1\ncamera: {calibration: instrument.yaml}\n", "image_width"),
     "nan": (SIMPLE + "misalignment_deg: [.nan, 0, 0]\n", "finite"),
     "infinite size": (FULL.replace("1392", ".inf"), "width"),
     "fraction of a pixel": (FULL.replace("1392", "1392.5"), "width"),

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera calibration files: the YAML that camera_calibration, camera_info_manager and image_proc write and read."""
+
+import reprlib
+from pathlib import Path
+
+from starpos import yaml_file
+from starpos.camera import Camera
+from starpos.errors import InstrumentError
+
+LARGEST_SIDE = 1_000_000  # px of a frame
+
+
+def read(path: Path) -> Camera:
+    """The camera of a calibration file; InstrumentError with the reason where it is none."""
+    content = yaml_file.load(path, "calibration file")
+    try:
+        model = content.get("distortion_model", "plumb_bob")
+        width, height = content["image_width"], content["image_height"]
+        k = _numbers(content["camera_matrix"], 9)
+        d = (
+            _numbers(content["distortion_coefficients"], 5)
+            if "distortion_coefficients" in content
+            else (0.0,) * 5
+        )
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InstrumentError(
+            f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
+            "it needs image_width, image_height, camera_matrix, distortion_coefficients."
+        ) from None
+    if model != "plumb_bob":
+        raise InstrumentError(
+            f"{path}: the distortion model is {reprlib.repr(model)}; only 'plumb_bob' is understood: calibrate with it."
+        )
+    if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
+        raise InstrumentError(f"{path}: image_width and image_height must be whole numbers of px.")
+    if any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:
+        raise InstrumentError(
+            f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
+        )
+    try:
+        return Camera(width, height, k[0], k[4], k[2], k[5], d)
+    except InstrumentError as error:
+        raise InstrumentError(f"{path}: {error}") from None
+
+
+def _numbers(matrix: dict, count: int) -> tuple[float, ...]:
+    values = tuple(float(value) for value in matrix["data"])
+    if len(values) != count:
+        raise ValueError(f"{len(values)} values for {count}")
+    return values
+
+
+def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
+    """Write a calibration file, whole or not at all; comment: lines for people, which every reader passes over.
+
+    Raises InstrumentError where it cannot be written.
+    """
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    content = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": _matrix(3, 3, (fx, 0, cx, 0, fy, cy, 0, 0, 1)),
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": _matrix(1, 5, camera.distortion),
+        "rectification_matrix": _matrix(3, 3, (1, 0, 0, 0, 1, 0, 0, 0, 1)),
+        "projection_matrix": _matrix(3, 4, (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)),
+    }
+    yaml_file.save(path, content, comment)
+
+
+def _matrix(rows: int, columns: int, values) -> dict:
+    return {"rows": rows, "cols": columns, "data": [float(value) for value in values]}
