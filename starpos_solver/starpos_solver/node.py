@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from starpos import catalogue
 from starpos.camera import Camera
 from starpos.errors import StarposError
+from starpos.geoid import Geoid
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
 from starpos.solve import Solution as Answer
@@ -65,8 +66,11 @@ class SolverNode(Node):
         super().__init__("solver")
         self._known: Instrument | None = None
         self._known_url = ""
+        self._geoid: Geoid | None = None
+        self._geoid_name = ""
         self._values = declare(self, parameters.PARAMETERS, apply=self._apply, check=self._check)
         self._read_instrument()
+        self._read_geoid()
         self._catalogue = catalogue.load()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tilts = TiltBuffer()
@@ -114,7 +118,10 @@ class SolverNode(Node):
                 known = parameters.instrument_file(values["calibration_url"])
             parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0), known)
             parameters.atmosphere_of(values)
-            parameters.deflection_of(values)
+            grid = self._geoid
+            if values["deflection.geoid"] != self._geoid_name:
+                grid = parameters.geoid_file(values["deflection.geoid"])
+            parameters.vertical_of(values, grid)
         except StarposError as e:
             return str(e)
         return None
@@ -122,6 +129,8 @@ class SolverNode(Node):
     def _apply(self, names: frozenset[str]):
         if "calibration_url" in names:
             self._read_instrument()
+        if "deflection.geoid" in names:
+            self._read_geoid()
         if self._solver is not None and self._camera is not None:
             self._solver = self._make_solver(self._camera)
 
@@ -129,6 +138,10 @@ class SolverNode(Node):
         """Read once for each value of calibration_url: a file that goes away later is no matter."""
         self._known_url = self._values["calibration_url"]
         self._known = parameters.instrument_file(self._known_url)
+
+    def _read_geoid(self):
+        self._geoid_name = self._values["deflection.geoid"]
+        self._geoid = parameters.geoid_file(self._geoid_name)
 
     def _make_solver(self, camera: Camera) -> Solver:
         return Solver(
@@ -203,7 +216,7 @@ class SolverNode(Node):
         stated = math.radians(self._values["tilt_stddev"])
         if not math.isnan(stated):
             return stated
-        return self._known.tilt_noise_rad if self._known else SCA100T_NOISE_RAD
+        return self._known.inclinometer.noise_rad if self._known else SCA100T_NOISE_RAD
 
     def _on_stars(self, message: StarArray):
         self._seen("stars")
@@ -295,13 +308,12 @@ class SolverNode(Node):
         self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
 
     def _messages(self, header: Header, answer: Answer):
-        deflection = parameters.deflection_of(self._values)
-        ground = outputs.on_ground(answer, deflection)
-        message = outputs.solution(header, answer, ground, deflection)
+        ground = outputs.on_ground(answer, parameters.vertical_of(self._values, self._geoid))
+        message = outputs.solution(header, answer, ground)
         if self._solver is None and self._camera is None:
             message.status = Solution.NO_CAMERA
         fix = outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
-        return message, fix, outputs.imu(header, answer, ground, deflection) if ground else None
+        return message, fix, outputs.imu(header, answer, ground) if ground else None
 
     def _log_change(self, sentence: str, good: bool, state: object = None):
         state = state or sentence

@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 from starpos import rotation
 from starpos.solve import Solution as Answer
 from starpos.solve import Status
-from starpos.vertical import ARCSEC, Deflection, Geodetic, geodetic
+from starpos.vertical import ARCSEC, Geodetic, Vertical, geodetic
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces.msg import ErrorTerm, Solution
 
@@ -29,10 +29,10 @@ UNKNOWN_ALTITUDE_VARIANCE = 1e8  # m2; a NaN would make consumers drop the whole
 NAN = math.nan
 
 
-def on_ground(answer: Answer, deflection: Deflection) -> Geodetic | None:
+def on_ground(answer: Answer, vertical: Vertical) -> Geodetic | None:
     """The geodetic position of an answer; None without a fix."""
     fix = answer.fix
-    return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, deflection) if fix else None
+    return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical) if fix else None
 
 
 def nav_sat_fix(
@@ -57,10 +57,12 @@ def nav_sat_fix(
     return message
 
 
-def imu(header: Header, answer: Answer, ground: Geodetic, deflection: Deflection) -> Imu:
+def imu(header: Header, answer: Answer, ground: Geodetic) -> Imu:
     """The attitude of the base link in true-north ENU; rates and accelerations are not measured."""
     fix = answer.fix
-    to_geodetic_north = rotation.about_axis(2, deflection.eta_arcsec * ARCSEC * math.tan(ground.latitude))
+    to_geodetic_north = rotation.about_axis(
+        2, ground.deflection.eta_arcsec * ARCSEC * math.tan(ground.latitude)
+    )
     x, y, z, w = rotation.to_quaternion(to_geodetic_north @ fix.link_to_enu).tolist()
     message = Imu(header=header)
     message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w = x, y, z, w
@@ -74,7 +76,7 @@ def imu(header: Header, answer: Answer, ground: Geodetic, deflection: Deflection
     return message
 
 
-def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection: Deflection) -> Solution:
+def solution(header: Header, answer: Answer, ground: Geodetic | None) -> Solution:
     """All there is to say about one frame."""
     message = Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
@@ -82,7 +84,6 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
     message.indices = [] if answer.star is None else answer.star.tolist()
     message.magnitudes = [] if answer.magnitudes is None else answer.magnitudes.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
-    message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
     a, fix = answer.attitude, answer.fix
     message.right_ascension, message.declination, message.roll = (
         (math.degrees(v) for v in (a.ra, a.dec, a.roll)) if a else (NAN,) * 3
@@ -95,7 +96,7 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
         message.tilt_samples = answer.tilt.samples
     if fix is None:
         for name in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading", "heading_stddev",
-                     "refraction", "diurnal_aberration", "ut1_minus_utc"):  # fmt: skip
+                     "refraction", "diurnal_aberration", "ut1_minus_utc", "xi", "eta"):  # fmt: skip
             setattr(message, name, NAN)
         message.covariance = message.covariance_geodetic = [NAN] * 9
         return message
@@ -105,6 +106,7 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None, deflection
         math.degrees(ground.latitude),
         math.degrees(ground.longitude),
     )
+    message.xi, message.eta = ground.deflection.xi_arcsec, ground.deflection.eta_arcsec
     message.heading = math.degrees(ground.heading)
     message.covariance = (fix.covariance * np.outer(degrees, degrees)).ravel()
     message.covariance_geodetic = (ground.covariance * np.outer(degrees, degrees)).ravel()

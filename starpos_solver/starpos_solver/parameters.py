@@ -5,11 +5,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from starpos import instrument
+from starpos import geoid, instrument
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
-from starpos.instrument import Instrument
-from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection
+from starpos.errors import GeoidError
+from starpos.geoid import Geoid
+from starpos.instrument import Calibration, Instrument
+from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos_common.parameters import Parameter
 
 NAN = math.nan
@@ -87,6 +89,13 @@ PARAMETERS = (
         0.0,
         120.0,
     ),
+    Parameter(
+        "deflection.geoid",
+        "",
+        "Geoid grid (GTX, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, instead of the "
+        "three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse one misses 1 "
+        "arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, 190 m.",
+    ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", "", 4, 1000),
     Parameter("tilt_window", 0.5, "Span of tilts averaged where the exposure is unknown.", "s", 0.01, 60.0),
     Parameter(
@@ -116,22 +125,22 @@ def instrument_of(values: Mapping, camera: Camera, known: Instrument | None) -> 
     if known is None:
         known = Instrument(
             camera.fx,
-            misalignment_deg=values["misalignment"],
-            calibration_stddev_arcsec=(values["misalignment_stddev"],) * 3,
+            calibration=Calibration.of(values["misalignment"], (values["misalignment_stddev"],) * 3),
         )
     clock, tilt = values["clock_stddev"], values["tilt_stddev"]
+    errors = known.inclinometer
     return replace(
         known,
         camera=camera,
         focal_px=camera.fx,
         clock_stddev_s=known.clock_stddev_s if math.isnan(clock) else clock,
-        tilt_noise_rad=known.tilt_noise_rad if math.isnan(tilt) else math.radians(tilt),
+        inclinometer=errors if math.isnan(tilt) else replace(errors, noise_rad=math.radians(tilt)),
     )
 
 
 def instrument_file(url: str) -> Instrument | None:
     """The Instrument that calibration_url names, None for ''; InstrumentError with the reason where it is broken."""
-    return instrument.read(url.removeprefix("file://")) if url else None
+    return instrument_file.read(url.removeprefix("file://")) if url else None
 
 
 def atmosphere_of(values: Mapping) -> Atmosphere:
@@ -144,5 +153,18 @@ def atmosphere_of(values: Mapping) -> Atmosphere:
     )
 
 
-def deflection_of(values: Mapping) -> Deflection:
-    return Deflection(values["deflection.xi"], values["deflection.eta"], values["deflection.stddev"])
+def geoid_file(name: str) -> Geoid | None:
+    """The Geoid that deflection.geoid names, None for ''; GeoidError with the reason where it is broken."""
+    return geoid.read(name) if name else None
+
+
+def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
+    """The Geoid of a grid (`known`, None without one), or the deflection the parameters give for the place."""
+    xi, eta = values["deflection.xi"], values["deflection.eta"]
+    if known is None:
+        return Deflection(xi, eta, values["deflection.stddev"])
+    if xi or eta:
+        raise GeoidError(
+            "deflection.geoid tells the deflection: set deflection.xi and deflection.eta to 0, or it to ''"
+        )
+    return known

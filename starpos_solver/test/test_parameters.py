@@ -2,13 +2,21 @@
 """What the parameters mean to starpos."""
 
 import math
+import struct
 
 import numpy as np
 import pytest
 
 from starpos.camera import Camera
-from starpos.errors import InstrumentError
-from starpos_solver.parameters import PARAMETERS, atmosphere_of, deflection_of, instrument_file, instrument_of
+from starpos.errors import GeoidError, InstrumentError
+from starpos_solver.parameters import (
+    PARAMETERS,
+    atmosphere_of,
+    geoid_file,
+    instrument_file,
+    instrument_of,
+    vertical_of,
+)
 
 CAMERA = Camera.from_focal(100, 80, 1000.0)
 
@@ -39,12 +47,12 @@ def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):
     )
     known = instrument_file(f"file://{path}")
     instrument = instrument_of(values(), CAMERA, known)
-    assert instrument.misalignment_deg == (1.0, 2.0, 3.0)
+    assert instrument.calibration.misalignment_deg == (1.0, 2.0, 3.0)
     assert instrument.camera is CAMERA
     assert instrument.clock_stddev_s == known.clock_stddev_s
     # a parameter that is set wins
     assert instrument_of(values(clock_stddev=2.0), CAMERA, known).clock_stddev_s == 2.0
-    assert instrument_of(values(tilt_stddev=1.0), CAMERA, known).tilt_noise_rad == pytest.approx(
+    assert instrument_of(values(tilt_stddev=1.0), CAMERA, known).inclinometer.noise_rad == pytest.approx(
         math.radians(1)
     )
 
@@ -55,5 +63,22 @@ def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):
 
 
 def test_the_deflection_defaults_to_knowing_nothing():
-    assert deflection_of(values()).stddev_arcsec > 1
-    assert not math.isnan(deflection_of(values()).xi_arcsec)
+    assert vertical_of(values(), None).stddev_arcsec > 1
+    assert not math.isnan(vertical_of(values(), None).xi_arcsec)
+
+
+def test_a_deflection_is_given_by_hand_or_by_a_geoid(tmp_path):
+    path = tmp_path / "slope.gtx"
+    heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))  # 1 m a degree to the north
+    path.write_bytes(struct.pack(">4d2i", 30, 40, 1, 1, *heights.shape) + heights.astype(">f4").tobytes())
+    grid = geoid_file(str(path))
+    there = vertical_of(values(), grid).at(math.radians(45), math.radians(60))
+    assert there.xi_arcsec == pytest.approx(-1 / 111132 / math.radians(1 / 3600), rel=1e-3)
+    with pytest.raises(GeoidError, match=r"deflection\.xi"):
+        vertical_of(values(deflection__xi=3.0), grid)
+    assert vertical_of(values(deflection__eta=3.0), geoid_file("")).eta_arcsec == 3.0
+
+
+def test_a_broken_geoid_is_refused_with_its_path(tmp_path):
+    with pytest.raises(GeoidError, match=r"missing\.gtx"):
+        geoid_file(str(tmp_path / "missing.gtx"))

@@ -30,5 +30,13 @@ class InstrumentError(StarposError):
     """The instrument's description (camera, misalignment, mount) is missing or inconsistent."""
 
 
+class GeoidError(StarposError):
+    """A grid of geoid undulations is missing or broken."""
+
+
+class CalibrationError(StarposError):
+    """The stars do not support a calibration."""
+
+
 class FixError(StarposError):
     """The stars do not support a fix."""

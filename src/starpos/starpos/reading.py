@@ -220,8 +220,6 @@ def _focal_px(header):
 
 
 def _read_picture(path):
-    import cv2
-
     size = _picture_size(path)
     if size is None:
         raise FrameError(f"{path}: this is not a PNG or TIFF image; give one, or FITS.")
@@ -232,14 +230,7 @@ def _read_picture(path):
     data = path.read_bytes()
     if data.startswith(PNG):
         data = _png_image(data)
-    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 4.6 has it at the top
-    level = log.setLogLevel(0)  # silent: what it would print is said below
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        pixels = None
-    finally:
-        log.setLogLevel(level)
+    pixels = decode_picture(data)
     if pixels is None:
         raise FrameError(f"{path}: this is not a whole PNG or TIFF image; take or copy it again.")
     if pixels.ndim == 3:
@@ -252,6 +243,20 @@ def _read_picture(path):
     if pixels.ndim == 2:
         pixels = _to_unsigned(pixels, path)
     return Frame(pixels, source=str(path))
+
+
+def decode_picture(data: bytes) -> np.ndarray | None:
+    """A PNG's or TIFF's pixels as they are, None where they cannot be decoded; nothing is printed."""
+    import cv2
+
+    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 4.6 has it at the top
+    level = log.setLogLevel(0)
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        log.setLogLevel(level)
 
 
 def _picture_size(path):

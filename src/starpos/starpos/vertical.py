@@ -2,6 +2,7 @@
 """From astronomic to geodetic: the deflection of the vertical (DESIGN section 2)."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -13,6 +14,13 @@ ARCSEC = np.radians(1 / 3600)
 UNKNOWN_STDDEV_ARCSEC = (
     6.0  # of each component where nothing is known: the root mean square over the continents
 )
+
+
+class Vertical(Protocol):
+    """What knows the deflection of the vertical: a Deflection, the same everywhere, or a geoid.Geoid."""
+
+    def at(self, latitude: float, longitude: float) -> "Deflection":
+        """The Deflection at a place in rad, with its honest error; never an exception."""
 
 
 @dataclass(frozen=True)
@@ -32,21 +40,30 @@ class Deflection:
                 "deflection of the vertical: xi and eta must be finite, their stddev 0 or more"
             )
 
+    def at(self, latitude: float, longitude: float) -> "Deflection":
+        """Itself: it was given for the place."""
+        return self
+
 
 @dataclass(frozen=True)
 class Geodetic:
-    """Latitude, longitude, heading (rad) on WGS 84; covariance (3, 3) of east m, north m, heading rad."""
+    """Latitude, longitude, heading (rad) on WGS 84; covariance (3, 3) of east m, north m, heading rad.
+
+    deflection: what was taken off.
+    """
 
     latitude: float
     longitude: float
     heading: float
     covariance: np.ndarray
+    deflection: Deflection
 
 
 def geodetic(
-    latitude: float, longitude: float, heading: float, covariance: np.ndarray, d: Deflection
+    latitude: float, longitude: float, heading: float, covariance: np.ndarray, vertical: Vertical
 ) -> Geodetic:
     """phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); its unknown part widens all three."""
+    d = vertical.at(latitude, longitude)
     phi = latitude - d.xi_arcsec * ARCSEC
     eta = d.eta_arcsec * ARCSEC
     cos_phi = max(np.cos(phi), 1e-9)
@@ -57,4 +74,4 @@ def geodetic(
     eta_moves = np.array([prime, 0.0, np.sin(phi) / cos_phi])
     sigma = d.stddev_arcsec * ARCSEC
     extra = (np.outer(xi_moves, xi_moves) + np.outer(eta_moves, eta_moves)) * sigma**2
-    return Geodetic(float(phi), float(lam), full_turn(azimuth), covariance + extra)
+    return Geodetic(float(phi), float(lam), full_turn(azimuth), covariance + extra, d)

@@ -9,13 +9,16 @@ import time
 
 import numpy as np
 
-from starpos import instrument
+from starpos import geoid, instrument
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.frame import Frame
 from starpos.reading import read_frame
 from starpos.stars import Stars
+from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
+
+GIVEN_STDDEV_ARCSEC = 1.0  # of a deflection given by hand without its error
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +53,34 @@ def add_air(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--humidity", type=float, default=0.3, metavar="0..1", help="relative humidity (0.3)")
 
 
+def add_vertical(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--xi", type=float, metavar="ARCSEC", help="deflection of the vertical, north (0)")
+    parser.add_argument("--eta", type=float, metavar="ARCSEC", help="deflection of the vertical, east (0)")
+    parser.add_argument(
+        "--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)"
+    )
+    parser.add_argument(
+        "--geoid",
+        metavar="FILE",
+        help="take the deflection and its error from a geoid grid, GTX or GeoTIFF, such as egm96_15.gtx of proj-data",
+    )
+
+
+def vertical_of(args: argparse.Namespace) -> Vertical:
+    """The deflection given by hand, or a geoid's; that of knowing nothing without either."""
+    by_hand = args.xi, args.eta, args.deflection_stddev
+    if args.geoid is not None:
+        if by_hand != (None, None, None):
+            raise InstrumentError(
+                "--geoid tells the deflection and its error: give either it or --xi, --eta and theirs"
+            )
+        return geoid.read(args.geoid)
+    stddev = args.deflection_stddev
+    if stddev is None:
+        stddev = GIVEN_STDDEV_ARCSEC if args.xi or args.eta else UNKNOWN_STDDEV_ARCSEC
+    return Deflection(args.xi or 0.0, args.eta or 0.0, stddev)
+
+
 def number(low: float, high: float, kind: type = float):
     """An argparse type: a number from low to high."""
 
@@ -79,7 +110,7 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
             raise InstrumentError(
                 "--instrument holds focal length and misalignment: give either it or the options"
             )
-        return instrument.read(path)
+        return instrument_file.read(path)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
     if args.focal_mm is not None:
@@ -90,7 +121,7 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
         raise InstrumentError(
             "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
         )
-    return instrument.Instrument(focal_px, misalignment_deg=tuple(misalignment or (0.0, 0.0, 0.0)))
+    return instrument.Instrument(focal_px, calibration=instrument.Calibration(tuple(misalignment or (0.0, 0.0, 0.0))))
 
 
 def frames_of(paths: list[str]):

@@ -8,14 +8,14 @@ import numpy as np
 from starpos import catalogue
 from starpos.average import Average, average
 from starpos.cli import common
-from starpos.earth import utc_text
 from starpos.errors import FixError, FrameError
 from starpos.fix import Fix
 from starpos.inclinometer import TiltLog, read_tilt_csv
 from starpos.solve import Solution, Solver, Status
 from starpos.stars import Stars
 from starpos.turning import turn
-from starpos.vertical import Deflection, geodetic
+from starpos.utc import utc_text
+from starpos.vertical import Vertical, geodetic
 
 NO_FIX = 1
 
@@ -37,15 +37,7 @@ def define(parser) -> None:
         help="A3 in deg: camera to inclinometer",
     )
     common.add_air(parser)
-    parser.add_argument(
-        "--xi", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, north"
-    )
-    parser.add_argument(
-        "--eta", type=float, default=0.0, metavar="ARCSEC", help="deflection of the vertical, east"
-    )
-    parser.add_argument(
-        "--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)"
-    )
+    common.add_vertical(parser)
     parser.add_argument(
         "--self-calibrate",
         action="store_true",
@@ -55,7 +47,7 @@ def define(parser) -> None:
 
 
 def run(args) -> int:
-    deflection = _deflection(args)
+    vertical = common.vertical_of(args)
     solved, unreadable = [], False
     for path, answer in (_turned if args.self_calibrate else _one_by_one)(args):
         if isinstance(answer, FrameError):
@@ -66,13 +58,13 @@ def run(args) -> int:
         else:
             common.complain("solve", answer.message)
         if args.json:
-            common.print_json({"file": path} | _json_of(answer.fix, deflection) | _json_about(answer))
+            common.print_json({"file": path} | _json_of(answer.fix, vertical) | _json_about(answer))
         else:
             print(_line(path, answer))
     common.tell_extrapolation("solve", solved)
     together = _combine(solved)
     if solved:
-        _print_combined(together, solved, args, deflection)
+        _print_combined(together, solved, args, vertical)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
 
@@ -107,7 +99,7 @@ def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[So
         turned = turn(solver, frames, tilts.average, solver.progress)
     except FixError as e:
         return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames]
-    angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.misalignment_deg)
+    angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
     return turned.solutions
@@ -115,7 +107,7 @@ def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[So
 
 def _solver(args, first) -> tuple[Solver, TiltLog]:
     instrument = common.instrument_of(args, first)
-    tilts = read_tilt_csv(args.tilt, instrument.tilt_noise_rad)
+    tilts = read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
     solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar())
     return solver, tilts
 
@@ -131,19 +123,14 @@ def _combine(solved: list[Solution]) -> Average | None:
         return None
 
 
-def _deflection(args) -> Deflection:
-    if args.deflection_stddev is not None:
-        return Deflection(args.xi, args.eta, args.deflection_stddev)
-    return Deflection(args.xi, args.eta, 1.0) if args.xi or args.eta else Deflection()
-
-
-def _json_of(fix: Fix | Average | None, deflection: Deflection) -> dict:
+def _json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
     """The keys of the contract that a fix fills; without one they are null."""
     keys = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
-            "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "budget")  # fmt: skip
+            "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
+            "deflection_stddev_arcsec", "budget")  # fmt: skip
     if fix is None:
         return dict.fromkeys(keys)
-    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, deflection)
+    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
     covariance = _in_degrees(fix.covariance)
     sigma = np.sqrt(np.diag(covariance))
     values = (
@@ -156,7 +143,10 @@ def _json_of(fix: Fix | Average | None, deflection: Deflection) -> dict:
         *sigma,
         covariance,
         _in_degrees(ground.covariance),
-        budget_of(fix, deflection),
+        ground.deflection.xi_arcsec,
+        ground.deflection.eta_arcsec,
+        ground.deflection.stddev_arcsec,
+        budget_of(fix, vertical),
     )
     return dict(zip(keys, values, strict=True))
 
@@ -167,10 +157,10 @@ def _in_degrees(covariance: np.ndarray) -> np.ndarray:
     return covariance * np.outer(unit, unit)
 
 
-def budget_of(fix: Fix | Average, deflection: Deflection) -> dict:
+def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
     """1 sigma of each source: east m, north m, heading deg; the deflection only concerns the geodetic position."""
     terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
-    extra = geodetic(fix.latitude, fix.longitude, 0.0, np.zeros((3, 3)), deflection).covariance
+    extra = geodetic(fix.latitude, fix.longitude, 0.0, np.zeros((3, 3)), vertical).covariance
     terms["deflection (geodetic only)"] = np.sqrt(np.diag(extra)) * [1, 1, np.degrees(1)]
     return terms
 
@@ -201,9 +191,7 @@ def _where(fix: Fix | Average) -> str:
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
-def _print_combined(
-    all_together: Average | None, solved: list[Solution], args, deflection: Deflection
-) -> None:
+def _print_combined(all_together: Average | None, solved: list[Solution], args, vertical: Vertical) -> None:
     if args.json:
         about = {
             "stars_detected": sum(s.stars_detected for s in solved),
@@ -214,18 +202,18 @@ def _print_combined(
         }
         common.print_json(
             {"combined": True, "frames": all_together.frames if all_together else 0}
-            | _json_of(all_together, deflection)
+            | _json_of(all_together, vertical)
             | about
         )
         return
     if all_together is None:
         return
-    ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, deflection)
+    ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, vertical)
     print(f"{all_together.frames} frames together: {_where(all_together)} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
         f"+- {sigma[1]:.0f} m N {sigma[0]:.0f} m E (the deflection of the vertical included)"
     )
-    for name, (east, north, heading) in budget_of(all_together, deflection).items():
+    for name, (east, north, heading) in budget_of(all_together, vertical).items():
         print(f"  {name:<28} {east:8.2f} m E {north:8.2f} m N {heading * 3600:8.2f} arcsec")

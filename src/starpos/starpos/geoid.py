@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The deflection of the vertical from the slopes of a geoid grid, with what the grid cannot resolve as its error."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+
+from starpos.earth import curvature_radii_m
+from starpos.geoid_file import Grid, read_grid
+from starpos.vertical import ARCSEC, Deflection
+
+# Nodes each way under the spline: at 8 its ends no longer tell (0.27^8), at 2 it is one cubic.
+REACHES = (8, 4, 2)
+ROUGH_DEG = 1.0  # each way, of the neighbourhood whose roughness tells what the grid leaves out
+UNRESOLVED = 1.7  # times the change of slope from node to node; tools/geoid_sigma.py
+ROUGH_NORTH_DEG = 87.0  # nearer to a pole the columns bend of themselves
+FLOOR_ARCSEC = 0.5
+NEAREST_POLE_DEG = 1e-3  # 111 m: where east and west end
+WIDEST_STRIDE_DEG = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Geoid:
+    """Deflections of the vertical from a Grid of geoid undulations."""
+
+    grid: Grid
+
+    def at(self, latitude: float, longitude: float) -> Deflection:
+        """The Deflection at a place in rad; that of knowing nothing where the grid has no data around it.
+
+        xi = -dN / (M dphi), eta = -dN / (N' cos(phi) dlambda): Heiskanen & Moritz, Physical Geodesy (1967), equation
+        2-171, with WGS 84's radii M, N' and a cubic spline through the nodes.  They are deflections at the geoid: those
+        at the ground differ by the curvature of the plumb line, about 1 arcsec for each 1000 m in mountains, which the
+        stated error holds.  An astronomic place will do for a geodetic one: 10 arcsec, 300 m, do not tell.
+        """
+        phi = np.clip(np.degrees(latitude), NEAREST_POLE_DEG - 90, 90 - NEAREST_POLE_DEG)
+        lam = np.degrees(longitude)
+        if not np.isfinite([phi, lam]).all():
+            return Deflection()
+        slopes = self._slopes(phi, lam)
+        if slopes is None:
+            return Deflection()
+        return Deflection(*slopes, float(np.hypot(FLOOR_ARCSEC, UNRESOLVED * self._roughness(phi, lam))))
+
+    def _slopes(self, phi: float, lam: float) -> tuple[float, float] | None:
+        """xi and eta in arcsec; None without data."""
+        north_m, east_m, stride = self._spacing_m(phi)
+        for reach in REACHES:
+            nodes, row, column = self._window(phi, lam, reach, reach, stride)
+            if np.isfinite(nodes).all():
+                at = np.arange(2 * reach)
+                spline = RectBivariateSpline(at, at, nodes)
+                xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
+                return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
+        return None
+
+    def _roughness(self, phi: float, lam: float) -> float:
+        """How much the slope changes from node to node, root mean square of the neighbourhood, arcsec."""
+        phi = np.clip(phi, -ROUGH_NORTH_DEG, ROUGH_NORTH_DEG)
+        north_m, east_m, stride = self._spacing_m(phi)
+        up = max(4, round(ROUGH_DEG / self.grid.step_latitude))
+        across = max(4, round(up * north_m / east_m))
+        nodes, _, _ = self._window(phi, lam, up, min(across, self.grid.columns // (2 * stride)), stride)
+        bends = (
+            np.diff(nodes, 2, axis=0)[:, 1:-1] / north_m**2,
+            np.diff(nodes, 2, axis=1)[1:-1] / east_m**2,
+        )
+        return float(np.sqrt(np.nanmean(np.square(bends))) * north_m / ARCSEC)
+
+    def _spacing_m(self, phi: float) -> tuple[float, float, int]:
+        """Of the nodes to the north and to the east, and the columns from one to the next.
+
+        Towards the poles, where columns come together until the file's millimetres make slopes, some are left out.
+        """
+        prime, meridian = curvature_radii_m(np.radians(phi))
+        north_m = meridian * np.radians(self.grid.step_latitude)
+        column_m = prime * np.cos(np.radians(phi)) * np.radians(self.grid.step_longitude)
+        widest = max(1, int(WIDEST_STRIDE_DEG / self.grid.step_longitude))
+        stride = int(np.clip(np.ceil(0.1 * north_m / column_m), 1, widest))
+        return north_m, stride * column_m, stride
+
+    def _window(self, phi: float, lam: float, up: int, across: int, stride: int):
+        """Undulations (2 up, 2 across), NaN where there are none, and the place as row and column in it."""
+        row, column = self.grid.locate(phi, lam)
+        rows = np.arange(1 - up, 1 + up) + int(row)
+        columns = np.arange(1 - across, 1 + across) * stride + int(column)
+        nodes = self.grid.undulations(rows, columns)
+        return nodes, row - rows[0], (column - columns[0]) / stride
+
+
+def read(path) -> Geoid:
+    """A Geoid from a GTX or GeoTIFF file; a bare name is also looked for where PROJ keeps its grids.
+
+    Raises GeoidError with the reason where it is none.
+    """
+    return Geoid(read_grid(path))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Grids of geoid undulations: NOAA's GTX and PROJ's GeoTIFF (PROJ's specification of geodetic TIFF grids)."""
+
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starpos.errors import GeoidError
+from starpos.geotiff import read_geotiff
+
+GTX_HEADER = struct.Struct(">4d2i")  # south, west, step in latitude, in longitude (deg), rows, columns
+GTX_NODATA = np.float32(-88.8888)
+MAX_NODES = 300_000_000  # 1 arcmin of the whole globe are 233 million
+LEAST_NODES = 4
+STEPS_DEG = (1e-4, 2.0)
+UNDULATION_LIMIT_M = 150.0  # the geoid's own are -107 to 86 m; what is beyond is a mark for "no data"
+PROJ_FOLDERS = ("/usr/share/proj", "/usr/local/share/proj")
+TIFF_MAGIC = (b"II*\0", b"MM\0*")
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Geoid undulations in m (rows, columns) on WGS 84, southernmost row and westernmost column first, float32.
+
+    south, west: of the first node; the steps are positive.  All in deg.
+    """
+
+    values: np.ndarray
+    south: float
+    west: float
+    step_latitude: float
+    step_longitude: float
+
+    def __post_init__(self):
+        rows, columns = self.values.shape
+        steps = self.step_latitude, self.step_longitude
+        if not np.isfinite([self.south, self.west, *steps]).all():
+            raise GeoidError("its corner or spacing is not a finite number")
+        if min(rows, columns) < LEAST_NODES:
+            raise GeoidError(
+                f"{columns} x {rows} nodes are too few for slopes: {LEAST_NODES} each way are the least"
+            )
+        if not STEPS_DEG[0] <= min(steps) <= max(steps) <= STEPS_DEG[1]:
+            raise GeoidError(
+                f"its nodes are {steps[0]:g} and {steps[1]:g} deg apart: {STEPS_DEG[0]:g} to {STEPS_DEG[1]:g} can be used"
+            )
+        north, turn = self.south + (rows - 1) * steps[0], columns * steps[1]
+        if (
+            min(self.south, -north) < -90 - 0.01 * steps[0]
+            or abs(self.west) > 540
+            or turn > 360 + 1.01 * steps[1]
+        ):
+            raise GeoidError(
+                f"it claims latitudes {self.south:g} to {north:g} and {turn:g} deg of longitude from {self.west:g}: "
+                "these are no degrees on the globe"
+            )
+        sample = self._known(self.values[:: max(1, rows // 300), :: max(1, columns // 300)])
+        if not np.isfinite(sample).any():
+            raise GeoidError(
+                f"none of its values is a geoid undulation, which lie within {UNDULATION_LIMIT_M:g} m of 0"
+            )
+
+    @property
+    def columns(self) -> int:
+        """Of a full turn, where the grid goes around the globe; else all it has."""
+        return self._around or self.values.shape[1]
+
+    @property
+    def _around(self) -> int:
+        turn = round(360 / self.step_longitude)
+        whole = abs(turn * self.step_longitude - 360) < 0.01 * self.step_longitude
+        return turn if whole and self.values.shape[1] >= turn else 0
+
+    def locate(self, latitude: float, longitude: float) -> tuple[float, float]:
+        """Row and column of a place in deg, with fractions; outside the grid they are negative or too large."""
+        east = (longitude - self.west) % 360
+        middle = (self.values.shape[1] - 1) * self.step_longitude / 2
+        if east - middle > 180:  # nearer to the western edge
+            east -= 360
+        return (latitude - self.south) / self.step_latitude, east / self.step_longitude
+
+    def undulations(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """(R, C) in m of rows (R,) and columns (C,), NaN where there are none.
+
+        A grid around the globe goes on over its seam and, where its rows reach them, over the poles.
+        """
+        rows, over = self._over_the_poles(rows)
+        columns = columns[None, :] + over[:, None] * (self._around // 2)
+        if self._around:
+            columns = columns % self._around
+        height, width = self.values.shape
+        inside = (rows >= 0)[:, None] & (rows < height)[:, None] & (columns >= 0) & (columns < width)
+        taken = self.values[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
+        return np.where(inside, self._known(taken), np.nan)
+
+    def _over_the_poles(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The rows that those beyond a pole are, half a turn away, and which these are."""
+        last = len(self.values) - 1
+        if self._around % 2 or not self._around:
+            return rows, np.zeros(rows.shape, bool)
+        south, north = ((pole - 2 * self.south) / self.step_latitude for pole in (-180, 180))
+        beyond = np.zeros(rows.shape, bool)
+        # 0 and 2 last: a row on the pole; one further: the pole half a row away
+        if min(abs(south), abs(south + 1)) < 0.01:
+            beyond |= rows < 0
+            rows = np.where(rows < 0, round(south) - rows, rows)
+        if min(abs(north - 2 * last), abs(north - 2 * last - 1)) < 0.01:
+            over = rows > last
+            beyond |= over
+            rows = np.where(over, round(north) - rows, rows)
+        return rows, beyond
+
+    @staticmethod
+    def _known(values: np.ndarray) -> np.ndarray:
+        known = (np.abs(values) < UNDULATION_LIMIT_M) & (values != GTX_NODATA)
+        return np.where(known, values, np.nan).astype(float)
+
+
+def read_grid(path) -> Grid:
+    """A Grid from a GTX or GeoTIFF file; GeoidError with the reason where it is none."""
+    path = find(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(GTX_HEADER.size)
+            size = file.seek(0, os.SEEK_END)
+    except (OSError, ValueError) as e:
+        reason = getattr(e, "strerror", None) or e
+        raise GeoidError(
+            f"{path}: the geoid grid cannot be read ({reason}): give a GTX or GeoTIFF file"
+        ) from None
+    try:
+        return Grid(
+            *(read_geotiff(path, MAX_NODES) if head[:4] in TIFF_MAGIC else _read_gtx(path, head, size))
+        )
+    except GeoidError as e:
+        raise GeoidError(f"{path}: no geoid grid that can be used: {e}") from None
+
+
+def find(path) -> Path:
+    """`path`, or, of a bare file name that is not here, where PROJ keeps its grids."""
+    path = Path(path)
+    if len(path.parts) != 1 or path.exists():
+        return path
+    told = [
+        folder for name in ("PROJ_DATA", "PROJ_LIB") for folder in os.environ.get(name, "").split(os.pathsep)
+    ]
+    places = [Path(folder) / path for folder in (*filter(None, told), *PROJ_FOLDERS)]
+    return next((place for place in places if place.is_file()), path)
+
+
+def _read_gtx(path: Path, head: bytes, size: int):
+    """As NOAA's VDatum has it: big endian, rows from south to north.  The values stay in the file until they are used."""
+    if len(head) < GTX_HEADER.size:
+        raise GeoidError("it is shorter than a header")
+    south, west, step_latitude, step_longitude, rows, columns = GTX_HEADER.unpack(head)
+    if rows <= 0 or columns <= 0 or rows * columns > MAX_NODES:
+        raise GeoidError(f"its header claims {columns} x {rows} nodes: is it a GTX or GeoTIFF file?")
+    missing = GTX_HEADER.size + 4 * rows * columns - size
+    if missing > 0:
+        raise GeoidError(f"{missing} bytes are missing at its end: copy it again")
+    values = np.memmap(path, ">f4", "r", GTX_HEADER.size, (rows, columns))
+    return values, south, west, step_latitude, step_longitude
