@@ -228,14 +228,9 @@ class Solver:
         return camera
 
     def _identify(self, stars: Stars, camera: Camera, directions, year, velocity, priors=()):
-        # of square pixels, which is what identify fits
-        squeeze = camera.fx / camera.fy
-        height = max(1, round(camera.height * squeeze))
-        ideal = Camera(camera.width, height, camera.fx, camera.fx, camera.cx, camera.cy * squeeze)
         table = triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
         sky = ident.Sky(self.catalogue, table, year, velocity)
-        sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
-        return ident.identify(ideal.project(directions), sigma, ideal, sky, priors), sky
+        return ident.identify_directions(directions, stars.sigma, camera, sky, priors), sky
 
     def _unidentified(self, stars: Stars) -> Solution:
         place, n = stars.source or "the frame", len(stars)

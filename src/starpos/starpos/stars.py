@@ -82,6 +82,11 @@ class Stars:
     def __len__(self):
         return len(self.x)
 
+    @property
+    def sigma(self) -> np.ndarray:
+        """(N,) px: one axis, whichever way it lies."""
+        return np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2)
+
     def take(self, index) -> "Stars":
         """The stars of an index array or a boolean mask of length N; an index must keep the order of flux."""
         return Stars(

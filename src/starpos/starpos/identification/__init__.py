@@ -8,7 +8,15 @@ and never by a count, and fitted by least squares to the faintest stars seen.
 
 from starpos.identification.full import Identification
 from starpos.identification.prior import Plumb, Pointing
-from starpos.identification.search import FEWEST_STARS, identify
+from starpos.identification.search import FEWEST_STARS, identify, identify_directions
 from starpos.identification.sky import Sky
 
-__all__ = ["FEWEST_STARS", "Identification", "Plumb", "Pointing", "Sky", "identify"]
+__all__ = [
+    "FEWEST_STARS",
+    "Identification",
+    "Plumb",
+    "Pointing",
+    "Sky",
+    "identify",
+    "identify_directions",
+]

@@ -60,6 +60,21 @@ def identify(
     return None
 
 
+def identify_directions(
+    directions: np.ndarray,
+    sigma_px: np.ndarray,
+    camera: Camera,
+    sky: Sky,
+    priors: Sequence[Pointing | Plumb] = (),
+) -> Identification | None:
+    """`identify` from unit vectors (N, 3) in C, refraction taken off, as any `camera` gave them."""
+    # of square pixels, which is what identify fits
+    squeeze = camera.fx / camera.fy
+    height = max(1, round(camera.height * squeeze))
+    ideal = Camera(camera.width, height, camera.fx, camera.fx, camera.cx, camera.cy * squeeze)
+    return identify(ideal.project(directions), sigma_px, ideal, sky, priors)
+
+
 def _enough(hypotheses: int, share: float) -> float:
     """Log-odds that the best of so many hypotheses must have: wrong ones reach them with share * FALSE_ACCEPT (Ville)."""
     return math.log(max(hypotheses, 1) / (share * FALSE_ACCEPT))

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera from the sky: frames are identified with the camera as it is given, the camera is fitted to their stars, and
+the better camera finds more of them, to the faint and the corners."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos import triangles
+from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
+from starpos.catalogue import Catalogue
+from starpos.earth import earth_motion
+from starpos.errors import CalibrationError, InstrumentError
+from starpos.identification import Identification, Pointing, Sky, identify_directions
+from starpos.intrinsics import Intrinsics, Sighting, check_invertible, check_sound, fit_camera, unbent
+from starpos.progress import Progress, quiet
+from starpos.solve import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
+from starpos.stars import Stars
+
+FIRST = ("fx", "fy", "k1")  # what the first, coarse matches may tell
+ROUNDS = 4  # of the finer ones
+SETTLED_SHARE = 0.002  # of the stars: so few more are no reason for another round
+
+
+@dataclass(frozen=True)
+class FromSky:
+    """The camera that frames told, and which of them (indices) were identified: the fit's, in order."""
+
+    fit: Intrinsics
+    used: tuple[int, ...]
+
+
+def calibrate(
+    frames: Sequence[Stars],
+    levels: Sequence[np.ndarray | None],
+    given: Camera,
+    catalogue: Catalogue,
+    atmosphere: Atmosphere,
+    progress: Progress = quiet,
+) -> FromSky:
+    """One camera from frames of any attitudes.
+
+    levels: of each frame, C into the local level L (3, 3), None where it is unknown; given: right to 3 % of the focal
+    length and a few px of distortion.  Frames that are not identified are left out.  Raises CalibrationError where no
+    camera comes of it, InstrumentError for a mirrored frame, TimeError for an impossible time.
+    """
+    for stars in frames:
+        if (stars.width, stars.height) != (given.width, given.height):
+            raise CalibrationError(
+                f"{stars.source}: the frame is {stars.width} x {stars.height} px but the first or the instrument has "
+                f"{given.width} x {given.height}: give frames of one size"
+            )
+    table = triangles.cached(catalogue, given.half_diagonal_rad, progress)
+    skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
+    camera, known, before = given, {}, 0
+    for k in range(1 + ROUNDS):
+        sightings = {}
+        for n, frame in enumerate(skies):
+            if sighting := frame.sighting(camera, atmosphere, known.get(n)):
+                sightings[n] = sighting
+            progress("camera", (k + (n + 1) / len(skies)) / (1 + ROUNDS))
+        if not sightings:
+            raise CalibrationError(
+                f"none of the sky fits any of the {len(frames)} frames: check the focal length ({given.fx:.0f} px given, "
+                "3 % is allowed), clouds and exposure"
+            )
+        fit = fit_camera(list(sightings.values()), given, atmosphere, **({} if k else {"free": FIRST}))
+        check_invertible(fit.camera)
+        camera, known = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
+        count = sum(len(s.xy) for s in sightings.values())
+        if k and abs(count - before) <= SETTLED_SHARE * count:
+            break
+        before = count
+    check_sound(fit, given)
+    progress("camera", 1.0)
+    return FromSky(fit, tuple(sightings))
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame's stars and the sky of its date."""
+
+    stars: Stars
+    level: np.ndarray | None
+    sky: Sky
+
+    @classmethod
+    def of(cls, stars: Stars, level, catalogue: Catalogue, table: triangles.TriangleCatalogue) -> "_Frame":
+        year, velocity = J2000, (0.0, 0.0, 0.0)
+        if stars.mid_unix_s is not None:
+            year, velocity = earth_motion(stars.mid_unix_s)
+        on = (stars.x > -EDGE_PX) & (stars.x < stars.width - 1 + EDGE_PX)
+        on &= (stars.y > -EDGE_PX) & (stars.y < stars.height - 1 + EDGE_PX)
+        return cls(stars.take(on), level, Sky(catalogue, table, year, tuple(velocity)))
+
+    def sighting(
+        self, camera: Camera, atmosphere: Atmosphere, attitude: np.ndarray | None
+    ) -> Sighting | None:
+        """Its stars as this camera identifies them, first near the attitude where one is known; None: it does not."""
+        seen = unbent(camera.directions(self.stars.x, self.stars.y), self.level, atmosphere)
+        priors = () if attitude is None else (Pointing(attitude, camera.fx),)
+        found = identify_directions(seen, self.stars.sigma, camera, self.sky, priors)
+        if found is None:
+            return None
+        if found.mirrored:
+            raise InstrumentError(
+                f"{self.stars.source}: the frame is mirrored (its rows run bottom-up): flip it"
+            )
+        return self._of(found, camera)
+
+    def _of(self, found: Identification, camera: Camera) -> Sighting:
+        # a saturated, cut or blended image has its centroid elsewhere; such stars serve where there are no others
+        sound = (self.stars.flags[found.star] & UNSOUND) == 0
+        use = sound if sound.sum() >= ENOUGH_SOUND else np.ones(len(sound), bool)
+        star, index = found.star[use], found.catalogue[use]
+        return Sighting(
+            np.stack([self.stars.x, self.stars.y], -1)[star],
+            self.stars.covariance[star],
+            self.sky.directions(index),
+            np.hypot(self.sky.catalogue.sigma(index, self.sky.year), found.blend_px[use] / camera.fx),
+            found.attitude,
+            self.level,
+            self.stars.mid_unix_s is not None,
+        )

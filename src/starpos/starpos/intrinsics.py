@@ -1,0 +1,428 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One camera and one attitude a frame from identified stars: robust weighted least squares with weak priors.
+
+A narrow field cannot tell everything: a shift of the principal point is nearly a turn of the camera, k2 and k3 are nearly
+k1.  The priors say how far a camera may be from the one it was given as; the covariance holds what the sky told and what
+the priors did.  Attitudes are eliminated frame by frame (Schur complement), so that their number costs little.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import brentq
+
+from starpos import rotation
+from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
+from starpos.errors import CalibrationError, InstrumentError
+
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+# 1 sigma of the priors about the given camera: mean focal length, fx over fy, principal point (of the longer side), and
+# what k1, k2, p1, p2, k3 shift the corner by (of half the diagonal)
+FOCAL, SQUARE, PRINCIPAL = 0.03, 0.005, 0.03
+CORNER = (0.02, 0.01, 0.003, 0.003, 0.005)
+# Without tilts: refraction shrinks the field as at the zenith across the vertical, twice that along it at 45 deg
+UNLEVELLED = 1.25, 0.3  # of the shrinking at the zenith: taken, and 1 sigma an axis
+UNTIMED = 1e-4  # that and less is the scale changed by aberration, which needs a time
+TOLD = 0.5  # of the prior's sigma: below it the sky has told a parameter
+BEYOND_PRIOR = 5.0  # sigma: no camera as it was given
+FEWEST_STARS = 20
+MAX_SCATTER_PX = 1.5
+OUTLIER_SIGMA = 5.0
+MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
+MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6  # the last in sigma of the priors
+STEP_RAD = 1e-6  # of the numerical derivatives for the attitudes
+BORDER = 25  # points a side at which a camera is checked and its error told
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One frame's identified stars.
+
+    xy (N, 2) px and covariance_px2 (N, 2, 2) as measured; directions (N, 3): where they are, aberration in them;
+    direction_sigma (N,) rad, one axis; attitude (3, 3): `directions` into C, about right; level (3, 3): C into the local
+    level L, None where it is unknown; timed: whether the aberration is of the frame's date.
+    """
+
+    xy: np.ndarray
+    covariance_px2: np.ndarray
+    directions: np.ndarray
+    direction_sigma: np.ndarray
+    attitude: np.ndarray
+    level: np.ndarray | None
+    timed: bool
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera that the sky told.
+
+    covariance (9, 9): of PARAMETERS, scatter beyond the stars' own errors included; prior_sigma (9,): what was known
+    before; attitudes (F, 3, 3): of the frames; xy (N, 2) px: the stars that were kept, frame by frame; frame (N,): which
+    each is of; residual (N, 2) px: measured less predicted; before (N, 2): the same with the given camera, its focal length
+    and the attitudes fitted; scatter_px: 1 sigma an axis beyond the stars' own errors; rejected: stars left out.
+    """
+
+    camera: Camera
+    covariance: np.ndarray
+    prior_sigma: np.ndarray
+    attitudes: np.ndarray
+    xy: np.ndarray
+    frame: np.ndarray
+    residual: np.ndarray
+    before: np.ndarray
+    scatter_px: float
+    rejected: int
+
+    @property
+    def values(self) -> np.ndarray:
+        """(9,) of PARAMETERS."""
+        return _values(self.camera)
+
+    @property
+    def sigma(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def told(self) -> np.ndarray:
+        """Which of PARAMETERS the sky told (9,); the others are held by their priors."""
+        return self.sigma < TOLD * self.prior_sigma
+
+    @property
+    def rms_px(self) -> float:
+        """Of the residuals, one axis."""
+        return rms(self.residual)
+
+    def sigma_px(self, xy: np.ndarray) -> np.ndarray:
+        """How far off (N,) px, 1 sigma an axis, the camera's predictions at pixels xy (N, 2) are once a frame's attitude
+        and the scale are fitted: what is left of the covariance for those who use the camera."""
+        grid = _grid(self.camera, BORDER)
+        j, free = (_derivatives(self.camera, np.concatenate([grid, xy]), k) for k in (PARAMETERS, ()))
+        n = 2 * len(grid)
+        fitted = np.linalg.lstsq(free[:n], j[:n], rcond=None)[0]
+        left = (j - free @ fitted)[n:]
+        return np.sqrt(np.einsum("ni,ij,nj->n", left, self.covariance, left).reshape(-1, 2).mean(1))
+
+    @property
+    def worst_sigma_px(self) -> float:
+        """The largest of `sigma_px` over the frame."""
+        return float(self.sigma_px(_grid(self.camera, BORDER)).max())
+
+
+def rms(residual: np.ndarray) -> float:
+    """Root mean square of residuals (N, 2), one axis."""
+    return float(np.sqrt(np.mean(residual * residual)))
+
+
+def fit_camera(
+    sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str] = PARAMETERS
+) -> Intrinsics:
+    """The camera of all sightings, near the `given` one; of its parameters those not in `free` stay as they are.
+
+    Raises CalibrationError where the stars are too few or do not agree; whether they agree well enough and on a camera
+    that can be is for `check_sound` to say.
+    """
+    count = sum(len(s.xy) for s in sightings)
+    if count < FEWEST_STARS:
+        raise CalibrationError(
+            f"{count} identified stars are too few for a camera: give frames with {FEWEST_STARS} at least"
+        )
+    problem = _Problem.of(sightings, given, atmosphere, free)
+    fitted = _settled(problem)
+    camera = problem.camera(fitted.state.q)
+    to_named = problem.named_per_unit()
+    keep = fitted.keep
+    held = replace(problem, sigma=problem.sigma * _only("scale"))
+    before, _ = held.refined(_State(np.zeros(len(UNKNOWNS)), problem.start), problem.stated + np.eye(2), keep)
+    return Intrinsics(
+        camera,
+        to_named @ fitted.covariance @ to_named.T,
+        np.sqrt(np.square(to_named).sum(1)),
+        fitted.state.attitudes,
+        problem.xy[keep],
+        problem.frame[keep],
+        problem.residual(fitted.state)[keep],
+        held.residual(before)[keep],
+        float(np.sqrt(fitted.jitter2)),
+        int((~keep).sum()),
+    )
+
+
+def check_sound(fitted: Intrinsics, given: Camera) -> None:
+    """CalibrationError where the fit is none to work with."""
+    if (np.abs(fitted.values - _values(given)) > BEYOND_PRIOR * fitted.prior_sigma).any():
+        raise CalibrationError(
+            "the stars want a camera too unlike the given one: check focal length and pixel size, and that the frames "
+            "are of one camera"
+        )
+    if fitted.scatter_px > MAX_SCATTER_PX:
+        raise CalibrationError(
+            f"the identified stars lie {fitted.scatter_px:.1f} px off the best camera, {MAX_SCATTER_PX:g} at most are "
+            "allowed: check that the frames are sharp and of one camera and focus"
+        )
+    check_invertible(fitted.camera)
+
+
+def check_invertible(camera: Camera) -> None:
+    """CalibrationError where the distortion folds inside the frame."""
+    try:
+        camera.directions(*_grid(camera, BORDER).T)
+    except InstrumentError:
+        raise CalibrationError(
+            "the distortion these stars tell folds inside the frame: give more frames, with stars in the corners"
+        ) from None
+
+
+def unbent(seen: np.ndarray, level: np.ndarray | None, atmosphere: Atmosphere) -> np.ndarray:
+    """Directions (N, 3) in C without refraction; without a level, with a middling one undone."""
+    if level is not None:
+        return atmosphere.refraction().unbend(seen @ level.T) @ level
+    v = seen / np.append([_shrinking(atmosphere)] * 2, 1.0)
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def _shrinking(atmosphere: Atmosphere) -> float:
+    """Of a field whose level is unknown: the factor by which refraction makes it smaller."""
+    return 1 - UNLEVELLED[0] * atmosphere.refraction().a
+
+
+def _grid(camera: Camera, side: int) -> np.ndarray:
+    """Pixels (side^2, 2) evenly over the frame, its corners included."""
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, side), np.linspace(0, camera.height - 1, side))
+    return np.stack([x.ravel(), y.ravel()], -1)
+
+
+def _values(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+def _with_values(camera: Camera, values) -> Camera:
+    fx, fy, cx, cy, *distortion = (float(v) for v in values)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
+
+
+# The unknowns q, in sigma of their priors: scale, squareness, seven of the camera, then what the air may do beyond what
+# is assumed of it: strength of the refraction, and what shrinks the field along x and y where the level is not known.
+UNKNOWNS = ("scale", "square", *PARAMETERS[2:], "refraction", "shrink_x", "shrink_y")
+CAMERA_UNKNOWNS = 9
+
+
+def _only(name: str) -> np.ndarray:
+    return np.array([u == name for u in UNKNOWNS], float)
+
+
+@dataclass(frozen=True)
+class _State:
+    q: np.ndarray
+    attitudes: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Settled:
+    state: _State
+    covariance: np.ndarray  # of q
+    keep: np.ndarray
+    jitter2: float
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """All stars of all frames, frame by frame: first (F,) is the row where each begins."""
+
+    given: Camera
+    sigma: np.ndarray  # of UNKNOWNS' priors; 0 for what is held
+    xy: np.ndarray
+    stated: np.ndarray  # (N, 2, 2) px2
+    places: np.ndarray
+    frame: np.ndarray
+    first: np.ndarray
+    start: np.ndarray
+    level: np.ndarray  # (F, 3, 3); 0 where it is unknown
+    atmosphere: Atmosphere
+
+    @classmethod
+    def of(cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free) -> "_Problem":
+        sightings = [s for s in sightings if len(s.xy)]
+        counts = [len(s.xy) for s in sightings]
+        direction2 = np.square(np.concatenate([s.direction_sigma for s in sightings]) * given.fx)
+        untimed = any(not s.timed for s in sightings)
+        shrink = np.hypot(UNLEVELLED[1] * atmosphere.refraction().a, UNTIMED * untimed)
+        half = np.hypot(given.width, given.height) / 2
+        r = half / np.sqrt(given.fx * given.fy)
+        shift = np.array(CORNER) / np.array([r**2, r**4, 3 * r, 3 * r, r**6])
+        side = PRINCIPAL * max(given.width, given.height)
+        held = np.array([name in free for name in PARAMETERS])
+        camera = np.array([FOCAL, SQUARE, side, side, *shift]) * held
+        return cls(
+            given,
+            np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
+            np.concatenate([s.xy for s in sightings]),
+            np.concatenate([s.covariance_px2 for s in sightings]) + np.eye(2) * direction2[:, None, None],
+            np.concatenate([s.directions for s in sightings]),
+            np.repeat(np.arange(len(counts)), counts),
+            np.cumsum([0, *counts[:-1]]),
+            np.stack([s.attitude for s in sightings]),
+            np.stack([np.zeros((3, 3)) if s.level is None else s.level for s in sightings]),
+            atmosphere,
+        )
+
+    @cached_property
+    def levelled(self) -> np.ndarray:
+        """Whether each star's frame has a level (N,)."""
+        return self.level.any((1, 2))[self.frame]
+
+    def named_per_unit(self) -> np.ndarray:
+        """(9, U): how PARAMETERS change with the unknowns."""
+        m = np.zeros((len(PARAMETERS), len(UNKNOWNS)))
+        m[0, :2], m[1, :2] = np.array([1, 0.5]) * self.given.fx, np.array([1, -0.5]) * self.given.fy
+        m[range(2, 9), range(2, 9)] = 1.0
+        return m * self.sigma
+
+    def camera(self, q: np.ndarray) -> Camera:
+        return _with_values(self.given, _values(self.given) + self.named_per_unit() @ q)
+
+    def seen(self, state: _State) -> np.ndarray:
+        """Directions (N, 3) in C from which the light comes."""
+        u = np.einsum("nij,nj->ni", state.attitudes[self.frame], self.places)
+        strength, *shrink = (state.q * self.sigma)[CAMERA_UNKNOWNS:]
+        model = self.atmosphere.refraction(1 + strength)
+        if self.levelled.all():
+            g = self.level[self.frame]
+            return np.einsum("nij,ni->nj", g, model.bend(np.einsum("nij,nj->ni", g, u)))
+        out = u * np.append(_shrinking(self.atmosphere) - np.array(shrink), 1.0)
+        if (on := self.levelled).any():
+            g = self.level[self.frame[on]]
+            out[on] = np.einsum("nij,ni->nj", g, model.bend(np.einsum("nij,nj->ni", g, u[on])))
+        return out
+
+    def residual(self, state: _State) -> np.ndarray:
+        return self.xy - self.camera(state.q).project(self.seen(state))
+
+    def turned(self, state: _State, turns: np.ndarray) -> _State:
+        """Each attitude turned by a small rotation (F, 3) about C's axes."""
+        new = np.stack([rotation.from_vector(t) @ a for t, a in zip(turns, state.attitudes, strict=True)])
+        return _State(state.q, new)
+
+    def derivatives(self, state: _State) -> tuple[np.ndarray, np.ndarray]:
+        """d predicted / d q (N, 2, U), and for the turns of its own frame (N, 2, 3)."""
+        seen, camera = self.seen(state), self.camera(state.q)
+        here = camera.project(seen)
+        of_q = np.zeros((len(here), 2, len(UNKNOWNS)))
+        for k in np.flatnonzero(self.sigma):
+            q = state.q.copy()
+            q[k] += 1.0 if k < CAMERA_UNKNOWNS else 1e-3
+            # the projection is linear in each parameter of the camera: a difference is the derivative
+            if k < CAMERA_UNKNOWNS:
+                of_q[..., k] = self.camera(q).project(seen) - here
+            else:
+                of_q[..., k] = (camera.project(self.seen(replace(state, q=q))) - here) * 1e3
+        of_turn = []
+        for turn in np.eye(3) * STEP_RAD:
+            ahead, behind = (
+                camera.project(seen + sign * np.cross(turn, seen)) for sign in (1, -1)
+            )  # the light turns with the sky but for what refraction changes over the step
+            of_turn.append((ahead - behind) / (2 * STEP_RAD))
+        return of_q, np.stack(of_turn, -1)
+
+    def step(self, state: _State, covariance: np.ndarray, keep: np.ndarray):
+        """One of Gauss and Newton: dq (U,), turns (F, 3), and the covariance of q (U, U)."""
+        weight = np.linalg.cholesky(np.linalg.inv(covariance)) * keep[:, None, None]
+        of_q, of_turn = self.derivatives(state)
+        jq, jt = (np.einsum("nki,nkj->nij", weight, j) for j in (of_q, of_turn))
+        r = np.einsum("nki,nk->ni", weight, self.residual(state))
+
+        def each_frame(a, b):
+            return np.add.reduceat(np.einsum("nki,nkj->nij", a, b), self.first)
+
+        turns = each_frame(jt, jt) + np.eye(3)  # which a frame without stars needs, and no other feels
+        mixed, pull = each_frame(jt, jq), each_frame(jt, r[..., None])[..., 0]
+        solved, pulled = np.linalg.solve(turns, mixed), np.linalg.solve(turns, pull[..., None])[..., 0]
+        flat = jq.reshape(-1, len(UNKNOWNS))
+        normal = np.eye(len(UNKNOWNS)) + flat.T @ flat - np.einsum("fki,fkj->ij", mixed, solved)
+        right = flat.T @ r.ravel() - state.q - np.einsum("fki,fk->i", mixed, pulled)
+        inverse = np.linalg.inv(normal)
+        dq = inverse @ right
+        return dq, pulled - solved @ dq, inverse
+
+    def cost(self, state: _State, covariance: np.ndarray, keep: np.ndarray) -> float:
+        d2 = _distance2(self.residual(state)[keep], covariance[keep])
+        total = d2.sum() + state.q @ state.q
+        return float(total) if np.isfinite(total) else np.inf
+
+    def refined(self, state: _State, covariance: np.ndarray, keep: np.ndarray) -> tuple[_State, np.ndarray]:
+        """The minimum from `state`, and the covariance of q there."""
+        cost = self.cost(state, covariance, keep)
+        if cost == np.inf:
+            raise CalibrationError(
+                "the identified stars do not fit into the camera's field: check the focal length"
+            )
+        for _ in range(MAX_STEPS):
+            dq, turns, inverse = self.step(state, covariance, keep)
+            for shorter in 0.5 ** np.arange(8):
+                new = self.turned(_State(state.q + shorter * dq, state.attitudes), shorter * turns)
+                if (lower := self.cost(new, covariance, keep)) <= cost:
+                    state, cost = new, lower
+                    break
+            else:
+                break  # as low as rounding lets it be
+            if np.abs(dq).max() < SETTLED:
+                break
+        return state, inverse
+
+
+def _settled(problem: _Problem) -> _Settled:
+    """The fit with outliers left out and the stars' errors widened to their scatter."""
+    state = _State(np.zeros(len(UNKNOWNS)), problem.start)
+    keep, jitter2, settled = np.ones(len(problem.xy), bool), 0.0, False
+    unknowns = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
+    for _ in range(MAX_ROUNDS):
+        if keep.sum() < max(FEWEST_STARS, 0.5 * len(keep)):
+            raise CalibrationError(
+                f"only {int(keep.sum())} of {len(keep)} identified stars agree on one camera: check that the frames are "
+                "of one"
+            )
+        state, covariance = problem.refined(state, problem.stated + np.eye(2) * jitter2, keep)
+        if settled:
+            break
+        residual, before = problem.residual(state), (keep, jitter2)
+        freedom = max(1 - unknowns / (2 * keep.sum()), 0.05)
+        # by the median, else an outlier among few stars would widen the gate enough to pass itself
+        typical = _extra_variance(
+            residual[keep], problem.stated[keep], lambda d2, s: np.median(d2) / MEDIAN_OF_CHI2 - s, freedom
+        )
+        jitter2 = _extra_variance(
+            residual[keep], problem.stated[keep], lambda d2, s: d2.mean() / 2 - s, freedom
+        )
+        keep = _distance2(residual, problem.stated + np.eye(2) * typical) < OUTLIER_SIGMA**2
+        settled = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
+    return _Settled(state, covariance, keep, jitter2)
+
+
+def _distance2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    return np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
+
+
+def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess, freedom: float) -> float:
+    """The isotropic variance (px2) at which excess(squared distances, freedom) is 0; 0 where it never is above."""
+
+    def above(extra):
+        return excess(_distance2(residual, covariance + np.eye(2) * extra), freedom)
+
+    if above(0.0) <= 0:
+        return 0.0
+    high = 8 * np.sum(residual**2) + 1e-12
+    return float(brentq(above, 0.0, high, rtol=1e-3)) if above(high) < 0 else float(high)
+
+
+def _derivatives(camera: Camera, xy: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """d pixel / d parameter (2 N, 9); without names, / d attitude and scale, which every frame fits (2 N, 4)."""
+    v = camera.directions(*xy.T)
+    here = camera.project(v)
+    if not names:
+        turned = [camera.project(v + np.cross(t, v)) - here for t in np.eye(3) * STEP_RAD]
+        turned.append(camera.scaled(1 + STEP_RAD).project(v) - here)
+        return np.stack(turned, -1).reshape(-1, 4) / STEP_RAD
+    moved = [_with_values(camera, _values(camera) + step).project(v) - here for step in np.eye(9)]
+    return np.stack(moved, -1).reshape(-1, 9)
