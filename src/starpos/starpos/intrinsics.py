@@ -60,8 +60,8 @@ class Intrinsics:
     """A camera that the sky told.
 
     covariance (9, 9): of PARAMETERS, scatter beyond the stars' own errors included; prior_sigma (9,): what was known
-    before; attitudes (F, 3, 3): of the frames; xy (N, 2) px: the stars that were kept, frame by frame; frame (N,): which
-    each is of; residual (N, 2) px: measured less predicted; before (N, 2): the same with the given camera, its focal length
+    before; attitudes (F, 3, 3): of the frames; xy (N, 2) px: the stars that were kept, frame by frame; frame (N,): where
+    each is; residual (N, 2) px: measured less predicted; before (N, 2): the same with the given camera, its focal length
     and the attitudes fitted; scatter_px: 1 sigma an axis beyond the stars' own errors; rejected: stars left out.
     """
 

@@ -14,6 +14,7 @@ COMMANDS = {
     "solve": "position and heading of frames with their tilts",
     "detect": "the stars of frames",
     "identify": "where frames look, lost in space",
+    "calibrate": "the camera (and more of the instrument) from identified stars",
     "simulate": "write a night of frames and tilts from a place you choose",
     "catalogue": "build the star catalogue, or say what it and its triangles hold",
     "montecarlo": "identify random fields with false stars, and count: the paper's table",

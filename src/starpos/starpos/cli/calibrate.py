@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos calibrate`: what the stars tell of the instrument, written where the other commands read it."""
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from starpos import camera_yaml, catalogue
+from starpos.atmosphere import Atmosphere
+from starpos.camera_from_sky import FromSky
+from starpos.camera_from_sky import calibrate as camera_from_sky
+from starpos.cli import common
+from starpos.errors import CalibrationError, FrameError, InstrumentError, StarposError
+from starpos.inclinometer import TiltLog, a2_matrix, read_tilt_csv
+from starpos.instrument import Instrument
+from starpos.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
+from starpos.reading import why_no_time
+from starpos.stars import Stars
+
+NOTHING = 1  # exit status
+CAMERA_NAME = "camera"  # the node's
+
+
+def define(parser) -> None:
+    common.add_frames(parser)
+    parser.add_argument(
+        "--camera",
+        metavar="OUT",
+        help="write the camera's calibration (CameraInfo YAML): focal lengths, principal point, distortion",
+    )
+    parser.add_argument(
+        "--map", metavar="PNG", help="draw where the stars lie off the given and the fitted camera (--camera)"
+    )
+    parser.add_argument(
+        "--instrument", metavar="FILE", help="instrument file (YAML): the camera to begin with, A3"
+    )
+    common.add_optics(parser)
+    parser.add_argument(
+        "--tilt",
+        metavar="CSV",
+        help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]: refraction is undone",
+    )
+    common.add_air(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args) -> int:
+    if args.camera is None:
+        raise InstrumentError("nothing to calibrate: give --camera OUT.yaml")
+    if args.map is not None and find_spec("matplotlib") is None:
+        raise InstrumentError(
+            "--map draws with matplotlib, which is not here: pip install 'starpos[picture]'"
+        )
+    frames, unreadable = _stars_of_all(args)
+    if not frames:
+        return common.UNREADABLE
+    instrument = common.instrument_of(args, frames[0])
+    tilts = None if args.tilt is None else read_tilt_csv(args.tilt)
+    try:
+        _camera(args, frames, instrument, tilts)
+    except CalibrationError as e:
+        common.complain("calibrate", e)
+        return common.UNREADABLE if unreadable else NOTHING
+    return common.UNREADABLE if unreadable else 0
+
+
+def _stars_of_all(args) -> tuple[list[Stars], bool]:
+    """The stars of the frames that can be read, and whether some cannot."""
+    progress, frames, unreadable = common.ProgressBar(), [], False
+    for k, (_, item) in enumerate(common.frames_of(args.frames)):
+        if isinstance(item, FrameError):
+            common.complain("calibrate", item)
+            unreadable = True
+        else:
+            frames.append(common.stars_of(item))
+        progress("frames", (k + 1) / len(args.frames))
+    return frames, unreadable
+
+
+def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None) -> None:
+    """--camera: fit, write, draw and print it."""
+    air = common.atmosphere_of(args)
+    given = instrument.camera_for(frames[0].width, frames[0].height)
+    if tilts is None:
+        levels = [None] * len(frames)
+    else:
+        frames, levels = _levelled(frames, instrument, tilts)
+    found = camera_from_sky(frames, levels, given, catalogue.load(), air, common.ProgressBar())
+    for k in sorted(set(range(len(frames))) - set(found.used)):
+        common.complain("calibrate", f"{frames[k].source}: none of the sky fits it, it is left out")
+    if tilts is None:
+        _tell_what_tilts_would(found.fit, air, frames)
+    about = _about(found)
+    camera_yaml.write(Path(args.camera), found.fit.camera, CAMERA_NAME, about + _covariance_text(found.fit))
+    if args.map is not None:
+        _draw(args.map, found)
+    if args.json:
+        common.print_json(_json_of(found, args.camera))
+    else:
+        print(about, end="")
+
+
+def _levelled(frames: Sequence[Stars], instrument: Instrument, tilts: TiltLog):
+    """The frames that have a tilt, and C into L for each; a sentence about the others."""
+    kept, levels = [], []
+    for stars in frames:
+        try:
+            if stars.mid_unix_s is None:
+                raise FrameError(f"no time of exposure: {why_no_time(stars.source)}")
+            tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
+            levels.append(a2_matrix(tilt.theta_x, tilt.theta_y) @ instrument.mounting.a3)
+            kept.append(stars)
+        except StarposError as e:
+            common.complain("calibrate", f"{stars.source} is left out: {e}")
+    if not kept:
+        raise CalibrationError(
+            "no frame has a tilt: check that --tilt is of the same night, or leave it away"
+        )
+    return kept, levels
+
+
+def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[Stars]) -> None:
+    cost = UNLEVELLED[1] * air.refraction().a
+    timeless = any(stars.mid_unix_s is None for stars in frames)
+    what = "how refraction shrinks the field" + (
+        " and, without times, aberration scales it" if timeless else ""
+    )
+    cost = np.hypot(cost, UNTIMED * timeless)
+    common.complain(
+        "calibrate",
+        f"without --tilt {what} is not known: {1e6 * cost:.0f} ppm, {cost * fit.camera.fx:.2g} px, of fx and fy, "
+        "which their sigmas hold",
+    )
+
+
+def _about(found: FromSky) -> str:
+    """The camera as a table."""
+    fit = found.fit
+    lines = [
+        f"{len(found.used)} frames, {len(fit.xy)} stars ({fit.rejected} left out): {fit.rms_px:.3f} px rms an axis, "
+        f"of the given camera, its scale fitted, {rms(fit.before):.3f} px"
+    ]
+    for name, value, sigma, told in zip(PARAMETERS, fit.values, fit.sigma, fit.told, strict=True):
+        digits = max(0, 1 - int(np.floor(np.log10(sigma))))
+        by = "told by the sky" if told else "held by the prior"
+        lines.append(f"  {name:<4} {value:>16.{digits}f} +- {sigma:<12.{digits}f} {by}")
+    lines.append(
+        f"its predictions, attitude and scale aside: +- {fit.worst_sigma_px:.3f} px where they are worst"
+    )
+    return "\n".join(lines) + "\n"
+
+
+def _covariance_text(fit: Intrinsics) -> str:
+    rows = "\n".join(" ".join(f"{v:.6e}" for v in row) for row in fit.covariance)
+    return f"covariance of {' '.join(PARAMETERS)}, row by row:\n{rows}\n"
+
+
+def _draw(path: str, found: FromSky) -> None:
+    from starpos import residual_map
+
+    fit = found.fit
+    c = fit.camera
+    title = (
+        f"{c.width} x {c.height} px, fx {c.fx:.2f} fy {c.fy:.2f} cx {c.cx:.1f} cy {c.cy:.1f}, {len(found.used)} frames, "
+        f"{len(fit.xy)} stars: residuals from {rms(fit.before):.3f} to {fit.rms_px:.3f} px"
+    )
+    try:
+        residual_map.draw(path, fit, title)
+    except (OSError, ValueError) as e:  # ValueError: a suffix matplotlib cannot write
+        raise InstrumentError(f"{path}: the map cannot be written there ({e})") from None
+
+
+def _json_of(found: FromSky, path: str) -> dict:
+    fit = found.fit
+    c = fit.camera
+    return {
+        "camera": path,
+        "width": c.width,
+        "height": c.height,
+        "fx": c.fx,
+        "fy": c.fy,
+        "cx": c.cx,
+        "cy": c.cy,
+        "distortion": c.distortion,
+        "sigma": dict(zip(PARAMETERS, fit.sigma, strict=True)),
+        "covariance": fit.covariance,
+        "told": [name for name, told in zip(PARAMETERS, fit.told, strict=True) if told],
+        "rms_px": fit.rms_px,
+        "rms_before_px": rms(fit.before),
+        "scatter_px": fit.scatter_px,
+        "worst_sigma_px": fit.worst_sigma_px,
+        "stars": len(fit.xy),
+        "rejected": fit.rejected,
+        "frames": len(found.used),
+    }

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where on the frame stars lie off their predicted places, and by how much: pictures, with matplotlib."""
+
+import numpy as np
+
+from starpos.intrinsics import Intrinsics, rms
+
+MOST_ARROWS = 400  # more stars than this are drawn as the means of cells
+ARROW_CELLS, COLOUR_CELLS = 22, 12  # along the longer side
+USUAL_ARROW = 0.8  # of a cell of ARROW_CELLS: how long the key's arrow is
+FEWEST_IN_CELL = 3
+
+
+def draw(path, fit: Intrinsics, title: str) -> None:
+    """Write a picture of residual vectors before and after the fit, and of what is left, binned over the frame."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = fit.camera.width, fit.camera.height
+    figure = Figure(figsize=(18, 1.5 + 5.2 * height / width), layout="constrained")
+    FigureCanvasAgg(figure)
+    before, after, cells = figure.subplots(1, 3)
+    for axes, residual, name in (
+        (before, fit.before, "camera as given"),
+        (after, fit.residual, "fitted camera"),
+    ):
+        draw_residuals(axes, fit.xy, residual, width, height)
+        axes.set_title(f"{name}: {rms(residual):.3f} px rms an axis")
+    image = draw_rms(cells, fit.xy, fit.residual, width, height)
+    figure.colorbar(image, ax=cells, label="rms an axis, px", shrink=0.85)
+    cells.set_title("what is left, by place")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=90)
+
+
+def draw_residuals(axes, xy: np.ndarray, residual: np.ndarray, width: int, height: int) -> None:
+    """Residuals (N, 2) px of stars at xy (N, 2) px as arrows over a frame, with an arrow that says their scale.
+
+    Of more than MOST_ARROWS stars the means of cells with FEWEST_IN_CELL or more.
+    """
+    if len(xy) > MOST_ARROWS:
+        xy, residual = _Cells(xy, ARROW_CELLS, width, height).means(xy, residual)
+    usual = float(np.median(np.hypot(*residual.T))) if len(residual) else 0.0
+    key = _round_number(usual) if usual > 0 else 1.0
+    per_px = key / (USUAL_ARROW * max(width, height) / ARROW_CELLS)
+    arrows = axes.quiver(
+        *xy.T, *residual.T, angles="xy", scale_units="xy", scale=per_px, color="tab:blue", width=0.002
+    )
+    axes.quiverkey(arrows, 0.85, -0.13, key, f"{key:g} px", labelpos="E", color="black")
+    _frame(axes, width, height)
+
+
+def draw_rms(axes, xy: np.ndarray, residual: np.ndarray, width: int, height: int):
+    """The frame in square cells coloured by the rms of the residuals in them; returns the image, for a colour bar."""
+    cells = _Cells(xy, COLOUR_CELLS, width, height)
+    (square,) = cells.means(np.square(residual).mean(1))
+    colour = np.full(len(cells.count), np.nan)
+    colour[cells.filled] = np.sqrt(square)
+    edges = [np.arange(n + 1) * cells.size - 0.5 for n in cells.shape]
+    image = axes.pcolormesh(edges[1], edges[0], colour.reshape(cells.shape), cmap="viridis", vmin=0)
+    _frame(axes, width, height)
+    return image
+
+
+class _Cells:
+    """Square cells over a frame, so many along its longer side, and which of them each star is in."""
+
+    def __init__(self, xy: np.ndarray, along: int, width: int, height: int):
+        self.size = max(width, height) / along
+        self.shape = int(np.ceil(height / self.size)), int(np.ceil(width / self.size))
+        last = [self.shape[1] - 1, self.shape[0] - 1]
+        column, row = np.clip(np.floor((xy + 0.5) / self.size).astype(int), 0, last).T
+        self.of = row * self.shape[1] + column
+        self.count = np.bincount(self.of, minlength=self.shape[0] * self.shape[1])
+        self.filled = self.count >= FEWEST_IN_CELL
+
+    def means(self, *values: np.ndarray) -> list[np.ndarray]:
+        """Of each array (N, ...) the means in the filled cells (M, ...)."""
+        return [self._mean(v) for v in values]
+
+    def _mean(self, v: np.ndarray) -> np.ndarray:
+        total = np.zeros((len(self.count), *v.shape[1:]))
+        np.add.at(total, self.of, v)
+        return total[self.filled] / self.count[self.filled].reshape(-1, *[1] * (v.ndim - 1))
+
+
+def _round_number(value: float) -> float:
+    """1, 2 or 5 times a power of ten, at or just below `value`."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)
+
+
+def _frame(axes, width: int, height: int) -> None:
+    axes.set(
+        xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x, px", ylabel="y, px", aspect="equal"
+    )
