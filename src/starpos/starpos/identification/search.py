@@ -27,6 +27,10 @@ STAGES = (
     (8, 6.0, 0.01),
 )
 MAX_VERIFIED = 25  # candidates a stage
+EDGE_PX, WIDEST_MARGIN = (
+    2.0,
+    0.25,
+)  # how far stars may lie beyond the frame as it is, and (share of it) as it becomes
 
 
 def identify(
@@ -70,9 +74,14 @@ def identify_directions(
     """`identify` from unit vectors (N, 3) in C, refraction taken off, as any `camera` gave them."""
     # of square pixels, which is what identify fits
     squeeze = camera.fx / camera.fy
-    height = max(1, round(camera.height * squeeze))
-    ideal = Camera(camera.width, height, camera.fx, camera.fx, camera.cx, camera.cy * squeeze)
-    return identify(ideal.project(directions), sigma_px, ideal, sky, priors)
+    size = np.array([camera.width, max(1, round(camera.height * squeeze))])
+    middle = np.array([camera.cx, camera.cy * squeeze])
+    xy = Camera(*size.tolist(), camera.fx, camera.fx, *middle.tolist()).project(directions)
+    # what a lens has drawn in from the sides lies beyond them without its distortion, and so do the catalogue's stars
+    beyond = np.maximum(-xy, xy - (size - 1)).max(initial=0.0)
+    margin = int(np.ceil(np.clip(beyond - EDGE_PX, 0.0, WIDEST_MARGIN * size.max())))
+    ideal = Camera(*(size + 2 * margin).tolist(), camera.fx, camera.fx, *(middle + margin).tolist())
+    return identify(xy + margin, sigma_px, ideal, sky, priors)
 
 
 def _enough(hypotheses: int, share: float) -> float:
