@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The deflection of the vertical from the slopes of a geoid grid, with what the grid cannot resolve as its error."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +17,13 @@ REACHES = (8, 4, 2)
 # how many times that is said to be missing: with it EGM96 misses the slopes of the national geoids of Australia, Austria,
 # Iceland, the Netherlands, Poland, South Africa, Spain, Switzerland and the USA by 0.3 (its islands) to 1.2 (Iceland)
 # sigma, root mean square (tools/geoid_sigma.py).
-ROUGH_DEG, ROUGH_NODES = 0.5, 8
+ROUGH_DEG, ROUGH_NODES = 0.5, (8, 60)
 UNRESOLVED = 1.5
 FLOOR_ARCSEC = 0.5
 ROUGH_NORTH_DEG = 87.0  # nearer to a pole the columns bend of themselves
 NEAREST_POLE_DEG = 1e-3  # 111 m: where east and west end
 WIDEST_STRIDE_DEG = 10.0
+LARGEST_ARCSEC = 120.0  # more is a cliff between data and none; the Earth's own stay below 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,22 +35,24 @@ class Geoid:
     def at(self, latitude: float, longitude: float) -> Deflection:
         """The Deflection at a place in rad; that of knowing nothing where the grid has no data around it.
 
-        xi = -dN / (M dphi), eta = -dN / (N' cos(phi) dlambda): Heiskanen & Moritz, Physical Geodesy (1967), equation
-        2-171, with WGS 84's radii M, N' and a cubic spline through the nodes.  They are deflections at the geoid: those
-        at the ground differ by the curvature of the plumb line, about 1 arcsec for each 1000 m in mountains, which the
-        stated error holds.  An astronomic place will do for a geodetic one: 10 arcsec, 300 m, do not tell.
+        xi = -dN / (M dphi), eta = -dN / (N' cos(phi) dlambda): Heiskanen & Moritz, Physical Geodesy (1967), section 2-22,
+        with WGS 84's radii M, N' and a cubic spline through the nodes.  They are deflections at the geoid.  At the ground
+        the curvature of the plumb line adds 0.17 arcsec sin(2 phi) a km of height, and in mountains arcseconds more,
+        which no grid of the geoid tells and for which the stated error leaves room.  An astronomic place will do for a
+        geodetic one: 10 arcsec, 300 m, do not tell.
         """
         phi = np.clip(np.degrees(latitude), NEAREST_POLE_DEG - 90, 90 - NEAREST_POLE_DEG)
         lam = np.degrees(longitude)
         if not np.isfinite([phi, lam]).all():
             return Deflection()
-        slopes = self._slopes(phi, lam)
-        if slopes is None:
+        xi, eta = self._slopes(phi, lam)
+        stddev = math.hypot(FLOOR_ARCSEC, UNRESOLVED * self._roughness(phi, lam))
+        if not all(abs(v) < LARGEST_ARCSEC for v in (xi, eta, stddev)):  # NaN neither
             return Deflection()
-        return Deflection(*slopes, float(np.hypot(FLOOR_ARCSEC, UNRESOLVED * self._roughness(phi, lam))))
+        return Deflection(xi, eta, stddev)
 
-    def _slopes(self, phi: float, lam: float) -> tuple[float, float] | None:
-        """xi and eta in arcsec; None without data."""
+    def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
+        """xi and eta in arcsec; NaN without data."""
         north_m, east_m, stride = self._spacing_m(phi)
         for reach in REACHES:
             nodes, row, column = self._window(phi, lam, reach, reach, stride)
@@ -57,20 +61,20 @@ class Geoid:
                 spline = RectBivariateSpline(at, at, nodes)
                 xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
                 return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
-        return None
+        return math.nan, math.nan
 
     def _roughness(self, phi: float, lam: float) -> float:
-        """How much the slope changes from node to node, root mean square of the neighbourhood, arcsec."""
+        """How much the slope changes from node to node (root mean square around the place), arcsec; NaN without data."""
         phi = np.clip(phi, -ROUGH_NORTH_DEG, ROUGH_NORTH_DEG)
         north_m, east_m, stride = self._spacing_m(phi)
-        up = max(ROUGH_NODES, round(ROUGH_DEG / self.grid.step_latitude))
-        across = max(ROUGH_NODES, round(up * north_m / east_m))
-        nodes, _, _ = self._window(phi, lam, up, min(across, self.grid.columns // (2 * stride)), stride)
-        bends = (
-            np.diff(nodes, 2, axis=0)[:, 1:-1] / north_m**2,
-            np.diff(nodes, 2, axis=1)[1:-1] / east_m**2,
-        )
-        return float(np.sqrt(np.nanmean(np.square(bends))) * north_m / ARCSEC)
+        up = int(np.clip(round(ROUGH_DEG / self.grid.step_latitude), *ROUGH_NODES))
+        across = max(ROUGH_NODES[0], round(up * north_m / east_m))
+        nodes, _, _ = self._window(phi, lam, up, across, stride)
+        north = np.diff(nodes, 2, axis=0)[:, 1:-1] / north_m**2
+        east = np.diff(nodes, 2, axis=1)[1:-1] / east_m**2
+        bends = np.concatenate([north.ravel(), east.ravel()])
+        bends = bends[np.isfinite(bends)]
+        return float(np.sqrt(np.mean(bends**2)) * north_m / ARCSEC) if bends.size else math.nan
 
     def _spacing_m(self, phi: float) -> tuple[float, float, int]:
         """Of the nodes to the north and to the east, and the columns from one to the next.
@@ -87,8 +91,8 @@ class Geoid:
     def _window(self, phi: float, lam: float, up: int, across: int, stride: int):
         """Undulations (2 up, 2 across), NaN where there are none, and the place as row and column in it."""
         row, column = self.grid.locate(phi, lam)
-        rows = np.arange(1 - up, 1 + up) + int(row)
-        columns = np.arange(1 - across, 1 + across) * stride + int(column)
+        rows = np.arange(1 - up, 1 + up) + math.floor(row)
+        columns = np.arange(1 - across, 1 + across) * stride + math.floor(column)
         nodes = self.grid.undulations(rows, columns)
         return nodes, row - rows[0], (column - columns[0]) / stride
 

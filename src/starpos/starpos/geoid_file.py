@@ -64,22 +64,15 @@ class Grid:
             )
 
     @property
-    def columns(self) -> int:
-        """Of a full turn, where the grid goes around the globe; else all it has."""
-        return self._around or self.values.shape[1]
-
-    @property
     def _around(self) -> int:
+        """Columns of a full turn, 0 where the grid does not go around the globe."""
         turn = round(360 / self.step_longitude)
         whole = abs(turn * self.step_longitude - 360) < 0.01 * self.step_longitude
         return turn if whole and self.values.shape[1] >= turn else 0
 
     def locate(self, latitude: float, longitude: float) -> tuple[float, float]:
-        """Row and column of a place in deg, with fractions; outside the grid they are negative or too large."""
+        """Row and column of a place in deg, with fractions; outside the grid negative or too large."""
         east = (longitude - self.west) % 360
-        middle = (self.values.shape[1] - 1) * self.step_longitude / 2
-        if east - middle > 180:  # nearer to the western edge
-            east -= 360
         return (latitude - self.south) / self.step_latitude, east / self.step_longitude
 
     def undulations(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
