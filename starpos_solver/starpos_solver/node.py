@@ -115,7 +115,7 @@ class SolverNode(Node):
         try:
             known = self._known
             if values["calibration_url"] != self._known_url:
-                known = parameters.instrument_file(values["calibration_url"])
+                known = parameters.known_instrument(values["calibration_url"])
             parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0), known)
             parameters.atmosphere_of(values)
             grid = self._geoid
@@ -137,7 +137,7 @@ class SolverNode(Node):
     def _read_instrument(self):
         """Read once for each value of calibration_url: a file that goes away later is no matter."""
         self._known_url = self._values["calibration_url"]
-        self._known = parameters.instrument_file(self._known_url)
+        self._known = parameters.known_instrument(self._known_url)
 
     def _read_geoid(self):
         self._geoid_name = self._values["deflection.geoid"]

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from starpos import geoid, instrument
+from starpos import geoid, instrument, instrument_file
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.errors import GeoidError
@@ -138,7 +138,7 @@ def instrument_of(values: Mapping, camera: Camera, known: Instrument | None) -> 
     )
 
 
-def instrument_file(url: str) -> Instrument | None:
+def known_instrument(url: str) -> Instrument | None:
     """The Instrument that calibration_url names, None for ''; InstrumentError with the reason where it is broken."""
     return instrument_file.read(url.removeprefix("file://")) if url else None
 

@@ -26,8 +26,8 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
     forward, up = np.array([math.sin(a), math.cos(a), 0.0]), np.array([0.0, 0.0, 1.0])
     link = np.stack([forward, np.cross(up, forward), up], 1)
     factor = np.diag([100.0, 50.0, 1e-4, 2e-4, 3e-4, 1e-4])
-    return Fix(1.8e9, math.radians(latitude_deg), 1.0, heading_of(link), link, (ErrorTerm("all", factor, False),),
-               np.arange(3), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05)  # fmt: skip
+    return Fix(1.8e9, math.radians(latitude_deg), 1.0, heading_of(link), link, (ErrorTerm("all", factor),),
+               np.arange(3), np.zeros((3, 2)), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05, np.eye(3), 1e-6)  # fmt: skip
 
 
 def answer_facing(azimuth_deg: float) -> Answer:

@@ -13,8 +13,8 @@ from starpos_solver.parameters import (
     PARAMETERS,
     atmosphere_of,
     geoid_file,
-    instrument_file,
     instrument_of,
+    known_instrument,
     vertical_of,
 )
 
@@ -45,7 +45,7 @@ def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):
         "starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [1, 2, 3]\n"
         "calibration_stddev_arcsec: [1, 1, 1]\n"
     )
-    known = instrument_file(f"file://{path}")
+    known = known_instrument(f"file://{path}")
     instrument = instrument_of(values(), CAMERA, known)
     assert instrument.calibration.misalignment_deg == (1.0, 2.0, 3.0)
     assert instrument.camera is CAMERA
@@ -59,7 +59,7 @@ def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):
 
 def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):
     with pytest.raises(InstrumentError, match=r"missing\.yaml"):
-        instrument_file(str(tmp_path / "missing.yaml"))
+        known_instrument(str(tmp_path / "missing.yaml"))
 
 
 def test_the_deflection_defaults_to_knowing_nothing():

@@ -1,31 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many frames of one place made into one fix: what is new in every frame averages, a common error stays.
+"""Many frames of one place made into one fix, as they come in or all at once: both go through the same recursion.
 
-Generalised least squares over all frames with their full covariance: a calibration error that turns with the instrument
-is told apart from the place, one that does not stays in the answer.
+A fix that lies far from the others (a tilt misread, a time stamp off) is left out; a robot that moved on begins anew.
+Which of the two it is, the stars tell: a camera that has not turned against the Earth has not moved.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammainccinv
 
-from starpos.budget import ErrorTerm, symmetric_root
-from starpos.earth import curvature_radii_m
+from starpos import rotation
+from starpos.budget import ErrorTerm
 from starpos.errors import FixError
 from starpos.fix import Fix
-from starpos.rotation import full_turn
+from starpos.running import Running
 
-SAME_HEADING_SIGMA = 5.0
-IMPROBABLE = 1e-9  # of frames that differ as much by chance: they are not of one place
-TILT = "tilt"
-HIGHEST_LATITUDE = np.radians(89.9995)  # 56 m from the pole
+GATE_SIGMA = 6.0  # further off a fix is not of this place, or wrong
+MOVED_FIXES, MOVED_SIGMA = (
+    3,
+    5.5,
+)  # so many fixes of a turned camera, so far from the average, are another place
+RIVAL_FIXES = 10  # a rival is replaced by a newer one no sooner
+HIGHEST_LATITUDE = np.radians(89.0)
+POSE_RAD, POSE_SIGMA = (
+    np.radians(10 / 3600),
+    6.0,
+)  # a camera that turned by more against the Earth was touched
 
 
 @dataclass(frozen=True)
 class Average:
-    """The combined position (rad) with its budget; heading NaN where the instrument turned between frames."""
+    """The combined position and the heading of the last pose (rad), with the budget of its errors.
+
+    frames: how many it is of, in how many poses; left_out: how many since its beginning were not believed.
+    began_unix_s, utc_unix_s: of its first fix, and the mean of all.  moved: how many averages of other places there were
+    before it.
+    """
 
     utc_unix_s: float
     latitude: float
@@ -33,191 +44,160 @@ class Average:
     heading: float
     terms: tuple[ErrorTerm, ...]
     frames: int
+    poses: int
+    left_out: int
+    began_unix_s: float
+    moved: int
 
     @property
     def covariance(self) -> np.ndarray:
-        """(3, 3) of east m, north m, heading rad; NaN in the heading's row and column where there is none."""
-        c = sum(t.covariance for t in self.terms)[:3, :3].copy()
-        if np.isnan(self.heading):
-            c[2, :] = c[:, 2] = np.nan
-        return c
+        """(3, 3) of east m, north m, heading rad."""
+        return sum(t.covariance for t in self.terms)[:3, :3]
 
 
 def average(fixes: Sequence[Fix]) -> Average:
-    """The weighted mean of at least one fix; the same frame given twice counts once.
+    """The average of at least one fix, of the last place in time if there are several; the same frame twice counts once.
 
-    Frames that took the same inclinometer readings share the errors of these.  Raises FixError where the positions
-    differ by more than their errors allow: they are not of one place.
+    Raises FixError where as many were left out as were used, so that it cannot be told which are right.
     """
-    fixes = list({(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values())
-    plane = _Plane.about(fixes)
-    seen = np.array([plane.seen(f) for f in fixes])  # (N, 3): east, north m, heading rad
-    factors = [[plane.turned(f, f.terms[k].factor) for f in fixes] for k in range(len(fixes[0].terms))]
-    shared = _sharing_readings(fixes)
-    own = np.array([_own_covariance(plane, f, shared[k]) for k, f in enumerate(fixes)])
-    at_pole = max(abs(f.latitude) for f in fixes) > HIGHEST_LATITUDE  # where a heading means nothing
-    turned = at_pole or _heading_spread(seen[:, 2], own[:, 2, 2]) > SAME_HEADING_SIGMA
-    rows = 2 if turned else 3
-    unit = np.array([1.0, 1.0, 1e-6])[:rows]  # m and rad, brought to like sizes
-    names = [t.name for t in fixes[0].terms]
-    columns = [np.concatenate([f[:rows] / unit[:, None] for f in factors[k]])
-               for k, t in enumerate(fixes[0].terms) if t.common]  # fmt: skip
-    tilts = factors[names.index(TILT)]
-    for group in sorted(set(shared.tolist()) - {-1}):
-        columns.append(
-            np.concatenate([f[:rows] / unit[:, None] * (shared[k] == group) for k, f in enumerate(tilts)])
-        )
-    blocks = own[:, :rows, :rows]
-    gain, misfit = _least_squares(seen[:, :rows] / unit, blocks / np.outer(unit, unit), np.hstack(columns))
-    freedom = rows * (len(fixes) - 1)
-    if freedom and misfit > 2 * gammainccinv(freedom / 2, IMPROBABLE):
-        apart = np.ptp(seen[:, :2], axis=0).max()
+    averager = Averager()
+    for f in sorted({(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values(), key=_time):
+        averager.add(f)
+    whole = averager.average
+    if whole.left_out >= whole.frames:
         raise FixError(
-            f"the positions of {len(fixes)} frames lie up to {apart:.0f} m apart, more than their errors allow: "
-            "they are not of one place, or the mount or the clock slipped; solve them apart"
+            f"of {whole.frames + whole.left_out} frames {whole.left_out} lie further from the others than their errors "
+            "allow, too many to say which are right: they are not of one place, or the mount or the clock slipped"
         )
-    mean = np.einsum("nij,nj->i", gain, seen[:, :rows] / unit) * unit
-    latitude, longitude = plane.place(mean)
-    terms = tuple(
-        ErrorTerm(t.name, plane.local(latitude, _propagated(gain, factors[k], unit, t, shared)), t.common)
-        for k, t in enumerate(fixes[0].terms)
-    )
-    heading = float("nan")
-    if not turned:
-        heading = full_turn(mean[2] + plane.heading - plane.convergence(latitude, longitude))
-    return Average(
-        float(np.mean([f.utc_unix_s for f in fixes])), latitude, longitude, heading, terms, len(fixes)
-    )
+    return whole
+
+
+def _time(f: Fix) -> float:
+    return f.utc_unix_s
 
 
 @dataclass(frozen=True)
-class _Plane:
-    """The tangent plane at the middle of the fixes, where their east and north are made one."""
+class _Track:
+    """An average in the making; in_pose: its frames since the camera was last touched."""
 
-    zenith: np.ndarray
-    axes: np.ndarray  # (2, 3): east and north in ITRS
-    radii: np.ndarray  # prime vertical, meridian; m
-    heading: float  # of the first fix, against these axes
+    running: Running
+    frames: int = 0
+    poses: int = 1
+    in_pose: int = 0
+    mean_unix_s: float = 0.0
+    began_unix_s: float = float("nan")
 
     @classmethod
-    def about(cls, fixes: Sequence[Fix]) -> "_Plane":
-        zenith = np.mean([_zenith(f) for f in fixes], axis=0)
-        zenith /= np.linalg.norm(zenith)
-        latitude, longitude = _latitude_longitude(zenith)
-        plane = cls(zenith, _axes(latitude, longitude), np.array(curvature_radii_m(latitude)), 0.0)
-        first = fixes[0].heading + plane.convergence(fixes[0].latitude, fixes[0].longitude)
-        return cls(plane.zenith, plane.axes, plane.radii, first)
+    def before(cls, f: Fix) -> "_Track":
+        return cls(Running.before(f), began_unix_s=f.utc_unix_s)
 
-    def convergence(self, latitude: float, longitude: float) -> float:
-        """Azimuth of a place's own north against this plane's."""
-        return float(np.arctan2(*(self.axes @ _axes(latitude, longitude)[1])))
+    def rival(self, f: Fix) -> "_Track":
+        """A new one that knows of this one's errors, not of its place."""
+        return _Track(self.running.elsewhere(f), began_unix_s=f.utc_unix_s)
 
-    def seen(self, f: Fix) -> np.ndarray:
-        """East, north (m) of the plane's middle, heading (rad) against the first fix's."""
-        moved = self.axes @ (_zenith(f) - self.zenith) * self.radii
-        return np.array([*moved, _turn(f.heading + self.convergence(f.latitude, f.longitude) - self.heading)])
+    def touched(self) -> "_Track":
+        return replace(self, running=self.running.heading_unknown(), poses=self.poses + 1, in_pose=0)
 
-    def turned(self, f: Fix, factor: np.ndarray) -> np.ndarray:
-        """The first three rows of an error factor, brought from the fix's axes into these."""
-        turn = self.convergence(f.latitude, f.longitude)
-        c, s = np.cos(turn), np.sin(turn)
-        east, north, heading = factor[:3]
-        # the fix's north turns with its longitude, and its heading was taken from there
-        prime, _ = curvature_radii_m(f.latitude)
-        heading = heading - np.tan(f.latitude) / prime * east
-        return np.stack([c * east + s * north, c * north - s * east, heading])
-
-    def local(self, latitude: float, factor: np.ndarray) -> np.ndarray:
-        """A factor (3, m) of the mean with the heading against the mean's own north again."""
-        prime, _ = curvature_radii_m(latitude)
-        return factor + np.outer([0.0, 0.0, np.tan(latitude) / prime], factor[0])
-
-    def place(self, mean: np.ndarray) -> tuple[float, float]:
-        zenith = self.zenith + (mean[:2] / self.radii) @ self.axes
-        return _latitude_longitude(zenith / np.linalg.norm(zenith))
+    def add(self, f: Fix) -> "_Track | None":
+        """With one more fix; None where it is too far off."""
+        running, sigmas = self.running.add(f)
+        if sigmas > GATE_SIGMA:
+            return None
+        n = self.frames + 1
+        mean = self.mean_unix_s + (f.utc_unix_s - self.mean_unix_s) / n
+        return replace(self, running=running, frames=n, in_pose=self.in_pose + 1, mean_unix_s=mean)
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """A root of a covariance (3, 3) in m and rad."""
-    unit = np.array([1.0, 1.0, 1e-6])
-    return symmetric_root(covariance / np.outer(unit, unit)) * unit[:, None]
+class Averager:
+    """The recursion: `add` fixes in order of time, `average` is what they say.  Its memory does not grow."""
 
+    def __init__(self):
+        self._track: _Track | None = None
+        self._rival: _Track | None = (
+            None  # of the fixes since the camera was touched, or since one was not believed
+        )
+        self._rival_turned = False  # whether the camera was touched when the rival began
+        self._disbelieved = 0  # fixes in a row
+        self._left_out = self._moved = 0
+        self._last: Fix | None = None
+        self._pose: Fix | None = None  # the first of this pose
 
-def _own_covariance(plane: _Plane, f: Fix, group: int) -> np.ndarray:
-    """(3, 3) of the errors that are new in this frame; its tilt is not where it shares readings with another."""
-    own = [t for t in f.terms if not t.common and not (t.name == TILT and group >= 0)]
-    factors = [plane.turned(f, t.factor) for t in own]
-    return sum(factor @ factor.T for factor in factors)
+    @property
+    def average(self) -> Average | None:
+        """None before the first fix."""
+        t = self._track
+        if t is None:
+            return None
+        return Average(
+            t.mean_unix_s, *t.running.place, t.running.terms(self._last.terms), t.frames, t.poses, self._left_out,
+            t.began_unix_s, self._moved,
+        )  # fmt: skip
 
+    def add(self, f: Fix) -> None:
+        """One more fix, later than those before."""
+        if self._track is None:
+            self._track, self._last, self._pose = _Track.before(f).add(f), f, f
+            return
+        slipped = self._slipped(f)
+        if not slipped and self._touched(f):
+            self._turn(f)
+        self._last = f
+        before, with_it = self._track, None if slipped else self._track.add(f)
+        rival = self._rival.add(f) if self._rival else None
+        if with_it is not None:
+            self._track, self._disbelieved = with_it, 0
+            if self._rival is not None and rival is None:  # it began with a wrong one
+                rival = before.rival(f).add(f) if self._rival_turned else None
+            self._rival = rival
+            if rival is not None and self._is_elsewhere(rival):
+                self._move(f)
+            return
+        self._left_out += 1
+        self._disbelieved += 1
+        if rival is None:
+            self._rival_turned &= self._rival is not None
+            rival, self._disbelieved = before.rival(f).add(f), 1
+        self._rival = rival
+        # of a camera nobody touched it takes the majority to say that the average is wrong
+        if self._disbelieved >= MOVED_FIXES if self._rival_turned else rival.frames > self._track.in_pose:
+            self._move(f)
 
-def _sharing_readings(fixes: Sequence[Fix]) -> np.ndarray:
-    """For each fix the number of the group that shares inclinometer readings with it, -1 where none does (N,)."""
-    group, of_reading = np.arange(len(fixes)), {}
-    for k, f in enumerate(fixes):
-        for moment in f.tilt_times:
-            first = of_reading.setdefault(moment, k)
-            group[group == group[k]] = group[first]
-    _, inverse, count = np.unique(group, return_inverse=True, return_counts=True)
-    return np.where(count[inverse] > 1, inverse, -1)
+    def _touched(self, f: Fix) -> bool:
+        """Whether the camera has turned against the Earth since its pose began."""
+        turned = np.linalg.norm(f.camera_to_itrs - self._pose.camera_to_itrs) / np.sqrt(2)
+        return bool(turned > self._allowed(f))
 
+    def _slipped(self, f: Fix) -> bool:
+        """Whether it seems to have turned about the Earth's axis, as no hand turns it: the time stamp is off."""
+        x, y, z = rotation.to_small_vector(f.camera_to_itrs @ self._pose.camera_to_itrs.T)
+        near_pole = abs(f.latitude) > HIGHEST_LATITUDE  # there any turn on the spot is one about that axis
+        return bool(abs(z) > self._allowed(f) > np.hypot(x, y) and not near_pole)
 
-def _heading_spread(heading: np.ndarray, variance: np.ndarray) -> float:
-    sigma = np.sqrt(variance + np.median(variance) * 1e-12 + 1e-24)
-    weight = sigma**-2 / np.sum(sigma**-2)
-    return float(np.max(np.abs(heading - weight @ heading) / sigma))
+    def _allowed(self, f: Fix) -> float:
+        """By how much a camera may seem to turn that nobody touched, rad."""
+        return max(POSE_RAD, POSE_SIGMA * float(np.hypot(f.attitude_sigma, self._pose.attitude_sigma)))
 
+    def _turn(self, f: Fix) -> None:
+        """The camera was touched: its heading is another, and its place may be."""
+        self._pose, self._track = f, self._track.touched()
+        if self._rival is not None and (self._disbelieved or self._rival.frames < RIVAL_FIXES):
+            self._rival, self._rival_turned = self._rival.touched(), True
+            return
+        self._rival, self._rival_turned = self._track.rival(f), True
 
-def _least_squares(y: np.ndarray, own: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, float]:
-    """Mean of y (N, r) with errors own (N, r, r) of each and factors common (N r, m) of all: gains (N, r, r), chi-square.
+    def _is_elsewhere(self, rival: _Track) -> bool:
+        return (
+            self._rival_turned
+            and rival.frames >= MOVED_FIXES
+            and self._track.frames > rival.frames
+            and self._track.running.sigmas_apart(rival.running) > MOVED_SIGMA
+        )
 
-    By Woodbury's identity, so that a thousand frames are no thousand-square matrix.
-    """
-    n, r = y.shape
-    common = common.reshape(n, r, -1)
-    weight = np.linalg.inv(own)
-    weighted = weight @ common  # (N, r, m)
-    inner = np.linalg.inv(np.eye(common.shape[2]) + np.einsum("nrm,nrk->mk", common, weighted))
-
-    def weigh(v):  # (N, r, k): inverse covariance times v
-        return weight @ v - weighted @ (inner @ np.einsum("nrm,nrk->mk", weighted, v))
-
-    ones = np.broadcast_to(np.eye(r), (n, r, r))
-    w = weigh(ones)
-    gain = np.einsum("ij,njk->nik", np.linalg.inv(w.sum(0)), w.swapaxes(1, 2))
-    rest = y - np.einsum("nij,nj->i", gain, y)
-    return gain, float(np.sum(rest[..., None] * weigh(rest[..., None])))
-
-
-def _propagated(gain, factors, unit, term: ErrorTerm, shared: np.ndarray) -> np.ndarray:
-    """A term's factor (3, m) of the mean: its errors add up where it is common, or within a group of shared readings."""
-    r = len(unit)
-    moved = [gain[n] @ (f[:r] / unit[:, None]) * unit[:, None] for n, f in enumerate(factors)]
-    if term.common:
-        factor = sum(moved)
-        return np.vstack([factor, np.zeros((3 - r, factor.shape[1]))])
-    alone = np.arange(len(moved))
-    groups = np.where(shared >= 0, -1 - shared, alone) if term.name == TILT else alone
-    sums = [sum(moved[n] for n in np.flatnonzero(groups == g)) for g in np.unique(groups)]
-    covariance = np.zeros((3, 3))
-    covariance[:r, :r] = sum(s @ s.T for s in sums)
-    return _root(covariance)
-
-
-def _zenith(f: Fix) -> np.ndarray:
-    c = np.cos(f.latitude)
-    return np.array([c * np.cos(f.longitude), c * np.sin(f.longitude), np.sin(f.latitude)])
-
-
-def _latitude_longitude(zenith: np.ndarray) -> tuple[float, float]:
-    return float(np.arctan2(zenith[2], np.hypot(*zenith[:2]))), float(np.arctan2(zenith[1], zenith[0]))
-
-
-def _axes(latitude: float, longitude: float) -> np.ndarray:
-    """East and north (2, 3) in ITRS."""
-    cl, sl, cp, sp = np.cos(longitude), np.sin(longitude), np.cos(latitude), np.sin(latitude)
-    return np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp]])
-
-
-def _turn(angle: float) -> float:
-    """An angle in [-pi, pi)."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+    def _move(self, f: Fix) -> None:
+        """The rival is right, with its last fix."""
+        if self._rival_turned:
+            self._moved += 1
+            self._left_out = 0
+        else:
+            self._left_out += self._track.in_pose - self._rival.frames
+        self._track, self._rival, self._disbelieved, self._pose = self._rival, None, 0, f

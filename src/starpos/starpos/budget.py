@@ -8,26 +8,39 @@ import numpy as np
 from starpos import rotation
 from starpos.earth import ROTATION_RAD_S, EarthState, curvature_radii_m
 from starpos.inclinometer import Tilt, a2_matrix
+from starpos.mounting import Mounting
 
 STEP_RAD = 1e-6
+HOUR_S = 3600.0
+
+
+ALWAYS = ("always",)
 
 
 @dataclass(frozen=True)
 class ErrorTerm:
-    """One source of error: factor (6, m) of the covariance factor @ factor.T.
+    """One source of error: factor (6, m) of the covariance variance * factor @ factor.T.
 
-    Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  A common term
-    keeps its sign from frame to frame (a calibration, a clock); the others are new in every frame.
+    Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  shared: None
+    where the error is new in every frame; else keys, and frames whose terms have one in common have the same m errors:
+    ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a second, for an error that wanders.
     """
 
     name: str
     factor: np.ndarray
-    common: bool
+    shared: tuple | None = None
+    variance: float = 1.0
+    walk_s: float = 0.0
 
     @property
     def covariance(self) -> np.ndarray:
         """(6, 6)."""
-        return self.factor @ self.factor.T
+        return self.variance * self.factor @ self.factor.T
+
+    @property
+    def common(self) -> bool:
+        """Whether it keeps its sign from frame to frame."""
+        return self.shared == ALWAYS
 
 
 @dataclass(frozen=True)
@@ -114,6 +127,13 @@ class StarErrors:
     centroids: np.ndarray
     catalogue: np.ndarray
 
+    @classmethod
+    def of(cls, slope: np.ndarray, centroids: np.ndarray, catalogue: np.ndarray) -> "StarErrors":
+        """Of weighted least squares; slope (N, 2, P): px for each parameter, of which the first three turn A4."""
+        weighted = np.linalg.solve(centroids + catalogue, slope)
+        normal = np.einsum("nki,nkj->ij", slope, weighted)
+        return cls(np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3], centroids, catalogue)
+
     def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """(3, 3) rad2 of A4 from independent covariances (N, 2, 2)."""
         return np.einsum("anj,njk,bnk->ab", self.gain, covariance, self.gain)
@@ -123,35 +143,63 @@ def error_terms(
     sensitivity: Sensitivity,
     stars: StarErrors,
     tilt: Tilt,
-    calibration_covariance: np.ndarray,
+    mounting: Mounting,
     refraction_rotation: np.ndarray,
     latitude: float,
     earth: EarthState,
     clock_stddev_s: float,
 ) -> tuple[ErrorTerm, ...]:
-    """All sources that are known.
-
-    calibration_covariance (3, 3) rad2 about S's axes; refraction_rotation (3,) rad: of A4 for 1 sigma of refraction.
-    """
+    """All sources that are known.  refraction_rotation (3,) rad: of A4 for 1 sigma of refraction."""
 
     def of_stars(covariance):
         return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
 
-    a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
-    steps = (np.array([STEP_RAD, 0.0]), np.array([0.0, STEP_RAD]))
-    levelling = [a2_matrix(tilt.theta_x + dx, tilt.theta_y + dy) @ a2.T for dx, dy in steps]
-    levelling = np.stack([rotation.to_small_vector(r) / STEP_RAD for r in levelling], -1)
     prime, _ = curvature_radii_m(latitude)
     east, north = np.eye(6)[:, :1], np.eye(6)[:, 1:2]
     second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
     pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
+    a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
+    calibration = sensitivity.level @ a2 @ symmetric_root(mounting.calibration_covariance)
     return (
-        ErrorTerm("centroids", of_stars(stars.centroids), False),
-        ErrorTerm("catalogue", of_stars(stars.catalogue), True),
-        ErrorTerm("tilt", sensitivity.level @ levelling @ symmetric_root(tilt.covariance), False),
-        ErrorTerm("calibration", sensitivity.level @ a2 @ symmetric_root(calibration_covariance), True),
-        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], True),
-        ErrorTerm("clock", second_of_time * clock_stddev_s, True),
-        ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, True),
-        ErrorTerm("pole", pole, True),
+        ErrorTerm("centroids", of_stars(stars.centroids)),
+        ErrorTerm("catalogue", of_stars(stars.catalogue), ALWAYS),
+        ErrorTerm("calibration", calibration, ALWAYS),
+        *_of_inclinometer(sensitivity.level @ _levelling(tilt, a2), tilt, mounting, earth.utc_unix_s),
+        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], ALWAYS),
+        ErrorTerm("clock", second_of_time * clock_stddev_s, ALWAYS),
+        ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, ALWAYS),
+        ErrorTerm("pole", pole, ALWAYS),
+    )
+
+
+def _levelling(tilt: Tilt, a2: np.ndarray) -> np.ndarray:
+    """(3, 2): small rotation of L for an error of theta_x, theta_y."""
+    steps = (np.array([STEP_RAD, 0.0]), np.array([0.0, STEP_RAD]))
+    turned = [a2_matrix(tilt.theta_x + dx, tilt.theta_y + dy) @ a2.T for dx, dy in steps]
+    return np.stack([rotation.to_small_vector(r) / STEP_RAD for r in turned], -1)
+
+
+def _of_inclinometer(
+    level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
+) -> tuple[ErrorTerm, ...]:
+    """Its sources; level (6, 2): what an error of theta_x, theta_y does.  The zero is the calibration's."""
+    errors, theta = mounting.inclinometer, np.array([tilt.theta_x, tilt.theta_y])
+    warmer = tilt.temperature_c - mounting.calibrated_temperature_c
+    since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
+    return (
+        ErrorTerm("tilt", level @ symmetric_root(tilt.covariance), tilt.times),
+        ErrorTerm("tilt quantisation", level * errors.undithered_rad(tilt), errors.steps(tilt)),
+        ErrorTerm(
+            "tilt drift",
+            level * errors.drift_rad_per_sqrt_hour / np.sqrt(HOUR_S),
+            ALWAYS,
+            variance=since_s if np.isfinite(since_s) else 0.0,
+            walk_s=1.0,
+        ),
+        ErrorTerm(
+            "tilt temperature",
+            level * errors.temperature_rad_per_c * (warmer if np.isfinite(warmer) else 0.0),
+            ALWAYS,
+        ),
+        ErrorTerm("tilt scale", level * theta * errors.scale, ALWAYS),
     )

@@ -13,6 +13,7 @@ import erfa
 import numpy as np
 
 from starpos.errors import TimeError
+from starpos.utc import utc_text
 
 UNIX_EPOCH_JD = 2440587.5
 DAY_S = 86400.0
@@ -197,17 +198,6 @@ def curvature_radii_m(latitude: float) -> tuple[float, float]:
     """Radii of curvature of WGS 84 (prime vertical, meridian) in m at a latitude in rad."""
     w2 = 1 - ECCENTRICITY2 * np.sin(latitude) ** 2
     return EQUATOR_RADIUS_M / np.sqrt(w2), EQUATOR_RADIUS_M * (1 - ECCENTRICITY2) / w2**1.5
-
-
-def utc_text(utc_unix_s: float) -> str:
-    """ISO 8601 with milliseconds, UTC."""
-    import datetime
-
-    try:
-        moment = datetime.datetime.fromtimestamp(utc_unix_s, datetime.timezone.utc)
-    except (OverflowError, ValueError, OSError):
-        return f"{utc_unix_s:g} s after 1970"
-    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
 
 
 def _year(mjd: float) -> float:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import brentq
 
 from starpos import rotation
 from starpos.atmosphere import Atmosphere, Refraction
@@ -18,6 +18,7 @@ from starpos.camera import Camera
 from starpos.earth import EarthState, station_velocity
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
+from starpos.mounting import Mounting
 
 OUTLIER_SIGMA = 5.0
 MAX_ROUNDS = 6
@@ -26,19 +27,7 @@ MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
 MIN_STARS = 3
 STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
 STEP_REFRACTION = 0.01
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """How the parts are fixed to each other: A3 (camera C into inclinometer S) and base link into C, (3, 3) each.
-
-    calibration_covariance (3, 3) rad2: of A3 as a small rotation about S's axes, the inclinometer's zero included
-    (only the sum of the two matters).
-    """
-
-    a3: np.ndarray
-    link_to_camera: np.ndarray
-    calibration_covariance: np.ndarray
+SETTLED, MOST_STEPS = 1e-13, 20  # rad, and share of the scale, below which a step no longer counts
 
 
 @dataclass(frozen=True)
@@ -57,7 +46,9 @@ class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 
     link_to_enu (3, 3): attitude of the base link.  used (M,): which of the given stars were kept.  focal_scale: factor
-    on the given focal length.  jitter_px: scatter beyond the centroids' own errors (seeing, optics).
+    on the given focal length.  residual_px (M, 2): where the fit has them less where they were seen.  jitter_px: scatter
+    beyond the centroids' own errors (seeing, optics).  camera_to_itrs (3, 3): how the camera stands on the Earth by the
+    stars alone, attitude_sigma rad about its worst axis.
     """
 
     utc_unix_s: float
@@ -67,6 +58,7 @@ class Fix:
     link_to_enu: np.ndarray
     terms: tuple[ErrorTerm, ...]
     used: np.ndarray
+    residual_px: np.ndarray
     residual_arcsec: float
     jitter_px: float
     focal_scale: float
@@ -74,9 +66,8 @@ class Fix:
     refraction_arcsec: float
     diurnal_aberration_arcsec: float
     ut1_minus_utc_s: float
-    tilt_times: tuple[
-        float, ...
-    ] = ()  # of the inclinometer's readings: frames that share some share their errors
+    camera_to_itrs: np.ndarray
+    attitude_sigma: float
 
     @property
     def covariance(self) -> np.ndarray:
@@ -100,8 +91,9 @@ def solve_fix(
 ) -> Fix:
     """The fix of one frame from identified stars.
 
-    The start is closed (singular values), the rest Levenberg-Marquardt over the rotation A4 and the plate scale.
-    Raises FixError where the stars are too few or do not agree.
+    The start is closed (singular values), the rest Gauss-Newton over the rotation A4 and the plate scale, whose
+    derivatives hardly change over the arcseconds that are left.  Raises FixError where the stars are too few or do not
+    agree.
     """
     problem = _Problem(
         stars.xy,
@@ -114,12 +106,13 @@ def solve_fix(
     stated = stars.covariance_px2 + catalogue_px2
     keep, jitter2 = np.ones(len(stars.xy), bool), 0.0
     state, settled = problem.closed_form(), False
+    slope = problem.jacobian(state)
     for _ in range(MAX_ROUNDS):
         if keep.sum() < max(MIN_STARS, 0.5 * len(keep)):
             raise FixError(
                 f"only {int(keep.sum())} of {len(keep)} identified stars agree on one attitude: no fix from them"
             )
-        state = problem.refine(state, stated + np.eye(2) * jitter2, keep)
+        state = problem.refine(state, slope, stated + np.eye(2) * jitter2, keep)
         if settled:
             break
         residual, before = problem.residual(state), (keep, jitter2)
@@ -134,8 +127,10 @@ def solve_fix(
         raise FixError(
             f"the identified stars lie {np.sqrt(jitter2):.1f} px off the best attitude: check the camera's distortion"
         )
-    errors = _StarCovariances(stars.covariance_px2[keep] + np.eye(2) * jitter2, catalogue_px2[keep])
+    centroids = stars.covariance_px2[keep] + np.eye(2) * jitter2
+    errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep])
     terms = _terms(problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s)
+    residual = problem.residual(state)[keep]
     place = place_of(state.a4)
     link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
     axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
@@ -148,20 +143,28 @@ def solve_fix(
         link_to_enu=link_to_enu,
         terms=terms,
         used=np.flatnonzero(keep),
-        residual_arcsec=float(np.sqrt(np.mean(problem.residual(state)[keep] ** 2)) * camera.scale_arcsec),
+        residual_px=residual,
+        residual_arcsec=float(np.sqrt(np.mean(residual**2)) * camera.scale_arcsec),
         jitter_px=float(np.sqrt(jitter2)),
         focal_scale=state.scale,
         zenith_distance=float(np.arccos(np.clip(axis[0, 2], -1, 1))),
         refraction_arcsec=float(np.degrees(bent) * 3600),
         diurnal_aberration_arcsec=float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
         ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
-        tilt_times=tilt.times,
+        camera_to_itrs=state.a4.T @ problem.g,
+        attitude_sigma=float(np.sqrt(np.linalg.eigvalsh(errors.rotation_covariance(centroids))[-1])),
     )
 
 
 def _distance2(residual: np.ndarray, covariance: np.ndarray, extra: float) -> np.ndarray:
     """Squared residuals (N,) in units of their covariance and an extra isotropic variance (px2)."""
-    return np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance + np.eye(2) * extra), residual)
+    (x, y), xx, xy, yy = (
+        residual.T,
+        covariance[:, 0, 0] + extra,
+        covariance[:, 0, 1],
+        covariance[:, 1, 1] + extra,
+    )
+    return (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
 
 def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callable) -> float:
@@ -177,7 +180,7 @@ def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callab
     if above(0.0) <= 0:
         return 0.0
     high = 8 * np.sum(residual**2) + 1e-12
-    return float(brentq(above, 0.0, high, rtol=1e-3)) if above(high) < 0 else float(high)
+    return float(brentq(above, 0.0, high, xtol=1e-12, rtol=1e-3)) if above(high) < 0 else float(high)
 
 
 @dataclass(frozen=True)
@@ -215,20 +218,21 @@ class _Problem:
         """The state after a small rotation p[:3] about L's axes and a relative change p[3] of the scale."""
         return _State(rotation.from_vector(p[:3]) @ state.a4, state.scale * (1 + p[3]))
 
-    def refine(self, state: _State, covariance_px2: np.ndarray, keep: np.ndarray) -> _State:
-        """Levenberg-Marquardt (MINPACK) from `state` over the stars to keep."""
-        whiten = np.linalg.cholesky(np.linalg.inv(covariance_px2[keep]))
-
-        def whitened(p):
-            r = self.residual(self.moved(state, p))[keep]
-            return np.einsum("nji,nj->ni", whiten, r).ravel()
-
-        if np.isnan(whitened(np.zeros(4))).any():
-            raise FixError(
-                "the identified stars do not fit into the camera's field: check focal length and tilt"
-            )
-        found = least_squares(whitened, np.zeros(4), method="lm", xtol=1e-12, ftol=1e-12)
-        return self.moved(state, found.x)
+    def refine(
+        self, state: _State, slope: np.ndarray, covariance_px2: np.ndarray, keep: np.ndarray
+    ) -> _State:
+        """Gauss-Newton from `state` over the stars to keep, with the derivatives (N, 2, 4) of its neighbourhood."""
+        slope = slope[keep]
+        weighted = np.linalg.solve(covariance_px2[keep], slope)
+        gain = np.linalg.solve(np.einsum("nki,nkj->ij", slope, weighted), weighted.reshape(-1, 4).T)
+        for _ in range(MOST_STEPS):
+            step = -gain @ self.residual(state)[keep].ravel()
+            if not np.isfinite(step).all():
+                break
+            state = self.moved(state, step)
+            if np.abs(step).max() < SETTLED:
+                return state
+        raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
 
     def jacobian(self, state: _State) -> np.ndarray:
         """d predict / d p, (N, 2, 4), central differences."""
@@ -242,28 +246,20 @@ class _Problem:
         return np.stack(columns, -1)
 
 
-@dataclass(frozen=True)
-class _StarCovariances:
-    centroids: np.ndarray  # (M, 2, 2) px2, scatter included
-    catalogue: np.ndarray  # (M, 2, 2) px2
-
-
 def _terms(
     problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s
 ) -> tuple[ErrorTerm, ...]:
     """The budget: how the fit passes on the errors of its stars, and what else there is."""
     place = place_of(state.a4)
-    j = problem.jacobian(state)[keep]
-    weighted = np.linalg.solve(errors.centroids + errors.catalogue, j)
-    normal = np.einsum("nki,nkj->ij", j, weighted)
-    gain = np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3]
     stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
-    bending = -np.einsum("ank,nk->a", gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
+    bending = (
+        -np.einsum("ank,nk->a", errors.gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
+    )
     return error_terms(
         Sensitivity.of(state.a4, place.local_to_enu @ problem.g @ mounting.link_to_camera),
-        StarErrors(gain, errors.centroids, errors.catalogue),
+        errors,
         tilt,
-        mounting.calibration_covariance,
+        mounting,
         bending,
         place.latitude,
         earth,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.errors import TiltError, TiltRangeError
+from starpos.errors import InstrumentError, TiltError, TiltRangeError
 
 LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
@@ -46,6 +46,47 @@ class Tilt:
                 f"tilt ({np.degrees(self.theta_x):.3f}, {np.degrees(self.theta_y):.3f}) deg is beyond +-30 deg, "
                 "the inclinometer's range: set the instrument more upright"
             )
+
+
+@dataclass(frozen=True)
+class InclinometerErrors:
+    """How far an inclinometer is off, 1 sigma; the default is the SCA100T-D01 behind a good converter.
+
+    noise_rad: white, of one reading.  quantum_rad: step of its readings.  drift_rad_per_sqrt_hour: how its zero wanders.
+    temperature_rad_per_c: the zero's, after what compensation there is.  scale: share of the angle itself.
+    """
+
+    noise_rad: float = SCA100T_NOISE_RAD
+    quantum_rad: float = np.radians(0.0005)
+    drift_rad_per_sqrt_hour: float = np.radians(2 / 3600)
+    temperature_rad_per_c: float = np.radians(3 / 3600)
+    scale: float = 1e-4
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise InstrumentError(
+                    f"the inclinometer's {name} is {value}: it must be a finite number of 0 or more"
+                )
+
+    def undithered_rad(self, tilt: Tilt) -> float:
+        """What rounding leaves in the mean of many readings: noise larger than half a step averages it away.
+
+        The first harmonic of a quantiser's mean error under Gaussian noise (Widrow and Kollar, Quantization Noise, 2008).
+        """
+        if self.quantum_rad == 0:
+            return 0.0
+        noise2 = np.diag(tilt.covariance).min() * tilt.samples / self.quantum_rad**2
+        return float(self.quantum_rad / np.sqrt(12) * np.exp(-2 * np.pi**2 * noise2))
+
+    def steps(self, tilt: Tilt) -> tuple:
+        """The step its two readings stand on: as long as they do, rounding errs by the same."""
+        if self.quantum_rad == 0:
+            return ()
+        return ((round(tilt.theta_x / self.quantum_rad), round(tilt.theta_y / self.quantum_rad)),)
+
+
+EXACT = InclinometerErrors(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:

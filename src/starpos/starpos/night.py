@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from starpos.catalogue import Catalogue
-from starpos.errors import FrameError, TimeError
+from starpos.errors import FrameError
 from starpos.frame import Frame
 from starpos.progress import Progress, quiet
 from starpos.simulate import Scene, detected, expose, read_tilt, render
 from starpos.stars import Stars
+from starpos.utc import unix_of
 
 TILT_RATE_HZ = 10.0
 
@@ -60,19 +61,6 @@ def write_night(
         (folder / "truth.json").write_text(json.dumps(place | {"frames": truth}, indent=1))
     except OSError as e:
         raise FrameError(f"{folder}: the night cannot be written there ({e.strerror})") from None
-
-
-def unix_of(utc: str) -> float:
-    """Unix seconds of an ISO 8601 time, UTC unless it says otherwise; TimeError if it is none."""
-    import datetime
-
-    try:
-        moment = datetime.datetime.fromisoformat(utc.replace("Z", "+00:00"))
-    except ValueError:
-        raise TimeError(f"{utc!r} is no time: write it like 2026-11-02T18:00:00") from None
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=datetime.timezone.utc)
-    return moment.timestamp()
 
 
 def _text(unix_s: float) -> str:

@@ -15,7 +15,7 @@ from starpos.camera import Camera
 from starpos.catalogue import Catalogue
 from starpos.earth import earth_state
 from starpos.frame import Frame
-from starpos.instrument import Instrument
+from starpos.instrument import Calibration, Instrument
 from starpos.sky import Site, camera_to_enu
 from starpos.stars import Stars
 
@@ -180,7 +180,7 @@ def scene_of(
     """The paper's instrument at a place, with what is usually varied as plain numbers."""
     return Scene(
         Camera.from_focal(*size, focal_px),
-        Instrument(focal_px, misalignment_deg=misalignment_deg),
+        Instrument(focal_px, calibration=Calibration(misalignment_deg)),
         Site(latitude_deg, longitude_deg, atmosphere),
         *pointing_deg,
         tilt_errors=TiltErrors(np.radians(tilt_noise_deg), tuple(np.radians(tilt_zero_deg))),

@@ -16,9 +16,8 @@ from starpos import rotation
 from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, a2_matrix
-from starpos.instrument import Instrument
+from starpos.instrument import Calibration, Instrument
 from starpos.progress import Progress, quiet
-from starpos.sky import Site
 from starpos.solve import Solution, Solver
 from starpos.stars import Stars
 
@@ -66,7 +65,8 @@ def turn(
     tilt: of (mid_unix_s, exposure_s).  From fewer than two fixes A3 stays what it was; FixError where the instrument
     leans and the headings do not tell which way.
     """
-    solver = replace(solver, instrument=replace(solver.instrument, calibration_stddev_arcsec=UNKNOWN_ARCSEC))
+    unknown = Calibration.of(solver.instrument.calibration.misalignment_deg, UNKNOWN_ARCSEC)
+    solver = replace(solver, instrument=replace(solver.instrument, calibration=unknown))
     solutions: list[Solution | None] = [None] * len(frames)
     plumb_stddev = float(np.max(UNKNOWN_ARCSEC[:2]))
     for k in range(ROUNDS):
@@ -79,7 +79,10 @@ def turn(
             break
         a3, plumb_stddev = _level(solved, solver.instrument)
         moved = np.linalg.norm(rotation.to_small_vector(a3 @ solver.instrument.mounting.a3.T)[:2])
-        solver = replace(solver, instrument=solver.instrument.turned_to(a3))
+        solver = replace(
+            solver,
+            instrument=replace(solver.instrument, calibration=solver.instrument.calibration.turned_to(a3)),
+        )
         if moved < SETTLED_RAD:
             break
     progress("turning", 1.0)
@@ -91,7 +94,7 @@ def _level(solved: Sequence[Solution], instrument: Instrument) -> tuple[np.ndarr
 
     Its turn about the plumb line is told by the instrument's lean alone, if there is any: all of them are tried.
     """
-    to_camera = np.array([_itrs_to_camera(s.fix, instrument) for s in solved])
+    to_camera = np.array([s.fix.camera_to_itrs.T for s in solved])
     plumb = np.array([a2_matrix(s.tilt.theta_x, s.tilt.theta_y)[2] for s in solved])
     sigma = np.array([_own_sigma(s.fix) for s in solved])
     mean = plumb.sum(0) / np.linalg.norm(plumb.sum(0))
@@ -179,13 +182,6 @@ def _axis_of_turn(to_camera: np.ndarray, plumb: np.ndarray, given: np.ndarray) -
     if sine < 1e-12:
         return given
     return rotation.from_vector(axis / sine * np.arctan2(sine, between @ mean)) @ given
-
-
-def _itrs_to_camera(fix: Fix, instrument: Instrument) -> np.ndarray:
-    """Attitude (3, 3) of the camera on the Earth: of the stars alone, place and A3 cancel in it."""
-    camera_to_enu = fix.link_to_enu @ instrument.mounting.link_to_camera.T
-    enu = Site(np.degrees(fix.latitude), np.degrees(fix.longitude)).enu
-    return camera_to_enu.T @ enu
 
 
 def _own_sigma(fix: Fix) -> float:

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -6,10 +7,12 @@ import pytest
 from fields import ARCSEC, UTC, Field, random_field, turn
 
 from starpos import rotation
-from starpos.average import average
+from starpos.average import Averager, average
+from starpos.budget import ALWAYS, ErrorTerm
 from starpos.earth import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt
+from starpos.running import UNIT, Plane
 
 STATE = earth_state(UTC)
 
@@ -30,6 +33,16 @@ def fixes(field, rng, headings, tilt=12.6, calibration=0.0, slip=None):
             tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, UTC), mounting=here.mounting(calibration),
         ))  # fmt: skip
     return made
+
+
+def in_order(made, apart_s=10.0):
+    """The same fixes one after the other."""
+    return [replace(f, utc_unix_s=UTC + apart_s * k) for k, f in enumerate(made)]
+
+
+def read_at(f, *times):
+    """A fix whose tilt is of these readings."""
+    return replace(f, terms=tuple(replace(t, shared=times) if t.name == "tilt" else t for t in f.terms))
 
 
 def moved_m(a, field):
@@ -86,12 +99,12 @@ def test_an_average_errs_as_its_covariance_says(calibration, rng):
     assert np.mean(heading) == pytest.approx(1, abs=4 * np.sqrt(2 / 60))
 
 
-def test_an_instrument_that_turned_has_no_heading(rng):
-    a = average(fixes(Field(), rng, [10.0, 12.0]))
-    assert np.isnan(a.heading)
-    assert np.isnan(a.covariance[2]).all()
-    assert np.isfinite(a.covariance[:2, :2]).all()
-    assert np.isfinite([a.latitude, a.longitude]).all()
+def test_an_instrument_that_turned_has_the_heading_of_its_last_pose(rng):
+    made = fixes(Field(), rng, [10.0, 10.0, 12.0, 12.0])
+    a, last = average(made), average(made[2:])
+    assert a.poses == 2
+    assert turn(a.heading - last.heading) == pytest.approx(0, abs=3 * sigmas(last)[2])
+    assert 0.5 * sigmas(last)[2] < sigmas(a)[2] < sigmas(last)[2]  # what is known of the place helps it
 
 
 def test_over_the_date_line_and_over_north(rng):
@@ -111,10 +124,10 @@ def test_a_better_frame_counts_more(rng):
     assert sigmas(a, "tilt")[:2] == pytest.approx(sigmas(good[0], "tilt")[:2], rel=0.01)
 
 
-def test_frames_of_two_places_are_not_averaged(rng):
+def test_two_frames_of_two_places_have_no_average(rng):
     here, there = Field(), replace(Field(), latitude=Field().latitude + 0.5)
     with pytest.raises(FixError, match="not of one place"):
-        average(fixes(here, rng, [40.0] * 3) + fixes(there, rng, [40.0] * 3))
+        average(in_order(fixes(here, rng, [40.0]) + fixes(there, rng, [40.0])))
 
 
 def test_the_same_frame_given_twice_counts_once(rng):
@@ -127,10 +140,9 @@ def test_the_same_frame_given_twice_counts_once(rng):
 def test_frames_that_share_a_tilt_reading_share_its_error(rng):
     """One reading served four frames: its noise does not average."""
     field = Field()
-    made = [replace(f, tilt_times=(UTC,)) for f in fixes(field, rng, [40.0], tilt=12.6) for _ in range(4)]
-    made = [replace(f, utc_unix_s=UTC + k) for k, f in enumerate(made)]
+    made = in_order([read_at(f, UTC) for f in fixes(field, rng, [40.0], tilt=12.6) for _ in range(4)])
     assert sigmas(average(made), "tilt") == pytest.approx(sigmas(made[0], "tilt"), rel=1e-3)
-    apart = [replace(f, tilt_times=(UTC + k,)) for k, f in enumerate(made)]
+    apart = [read_at(f, UTC + k) for k, f in enumerate(made)]
     assert sigmas(average(apart), "tilt") == pytest.approx(sigmas(made[0], "tilt") / 2, rel=1e-3)
 
 
@@ -147,3 +159,166 @@ def test_a_thousand_frames(rng):
     made = fixes(Field(), rng, [40.0] * 2)
     many = [replace(made[k % 2], utc_unix_s=UTC + k) for k in range(1000)]
     assert sigmas(average(many), "tilt") == pytest.approx(sigmas(made[0], "tilt") / np.sqrt(1000), rel=0.02)
+
+
+def dense(made):
+    """Generalised least squares over all fixes at once: east, north, heading against the first, and their covariance."""
+    plane, n = Plane.at(made[0]), len(made)
+    seen = np.array([plane.seen(f) * UNIT for f in made])
+    whole = np.zeros((n, 3, n, 3))
+    for k, term in enumerate(made[0].terms):
+        factors = [plane.turned(f, f.terms[k].factor) * UNIT[:, None] for f in made]
+        for i, f in enumerate(made):
+            for j, g in enumerate(made):
+                a, b = f.terms[k].shared, g.terms[k].shared
+                if i == j or (a and b and set(a) & set(b)):
+                    first = f.terms[k] if f.utc_unix_s < g.utc_unix_s else g.terms[k]
+                    since = min(f.utc_unix_s, g.utc_unix_s) - made[0].utc_unix_s
+                    start = made[0].terms[k].variance if a == ALWAYS else first.variance
+                    whole[i, :, j] += (start + term.walk_s * since) * factors[i] @ factors[j].T
+    unit = np.tile(UNIT, n)
+    inverse = np.linalg.inv(whole.reshape(3 * n, 3 * n) / np.outer(unit, unit))
+    design = np.tile(np.eye(3), (n, 1))
+    covariance = np.linalg.inv(design.T @ inverse @ design)
+    return covariance @ design.T @ inverse @ (seen / UNIT).ravel() * UNIT, covariance * np.outer(UNIT, UNIT)
+
+
+def wandering(f, rad_per_s=3e-7):
+    """A fix whose zero wanders, after an hour since its calibration."""
+    (tilt,) = (t for t in f.terms if t.name == "calibration")
+    walk = ErrorTerm("tilt drift", tilt.factor / 5e-5 * rad_per_s, ALWAYS, variance=3600.0, walk_s=1.0)
+    return replace(f, terms=tuple(walk if t.name == walk.name else t for t in f.terms))
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_the_recursion_is_generalised_least_squares_over_all(shared, rng):
+    field = replace(Field(), altitude=80.0)
+    if shared:  # three frames to a reading
+        made = [f for f in fixes(field, rng, [40.0] * 3, calibration=10.0) for _ in range(3)]
+        made = [read_at(spoiled(f, *rng.normal(0, 3, 2)), UTC + k // 3) for k, f in enumerate(made)]
+    else:
+        made = fixes(field, rng, [40.0] * 7, calibration=10.0)
+    made = in_order([wandering(f) for f in made])
+    a, (moved, covariance) = average(made), dense(made)
+    plane = Plane.at(made[0])
+    latitude, longitude = plane.place(moved[:2])
+    assert moved_m(a, replace(Field(), latitude=np.degrees(latitude), longitude=np.degrees(longitude))) == (
+        pytest.approx([0, 0], abs=1e-3)
+    )
+    np.testing.assert_allclose(a.covariance[:2, :2], covariance[:2, :2], rtol=1e-5)
+    heading = moved[2] + plane.heading - plane.convergence(latitude, longitude)
+    assert turn(a.heading - heading) == pytest.approx(0, abs=1e-11)
+
+
+def test_as_they_come_or_all_at_once(rng):
+    made = in_order(fixes(Field(), rng, [40.0] * 5 + [90.0] * 5, calibration=10.0))
+    averager = Averager()
+    for f in made:
+        averager.add(f)
+    a, b = average(made[::-1]), averager.average
+    assert (a.latitude, a.longitude, a.heading, a.frames) == (b.latitude, b.longitude, b.heading, 10)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def spoiled(f, east_m=0.0, north_m=0.0):
+    """A fix that is off by so much, of a camera that did not move."""
+    prime, meridian = curvature_radii_m(f.latitude)
+    return replace(
+        f,
+        latitude=f.latitude + north_m / meridian,
+        longitude=f.longitude + east_m / prime / np.cos(f.latitude),
+    )
+
+
+def check_not_moved(spoiled_fixes, sound, field):
+    """That the average of these is that of the sound ones, within a fraction of its error."""
+    a, b = average(in_order(spoiled_fixes)), average(in_order(sound))
+    off = moved_m(a, field) - moved_m(b, field)
+    assert np.all(np.abs(off) < 0.5 * sigmas(b)[:2])
+    return a
+
+
+@pytest.mark.parametrize("first", [0, 12, 24])
+def test_a_burst_of_bad_tilts_does_not_move_it(first, rng):
+    """Ten in a row that agree with each other, 11 km off, at the beginning, in the middle, at the end."""
+    field = Field()
+    made = fixes(field, rng, [40.0] * 25)
+    bad = [spoiled(f, 8e3, -8e3) for f in fixes(field, rng, [40.0] * 10)]
+    a = check_not_moved(made[:first] + bad + made[first:], made, field)
+    assert (a.frames, a.left_out, a.moved) == (25, 10, 0)
+
+
+def test_single_bad_tilts_do_not_move_it(rng):
+    field = Field()
+    made = fixes(field, rng, [40.0] * 25)
+    mixed = [spoiled(f, *rng.normal(0, 3e4, 2)) if k % 6 == 0 else f for k, f in enumerate(made)]
+    a = check_not_moved(mixed, [f for k, f in enumerate(made) if k % 6], field)
+    assert a.frames == 20 and a.left_out == 5
+
+
+def slipped(f, seconds):
+    """A fix whose frame was stamped late: the Earth turns under the camera, and the place runs east to west."""
+    angle = 7.292115e-5 * seconds
+    return replace(
+        f, longitude=f.longitude - angle, camera_to_itrs=rotation.about_axis(2, -angle) @ f.camera_to_itrs
+    )
+
+
+@pytest.mark.parametrize("seconds", [1.0, -1.0, 60.0, 3600.0])
+@pytest.mark.parametrize("at", [0, 7, 24])
+def test_a_wrong_time_stamp_does_not_move_it(seconds, at, rng):
+    field = Field()
+    made = fixes(field, rng, [40.0] * 25, tilt=1.0)
+    mixed = [slipped(f, seconds) if k == at else f for k, f in enumerate(made)]
+    a = check_not_moved(mixed, made[:at] + made[at + 1 :], field)
+    assert a.left_out == 1 and a.frames == 24
+
+
+def test_a_knocked_tripod_does_not_move_the_place(rng):
+    """Its heading and tilt are others from then on; the frame of the knock itself is far off."""
+    field = Field()
+    before = fixes(field, rng, [40.0] * 12)
+    after = fixes(replace(field, altitude=field.altitude - 0.7, roll=field.roll + 0.5), rng, [40.4] * 12)
+    during = [spoiled(fixes(field, rng, [40.2])[0], 5e4, 2e4)]
+    a = check_not_moved(before + during + after, before + after, field)
+    assert (a.moved, a.left_out) == (0, 1)
+    assert turn(a.heading - average(in_order(after)).heading) == pytest.approx(0, abs=3 * sigmas(a)[2])
+
+
+@pytest.mark.parametrize(("moved_to_m", "needs"), [(1e6, 3), (2e4, 3), (700.0, 25)])
+def test_a_robot_that_drove_on_begins_a_new_average(moved_to_m, needs, rng):
+    """A long way off after three frames; less than two errors of one frame after a few."""
+    here = Field()
+    there = replace(here, latitude=here.latitude - np.degrees(moved_to_m / 6.371e6), azimuth=90.0)
+    averager = Averager()
+    for f in in_order(fixes(here, rng, [40.0] * 30) + fixes(there, rng, [90.0] * needs)):
+        averager.add(f)
+    a = averager.average
+    assert a.moved == 1 and a.frames <= needs
+    assert np.all(np.abs(moved_m(a, there)) < 4 * sigmas(a)[:2])
+
+
+def test_a_robot_on_shaking_ground_that_drives_on_is_noticed(rng):
+    """Every frame in a pose of its own."""
+    here, there = Field(), replace(Field(), latitude=Field().latitude - 0.1)
+    made = fixes(here, rng, 40 + 0.1 * rng.normal(size=15)) + fixes(there, rng, 40 + 0.1 * rng.normal(size=6))
+    a = average(in_order(made))
+    assert a.moved == 1 and a.frames == 6
+    assert np.all(np.abs(moved_m(a, there)) < 4 * sigmas(a)[:2])
+
+
+def test_a_robot_that_turns_on_the_spot_has_not_moved(rng):
+    field = Field()
+    made = in_order(fixes(field, rng, np.repeat(np.arange(0.0, 720.0, 40.0), 4)))
+    a = average(made)
+    assert (a.frames, a.moved, a.left_out) == (72, 0, 0)
+    assert np.all(np.abs(moved_m(a, field)) < 4 * sigmas(a)[:2])
+
+
+def test_memory_does_not_grow(rng):
+    averager, two = Averager(), fixes(Field(), rng, [40.0] * 2)
+    sizes = []
+    for k in range(300):
+        averager.add(read_at(replace(two[k % 2], utc_unix_s=UTC + k), UTC + k, UTC + k + 1))
+        sizes.append(len(pickle.dumps(vars(averager))))
+    assert max(sizes[100:]) <= max(sizes[:100])

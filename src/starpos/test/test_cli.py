@@ -4,6 +4,7 @@
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 
@@ -103,7 +104,8 @@ def test_solve_star_lists_that_turn(lists, capsys):
     status, out, _ = solve(capsys, lists, *WIDE, "--json", frames="stars_*.csv")
     assert status == 0
     *each, combined = objects(out)
-    assert combined["heading"] is None  # it turned
+    assert combined["poses"] == 3
+    assert combined["heading"] == pytest.approx(each[-1]["heading"], abs=0.01)  # of the last pose
     assert [e["status"] for e in each] == ["ok"] * 3
     assert abs(combined["latitude"] - PLACE["latitude"]) * 3600 < 1
     truth = json.loads((lists / "truth.json").read_text())
@@ -149,6 +151,29 @@ def test_a_deflection_moves_the_geodetic_position_only(lists, capsys):
     assert moved["latitude"] == plain["latitude"]
     assert (moved["latitude_geodetic"] - plain["latitude_geodetic"]) * 3600 == pytest.approx(-10)
     assert moved["covariance_geodetic"][0][0] < plain["covariance_geodetic"][0][0]
+
+
+def test_a_geoid_gives_the_deflection_of_the_place_or_says_that_it_cannot(lists, tmp_path, capsys):
+    def solved(south):
+        heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))  # 1 m a degree to the north
+        header = struct.pack(">4d2i", south, -140, 1, 1, *heights.shape)
+        (tmp_path / "slope.gtx").write_bytes(header + heights.astype(">f4").tobytes())
+        geoid = ("--geoid", tmp_path / "slope.gtx")
+        status, out, errors = solve(capsys, lists, *WIDE, "--json", *geoid, frames="stars_0000.csv")
+        assert status == 0
+        return objects(out), errors
+
+    answers, errors = solved(30)
+    for answer in answers:
+        assert answer["xi_arcsec"] == pytest.approx(-1.855, abs=0.002)
+        assert abs(answer["eta_arcsec"]) < 1e-6
+        assert 0 < answer["deflection_stddev_arcsec"] < 1
+        assert (answer["latitude"] - answer["latitude_geodetic"]) * 3600 == pytest.approx(-1.855, abs=0.002)
+    assert errors == []
+    answers, errors = solved(-60)
+    assert [a["deflection_stddev_arcsec"] for a in answers] == [6.0, 6.0]
+    assert len(errors) == 1
+    assert "6 arcsec" in errors[0]
 
 
 def test_a_wrong_misalignment_is_a_wrong_place(lists, capsys):
@@ -206,6 +231,9 @@ BAD_CALLS = {
     "pressure in Pa": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--pressure-hpa", "101325"),
     "humidity in percent": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--humidity", "30"),
     "a deflection of nan": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--xi", "nan"),
+    "a missing geoid": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--geoid", "none.gtx"),
+    "a geoid that is none": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--geoid", "TILT"),
+    "a geoid and a deflection": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--geoid", "a.gtx", "--eta", "0"),
     "a missing instrument file": ("solve", "STARS", "--tilt", "TILT", "--instrument", "none.yaml"),
     "a missing frame": ("detect", "none.fits"),
     "a folder for a frame": ("detect", "."),

@@ -7,7 +7,8 @@ import pytest
 from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.errors import InstrumentError
-from starpos.instrument import Instrument, focal_px_of, read
+from starpos.instrument import Calibration, Instrument, focal_px_of
+from starpos.instrument_file import read, write
 
 SIMPLE = "starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\n"
 FULL = """starpos_instrument: 1
@@ -41,8 +42,8 @@ def test_every_key(reads):
     i = reads(FULL)
     assert i.camera == Camera(1392, 1040, 5200.5, 5201.5, 700.25, 520.0, (-0.1, 0.01, 1e-3, -2e-3, 0.0))
     assert i.focal_px == 5200.5
-    assert i.misalignment_deg == (0.1, -0.2, 30.0)
-    assert i.tilt_noise_rad == pytest.approx(np.radians(0.002))
+    assert i.calibration.misalignment_deg == (0.1, -0.2, 30.0)
+    assert i.inclinometer.noise_rad == pytest.approx(np.radians(0.002))
     assert i.clock_stddev_s == 0.001
     np.testing.assert_allclose(
         np.sqrt(np.diag(i.mounting.calibration_covariance)), np.radians([1 / 3600, 2 / 3600, 3 / 3600])
@@ -52,19 +53,11 @@ def test_every_key(reads):
 
 def test_misalignment_is_r3_r2_r1():
     """DESIGN section 3: A3 = R3(rz) R2(ry) R1(rx), active, C into S."""
-    np.testing.assert_allclose(
-        Instrument(1.0, misalignment_deg=(90, 0, 0)).mounting.a3 @ [0, 1, 0], [0, 0, 1], atol=1e-15
-    )
-    np.testing.assert_allclose(
-        Instrument(1.0, misalignment_deg=(0, 90, 0)).mounting.a3 @ [0, 0, 1], [1, 0, 0], atol=1e-15
-    )
-    np.testing.assert_allclose(
-        Instrument(1.0, misalignment_deg=(0, 0, 90)).mounting.a3 @ [1, 0, 0], [0, 1, 0], atol=1e-15
-    )
+    np.testing.assert_allclose(Calibration((90, 0, 0)).a3 @ [0, 1, 0], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(Calibration((0, 90, 0)).a3 @ [0, 0, 1], [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(Calibration((0, 0, 90)).a3 @ [1, 0, 0], [0, 1, 0], atol=1e-15)
     # R1 acts first: y -> z -> (R2) x -> (R3) y
-    np.testing.assert_allclose(
-        Instrument(1.0, misalignment_deg=(90, 90, 90)).mounting.a3 @ [0, 1, 0], [0, 1, 0], atol=1e-15
-    )
+    np.testing.assert_allclose(Calibration((90, 90, 90)).a3 @ [0, 1, 0], [0, 1, 0], atol=1e-15)
 
 
 def test_the_link_looks_along_the_top_of_the_frame():

@@ -23,12 +23,13 @@ from scenes import (
 
 from starpos.camera import Camera
 from starpos.cli.common import tell_extrapolation
-from starpos.earth import curvature_radii_m, earth_state, station_velocity, utc_text
+from starpos.earth import curvature_radii_m, earth_state, station_velocity
 from starpos.errors import TiltError
-from starpos.inclinometer import Tilt, TiltLog
-from starpos.instrument import Instrument
+from starpos.inclinometer import EXACT, Tilt, TiltLog
+from starpos.instrument import Calibration, Instrument
 from starpos.solve import Solver, Status
 from starpos.stars import SATURATED, Stars, no_stars
+from starpos.utc import utc_text
 
 ARCSEC = np.radians(1 / 3600)
 
@@ -99,7 +100,12 @@ def test_over_many_nights_the_claims_hold(catalogue, rng):
             latitude_deg=float(rng.uniform(-65, 65)), longitude_deg=float(rng.uniform(-180, 180)),
             pointing_deg=(float(rng.uniform(0, 360)), float(rng.uniform(68, 85)), float(rng.uniform(0, 360))),
         )  # fmt: skip
-        exact = replace(scene.instrument, calibration_stddev_arcsec=(0.0,) * 3, clock_stddev_s=0.0)
+        exact = replace(
+            scene.instrument,
+            calibration=Calibration.of(scene.instrument.calibration.misalignment_deg, (0.0,) * 3),
+            inclinometer=replace(EXACT, noise_rad=1e-9),
+            clock_stddev_s=0.0,
+        )
         scene = replace(scene, instrument=exact)
         s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
         assert s.ok, s.message

@@ -12,7 +12,7 @@ from starpos.average import average
 from starpos.earth import curvature_radii_m
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
-from starpos.instrument import Instrument
+from starpos.instrument import Calibration, Instrument
 from starpos.solve import Solver, Status
 from starpos.stars import no_stars
 from starpos.turning import turn
@@ -26,7 +26,7 @@ def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(
     frames, tilts = [], {}
     for n, azimuth in enumerate(headings):
         scene = wide_scene(pointing_deg=(azimuth, 78.0 + lean * np.cos(np.radians(azimuth)), 15.0))
-        instrument = replace(scene.instrument, misalignment_deg=misalignment)
+        instrument = replace(scene.instrument, calibration=Calibration(misalignment))
         scene = replace(scene, instrument=instrument)
         begin = START + 60.0 * n
         stars, tilt = stars_of(scene, catalogue, rng, begin), tilt_of(scene, rng, begin)
@@ -72,7 +72,7 @@ def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
     s = answer.solutions[-1].tilt  # what the inclinometer says, its zero off, and what is so
     read = a2_matrix(s.theta_x, s.theta_y)[2]
     true = a2_matrix(*(np.array([s.theta_x, s.theta_y]) - np.radians(zero)))[2]
-    truth = replace(scene.instrument, misalignment_deg=misalignment).mounting.a3.T @ true
+    truth = replace(scene.instrument, calibration=Calibration(misalignment)).mounting.a3.T @ true
     found = answer.instrument.mounting.a3.T @ read
     off_arcsec = np.degrees(np.arccos(np.clip(truth @ found, -1, 1))) * 3600
     assert off_arcsec < 4 * 12.6  # one reading's noise is in both
@@ -100,10 +100,10 @@ def test_frames_without_stars_stay_without_a_fix(catalogue):
     empty = no_stars(1000, 700, START, 0.5)
     answer = turn(solver, [empty, empty], lambda *_: Tilt(0.0, 0.0, np.eye(2) * 1e-10, START))
     assert [s.status for s in answer.solutions] == [Status.TOO_FEW_STARS] * 2
-    assert answer.instrument.misalignment_deg == (0.0, 0.0, 0.0)
+    assert answer.instrument.calibration.misalignment_deg == (0.0, 0.0, 0.0)
 
 
 def test_a_rotation_becomes_the_three_angles_of_a3(rng):
     for _ in range(20):
         a3 = rotation.from_vector(rng.normal(size=3) * [0.3, 0.3, 2.0])
-        np.testing.assert_allclose(Instrument(1000.0).turned_to(a3).mounting.a3, a3, atol=1e-12)
+        np.testing.assert_allclose(Calibration().turned_to(a3).a3, a3, atol=1e-12)

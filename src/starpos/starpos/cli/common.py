@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from starpos import geoid, instrument
+from starpos import geoid, instrument, instrument_file
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, StarposError
@@ -121,7 +121,9 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
         raise InstrumentError(
             "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
         )
-    return instrument.Instrument(focal_px, calibration=instrument.Calibration(tuple(misalignment or (0.0, 0.0, 0.0))))
+    return instrument.Instrument(
+        focal_px, calibration=instrument.Calibration(tuple(misalignment or (0.0, 0.0, 0.0)))
+    )
 
 
 def frames_of(paths: list[str]):
@@ -157,6 +159,15 @@ def _plain(value):
     if isinstance(value, np.integer):
         return int(value)
     return value
+
+
+def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection) -> None:
+    """One line where a geoid was given and has nothing to say about the place."""
+    if args.geoid is not None and deflection == Deflection():
+        stddev = deflection.stddev_arcsec
+        complain(
+            command, f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:g} arcsec"
+        )
 
 
 def complain(command: str, error: StarposError | str) -> None:

@@ -18,6 +18,7 @@ from starpos.utc import utc_text
 from starpos.vertical import Vertical, geodetic
 
 NO_FIX = 1
+COUNTS = ("frames", "poses", "left_out", "moved")  # of an average
 
 
 def define(parser) -> None:
@@ -64,6 +65,8 @@ def run(args) -> int:
     common.tell_extrapolation("solve", solved)
     together = _combine(solved)
     if solved:
+        last = solved[-1].fix
+        common.tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
         _print_combined(together, solved, args, vertical)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
@@ -117,10 +120,20 @@ def _combine(solved: list[Solution]) -> Average | None:
     if not solved:
         return None
     try:
-        return average([s.fix for s in solved])
+        whole = average([s.fix for s in solved])
     except FixError as e:
         common.complain("solve", e)
         return None
+    if whole.moved:
+        begin = utc_text(whole.began_unix_s)
+        common.complain(
+            "solve", f"the instrument moved on: the average is of the {whole.frames} frames since {begin}"
+        )
+    if whole.left_out:
+        common.complain(
+            "solve", f"{whole.left_out} fixes lie far from the others and are left out of the average"
+        )
+    return whole
 
 
 def _json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
@@ -184,10 +197,7 @@ def _line(path: str, s: Solution) -> str:
 
 def _where(fix: Fix | Average) -> str:
     east, north, heading = np.sqrt(np.diag(_in_degrees(fix.covariance)))
-    turned = np.isnan(fix.heading)
-    facing = (
-        "turned between frames" if turned else f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
-    )
+    facing = f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
@@ -201,7 +211,12 @@ def _print_combined(all_together: Average | None, solved: list[Solution], args, 
             "status": (Status.OK if all_together else Status.POOR_FIT).value,
         }
         common.print_json(
-            {"combined": True, "frames": all_together.frames if all_together else 0}
+            {"combined": True}
+            | (
+                dict.fromkeys(COUNTS)
+                if all_together is None
+                else {k: getattr(all_together, k) for k in COUNTS}
+            )
             | _json_of(all_together, vertical)
             | about
         )
@@ -209,7 +224,8 @@ def _print_combined(all_together: Average | None, solved: list[Solution], args, 
     if all_together is None:
         return
     ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, vertical)
-    print(f"{all_together.frames} frames together: {_where(all_together)} (astronomic)")
+    turned = f" (the last of {all_together.poses} poses)" if all_together.poses > 1 else ""
+    print(f"{all_together.frames} frames together: {_where(all_together)}{turned} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The instrument file: YAML for people, nodes and the command line alike; format 1."""
+
+import math
+import reprlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from starpos import camera_yaml, yaml_file
+from starpos.camera import Camera
+from starpos.camera_yaml import LARGEST_SIDE
+from starpos.errors import InstrumentError, TimeError
+from starpos.inclinometer import InclinometerErrors
+from starpos.instrument import Calibration, Instrument, focal_px_of
+from starpos.utc import unix_of, utc_text
+
+FORMAT = 1
+INCLINOMETER = {  # key, field, unit in rad or 1
+    "tilt_noise_deg": ("noise_rad", math.radians(1)),
+    "tilt_quantum_deg": ("quantum_rad", math.radians(1)),
+    "tilt_drift_arcsec_per_sqrt_hour": ("drift_rad_per_sqrt_hour", math.radians(1 / 3600)),
+    "tilt_temperature_arcsec_per_c": ("temperature_rad_per_c", math.radians(1 / 3600)),
+    "tilt_scale": ("scale", 1.0),
+}
+KEYS = (
+    "camera",
+    "misalignment_deg",
+    "calibration_stddev_arcsec",
+    "calibration_covariance_arcsec2",
+    "calibrated",
+    "link_to_camera",
+    *INCLINOMETER,
+    "clock_stddev_s",
+)
+
+
+def read(path) -> Instrument:
+    """An Instrument from its YAML file (format below); InstrumentError with the reason where it is none.
+
+    starpos_instrument: 1
+    camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
+            or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path
+    misalignment_deg: [rx, ry, rz]
+    calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
+    calibration_covariance_arcsec2: [[..], [..], [..]]
+    calibrated: {utc, temperature_c, frames, valid_days}  which `starpos calibrate` writes
+    link_to_camera: [[..], [..], [..]]
+    tilt_noise_deg: 0.0035                               of one reading; the others are of the zero and of the angle
+    tilt_quantum_deg: 0.0005
+    tilt_drift_arcsec_per_sqrt_hour: 2
+    tilt_temperature_arcsec_per_c: 3
+    tilt_scale: 1e-4
+    clock_stddev_s: 0.01
+    """
+    path = Path(path)
+    content = yaml_file.load(path, "instrument file")
+    if not isinstance(content, dict) or content.pop("starpos_instrument", None) != FORMAT:
+        raise InstrumentError(
+            f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`"
+        )
+    try:
+        return _from_mapping(content, path.parent)
+    except InstrumentError as e:
+        raise InstrumentError(f"{path}: {e}") from None
+
+
+def write(path, instrument: Instrument, comment: str = "") -> None:
+    """Write a file that `read` makes the same of; InstrumentError where it cannot be written.  comment: for people."""
+    c, camera = instrument.calibration, instrument.camera
+    content = {"starpos_instrument": FORMAT, "camera": {"focal_px": float(instrument.focal_px)}}
+    if camera is not None:
+        content["camera"] = {"width": camera.width, "height": camera.height}
+        content["camera"] |= {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
+        content["camera"]["distortion"] = [float(d) for d in camera.distortion]
+    content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
+    content["calibration_covariance_arcsec2"] = np.asarray(c.covariance_arcsec2, float).tolist()
+    if not math.isnan(c.utc_unix_s):
+        content["calibrated"] = {"utc": utc_text(c.utc_unix_s), "frames": int(c.frames)}
+        if not math.isnan(c.temperature_c):
+            content["calibrated"]["temperature_c"] = float(c.temperature_c)
+        if math.isfinite(c.valid_days):
+            content["calibrated"]["valid_days"] = float(c.valid_days)
+    content["link_to_camera"] = np.asarray(instrument.link_to_camera, float).tolist()
+    for key, (name, unit) in INCLINOMETER.items():
+        content[key] = float(getattr(instrument.inclinometer, name) / unit)
+    content["clock_stddev_s"] = float(instrument.clock_stddev_s)
+    yaml_file.save(Path(path), content, comment)
+
+
+def _from_mapping(content: dict, folder: Path) -> Instrument:
+    _refuse_others(content, KEYS)
+    camera, focal_px = _camera(content.get("camera"), folder)
+    instrument = Instrument(focal_px, camera, _calibration(content))
+    if "link_to_camera" in content:
+        link = _matrix(content["link_to_camera"], "link_to_camera")
+        instrument = replace(instrument, link_to_camera=link)
+    errors = {
+        name: _number(content, key) * unit for key, (name, unit) in INCLINOMETER.items() if key in content
+    }
+    instrument = replace(instrument, inclinometer=InclinometerErrors(**errors))
+    if "clock_stddev_s" in content:
+        instrument = replace(instrument, clock_stddev_s=_number(content, "clock_stddev_s"))
+    return instrument
+
+
+def _camera(camera, folder: Path) -> tuple[Camera | None, float]:
+    """Intrinsics, None where only the focal length (px) is given."""
+    if not isinstance(camera, dict):
+        raise InstrumentError(
+            f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"
+        )
+    if "focal_mm" in camera:
+        _refuse_others(camera, ("focal_mm", "pixel_um"))
+        return None, focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um"))
+    if "focal_px" in camera:
+        _refuse_others(camera, ("focal_px",))
+        return None, _number(camera, "focal_px")
+    if "calibration" in camera:
+        _refuse_others(camera, ("calibration",))
+        if not isinstance(camera["calibration"], str):
+            raise InstrumentError(
+                f"the camera's calibration is {_short(camera['calibration'])}: give the name of a file"
+            )
+        full = camera_yaml.read(folder / camera["calibration"])
+        return full, full.fx
+    axes = ("fx", "fy", "cx", "cy")
+    _refuse_others(camera, ("width", "height", *axes, "distortion"))
+    for side in ("width", "height"):
+        if not isinstance(camera.get(side), int) or not 1 <= camera[side] <= LARGEST_SIDE:
+            raise InstrumentError(
+                f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
+            )
+    distortion = _row(camera.get("distortion", [0.0] * 5), "distortion")
+    full = Camera(camera["width"], camera["height"], *(_number(camera, k) for k in axes), distortion)
+    return full, full.fx
+
+
+def _calibration(content: dict) -> Calibration:
+    keys = ("calibration_stddev_arcsec", "calibration_covariance_arcsec2")
+    if all(key in content for key in keys):
+        raise InstrumentError(f"{keys[0]} and {keys[1]} say the same thing: give one of them")
+    angles = _row(content.get("misalignment_deg", [0.0] * 3), "misalignment_deg")
+    calibration = Calibration(angles)
+    if keys[0] in content:
+        calibration = Calibration.of(angles, _row(content[keys[0]], keys[0]))
+    if keys[1] in content:
+        calibration = Calibration(angles, _matrix(content[keys[1]], keys[1]))
+    about = content.get("calibrated")
+    if about is None:
+        return calibration
+    if not isinstance(about, dict):
+        raise InstrumentError(
+            f"calibrated is {_short(about)}: give {{utc, temperature_c, frames, valid_days}}"
+        )
+    _refuse_others(about, ("utc", "temperature_c", "frames", "valid_days"))
+    try:
+        utc = unix_of(str(about.get("utc")))
+    except TimeError as e:
+        raise InstrumentError(f"calibrated: {e}") from None
+    more = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
+    frames = about.get("frames", 0)
+    if not isinstance(frames, int) or frames < 0:
+        raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")
+    return replace(calibration, utc_unix_s=utc, frames=frames, **more)
+
+
+def _matrix(rows, key: str) -> tuple:
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise InstrumentError(f"{key} is {_short(rows)}: give three rows of three numbers")
+    matrix = tuple(_row(row, key) for row in rows)
+    if {len(row) for row in matrix} != {3}:
+        raise InstrumentError(f"{key} has a row of another length: give three rows of three numbers")
+    return matrix
+
+
+def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
+    if unknown := [key for key in mapping if key not in known]:
+        raise InstrumentError(f"unknown key {_short(unknown[0])}: the keys here are {', '.join(known)}")
+
+
+def _number(mapping: dict, key: str) -> float:
+    try:
+        return float(mapping[key])  # float reads 1e-3 too, which YAML takes for text
+    except KeyError:
+        raise InstrumentError(f"{key} is missing: give a number") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InstrumentError(f"{key} is {_short(mapping[key])}: give a number") from None
+
+
+def _row(numbers: list, key: str) -> tuple[float, ...]:
+    if not isinstance(numbers, list):
+        raise InstrumentError(f"{key} is {_short(numbers)}: give a list of numbers, like [0.0, 0.0, 0.0]")
+    return tuple(_number({key: v}, key) for v in numbers)
+
+
+def _short(value) -> str:
+    """What a file gives for a value, in a sentence; however deep it is."""
+    if isinstance(value, int) and abs(value) > 1e18:
+        return "a number beyond any sense"
+    text = "missing" if value is None else reprlib.repr(value)
+    return text if len(text) < 60 else text[:57] + "..."

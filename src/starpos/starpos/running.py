@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The place of a standing instrument as its fixes come in: a Kalman filter over place, heading and what the fixes share.
+
+A calibration error that turns with the instrument is told apart from the place, one that does not stays in the answer; a
+zero that wanders does so in the filter too.  Its size is constant, and its answer is that of generalised least squares
+over all fixes at once (test_average.py).  The covariance is kept by source, so that the budget of the mean comes with it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos.budget import ErrorTerm, symmetric_root
+from starpos.earth import curvature_radii_m
+from starpos.fix import Fix
+from starpos.rotation import full_turn
+
+UNIT = np.array([1.0, 1.0, 1e-6])  # m and rad, brought to like sizes
+UNKNOWN = 1e14  # variance, in those units, of what is not known at all
+HUBER_SIGMA = 4.0  # a fix further off pulls no harder
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The tangent plane at a fix, where east and north of its neighbours are made one."""
+
+    zenith: np.ndarray
+    axes: np.ndarray  # (2, 3): east and north in ITRS
+    radii: np.ndarray  # prime vertical, meridian; m
+    heading: float  # of the fix, against these axes
+
+    @classmethod
+    def at(cls, f: Fix) -> "Plane":
+        axes = _axes(f.latitude, f.longitude)
+        return cls(_zenith(f.latitude, f.longitude), axes, np.array(curvature_radii_m(f.latitude)), f.heading)
+
+    def convergence(self, latitude: float, longitude: float) -> float:
+        """Azimuth of a place's own north against this plane's."""
+        return float(np.arctan2(*(self.axes @ _axes(latitude, longitude)[1])))
+
+    def across(self, latitude: float, longitude: float) -> np.ndarray:
+        """East, north in m (2,) of a place."""
+        return self.axes @ (_zenith(latitude, longitude) - self.zenith) * self.radii
+
+    def seen(self, f: Fix) -> np.ndarray:
+        """East, north, heading (3,) of a fix against the plane's own, in UNIT."""
+        moved = self.across(f.latitude, f.longitude)
+        heading = f.heading + self.convergence(f.latitude, f.longitude) - self.heading
+        return np.array([*moved, half_turn(heading)]) / UNIT
+
+    def turned(self, f: Fix, factor: np.ndarray) -> np.ndarray:
+        """The first three rows of an error factor, brought from the fix's axes into these; in UNIT."""
+        turn = self.convergence(f.latitude, f.longitude)
+        c, s = np.cos(turn), np.sin(turn)
+        east, north, heading = factor[:3]
+        # the fix's north turns with its longitude, and its heading was taken from there
+        prime, _ = curvature_radii_m(f.latitude)
+        heading = heading - np.tan(f.latitude) / prime * east
+        return np.stack([c * east + s * north, c * north - s * east, heading]) / UNIT[:, None]
+
+    def local(self, latitude: float, factor: np.ndarray) -> np.ndarray:
+        """A factor (3, m) in UNIT as m and rad, with the heading against its place's own north again."""
+        prime, _ = curvature_radii_m(latitude)
+        factor = factor * UNIT[:, None]
+        return factor + np.outer([0.0, 0.0, np.tan(latitude) / prime], factor[0])
+
+    def place(self, east_north_m: np.ndarray) -> tuple[float, float]:
+        """Latitude, longitude (rad)."""
+        across = east_north_m / self.radii
+        zenith = np.sqrt(max(1 - across @ across, 0.0)) * self.zenith + across @ self.axes
+        return float(np.arctan2(zenith[2], np.hypot(*zenith[:2]))), float(np.arctan2(zenith[1], zenith[0]))
+
+
+@dataclass(frozen=True)
+class Running:
+    """What the fixes so far say.
+
+    state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own; sources
+    (T + 1, n, n): covariance of the state's error by each of the T terms of a fix, and by what is not known yet; keys: of
+    each term's shared error, the frames it holds for; columns: its place in the state.
+    """
+
+    plane: Plane
+    names: tuple[str, ...]
+    columns: tuple[slice, ...]
+    keys: tuple[tuple, ...]
+    state: np.ndarray
+    sources: np.ndarray
+    utc_unix_s: float  # of the last fix
+
+    @classmethod
+    def before(cls, f: Fix) -> "Running":
+        """Nothing known yet, in a plane at the first fix and ready for fixes with terms like its."""
+        columns, n = [], 3
+        for t in f.terms:
+            width = 0 if t.shared is None else t.factor.shape[1]
+            columns.append(slice(n, n + width))
+            n += width
+        sources = np.zeros((len(f.terms) + 1, n, n))
+        empty = cls(
+            Plane.at(f), tuple(t.name for t in f.terms), tuple(columns), ((),) * len(f.terms), np.zeros(n), sources,
+            f.utc_unix_s,
+        )  # fmt: skip
+        return empty.forget(slice(0, 3))  # place and heading
+
+    def forget(self, which: slice) -> "Running":
+        """The same, with a part of the state unknown."""
+        sources = self.sources.copy()
+        sources[:, which, :] = sources[:, :, which] = 0.0
+        sources[-1, which, which] = np.eye(which.stop - which.start) * UNKNOWN
+        return replace(self, sources=sources)
+
+    def heading_unknown(self) -> "Running":
+        """The same place, the instrument turned."""
+        return self.forget(slice(2, 3))
+
+    def elsewhere(self, f: Fix) -> "Running":
+        """The same instrument, with all that is known of its errors, at an unknown place in the plane of a fix."""
+        return replace(self.forget(slice(0, 3)), plane=Plane.at(f))
+
+    def add(self, f: Fix) -> tuple["Running", float]:
+        """With one more fix, and how many sigma that was from what was expected of it."""
+        now, own = self._at(f)
+        n, covariance = len(now.state), now.sources.sum(0)
+        seen = np.zeros((3, n))
+        seen[:, :3] = np.eye(3)
+        noise = np.zeros((len(own), 3, 3))
+        for k, t in enumerate(f.terms):
+            factor = self.plane.turned(f, t.factor)
+            if own[k]:
+                noise[k] = t.variance * factor @ factor.T
+            else:
+                seen[:, now.columns[k]] = factor
+        across = covariance @ seen.T
+        spread = seen @ across + noise.sum(0)
+        rest = self.plane.seen(f) - seen @ now.state
+        rest[2] = half_turn(rest[2] * UNIT[2]) / UNIT[2]
+        sigmas = float(np.sqrt(rest @ np.linalg.solve(spread, rest)))
+        if sigmas > HUBER_SIGMA:
+            spread += noise.sum(0) * (sigmas / HUBER_SIGMA - 1)
+            noise *= sigmas / HUBER_SIGMA
+        gain = np.linalg.solve(spread, across.T).T
+        kept = np.eye(n) - gain @ seen
+        sources = kept @ now.sources @ kept.T
+        sources[:-1] += gain @ noise @ gain.T
+        sources = (sources + sources.swapaxes(1, 2)) / 2
+        return replace(now, state=now.state + gain @ rest, sources=sources), sigmas
+
+    def _at(self, f: Fix) -> tuple["Running", np.ndarray]:
+        """The shared errors as they are at the time of a fix; and which of its terms are all its own (T,)."""
+        if tuple(t.name for t in f.terms) != self.names:
+            raise ValueError("fixes with other error terms: they are not of one program")
+        state, sources, keys = self.state.copy(), self.sources.copy(), list(self.keys)
+        own = np.array([t.shared is None for t in f.terms])
+        for k, t in enumerate(f.terms):
+            if own[k]:
+                continue
+            at = self.columns[k]
+            unit = np.eye(at.stop - at.start)
+            if set(keys[k]) & set(t.shared):
+                sources[k, at, at] += unit * t.walk_s * abs(f.utc_unix_s - self.utc_unix_s)
+            else:  # another error of the kind, not met before
+                state[at] = 0.0
+                sources[:, at, :] = sources[:, :, at] = 0.0
+                sources[k, at, at] = unit * t.variance
+            keys[k] = t.shared
+        later = max(self.utc_unix_s, f.utc_unix_s)
+        return replace(self, state=state, sources=sources, keys=tuple(keys), utc_unix_s=later), own
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Latitude, longitude, heading (rad)."""
+        latitude, longitude = self.plane.place(self.state[:2] * UNIT[:2])
+        heading = self.state[2] * UNIT[2] + self.plane.heading - self.plane.convergence(latitude, longitude)
+        return latitude, longitude, full_turn(heading)
+
+    def terms(self, like: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
+        """The budget of `place`, with factors (3, 3)."""
+        latitude, _ = self.plane.place(self.state[:2] * UNIT[:2])
+        return tuple(
+            ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), t.shared)
+            for t, source in zip(like, self.sources[:-1], strict=True)
+        )
+
+    def sigmas_apart(self, part: "Running") -> float:
+        """How far the place of `part`, which had some of these fixes only, is from this one, in sigma."""
+        apart = self.plane.across(*part.place[:2]) - self.state[:2]
+        # what a part errs beyond the whole is independent of it
+        beyond = (part.sources.sum(0) - self.sources.sum(0))[:2, :2]
+        values, vectors = np.linalg.eigh(beyond)
+        values = np.maximum(values, 1e-3 * np.trace(part.sources.sum(0)[:2, :2]))
+        return float(np.sqrt(np.sum((apart @ vectors) ** 2 / values)))
+
+
+def half_turn(angle: float) -> float:
+    """An angle in [-pi, pi)."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _zenith(latitude: float, longitude: float) -> np.ndarray:
+    c = np.cos(latitude)
+    return np.array([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)])
+
+
+def _axes(latitude: float, longitude: float) -> np.ndarray:
+    """East and north (2, 3) in ITRS."""
+    cl, sl, cp, sp = np.cos(longitude), np.sin(longitude), np.cos(latitude), np.sin(latitude)
+    return np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp]])
