@@ -2,6 +2,7 @@
 """Parameters, services and diagnostics of the running solver."""
 
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
         ({"refraction__pressure": math.inf}, "refraction.pressure must be a number from 0 to 120000 Pa"),
         ({"misalignment": [1.0, 2.0]}, "misalignment must be 3 values"),
         ({"calibration_url": "/nowhere/instrument.yaml"}, "/nowhere/instrument.yaml"),
+        ({"deflection__geoid": "/nowhere/egm.gtx"}, "/nowhere/egm.gtx GTX GeoTIFF"),
         ({"refraction__humidity": 1.5}, "refraction.humidity 0 1"),
         ({"min_stars": 2}, "min_stars 4 1000"),
         ({"clock_stddev": 0.5, "min_stars": 0}, "min_stars 4 1000"),
@@ -66,6 +68,23 @@ def test_deflection_and_altitude(graph, solver):
     assert (solution.longitude - fix.longitude) * 3600 * cos_phi == pytest.approx(-5, abs=1e-6)
     assert (fix.altitude, fix.position_covariance[8]) == (2410.0, 9.0)
     assert graph.set("solver", deflection__xi=0, deflection__eta=0, altitude=math.nan)[0]  # whole numbers do
+
+
+def test_a_geoid_tells_the_deflection_of_the_place_and_its_error(graph, solver, tmp_path):
+    path = tmp_path / "slope.gtx"
+    heights = np.broadcast_to(np.arange(176)[:, None], (176, 360))  # 1 m a degree to the north
+    path.write_bytes(struct.pack(">4d2i", -88, -180, 1, 1, 176, 360) + heights.astype(">f4").tobytes())
+    assert graph.set("solver", deflection__geoid=str(path)) == (True, "")
+    path.unlink()  # it is read once
+    done, reason = graph.set("solver", deflection__xi=10.0)
+    assert not done and "deflection.geoid" in reason
+    solution, fix, _ = graph.answer(shoot())
+    assert solution.xi == pytest.approx(-1.86, abs=0.02) and abs(solution.eta) < 1e-3
+    assert (solution.latitude - fix.latitude) * 3600 == pytest.approx(solution.xi, abs=1e-6)
+    widened = fix.position_covariance[4] - solution.covariance[4]
+    assert widened == pytest.approx((0.5 * 30.85) ** 2, rel=0.02)  # its least error, in m
+    assert graph.set("solver", deflection__geoid="")[0]
+    assert graph.call(Solve, "solver/solve", Solve.Request()).solution.xi == 0
 
 
 def test_reset_forgets(graph, solver):
