@@ -25,6 +25,6 @@ setup(
         "opencv-python-headless>=4.6",
         "PyYAML",
     ],
-    extras_require={"picture": ["matplotlib"], "test": ["pytest"]},
+    extras_require={"picture": ["matplotlib"], "report": ["matplotlib", "rosbags>=0.10"], "test": ["pytest"]},
     entry_points={"console_scripts": ["starpos = starpos.cli:main"]},
 )

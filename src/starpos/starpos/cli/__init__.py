@@ -15,6 +15,7 @@ COMMANDS = {
     "detect": "the stars of frames",
     "identify": "where frames look, lost in space",
     "calibrate": "the camera (and more of the instrument) from identified stars",
+    "report": "nights on one page: stability, scatter, residuals, sky, error budget",
     "simulate": "write a night of frames and tilts from a place you choose",
     "catalogue": "build the star catalogue, or say what it and its triangles hold",
     "montecarlo": "identify random fields with false stars, and count: the paper's table",

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos report`: what nights gave, as pictures and one page that opens anywhere."""
+
+import time
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+from starpos import catalogue
+from starpos.cli import common
+from starpos.errors import FrameError, InstrumentError
+from starpos.instrument import Instrument
+from starpos.report.night import Night
+from starpos.stars import Stars, no_stars
+from starpos.utc import utc_text
+
+NO_FIX = 1
+ALL_FIGURES = 6  # nights that have all their figures; of more there are the table and the errors
+PIP = "pip install 'starpos[report]'"
+
+
+def define(parser) -> None:
+    parser.add_argument(
+        "nights",
+        nargs="+",
+        metavar="NIGHT",
+        help="a folder of frames (FITS, or CSV of stars) with tilt.csv and perhaps truth.json, or a rosbag2",
+    )
+    parser.add_argument(
+        "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
+    )
+    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
+    parser.add_argument(
+        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
+    )
+    common.add_optics(parser)
+    parser.add_argument(
+        "--misalignment",
+        type=float,
+        nargs=3,
+        metavar=("RX", "RY", "RZ"),
+        help="A3 in deg: camera to inclinometer",
+    )
+    common.add_air(parser)
+    common.add_vertical(parser)
+    parser.add_argument(
+        "--self-calibrate",
+        action="store_true",
+        help="frames of one place at several headings: find A3 too, whatever it is",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args) -> int:
+    if find_spec("matplotlib") is None:
+        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
+    from starpos.report.page import page
+    from starpos.report.pictures import nights_picture, pictures_of
+    from starpos.report.writing import write
+
+    nights = [_night(Path(path), args) for path in args.nights]
+    for night in nights:
+        for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
+            common.complain("report", f"{night.name}: {sentence}")
+    bar, each = common.ProgressBar(), []
+    for k, night in enumerate(nights):
+        each.append(list(pictures_of(night, catalogue.load())) if len(nights) <= ALL_FIGURES else [])
+        bar("figures", (k + 1) / len(nights))
+    known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
+    overall = [nights_picture(known)] if len(nights) > 1 and known else []
+    html = page(nights, each, overall, utc_text(time.time())[:16].replace("T", " ") + " UTC")
+    files = {f"{p.name}.png": p.png for p in overall}
+    for k, pictures in enumerate(each, 1):
+        prefix = f"night{k}-" if len(nights) > 1 else ""
+        files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
+    write(Path(args.out), files | {"index.html": html.encode()})
+    print(Path(args.out) / "index.html")
+    return 0 if any(n.combined for n in nights) else NO_FIX
+
+
+def _night(path: Path, args) -> Night:
+    """One night worked through; StarposError where there is nothing to work on."""
+    from starpos.report import bag, folder, recorded
+    from starpos.report.working import Workshop, worked
+
+    shop = Workshop(
+        lambda stars: common.instrument_of(args, stars),
+        catalogue.load(),
+        common.atmosphere_of(args),
+        common.vertical_of(args),
+        args.self_calibrate,
+        common.ProgressBar(),
+    )
+    if not path.exists():
+        raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
+    if not bag.is_bag(path):
+        if path.is_file():
+            raise FrameError(
+                f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3): give one of these"
+            )
+        return worked(folder.exposures(path, _tilt_noise(args)), shop)
+    if find_spec("rosbags") is None:
+        raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
+    found = bag.read(path, args.namespace, _tilt_noise(args), shop.progress)
+    return recorded.night(found, replace(shop, instrument_for=_with_camera(args, found)))
+
+
+def _tilt_noise(args) -> float:
+    """rad, of a reading that does not tell its own; the focal length has no say in it."""
+    return _instrument(args).inclinometer.noise_rad
+
+
+def _instrument(args) -> Instrument:
+    """What the options say besides the camera."""
+    return common.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
+
+
+def _with_camera(args, found):
+    """Instruments whose camera is the bag's own for that size of frame, unless the options give a focal length."""
+
+    def instrument_for(stars: Stars) -> Instrument:
+        camera = found.cameras.get((stars.width, stars.height))
+        if args.focal_mm is not None or camera is None:
+            return common.instrument_of(args, stars)
+        return replace(_instrument(args), camera=camera, focal_px=camera.fx)
+
+    return instrument_for

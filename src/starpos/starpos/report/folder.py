@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A night in a folder, as `starpos simulate` writes it: frames or lists of stars, tilt.csv, perhaps truth.json."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starpos.detection import detect
+from starpos.errors import FrameError, TiltError
+from starpos.inclinometer import Tilt, read_tilt_csv
+from starpos.reading import FITS, read_frame
+from starpos.report.night import Truth
+from starpos.stars import Stars
+
+TILTS, TRUTH = "tilt.csv", "truth.json"
+TRUTH_LIMIT = 1 << 26
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A frame's stars, or why there are none; clock_stddev_s: of its time stamp, where that is told."""
+
+    name: str
+    stars: Stars | FrameError
+    clock_stddev_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """What is to be solved: `read` goes through the `count` exposures one at a time, as often as it is called.
+
+    tilt: of (mid_unix_s, exposure_s), raises TiltError.
+    """
+
+    name: str
+    origin: str
+    count: int
+    read: Callable[[], Iterator[Exposure]]
+    tilt: Callable[[float, float], Tilt]
+    truth: Truth | None = None
+
+
+def exposures(folder: Path, tilt_noise_rad: float) -> Exposures:
+    """The frames of a folder by name; FrameError where there are none, or truth.json is no truth.
+
+    FITS where there are any, else CSV: a picture without a time gives no place.  Where tilt.csv is missing each frame
+    says so.
+    """
+    frames = frames_in(folder)
+    try:
+        tilt = read_tilt_csv(folder / TILTS, tilt_noise_rad).average
+    except TiltError as error:
+        tilt = _no_tilt(str(error))
+
+    def read() -> Iterator[Exposure]:
+        for path in frames:
+            try:
+                item = read_frame(path)
+                yield Exposure(path.name, item if isinstance(item, Stars) else detect(item).stars)
+            except FrameError as error:
+                yield Exposure(path.name, error)
+
+    origin = f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}"
+    return Exposures(folder.name or str(folder), origin, len(frames), read, tilt, truth_in(folder))
+
+
+def frames_in(folder: Path) -> list[Path]:
+    """Paths by name, at least one; FrameError where there is none."""
+    try:
+        files = sorted(p for p in folder.iterdir() if p.is_file())
+    except OSError as e:
+        raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
+    frames = [p for p in files if p.suffix.lower() in FITS]
+    frames = frames or [p for p in files if p.suffix.lower() == ".csv" and p.name != TILTS]
+    if not frames:
+        raise FrameError(
+            f"{folder}: no frames in it: a night is a folder of FITS frames, or of CSV lists of stars, and {TILTS}"
+        )
+    return frames
+
+
+def truth_in(folder: Path) -> Truth | None:
+    """Of truth.json: latitude_deg, longitude_deg, and of its frames mid_unix_s and heading_deg; None without the file."""
+    path = folder / TRUTH
+    if not path.is_file():
+        return None
+    try:
+        if path.stat().st_size > TRUTH_LIMIT:
+            raise ValueError
+        content = json.loads(path.read_text(encoding="utf-8"))
+        place = [float(content[k]) for k in ("latitude_deg", "longitude_deg")]
+        frames = content.get("frames", [])
+        headings = tuple((float(f["mid_unix_s"]), float(np.radians(f["heading_deg"]))) for f in frames)
+        if not (np.isfinite(place).all() and np.isfinite(headings).all() and abs(place[0]) <= 90):
+            raise ValueError
+    except OSError as e:
+        raise FrameError(f"{path}: it cannot be read ({e.strerror})") from None
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        raise FrameError(
+            f"{path}: not what is true of a night: give latitude_deg and longitude_deg, or take the file away"
+        ) from None
+    return Truth(*np.radians(place).tolist(), headings)
+
+
+def _no_tilt(reason: str) -> Callable[[float, float], Tilt]:
+    def tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
+        raise TiltError(reason)
+
+    return tilt

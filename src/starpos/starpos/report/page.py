@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One HTML page that needs nothing else: its pictures are in it, it loads nothing, and text from files is only text."""
+
+import base64
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from starpos import __version__
+from starpos.report import measures
+from starpos.report.night import Night
+from starpos.report.pictures import Picture
+from starpos.report.style import figures_of
+from starpos.utc import utc_text
+
+LISTED = 200  # names of frames
+STYLE = """
+:root { color-scheme: light dark; --ink: #1d2329; --soft: #5a646e; --paper: #fbfbf9; --card: #ffffff; --line: #dcdfe2;
+  --bad: #b3401f; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e4e7ea; --soft: #a2abb3; --paper: #15181b; --card: #1d2125;
+  --line: #363c42; --bad: #ff9a76; } img { filter: invert(0.89) hue-rotate(180deg); } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 1.2rem; max-width: 80rem; background: var(--paper); color: var(--ink);
+  font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: anywhere; }
+h1 { font-size: 1.6rem; margin: .4rem 0; } h2 { font-size: 1.3rem; margin: 2.4rem 0 .6rem; }
+.place { font-size: 1.25rem; font-variant-numeric: tabular-nums; margin: .2rem 0; }
+.soft, figcaption, footer { color: var(--soft); font-size: .92rem; } .bad { color: var(--bad); }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; background: var(--card); font-variant-numeric: tabular-nums; }
+th, td { text-align: left; vertical-align: top; padding: .4rem .7rem; border: 1px solid var(--line); }
+th { font-weight: 600; width: 13rem; } thead th { width: auto; }
+.figures { display: grid; gap: 1.2rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 36rem), 1fr)); }
+figure { margin: 0; padding: .8rem; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
+figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; } figure div { overflow-x: auto; }
+img { display: block; width: 100%; min-width: 24rem; height: auto; background: #fff; }
+figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { cursor: pointer; }
+@media (max-width: 40rem) { th { width: 8rem; } body { padding: .7rem; } }
+@media print { img { filter: none; } }
+"""
+
+
+def page(
+    nights: Sequence[Night], each: Sequence[Sequence[Picture]], overall: Sequence[Picture], made_utc: str
+) -> str:
+    """The page; each: the pictures of every night, empty ones where there were too many; overall: of all nights."""
+    title = (
+        f"starpos report: {nights[0].name}" if len(nights) == 1 else f"starpos report: {len(nights)} nights"
+    )
+    parts = [f"<h1>{escape(title)}</h1>"]
+    if len(nights) > 1:
+        parts += [_table_of_nights(nights), _figures(overall)]
+    for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
+        if len(nights) > 1:
+            parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
+        parts += [_place(night), _summary(night), _figures(pictures)]
+    parts.append(
+        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}. Positions are astronomic unless said "
+        "otherwise; errors are 1 sigma. The paper is Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction of a "
+        "high resolution, portable and low-cost positioner by a star tracking system&rdquo;.</p></footer>"
+    )
+    body = "\n".join(parts)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="generator" content="starpos {escape(__version__)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+        "style-src 'unsafe-inline'\">\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _place(night: Night) -> str:
+    """The answer, or why there is none."""
+    if night.combined is None:
+        return f'<p class="place bad">No position: {escape(night.why_not)}</p>'
+    c = night.combined
+    east, north, heading = c.sigma
+    facing = "turned between the frames"
+    if np.isfinite(c.heading):
+        last = "last " if c.poses > 1 else ""
+        facing = f"{last}heading {np.degrees(c.heading):.4f} &plusmn; {np.degrees(heading):.4f}&deg;"
+    return (
+        f'<p class="place">{_degrees(c.latitude)}, {_degrees(c.longitude)} '
+        f"&plusmn; {north:.0f} m N {east:.0f} m E, {facing}</p>"
+    )
+
+
+def _degrees(angle: float) -> str:
+    """As `starpos solve` prints it."""
+    return f"{np.degrees(angle):+.6f}&deg;"
+
+
+def _summary(night: Night) -> str:
+    rows = []
+    if night.combined:
+        c = night.combined
+        rows.append(
+            (
+                "Astronomic (by gravity)",
+                f"{_sexagesimal(c.latitude, 'NS')}, {_sexagesimal(c.longitude, 'EW')}",
+            )
+        )
+        ground = c.on_ground(night.vertical)
+        sigma = np.sqrt(np.diag(ground.covariance))
+        rows.append((
+            "Geodetic, WGS 84",
+            f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)} &plusmn; {sigma[1]:.0f} m N {sigma[0]:.0f} m E, "
+            "the deflection of the vertical included",
+        ))  # fmt: skip
+        if np.isfinite(c.heading):
+            text = f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; astronomic"
+            last = f", of the last of {c.poses} poses" if c.poses > 1 else ""
+            rows.append(("Heading", f"{text}, {np.degrees(ground.heading):.4f}&deg; geodetic{last}"))
+        else:
+            rows.append(("Heading", "none in common: the instrument turned between the frames"))
+    if night.truth and night.combined:
+        rows.append(("Error against the truth", _error(night)))
+    used = len(night.fixed)
+    failed = Counter(s.status.value for s in night.shots if s.place is None)
+    counts = f"{used} with a fix" + "".join(f", {n} {escape(why)}" for why, n in failed.most_common())
+    rows.append(("Frames", f"{len(night.shots)}: {counts}"))
+    for why in failed:
+        first = next(s for s in night.shots if s.place is None and s.status.value == why)
+        rows.append((f"First &lsquo;{escape(why)}&rsquo;", escape(first.message)))
+    times = [s.utc_unix_s for s in night.shots if np.isfinite(s.utc_unix_s)]
+    if times:
+        rows.append(("From, to", f"{escape(utc_text(min(times)))}, {escape(utc_text(max(times)))}"))
+    if used:
+        rows += _of_fixes(night)
+    rows.append(("Source", escape(night.origin)))
+    rows += [("Note", escape(remark)) for remark in night.remarks]
+    cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>\n" for name, text in rows)
+    return f"<table>\n{cells}</table>\n{_names(night)}"
+
+
+def _of_fixes(night: Night) -> list[tuple[str, str]]:
+    shots = [s for _, s in night.fixed]
+
+    def median(values):
+        return float(np.median(values))
+
+    detected, matched = (median([getattr(s, k) for s in shots]) for k in ("stars_detected", "stars_matched"))
+    identify, fix = (1e3 * median([getattr(s, k) for s in shots]) for k in ("identify_s", "fix_s"))
+    s = measures.stability(night)
+    rows = [
+        ("Stars, median", f"{detected:.0f} detected, {matched:.0f} in the fix"),
+        ("Residual, median", f"{figures_of(median([x.residual_arcsec for x in shots]))}&Prime;"),
+        ("Time, median", f"{figures_of(identify)} ms identification, {figures_of(fix)} ms fix"),
+    ]
+    if len(shots) > 1:
+        lat, lon, _ = (figures_of(v) for v in s.mean_absolute)
+        rows.append(
+            (
+                "Mean absolute deviation",
+                f"latitude {lat}&Prime;, longitude {lon}&Prime;, each with its own tilt",
+            )
+        )
+    if night.steady is not None:
+        lat, lon, north = (figures_of(v) for v in measures.steadiness(night).mean_absolute)
+        rows.append((
+            "Stability",
+            f"latitude {lat}&Prime;, longitude {lon}&Prime;, north {north}&Prime; with one tilt for all (the paper's "
+            "0.526&Prime;, 1.70&Prime;, 6.34&Prime;)",
+        ))  # fmt: skip
+    return rows
+
+
+def _error(night: Night) -> str:
+    east, north = measures.offset_m(night.combined, night.truth.latitude, night.truth.longitude)
+    latitude, longitude = measures.error_arcsec(night)
+    return (
+        f"{figures_of(np.hypot(east, north))} m: {east:+.0f} m E {north:+.0f} m N, latitude {latitude:+.2f}&Prime;, "
+        f"longitude {longitude:+.2f}&Prime;"
+    )
+
+
+def _names(night: Night) -> str:
+    names = [s.name for s in night.shots]
+    more = f" ... and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    listed = escape(", ".join(names[:LISTED])) + more
+    summary = f"Input: {escape(night.name)}, {len(names)} frames"
+    return f'<details class="soft"><summary>{summary}</summary><p>{listed}</p></details>'
+
+
+def _table_of_nights(nights: Sequence[Night]) -> str:
+    head = "".join(
+        f"<th>{t}</th>" for t in ("", "Night", "Latitude, longitude", "1 sigma N, E", "Error", "Frames")
+    )
+    rows = []
+    for number, n in enumerate(nights, 1):
+        cells = ["", "", ""]
+        if n.combined:
+            east, north, _ = n.combined.sigma
+            place = f"{_degrees(n.combined.latitude)}, {_degrees(n.combined.longitude)}"
+            cells = [place, f"{north:.0f} m, {east:.0f} m", _error(n) if n.truth else ""]
+        else:
+            cells[0] = f'<span class="bad">{escape(n.why_not)}</span>'
+        name = f'<a href="#night{number}">{escape(n.name)}</a>'
+        row = [str(number), name, *cells, f"{len(n.fixed)} of {len(n.shots)}"]
+        rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>")
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n' + "\n".join(rows) + "</table></div>"
+
+
+def _figures(pictures: Sequence[Picture]) -> str:
+    if not pictures:
+        return ""
+    cards = "\n".join(
+        f'<figure><h3>{escape(p.title)}</h3><div><img alt="{escape(p.title)}" '
+        f'src="data:image/png;base64,{base64.b64encode(p.png).decode()}"></div>'
+        f"<figcaption>{escape(p.caption)}</figcaption></figure>"
+        for p in pictures
+    )
+    return f'<div class="figures">\n{cards}\n</div>'
+
+
+def _sexagesimal(angle: float, sides: str) -> str:
+    hundredths = round(abs(np.degrees(angle)) * 360_000)
+    seconds, hundredths = divmod(hundredths, 100)
+    minutes, seconds = divmod(seconds, 60)
+    degrees, minutes = divmod(minutes, 60)
+    side = sides[0] if angle >= 0 else sides[1]
+    return f"{degrees}&deg; {minutes:02d}&prime; {seconds:02d}.{hundredths:02d}&Prime; {side}"

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of the place: how steady the frames are, how they scatter, what the errors are made of, night by night."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from starpos.report import measures
+from starpos.report.measures import Stability
+from starpos.report.night import Night, Place
+from starpos.report.style import BLUE, GREEN, GREY, ORANGE, RED, SKY, figures_of, number_axis, plain
+
+MANY = 150  # points beyond which they are small and their bars a band
+SMALLEST_SHOWN = 1e-3  # m or arcsec
+DEFLECTION = "deflection (geodetic only)"
+
+
+def draw_stability(figure, s: Stability) -> None:
+    """Three panels, of latitude, longitude and heading in arcsec against the frame's number."""
+    panels = figure.subplots(3, 1, sharex=True)
+    names = ("latitude", "longitude", "north")
+    for k, (axes, name, paper) in enumerate(zip(panels, names, measures.PAPER_STABILITY, strict=True)):
+        plain(axes)
+        axes.axhline(0, color=GREY, lw=0.8)
+        if k == 2 and not s.heading_from:
+            axes.text(0.5, 0.5, "the instrument turned between the frames:\ntheir headings have no mean",
+                      ha="center", va="center", transform=axes.transAxes, color=GREY)  # fmt: skip
+            axes.set(yticks=[], ylabel="north")
+            continue
+        value, sigma = s.arcsec[:, k], s.sigma[:, k]
+        _with_errors(axes, s.number, value, sigma)
+        if k < 2 and s.outlier.any():
+            axes.plot(
+                s.number[s.outlier], value[s.outlier], "X", color=RED, ms=8, mec="white", label="outlier"
+            )
+            axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
+        if k == 2 and s.heading_from == "truth":
+            axes.set_title(
+                f"north, less the truth: mean absolute {figures_of(s.mean_absolute[k])}″", fontsize=10
+            )
+        else:
+            found = f"{name}: mean absolute deviation {figures_of(s.mean_absolute[k])}″"
+            axes.set_title(f"{found} (the paper's {figures_of(paper)}″)", fontsize=10)
+        axes.set_ylabel("arcsec")
+    number_axis(panels[-1], s.number)
+    panels[-1].set_xlabel("frame number")
+
+
+def _with_errors(axes, x, value, sigma) -> None:
+    """Points with bars of 1 sigma, or a band where there are many."""
+    many = len(x) > MANY
+    if many:
+        axes.fill_between(x, -sigma, sigma, color=SKY, alpha=0.3, lw=0, label="1 sigma")
+        axes.plot(x, value, ".", color=BLUE, ms=3)
+    else:
+        axes.errorbar(x, value, sigma, fmt="o", color=BLUE, ms=3.5, ecolor=SKY, elinewidth=1.2, capsize=0)
+    reach = max(1.06 * (np.abs(value) + (0 if many else sigma)).max(), 1.6 * np.median(sigma), 1e-3)
+    axes.set_ylim(-reach, reach)
+
+
+def draw_scatter(figure, night: Night) -> None:
+    """The fixes in m about the combined place, the ellipses of one frame's own errors and of the combined place."""
+    axes = figure.subplots()
+    latitude, longitude = measures.middle(night)
+    points = measures.around(night, latitude, longitude)
+    own = np.mean([s.place.own[:2, :2] for _, s in night.fixed], axis=0)
+    plain(axes)
+    reach = [np.abs(points).max(), 2.45 * np.sqrt(np.linalg.eigvalsh(own)[-1])]
+    _ellipses(axes, own, SKY, "one frame, its own errors", fill=True)
+    small = 5 if len(points) <= MANY else 2.5
+    axes.plot(*points.T, "o", color=BLUE, ms=small, mec="white", mew=0.4, label="frames", zorder=3)
+    if night.combined and len(points) > 1:
+        whole = night.combined.covariance[:2, :2]
+        _ellipses(axes, whole, ORANGE, "average, all errors", fill=False)
+        axes.plot(0, 0, "D", color=ORANGE, ms=7, mec="black", mew=0.6, label="average", zorder=4)
+        reach.append(2.45 * np.sqrt(np.linalg.eigvalsh(whole)[-1]))
+    if night.truth:
+        true = measures.offset_m(night.truth, latitude, longitude)
+        axes.plot(*true, "P", color=GREEN, ms=11, mec="black", mew=0.6, label="truth", zorder=5)
+        reach.append(np.abs(true).max())
+    limit = 1.12 * max(*reach, 0.01)
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), xlabel="east, m", ylabel="north, m")
+    axes.set_aspect("equal")
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+
+
+def _ellipses(axes, covariance: np.ndarray, colour: str, label: str, fill: bool) -> None:
+    """Of 39 % (1 sigma) and of 95 %."""
+    from matplotlib.patches import Ellipse
+
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    for squared, style, alpha, share in (
+        (measures.INSIDE_95, "--", 0.18, "95 %"),
+        (measures.INSIDE_1_SIGMA, "-", 0.3, "39 %"),
+    ):
+        height, width = 2 * np.sqrt(squared * np.maximum(values, 0))
+        how = {"fc": colour, "ec": "none", "alpha": alpha} if fill else {"fc": "none", "ec": colour}
+        axes.add_patch(
+            Ellipse((0, 0), width, height, angle=angle, ls=style, lw=1.6, label=f"{label}, {share}", **how)
+        )
+
+
+def draw_budget(figure, night: Night) -> None:
+    """Bars of 1 sigma, east and north in m and heading in arcsec, of one frame and of the average, largest on top."""
+    one = _shares(night.fixed[0][1].place, night)
+    places = [("one frame", one, SKY)]
+    if night.combined and len(night.fixed) > 1:
+        places.append((f"average of {len(night.fixed)}", _shares(night.combined, night), BLUE))
+    names = sorted(one, key=lambda n: np.hypot(*one[n][:2]))
+    panels = figure.subplots(1, 3, sharey=True)
+    height = 0.8 / len(places)
+    for k, (axes, title) in enumerate(zip(panels, ("east, m", "north, m", "heading, arcsec"), strict=True)):
+        plain(axes)
+        axes.grid(axis="y", visible=False)
+        values = [[shares.get(n, np.zeros(3))[k] for n in names] for _, shares, _ in places]
+        top = np.nanmax(values, initial=1e-9)
+        low = max(top * 1e-4, min((v for row in values for v in row if v > 0), default=top) / 2)
+        for j, ((label, _, colour), row) in enumerate(zip(places, values, strict=True)):
+            at = np.arange(len(names)) + (len(places) / 2 - 0.5 - j) * height
+            axes.barh(at, np.maximum(np.nan_to_num(row), low), height, color=colour, label=label)
+            for y, value in zip(at, row, strict=True):
+                axes.text(
+                    max(np.nan_to_num(value), low) * 1.15,
+                    y,
+                    _short(value),
+                    va="center",
+                    fontsize=7,
+                    color="#333333",
+                )
+        axes.set_xscale("log")
+        axes.set_xlim(low, top * 12)
+        axes.set_xlabel(title)
+    panels[0].set_yticks(np.arange(len(names)), [n.replace(" (", "\n(") for n in names])
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=9, frameon=False)
+
+
+def _short(value: float) -> str:
+    if np.isnan(value):
+        return "none"
+    return "0" if value == 0 else figures_of(value, 2) if value >= SMALLEST_SHOWN else f"< {SMALLEST_SHOWN:g}"
+
+
+def _shares(place: Place, night: Night) -> dict[str, np.ndarray]:
+    """1 sigma (3,) of each source: east m, north m, heading arcsec; NaN where there is no heading."""
+    unit = np.array([1, 1, 1 / measures.ARCSEC])
+    shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}
+    deflection = place.on_ground(night.vertical).covariance - place.covariance
+    shares = {name: share for name, share in shares.items() if share.max() >= SMALLEST_SHOWN}
+    shares[DEFLECTION] = np.sqrt(np.maximum(np.diag(deflection), 0)) * unit
+    if np.isnan(place.heading):
+        shares = {name: np.array([*share[:2], np.nan]) for name, share in shares.items()}
+    return shares
+
+
+def draw_nights(figure, nights: Sequence[tuple[int, Night]]) -> None:
+    """Error of latitude and longitude in arcsec of the numbered nights whose truth is known, at least one."""
+    number = [k for k, _ in nights]
+    error = np.array([measures.error_arcsec(n) for _, n in nights])
+    sigma = np.array([measures.sigma_arcsec(n.combined) for _, n in nights])
+    panels = figure.subplots(2, 1, sharex=True)
+    for k, (axes, name, paper) in enumerate(
+        zip(panels, ("latitude", "longitude"), measures.PAPER_NIGHTS, strict=True)
+    ):
+        plain(axes)
+        axes.axhline(0, color=GREY, lw=0.8)
+        axes.axhspan(-paper, paper, color=GREY, alpha=0.1, lw=0, label="the paper's mean absolute error")
+        axes.errorbar(number, error[:, k], sigma[:, k], fmt="o", color=BLUE, ms=5, ecolor=SKY, elinewidth=1.5)
+        reach = 1.15 * max(paper, (np.abs(error[:, k]) + sigma[:, k]).max())
+        mean = figures_of(np.abs(error[:, k]).mean())
+        axes.set_title(f"{name}: mean absolute error {mean}″ (the paper's {paper:.1f}″)", fontsize=10)
+        axes.set(ylim=(-reach, reach), ylabel="arcsec")
+    panels[0].legend(loc="upper right", fontsize=8, framealpha=0.9)
+    number_axis(panels[-1], number)
+    panels[-1].set_xlabel("night")

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag's part to a Night: solved anew where stars and tilts are both there, else what the solver said is shown."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from starpos.budget import ErrorTerm
+from starpos.errors import InstrumentError, TiltError
+from starpos.inclinometer import Tilt
+from starpos.report.bag import Recorded, star_lists
+from starpos.report.folder import Exposure, Exposures
+from starpos.report.measures import offset_m, turn
+from starpos.report.messages import exposure_of
+from starpos.report.night import Night, Place
+from starpos.report.working import Workshop, why_none, worked
+from starpos.rotation import full_turn
+
+
+def night(recorded: Recorded, shop: Workshop) -> Night:
+    """The night of a bag; StarposError where nothing in it can be worked on."""
+    r = recorded
+    if r.star_count and (r.tilts or not r.solutions):
+        try:
+            solved = worked(_exposures(r), shop)
+            return replace(solved, remarks=(*r.remarks, *solved.remarks, *_against_recorded(solved, r)))
+        except InstrumentError:
+            if not r.solutions:
+                raise
+    return _as_recorded(r, shop)
+
+
+def _exposures(r: Recorded) -> Exposures:
+    def read_stars() -> Iterator[Exposure]:
+        return map(exposure_of, star_lists(r))
+
+    def no_tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
+        raise TiltError(f"{r.path}: no usable tilt in it: record the topic tilt too")
+
+    tilt = r.tilts.average if r.tilts else no_tilt
+    origin = f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}"
+    return Exposures(r.name, origin, r.star_count, read_stars, tilt, r.truth)
+
+
+def _against_recorded(solved: Night, r: Recorded) -> tuple[str, ...]:
+    """A remark where the solver said something else at the time."""
+    if solved.combined is None or not any(s.place for s in r.solutions):
+        return ()
+    said = _bound([s.place for s in r.solutions if s.place])
+    apart = np.hypot(*offset_m(said, solved.combined.latitude, solved.combined.longitude))
+    if apart < np.hypot(*solved.combined.sigma[:2]):
+        return ()
+    return (
+        f"the solver's own solutions in the bag lie {apart:.0f} m from these: it had another A3, calibration or air than "
+        "these options give",
+    )
+
+
+def _as_recorded(r: Recorded, shop: Workshop) -> Night:
+    places = [s.place for s in r.solutions if s.place]
+    remark = (
+        "the error of the mean is that of one frame, an upper bound: a recorded solution does not tell how its errors go "
+        "with those of others"
+    )
+    return Night(
+        r.name,
+        f"as the solver recorded it in the bag {r.path.name}, namespace {r.namespace}",
+        r.solutions,
+        _bound(places) if places else None,
+        "" if places else why_none(r.solutions),
+        r.deflection or shop.vertical,
+        shop.atmosphere,
+        r.truth,
+        remarks=(*r.remarks, remark) if len(places) > 1 else r.remarks,
+    )
+
+
+def _bound(places: list[Place]) -> Place:
+    """The plain mean; its covariance is never more than the mean of theirs, however they go together."""
+    seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
+    away = turn(seen - seen[0])
+    mean = seen[0] + away.mean(0)
+    still = np.ptp(away[:, 2]) < 10 * np.median([p.sigma[2] for p in places]) or len(places) == 1
+    names = [t.name for t in places[0].terms]
+    terms = [
+        ErrorTerm(t.name, np.sqrt(np.mean([p.terms[k].factor ** 2 for p in places], axis=0)), t.shared)
+        for k, t in enumerate(places[0].terms)
+        if all([u.name for u in p.terms] == names for p in places)
+    ]
+    return Place(
+        float(np.mean([p.utc_unix_s for p in places])),
+        float(mean[0]),
+        float(turn(mean[1])),
+        full_turn(mean[2]) if still else float("nan"),
+        np.mean([p.covariance for p in places], axis=0),
+        tuple(terms),
+    )

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the figures look: one size, one palette, and a Figure to a PNG without any global state of matplotlib."""
+
+import io
+
+import numpy as np
+
+from starpos import __version__
+
+WIDTH_IN, DPI = 7.2, 130
+# Okabe and Ito's, told apart by all eyes
+BLUE, ORANGE, GREEN, RED, SKY, PURPLE, GREY = (
+    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#6e6e6e"
+)  # fmt: skip
+MADE_BY = f"starpos {__version__} report"
+
+
+def new_figure(height_in: float):
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
+
+
+def png_of(figure) -> bytes:
+    """The Figure as PNG, which says who made it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=DPI, metadata={"Software": MADE_BY})
+    return out.getvalue()
+
+
+def plain(axes) -> None:
+    """A quiet frame and grid."""
+    axes.grid(alpha=0.25, lw=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)
+
+
+def number_axis(axes, numbers) -> None:
+    """Whole numbers along x, with room at both ends."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = min(numbers), max(numbers)
+    margin = max(0.5, 0.03 * (high - low))
+    axes.set_xlim(low - margin, high + margin)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=10, integer=True, min_n_ticks=1))
+
+
+def figures_of(value: float, digits: int = 3) -> str:
+    """A number to so many significant digits, without an exponent where it can be read without."""
+    if not np.isfinite(value):
+        return "unknown"
+    if value == 0:
+        return "0"
+    decimals = digits - 1 - int(np.floor(np.log10(abs(value))))
+    return f"{value:.{max(0, decimals)}f}" if -3 < decimals < 8 else f"{value:.{digits - 1}e}"

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposures to a Night: every frame solved, all of them averaged."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos.atmosphere import Atmosphere
+from starpos.average import average
+from starpos.budget import heading_of, place_of
+from starpos.catalogue import Catalogue
+from starpos.errors import FixError
+from starpos.fix import Fix
+from starpos.inclinometer import a2_matrix
+from starpos.instrument import Instrument
+from starpos.progress import Progress, quiet
+from starpos.report.folder import Exposure, Exposures
+from starpos.report.measures import turn as wrapped
+from starpos.report.night import NO_TILT, Night, Place, Shot
+from starpos.solve import Solution, Solver, Status
+from starpos.stars import Stars
+from starpos.turning import turn
+from starpos.utc import utc_text
+from starpos.vertical import Vertical
+
+STILL_SIGMA = 8.0  # readings further than this from their mean say that the camera was moved
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What solving needs besides the exposures; instrument_for: of a frame's stars, raises InstrumentError."""
+
+    instrument_for: Callable[[Stars], Instrument]
+    catalogue: Catalogue
+    atmosphere: Atmosphere
+    vertical: Vertical
+    self_calibrate: bool = False
+    progress: Progress = quiet
+
+    def solver(self, stars: Stars, clock_stddev_s: float) -> Solver:
+        instrument = self.instrument_for(stars)
+        if clock_stddev_s:
+            clock = float(np.hypot(instrument.clock_stddev_s, clock_stddev_s))
+            instrument = replace(instrument, clock_stddev_s=clock)
+        return Solver(instrument, self.catalogue, self.atmosphere, progress=self.progress)
+
+
+def worked(exposures: Exposures, shop: Workshop) -> Night:
+    """The night of these exposures; InstrumentError where no frame can have one."""
+    solve = _turned if shop.self_calibrate else _one_by_one
+    shots, fixes, instrument, remarks = [], [], None, ()
+    for done, (exposure, solution, used, said) in enumerate(solve(exposures, shop), 1):
+        shots.append(_shot(exposure, solution))
+        if solution.fix:
+            fixes.append(solution.fix)
+            instrument = used
+        remarks = (*remarks, *said)
+        shop.progress(exposures.name[:20], done / exposures.count)
+    combined, why_not, said = _combined(fixes, shots)
+    night = Night(
+        exposures.name,
+        exposures.origin,
+        shots,
+        combined,
+        why_not,
+        shop.vertical,
+        shop.atmosphere,
+        exposures.truth,
+        remarks=(*remarks, *said),
+    )
+    return replace(night, steady=_steady(night, instrument)) if combined else night
+
+
+def _one_by_one(exposures: Exposures, shop: Workshop) -> Iterator:
+    """(Exposure, Solution, Instrument, remarks) of each frame."""
+    standing = None
+    for exposure in exposures.read():
+        if not isinstance(exposure.stars, Stars):
+            yield exposure, _unreadable(exposure), None, ()
+            continue
+        solver = shop.solver(exposure.stars, exposure.clock_stddev_s)
+        solution = solver.solve(exposure.stars, exposures.tilt, standing)
+        standing = solution.standing or standing
+        yield exposure, solution, solver.instrument, ()
+
+
+def _turned(exposures: Exposures, shop: Workshop) -> Iterator:
+    """The same of all frames together, with the A3 that they tell."""
+    rows = list(exposures.read())
+    good = [e for e in rows if isinstance(e.stars, Stars)]
+    answers, instrument, said = iter(()), None, ()
+    if good:
+        solver = shop.solver(good[0].stars, good[0].clock_stddev_s)
+        instrument = solver.instrument
+        try:
+            turned = turn(solver, [e.stars for e in good], exposures.tilt, shop.progress)
+            answers, instrument = iter(turned.solutions), turned.instrument
+            angles = " ".join(f"{a:.5f}" for a in instrument.calibration.misalignment_deg)
+            said = (
+                f"A3 was found from the headings: --misalignment {angles}, the plumb line in the camera to "
+                f"{turned.plumb_stddev_arcsec:.2f} arcsec",
+            )
+        except FixError as error:
+            answers = (Solution.failed(e.stars, Status.POOR_FIT, str(error)) for e in good)
+    for k, exposure in enumerate(rows):
+        solution = next(answers) if isinstance(exposure.stars, Stars) else _unreadable(exposure)
+        yield exposure, solution, instrument, said if k == 0 else ()
+
+
+def _unreadable(exposure: Exposure) -> Solution:
+    return Solution(Status.BAD_INPUT, str(exposure.stars), exposure.name, None, 0)
+
+
+def _shot(exposure: Exposure, s: Solution) -> Shot:
+    """What the report keeps of a solution."""
+    stars, fix = exposure.stars, s.fix
+    seen = {}
+    if s.star is not None:
+        seen["xy"] = np.stack([stars.x, stars.y], -1)[s.star]
+        seen["magnitudes"] = s.magnitudes
+    if fix:
+        seen |= {
+            "place": Place.of(fix),
+            "residual_px": -fix.residual_px,
+            "residual_arcsec": fix.residual_arcsec,
+            "camera_to_itrs": fix.camera_to_itrs,
+        }
+    elif s.attitude:
+        seen["residual_arcsec"] = s.attitude.residual_arcsec
+    return Shot(
+        exposure.name,
+        s.status,
+        s.message,
+        float("nan") if s.utc_unix_s is None else s.utc_unix_s,
+        pointing=s.attitude,
+        size=(stars.width, stars.height) if isinstance(stars, Stars) else None,
+        stars_detected=s.stars_detected,
+        stars_matched=len(s.names),
+        tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
+        identify_s=s.identify_s,
+        fix_s=s.fix_s,
+        **seen,
+    )
+
+
+def _combined(fixes: Sequence[Fix], shots: Sequence[Shot]) -> tuple[Place | None, str, list[str]]:
+    """The average; else a sentence why not; and what there is to say of it."""
+    if not fixes:
+        return None, why_none(shots), []
+    try:
+        whole = average(fixes)
+    except FixError as error:
+        return None, str(error), []
+    said = []
+    if whole.left_out:
+        said.append(
+            f"{whole.left_out} frames are not in the average: they lie further from it than their errors allow"
+        )
+    if whole.moved:
+        since = utc_text(whole.began_unix_s)
+        said.append(
+            f"the instrument was moved: the average is of its last place, {whole.frames} frames since {since}"
+        )
+    return Place.of(whole), "", said
+
+
+def why_none(shots: Sequence[Shot]) -> str:
+    """A sentence for a night without a fix."""
+    if not shots:
+        return "there is no frame in it"
+    return f"none of its {len(shots)} frames gave a fix; the first: {shots[0].message}"
+
+
+def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
+    """Night.steady: the fixes with the mean tilt of the night for each; None where the camera did not stand still."""
+    tilts = np.array([s.tilt for _, s in night.fixed])
+    headings = np.array([s.place.heading for _, s in night.fixed])
+    own = np.array([s.place.own for _, s in night.fixed])
+    moved = np.abs(tilts - np.median(tilts, axis=0)).max() * 6.371e6
+    noise = np.sqrt(np.median(np.trace(own[:, :2, :2], axis1=1, axis2=2) / 2))
+    turned = np.abs(wrapped(headings - headings[0])).max()
+    if len(tilts) < 3 or moved > STILL_SIGMA * noise + 1.0 or turned > np.radians(1.0):
+        return None
+    g = a2_matrix(*tilts.mean(0)) @ instrument.mounting.a3
+    steady = []
+    for _, shot in night.fixed:
+        place = place_of(g @ shot.camera_to_itrs.T)
+        link_to_enu = place.local_to_enu @ g @ instrument.mounting.link_to_camera
+        steady.append((place.latitude, place.longitude, heading_of(link_to_enu)))
+    return np.array(steady)

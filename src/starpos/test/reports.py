@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nights to report on and pages to look into, for the tests of the report."""
+
+import base64
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+
+from starpos.cli import main
+
+OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
+PLACE = {"latitude": 47.3, "longitude": -122.8}
+
+
+def simulate(folder, *more, frames=6, place=PLACE):
+    """A folder of lists of stars, tilt.csv and truth.json."""
+    at = [f"--{k}={v}" for k, v in place.items()]
+    wide = ("--stars-only", "--size", "1000", "700", *OPTICS, *AIR)
+    assert main(["simulate", str(folder), "-n", str(frames), *wide, *at, *map(str, more)]) == 0
+    return folder
+
+
+def run(capsys, *args):
+    """Exit status, standard output, lines of standard error."""
+    capsys.readouterr()
+    try:
+        status = main([str(a) for a in args])
+    except SystemExit as e:
+        status = e.code
+    said = capsys.readouterr()
+    return status, said.out, said.err.splitlines()
+
+
+def solved(capsys, night, *more):
+    """What `starpos solve` says of all frames together."""
+    frames = sorted(night.glob("stars_*.csv"))
+    _, out, _ = run(capsys, "solve", *frames, "--tilt", night / "tilt.csv", "--json", *more)
+    return json.loads(out.splitlines()[-1])
+
+
+class Page(HTMLParser):
+    """The text of a page, what it refers to, and its pictures (bytes of PNG by title)."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.text, self.references, self.pictures, self.tags = "", [], {}, set()
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.tags.add(tag)
+        self.references += [attributes[k] for k in ("src", "href", "srcset", "action") if k in attributes]
+        if tag == "img":
+            kind, _, data = attributes["src"].partition(",")
+            assert kind == "data:image/png;base64"
+            self.pictures[attributes["alt"]] = base64.b64decode(data, validate=True)
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def assert_drawn(png):
+    """A PNG that decodes and is not blank."""
+    import cv2
+
+    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None and min(pixels.shape[:2]) > 300
+    assert 0.003 < np.mean(pixels.min(2) < 200) < 0.6  # ink on white

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos report` on folders: the numbers of `starpos solve`, a page that needs nothing else, failures that say why."""
+
+import json
+import re
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
+
+from starpos.atmosphere import Atmosphere
+from starpos.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument import Instrument
+from starpos.report import folder, measures
+from starpos.report.working import Workshop, worked
+from starpos.vertical import Deflection
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """Twelve frames of a camera that stands still."""
+    return simulate(tmp_path_factory.mktemp("still") / "a still night", "--cadence", 30, frames=12)
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """Four frames at several headings, A3 off by half a degree."""
+    misaligned = ("--turn", 80, "--misalignment", 0.5, -0.3, 0.2)
+    return simulate(tmp_path_factory.mktemp("turned") / "turned", *misaligned, frames=4)
+
+
+def report(capsys, night, out, *more):
+    nights = night if isinstance(night, list) else [night]
+    status, said, errors = run(capsys, "report", *nights, "-o", out, *OPTICS, *AIR, *more)
+    return status, (Page(out / "index.html") if said else None), errors
+
+
+def shop(catalogue):
+    return Workshop(
+        lambda stars: Instrument(29.67e3 / 6.4), catalogue, Atmosphere(100000.0, 5.0, 0.3), Deflection()
+    )
+
+
+def numbers_after(page, text):
+    found = re.search(re.escape(text) + r"(.{0,160})", page.text, re.S)
+    return [float(n) for n in re.findall(r"[+-]?\d+\.?\d*", found.group(1))]
+
+
+def test_the_page_says_what_solve_says(still, tmp_path, capsys):
+    status, page, errors = report(capsys, still, tmp_path / "out")
+    want = solved(capsys, still, *OPTICS, *AIR)
+    assert (status, errors) == (0, [])
+    place = f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}° ± {want['sigma_north_m']:.0f} m N"
+    assert place in page.text
+    assert f"heading {want['heading']:.4f} ± {want['sigma_heading_deg']:.4f}°" in page.text
+    ground = f"{want['latitude_geodetic']:+.6f}°, {want['longitude_geodetic']:+.6f}°"
+    assert ground in page.text
+    assert "12: 12 with a fix" in page.text and "stars_0011.csv" in page.text
+    east = (want["longitude"] - PLACE["longitude"]) * 111320 * np.cos(np.radians(PLACE["latitude"]))
+    north = (want["latitude"] - PLACE["latitude"]) * 111195
+    assert numbers_after(page, "Error against the truth")[0] == pytest.approx(np.hypot(east, north), rel=0.02)
+
+
+def test_the_page_needs_nothing_else(still, tmp_path, capsys):
+    _, page, _ = report(capsys, still, tmp_path / "out")
+    assert page.references and all(r.startswith(("data:image/png;base64,", "#")) for r in page.references)
+    assert not page.tags & {"script", "link", "iframe", "object", "form"}
+    assert not re.search(r"https?:|url\(|@import", page.source)
+
+
+def test_pictures_are_drawn_and_lie_beside_the_page(still, tmp_path, capsys):
+    _, page, _ = report(capsys, still, tmp_path / "out")
+    names = {p.stem for p in (tmp_path / "out").glob("*.png")}
+    assert names == {"stability", "frames", "scatter", "budget", "residuals", "sky", "health"}
+    files = {(tmp_path / "out" / f"{n}.png").read_bytes() for n in names}
+    assert files == set(page.pictures.values())
+    for png in files:
+        assert_drawn(png)
+
+
+def test_one_tilt_for_all_takes_the_inclinometers_noise_away(still, catalogue):
+    night = worked(folder.exposures(still, SCA100T_NOISE_RAD), shop(catalogue))
+    tilts = np.array([s.tilt for _, s in night.fixed])
+    own, steady = measures.stability(night).arcsec, measures.steadiness(night).arcsec
+    # what the tilts did to latitude and longitude is what was taken away, and it is all there is between the two
+    design = np.column_stack([tilts - tilts.mean(0), np.ones(len(tilts))])
+    for axis in range(2):
+        rest = own[:, axis] - steady[:, axis]
+        told = design @ np.linalg.lstsq(design, rest, rcond=None)[0]
+        assert np.abs(rest - told).max() < 0.02 * np.abs(rest).max()
+    assert np.abs(own).max() > 3.0
+
+
+def test_a_turned_night_has_no_mean_heading_but_that_of_the_truth(turned, tmp_path, capsys):
+    misalignment = ("--misalignment", 0.5, -0.3, 0.2)
+    status, page, _ = report(capsys, turned, tmp_path / "out", *misalignment)
+    assert status == 0
+    assert "Stability: one tilt" not in page.text
+    assert "last heading" in page.text
+
+
+def test_self_calibration_is_said(turned, tmp_path, capsys):
+    status, page, errors = report(capsys, turned, tmp_path / "out", "--self-calibrate")
+    want = solved(capsys, turned, *OPTICS, *AIR, "--self-calibrate")
+    assert status == 0
+    assert "A3 was found from the headings: --misalignment" in page.text
+    assert any("A3 was found" in line for line in errors)
+    assert f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°" in page.text
+
+
+def test_several_nights_are_held_against_their_truths(still, turned, tmp_path, capsys):
+    other = simulate(tmp_path / "other", "--seed", 5, place={"latitude": -33.9, "longitude": 18.4}, frames=2)
+    status, page, errors = report(capsys, [still, other], tmp_path / "out")
+    assert (status, errors) == (0, [])
+    assert "2 nights" in page.text and "Error of the nights" in page.pictures
+    assert {"night1-scatter.png", "night2-scatter.png", "nights.png"} <= {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
+    for png in page.pictures.values():
+        assert_drawn(png)
+    for night in (still, other):
+        want = solved(capsys, night, *OPTICS, *AIR)
+        assert page.text.count(f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°") >= 2
+
+
+def test_names_from_files_are_text_only(still, tmp_path, capsys):
+    evil = tmp_path / '<img src=x onerror="alert(1)"> & <b>'
+    shutil.copytree(still, evil)
+    (evil / "stars_0000.csv").rename(evil / "stars_<i>&quot;.csv")
+    (evil / "a<u>.csv").write_text("no stars <em>at all</em>\n")
+    status, page, _ = report(capsys, evil, tmp_path / "out")
+    assert status == 0
+    assert not page.tags & {"b", "i", "u", "em"}
+    assert '<img src=x onerror="alert(1)"> & <b>' in page.text and "stars_<i>&quot;.csv" in page.text
+    assert all(r.startswith("data:image/png") for r in page.references)
+
+
+def test_without_tilts_the_page_says_so_and_there_is_no_fix(still, tmp_path, capsys):
+    night = tmp_path / "night"
+    shutil.copytree(still, night)
+    (night / "tilt.csv").unlink()
+    status, page, errors = report(capsys, night, tmp_path / "out")
+    assert status == 1
+    assert "No position: none of its 12 frames gave a fix" in page.text
+    assert "12 no tilt" in page.text and "tilt.csv: there is no such file" in page.text
+    assert len(errors) == 1 and "tilt.csv" in errors[0]
+    assert list(page.pictures) == ["Frame by frame"]
+    assert_drawn(page.pictures["Frame by frame"])
+
+
+def test_one_frame_is_a_night(still, tmp_path, capsys):
+    night = tmp_path / "night"
+    night.mkdir()
+    for name in ("stars_0003.csv", "tilt.csv"):
+        shutil.copy(still / name, night)
+    status, page, errors = report(capsys, night, tmp_path / "out")
+    assert (status, errors) == (0, [])
+    assert "Error against the truth" not in page.text
+    assert {"Scatter of the fixes", "Error budget", "Residuals over the frame"} <= set(page.pictures)
+
+
+def test_frames_that_fail_are_counted_with_their_reason(still, tmp_path, capsys):
+    night = tmp_path / "night"
+    shutil.copytree(still, night)
+    head = (night / "stars_0002.csv").read_text().splitlines()[:2]
+    (night / "stars_0002.csv").write_text("\n".join(head) + "\n")
+    (night / "stars_0005.csv").write_text("nothing\n")
+    (night / "stars_0007.csv").write_text(
+        (night / "stars_0007.csv").read_text().replace('"DATE-OBS"', '"DATE-NONE"')
+    )
+    status, page, _ = report(capsys, night, tmp_path / "out")
+    assert status == 0
+    assert "12: 9 with a fix, 2 bad input, 1 too few stars" in page.text
+    assert_drawn(page.pictures["Frame by frame"])
+
+
+@pytest.mark.parametrize("kind", ["nothing", "empty", "file", "truth"])
+def test_what_is_no_night_is_refused_in_one_line(kind, still, tmp_path, capsys):
+    night = tmp_path / "night"
+    if kind == "empty":
+        night.mkdir()
+    elif kind == "file":
+        night.write_text("no night")
+    elif kind == "truth":
+        shutil.copytree(still, night)
+        (night / "truth.json").write_text(json.dumps({"latitude_deg": "north", "longitude_deg": None}))
+    status, page, errors = report(capsys, night, tmp_path / "out")
+    assert (status, page, len(errors)) == (2, None, 1)
+    assert str(night) in errors[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_of_somebody_else_is_not_overwritten(still, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "index.html").write_text("<h1>mine</h1>")
+    status, _, errors = report(capsys, still, out)
+    assert (status, len(errors)) == (2, 1)
+    assert [p.name for p in out.iterdir()] == ["index.html"]
+    assert (out / "index.html").read_text() == "<h1>mine</h1>"
+
+
+def test_its_own_report_is_overwritten_whole(still, turned, tmp_path, capsys):
+    out = tmp_path / "out"
+    report(capsys, still, out)
+    first = (out / "scatter.png").read_bytes()
+    status, page, _ = report(capsys, turned, out, "--misalignment", 0.5, -0.3, 0.2)
+    assert status == 0 and "turned" in page.text
+    assert (out / "scatter.png").read_bytes() != first
+    assert not [p for p in out.iterdir() if p.name.startswith(".")]
+
+
+def test_where_nothing_can_be_written_one_line_says_so(still, tmp_path, capsys):
+    blocked = tmp_path / "blocked"
+    blocked.write_text("a file, no folder")
+    status, _, errors = run(capsys, "report", still, "-o", blocked / "out", *OPTICS, *AIR)
+    assert (status, len(errors)) == (2, 1)
+    assert "cannot be written" in errors[0]
+
+
+def test_without_matplotlib_the_pip_line_is_said(still, tmp_path, capsys, monkeypatch):
+    from starpos.cli import report as command
+
+    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    status, _, errors = report(capsys, still, tmp_path / "out")
+    assert (status, len(errors)) == (2, 1)
+    assert "pip install 'starpos[report]'" in errors[0]
+
+
+def test_a_report_leaves_matplotlib_as_it_was(still, tmp_path, capsys):
+    import matplotlib
+
+    settings = {k: v for k, v in matplotlib.rcParams.items() if k != "backend"}  # a look at that one sets it
+    pyplot = sys.modules.pop("matplotlib.pyplot", None)
+    report(capsys, still, tmp_path / "out")
+    assert "matplotlib.pyplot" not in sys.modules
+    assert {k: v for k, v in matplotlib.rcParams.items() if k != "backend"} == settings
+    if pyplot:
+        sys.modules["matplotlib.pyplot"] = pyplot
