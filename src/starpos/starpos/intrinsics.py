@@ -328,7 +328,7 @@ class _Problem:
 
     def step(self, state: _State, covariance: np.ndarray, keep: np.ndarray):
         """One of Gauss and Newton: dq (U,), turns (F, 3), and the covariance of q (U, U)."""
-        weight = np.linalg.cholesky(np.linalg.inv(covariance)) * keep[:, None, None]
+        weight = np.linalg.cholesky(_inverse(covariance)) * keep[:, None, None]
         of_q, of_turn = self.derivatives(state)
         jq, jt = (np.einsum("nki,nkj->nij", weight, j) for j in (of_q, of_turn))
         r = np.einsum("nki,nk->ni", weight, self.residual(state))
@@ -401,7 +401,13 @@ def _settled(problem: _Problem) -> _Settled:
 
 
 def _distance2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    return np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
+    return np.einsum("ni,nij,nj->n", residual, _inverse(covariance), residual)
+
+
+def _inverse(covariance: np.ndarray) -> np.ndarray:
+    """Of symmetric matrices (N, 2, 2): written out, ten times as quick as LAPACK's."""
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    return np.stack([c, -b, -b, a], -1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
 
 
 def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess, freedom: float) -> float:

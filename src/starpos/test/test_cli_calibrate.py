@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos calibrate --camera`: the file it writes, what it prints, what it refuses."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from lenses import FIELDS, night, random_camera, values
+
+from starpos import camera_yaml
+from starpos.cli import main
+from starpos.intrinsics import PARAMETERS
+from starpos.night import write_stars
+from starpos.utc import utc_text
+
+AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
+OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10")  # 2750 px: 25 deg
+
+
+@pytest.fixture(scope="module")
+def skies(tmp_path_factory, catalogue):
+    """A camera, the folder of four star lists of it and of their tilts; C is the inclinometer's frame."""
+    rng = np.random.default_rng(26)
+    true = random_camera(25, rng)
+    lists, levels = night(true, 4, catalogue, rng, FIELDS[25][2])
+    folder = tmp_path_factory.mktemp("skies")
+    tilts = ["utc_unix_s,theta_x_deg,theta_y_deg"]
+    for k, (stars, level) in enumerate(zip(lists, levels, strict=True)):
+        write_stars(folder / f"{k}.csv", stars, utc_text(stars.mid_unix_s - stars.exposure_s / 2).rstrip("Z"))
+        x, y = np.degrees(np.arcsin(level[2, :2]))
+        tilts.append(f"{stars.mid_unix_s},{x:.7f},{y:.7f}")
+    (folder / "tilt.csv").write_text("\n".join(tilts) + "\n")
+    return true, folder
+
+
+@pytest.fixture
+def run(capsys):
+    def of(*args):
+        capsys.readouterr()
+        try:
+            status = main([str(a) for a in args])
+        except SystemExit as e:
+            status = e.code
+        said = capsys.readouterr()
+        return status, said.out, said.err.splitlines()
+
+    return of
+
+
+def frames(folder: Path) -> list[Path]:
+    return sorted(folder.glob("?.csv"))
+
+
+def test_the_file_holds_the_camera_the_table_says_how_well(skies, run, tmp_path):
+    true, folder = skies
+    out = tmp_path / "new" / "camera.yaml"
+    status, said, errors = run(
+        "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", *OPTICS, *AIR, "--camera", out, "--map",
+        tmp_path / "map.png",
+    )  # fmt: skip
+    assert (status, errors) == (0, [])
+    camera = camera_yaml.read(out)
+    first, *table, last = said.splitlines()
+    assert first.startswith("4 frames, ")
+    assert [line.split()[0] for line in table] == list(PARAMETERS)
+    sigma = np.array([float(line.split()[3]) for line in table])
+    shown = np.array([float(line.split()[1]) for line in table])
+    assert (np.abs(shown - values(camera)) < 0.6 * sigma).all()
+    assert (np.abs(values(camera) - values(true)) < 4.2 * sigma).all()
+    assert all(line.endswith("told by the sky") for line in table)
+    assert "px where they are worst" in last
+    comment = [line for line in out.read_text().splitlines() if line.startswith("#")]
+    rows = np.array([[float(v) for v in line[1:].split()] for line in comment[-9:]])
+    np.testing.assert_allclose(np.sqrt(np.diag(rows)), sigma, rtol=0.06)
+    assert cv2.imread(str(tmp_path / "map.png")) is not None
+
+
+def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
+    true, folder = skies
+    status, said, errors = run(
+        "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", *OPTICS, *AIR, "--camera",
+        tmp_path / "camera.yaml", "--json",
+    )  # fmt: skip
+    assert (status, errors) == (0, [])
+    answer = json.loads(said)
+    camera = camera_yaml.read(tmp_path / "camera.yaml")
+    found = [*(answer[k] for k in ("fx", "fy", "cx", "cy")), *answer["distortion"]]
+    np.testing.assert_array_equal(found, values(camera))
+    covariance = np.array(answer["covariance"])
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [answer["sigma"][p] for p in PARAMETERS])
+    z = np.linalg.solve(np.linalg.cholesky(covariance), found - values(true))
+    assert (z @ z) < 40
+    assert answer["told"] == list(PARAMETERS)
+    assert answer["frames"] == 4
+    assert answer["stars"] > 200
+    assert answer["rms_px"] < 0.3 * answer["rms_before_px"]
+
+    instrument = tmp_path / "instrument.yaml"
+    instrument.write_text("starpos_instrument: 1\ncamera: {calibration: camera.yaml}\n")
+    status, said, _ = run(
+        "solve", *frames(folder), "--tilt", folder / "tilt.csv", "--instrument", instrument, *AIR, "--json"
+    )
+    assert status == 0
+    ideal = run("solve", *frames(folder), "--tilt", folder / "tilt.csv", *OPTICS, *AIR, "--json")[1]
+    better, worse = (json.loads(text.splitlines()[0])["residual_arcsec"] for text in (said, ideal))
+    assert better < 0.5 * worse
+    # and to begin with, where it stays what it is
+    status, said, _ = run(
+        "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", "--instrument", instrument, *AIR, "--camera",
+        tmp_path / "again.yaml", "--json",
+    )  # fmt: skip
+    again = values(camera_yaml.read(tmp_path / "again.yaml"))
+    assert (np.abs(again - found) < 0.3 * np.sqrt(np.diag(covariance))).all()
+
+
+def test_without_tilts_it_says_what_that_costs(skies, run, tmp_path):
+    true, folder = skies
+    out = tmp_path / "camera.yaml"
+    status, said, errors = run("calibrate", *frames(folder), *OPTICS, *AIR, "--camera", out, "--json")
+    assert status == 0
+    (line,) = errors
+    assert line.startswith(
+        "starpos calibrate: without --tilt how refraction shrinks the field is not known: "
+    )
+    assert "ppm" in line
+    answer = json.loads(said)
+    assert abs(answer["fx"] - true.fx) < 4 * answer["sigma"]["fx"]
+    assert answer["sigma"]["fx"] > 5e-5 * true.fx
+
+
+def test_a_frame_without_a_tilt_and_one_that_is_none(skies, run, tmp_path):
+    _, folder = skies
+    tilts = tmp_path / "tilt.csv"
+    tilts.write_text("\n".join((folder / "tilt.csv").read_text().splitlines()[:-1]) + "\n")
+    args = ("--tilt", tilts, *OPTICS, *AIR, "--camera", tmp_path / "camera.yaml")
+    status, said, errors = run("calibrate", *frames(folder), tmp_path / "none.fits", *args)
+    assert status == 2  # a camera, but one frame could not be read
+    assert said.startswith("3 frames, ")
+    assert len(errors) == 2
+    assert "none.fits: there is no such file" in errors[0]
+    assert "3.csv is left out: no tilt reading" in errors[1]
+    status, said, errors = run("calibrate", frames(folder)[-1], *args)
+    assert (status, said) == (1, "")
+    assert "no frame has a tilt" in errors[-1]
+
+
+REFUSED = {
+    "nothing": ((), 2, "give --camera OUT.yaml"),
+    "no focal length": (("--camera", "OUT"), 2, "no focal length"),
+    "wrong focal length": (("--camera", "OUT", "--focal-mm", "40", "--pixel-um", "10"), 1, "none of the sky fits any"),
+    "two instruments": (("--camera", "OUT", *OPTICS, "--instrument", "x.yaml"), 2, "give either"),
+    "no such instrument": (("--camera", "OUT", "--instrument", "x.yaml"), 2, "x.yaml: not a readable"),
+    "no such tilts": (("--camera", "OUT", *OPTICS, "--tilt", "x.csv"), 2, "x.csv"),
+    "no place for it": (("--camera", "/dev/null/camera.yaml", *OPTICS), 2, "cannot be written there"),
+    "no place for the map": (("--camera", "OUT", *OPTICS, "--map", "/dev/null/map.png"), 2, "map.png: the map cannot"),
+    "no kind of map": (("--camera", "OUT", *OPTICS, "--map", "OUT.docx"), 2, "docx: the map cannot"),
+    "air beyond air": (("--camera", "OUT", *OPTICS, "--pressure-hpa", "1e9"), 2, "pressure"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_refused_in_a_line(kind, skies, run, tmp_path):
+    _, folder = skies
+    options, expected, words = REFUSED[kind]
+    options = [o.replace("OUT", str(tmp_path / "camera.yaml")) for o in options]
+    status, said, errors = run("calibrate", *frames(folder), *options)
+    assert (status, said) == (expected, "")
+    assert words in errors[-1]
+    assert errors[-1].startswith("starpos calibrate: ")
+
+
+def test_no_calibration_no_file(skies, run, tmp_path):
+    _, folder = skies
+    out = tmp_path / "camera.yaml"
+    status, _, _ = run("calibrate", *frames(folder), "--focal-mm", "40", "--pixel-um", "10", "--camera", out)
+    assert status == 1
+    assert not out.exists()
