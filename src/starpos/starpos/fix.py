@@ -5,11 +5,9 @@ The equation is the paper's (15), A2 A3 W = A4 A1 V, with refraction in L and th
 residuals are taken in pixels, where the errors of the stars live.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from starpos import rotation
 from starpos.atmosphere import Atmosphere, Refraction
@@ -19,11 +17,10 @@ from starpos.earth import EarthState, station_velocity
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.mounting import Mounting
+from starpos.scatter import judged
 
-OUTLIER_SIGMA = 5.0
 MAX_ROUNDS = 6
 MAX_SCATTER = 0.003  # of the frame's diagonal: identified stars that scatter more are not these stars
-MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
 MIN_STARS = 3
 STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
 STEP_REFRACTION = 0.01
@@ -116,12 +113,9 @@ def solve_fix(
         if settled:
             break
         residual, before = problem.residual(state), (keep, jitter2)
-        # by the median, else an outlier among a dozen stars would widen the gate enough to pass itself
-        typical = _extra_variance(
-            residual[keep], stated[keep], lambda d2, share: np.median(d2) / MEDIAN_OF_CHI2 - share
-        )
-        jitter2 = _extra_variance(residual[keep], stated[keep], lambda d2, share: d2.mean() / 2 - share)
-        keep = _distance2(residual, stated, typical) < OUTLIER_SIGMA**2
+        # of the stars' 2 N coordinates the four parameters leave free
+        share = max(1 - 2 / keep.sum(), 1 / keep.sum())
+        jitter2, keep = judged(residual, stated, keep, share)
         settled = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
     if jitter2 > (MAX_SCATTER * np.hypot(camera.width, camera.height)) ** 2:
         raise FixError(
@@ -154,33 +148,6 @@ def solve_fix(
         camera_to_itrs=state.a4.T @ problem.g,
         attitude_sigma=float(np.sqrt(np.linalg.eigvalsh(errors.rotation_covariance(centroids))[-1])),
     )
-
-
-def _distance2(residual: np.ndarray, covariance: np.ndarray, extra: float) -> np.ndarray:
-    """Squared residuals (N,) in units of their covariance and an extra isotropic variance (px2)."""
-    (x, y), xx, xy, yy = (
-        residual.T,
-        covariance[:, 0, 0] + extra,
-        covariance[:, 0, 1],
-        covariance[:, 1, 1] + extra,
-    )
-    return (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-
-
-def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callable) -> float:
-    """The isotropic variance (px2) at which excess(squared distances, share of freedom) is 0; 0 where it never is above.
-
-    The share: of the stars' 2 N coordinates, those that the four parameters of the fit leave free.
-    """
-    share = max(1 - 2 / len(residual), 1 / len(residual))
-
-    def above(extra):
-        return excess(_distance2(residual, covariance, extra), share)
-
-    if above(0.0) <= 0:
-        return 0.0
-    high = 8 * np.sum(residual**2) + 1e-12
-    return float(brentq(above, 0.0, high, xtol=1e-12, rtol=1e-3)) if above(high) < 0 else float(high)
 
 
 @dataclass(frozen=True)

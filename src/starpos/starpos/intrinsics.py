@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
 
 from starpos import rotation
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.scatter import distance2, judged
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 # 1 sigma of the priors about the given camera: mean focal length, fx over fy, principal point (of the longer side), and
@@ -30,8 +30,6 @@ TOLD = 0.5  # of the prior's sigma: below it the sky has told a parameter
 BEYOND_PRIOR = 5.0  # sigma: no camera as it was given
 FEWEST_STARS = 20
 MAX_SCATTER_PX = 1.5
-OUTLIER_SIGMA = 5.0
-MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
 MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6  # the last in sigma of the priors
 STEP_RAD = 1e-6  # of the numerical derivatives for the attitudes
 BORDER = 25  # points a side at which a camera is checked and its error told
@@ -347,7 +345,7 @@ class _Problem:
         return dq, pulled - solved @ dq, inverse
 
     def cost(self, state: _State, covariance: np.ndarray, keep: np.ndarray) -> float:
-        d2 = _distance2(self.residual(state)[keep], covariance[keep])
+        d2 = distance2(self.residual(state)[keep], covariance[keep])
         total = d2.sum() + state.q @ state.q
         return float(total) if np.isfinite(total) else np.inf
 
@@ -388,38 +386,15 @@ def _settled(problem: _Problem) -> _Settled:
             break
         residual, before = problem.residual(state), (keep, jitter2)
         freedom = max(1 - unknowns / (2 * keep.sum()), 0.05)
-        # by the median, else an outlier among few stars would widen the gate enough to pass itself
-        typical = _extra_variance(
-            residual[keep], problem.stated[keep], lambda d2, s: np.median(d2) / MEDIAN_OF_CHI2 - s, freedom
-        )
-        jitter2 = _extra_variance(
-            residual[keep], problem.stated[keep], lambda d2, s: d2.mean() / 2 - s, freedom
-        )
-        keep = _distance2(residual, problem.stated + np.eye(2) * typical) < OUTLIER_SIGMA**2
+        jitter2, keep = judged(residual, problem.stated, keep, freedom)
         settled = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
     return _Settled(state, covariance, keep, jitter2)
-
-
-def _distance2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    return np.einsum("ni,nij,nj->n", residual, _inverse(covariance), residual)
 
 
 def _inverse(covariance: np.ndarray) -> np.ndarray:
     """Of symmetric matrices (N, 2, 2): written out, ten times as quick as LAPACK's."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return np.stack([c, -b, -b, a], -1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
-
-
-def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess, freedom: float) -> float:
-    """The isotropic variance (px2) at which excess(squared distances, freedom) is 0; 0 where it never is above."""
-
-    def above(extra):
-        return excess(_distance2(residual, covariance + np.eye(2) * extra), freedom)
-
-    if above(0.0) <= 0:
-        return 0.0
-    high = 8 * np.sum(residual**2) + 1e-12
-    return float(brentq(above, 0.0, high, rtol=1e-3)) if above(high) < 0 else float(high)
 
 
 def _derivatives(camera: Camera, xy: np.ndarray, names: Sequence[str]) -> np.ndarray:
