@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes rosbag2 files of a simulated night as the nodes would have filled them, for the tests of reading them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+MESSAGES = Path(__file__).resolve().parents[3] / "starpos_interfaces" / "msg"
+EMPTY = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+
+
+def typestore():
+    """ROS's types and ours; the test skips where ours are not beside this package."""
+    if not MESSAGES.is_dir():
+        pytest.skip("starpos_interfaces is not beside this package")
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for text in MESSAGES.glob("*.msg"):
+        store.register(get_types_from_msg(text.read_text(), f"starpos_interfaces/msg/{text.stem}"))
+    return store
+
+
+class Recorder:
+    """A bag in the making, MCAP unless told otherwise; topics lie in `namespace`."""
+
+    def __init__(self, path, namespace="", plugin=StoragePlugin.MCAP):
+        self.store, self.namespace, self._connections = typestore(), namespace, {}
+        self._writer = Writer(path, version=9, storage_plugin=plugin)
+
+    def __enter__(self):
+        self._writer.open()
+        return self
+
+    def __exit__(self, *exception):
+        self._writer.close()
+
+    def message(self, name, unix_s=0.0, /, **fields):
+        """One of starpos_interfaces, or of another package by its full name; all that is not given is 0."""
+        kind = name if "/" in name else f"starpos_interfaces/msg/{name}"
+        seconds, micro = divmod(round(unix_s * 1e6), 1_000_000)
+        made = self._blank(kind)
+        if hasattr(made, "header"):
+            made.header.stamp.sec, made.header.stamp.nanosec = seconds, micro * 1000
+        for field, value in fields.items():
+            assert hasattr(made, field)
+            setattr(made, field, value)
+        return made
+
+    def write(self, topic, message, unix_s):
+        topic, kind = f"{self.namespace}/{topic}", message.__msgtype__
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.store)
+        data = self.store.serialize_cdr(message, kind)
+        self._writer.write(self._connections[topic], round(unix_s * 1e9), data)
+
+    def camera(self, focal_px, width, height):
+        k = np.array([focal_px, 0, (width - 1) / 2, 0, focal_px, (height - 1) / 2, 0, 0, 1])
+        name = "sensor_msgs/msg/CameraInfo"
+        made = self.message(
+            name, width=width, height=height, distortion_model="plumb_bob", k=k, d=np.zeros(5)
+        )
+        self.write("camera/camera_info", made, 1.0)
+
+    def stars(self, stars):
+        rows = [
+            self.message("Star", x=x, y=y, flux=f, snr=s, covariance=c.ravel(), flags=int(g))
+            for x, y, f, s, c, g in zip(
+                stars.x.tolist(), stars.y.tolist(), stars.flux.tolist(), stars.snr.tolist(), stars.covariance,
+                stars.flags, strict=True,
+            )
+        ]  # fmt: skip
+        about = {"width": stars.width, "height": stars.height, "exposure": stars.exposure_s}
+        self.write(
+            "stars", self.message("StarArray", stars.mid_unix_s, stars=rows, **about), stars.mid_unix_s
+        )
+
+    def tilts(self, log):
+        """A TiltLog."""
+        for at, x, y, warm in zip(log.utc_unix_s, log.theta_x, log.theta_y, log.temperature_c, strict=True):
+            self.write("tilt", self.message("Tilt", at, x=x, y=y, temperature=warm), at)
+
+    def solution(self, unix_s, solved):
+        """From what `starpos solve --json` says of a frame."""
+        terms = [
+            self.message("ErrorTerm", name=name, east=e, north=n, heading=h, common=name != "tilt")
+            for name, (e, n, h) in solved["budget"].items()
+            if "geodetic" not in name
+        ]
+        given = {
+            k: solved[k]
+            for k in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading")
+        }
+        given |= {k: np.ravel(solved[k]).astype(float) for k in ("covariance", "covariance_geodetic")}
+        given |= {k: solved[k] for k in ("stars_detected", "stars_matched", "log_odds")}
+        made = self.message("Solution", unix_s, budget=terms, residual=solved["residual_arcsec"], **given)
+        self.write("solver/solution", made, unix_s)
+
+    def failure(self, unix_s, status, text):
+        """A Solution without a fix."""
+        nothing = np.full(9, np.nan)
+        about = {"status": status, "status_text": text, "covariance": nothing, "covariance_geodetic": nothing}
+        nan = dict.fromkeys(("latitude", "longitude", "heading", "right_ascension", "residual"), float("nan"))
+        self.write("solver/solution", self.message("Solution", unix_s, **about, **nan), unix_s)
+
+    def _blank(self, kind):
+        _, fields = self.store.fielddefs[kind]
+        return self.store.types[kind](**{name: self._empty(definition) for name, definition in fields})
+
+    def _empty(self, definition):
+        node, about = definition
+        if node == Nodetype.BASE:
+            return EMPTY.get(about[0], 0)
+        if node == Nodetype.NAME:
+            return self._blank(about)
+        (element, inner), length = about
+        count = length if node == Nodetype.ARRAY else 0
+        if element == Nodetype.BASE and inner[0] != "string":
+            return np.zeros(count, inner[0])
+        return [self._empty((element, inner)) for _ in range(count)]

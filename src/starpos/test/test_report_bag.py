@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos report` on a rosbag2: the answer of the same night in files, what the solver said, and bags that are none."""
+
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reports import AIR, OPTICS, Page, assert_drawn, run, simulate, solved
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("rosbags")
+
+from bags import Recorder, typestore
+from rosbags.rosbag2 import StoragePlugin
+
+from starpos.inclinometer import read_tilt_csv
+from starpos.reading import read_frame
+
+RECORDED = Path(__file__).resolve().parents[3] / "test" / "data" / "night"
+FOCAL_PX = 29.67e3 / 6.4
+NOT_IDENTIFIED = 2
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """Six frames in files."""
+    return simulate(tmp_path_factory.mktemp("night") / "night", "--cadence", 30)
+
+
+@pytest.fixture(scope="module")
+def lists(night):
+    return [read_frame(path) for path in sorted(night.glob("stars_*.csv"))]
+
+
+@pytest.fixture(scope="module")
+def tilts(night):
+    """As they are after they went through messages, whose stamps are whole microseconds."""
+    return read_tilt_csv(night / "tilt.csv")
+
+
+def record(path, lists, tilts, **how):
+    with Recorder(path, **how) as bag:
+        bag.camera(FOCAL_PX, 1000, 700)
+        for stars in lists:
+            bag.stars(stars)
+        if tilts is not None:
+            bag.tilts(tilts)
+    return path
+
+
+def report(capsys, bag, out, *more):
+    status, said, errors = run(capsys, "report", bag, "-o", out, *AIR, *more)
+    return status, (Page(out / "index.html") if said else None), errors
+
+
+def place(want):
+    return (
+        f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}° ± {want['sigma_north_m']:.0f} m N "
+        f"{want['sigma_east_m']:.0f} m E, heading {want['heading']:.4f} ± {want['sigma_heading_deg']:.4f}°"
+    )
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_gives_what_solve_gives_of_the_same_night(plugin, night, lists, tilts, tmp_path, capsys):
+    bag = record(tmp_path / "bag", lists, tilts, plugin=plugin)
+    status, page, errors = report(capsys, bag, tmp_path / "out")
+    assert (status, errors) == (0, [])
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert "6: 6 with a fix" in page.text and "solved from stars and tilt of the bag" in page.text
+    for png in page.pictures.values():
+        assert_drawn(png)
+
+
+def test_one_file_of_a_bag_is_a_bag(night, lists, tilts, tmp_path, capsys):
+    bag = record(tmp_path / "bag", lists, tilts)
+    (file,) = bag.glob("*.mcap")
+    status, page, _ = report(capsys, file, tmp_path / "out")
+    assert status == 0
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+
+
+def test_the_recorded_night_of_the_repository(tmp_path, capsys):
+    if not RECORDED.is_dir():
+        pytest.skip("the repository's bag is not beside this package")
+    truth = json.loads(RECORDED.with_suffix(".json").read_text())
+    air = ("--pressure-hpa", truth["pressure_pa"] / 100, "--temperature-c", truth["temperature_c"],
+           "--humidity", truth["humidity"])  # fmt: skip
+    about = (*air, "--misalignment", *truth["misalignment_deg"])
+    status, _, errors = run(capsys, "report", RECORDED, "-o", tmp_path / "out", *about)
+    page = Page(tmp_path / "out" / "index.html")
+    assert (status, errors) == (0, [])
+    assert "10: 10 with a fix" in page.text
+    latitude, longitude = page.text.split("starpos report: night")[-1].split("°")[:2]
+    assert float(latitude) == pytest.approx(truth["latitude_deg"], abs=3e-4)
+    assert float(longitude.strip(" ,")) == pytest.approx(truth["longitude_deg"], abs=4e-4)
+
+
+def test_of_several_instruments_one_is_chosen(night, lists, tilts, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        for bag.namespace in ("/north", "/far/south"):
+            bag.camera(FOCAL_PX, 1000, 700)
+            bag.tilts(tilts)
+            for stars in lists[: 6 if bag.namespace == "/north" else 2]:
+                bag.stars(stars)
+    status, _, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert (status, len(errors)) == (2, 1)
+    assert "/far/south, /north" in errors[0] and "--namespace" in errors[0]
+    status, _, errors = report(capsys, tmp_path / "bag", tmp_path / "out", "--namespace", "west")
+    assert (status, len(errors)) == (2, 1)
+    status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", "--namespace", "north")
+    assert status == 0
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    _, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", "--namespace", "/far/south")
+    assert "2: 2 with a fix" in page.text
+
+
+@pytest.fixture
+def said(night, capsys):
+    """What `starpos solve` says of each frame."""
+    frames = sorted(night.glob("stars_*.csv"))
+    _, out, _ = run(
+        capsys, "solve", *frames, "--tilt", night / "tilt.csv", "--json", *OPTICS, *AIR, "--eta", "20"
+    )
+    return [json.loads(line) for line in out.splitlines()[:-1]]
+
+
+def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        for stars, one in zip(lists, said, strict=True):
+            bag.solution(stars.mid_unix_s, one)
+        bag.failure(lists[-1].mid_unix_s + 5.0, NOT_IDENTIFIED, "none of the sky fits <its> stars")
+    status, page, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert status == 0
+    latitude, longitude = (np.mean([one[k] for one in said]) for k in ("latitude", "longitude"))
+    assert f"{latitude:+.6f}°, {longitude:+.6f}° ± " in page.text
+    assert "as the solver recorded it" in page.text and "none of the sky fits <its> stars" in page.text
+    assert "7: 6 with a fix, 1 not identified" in page.text
+    assert any("upper bound" in line for line in errors)
+    assert {"Each frame with its own tilt", "Scatter of the fixes", "Error budget", "Frame by frame"} == set(
+        page.pictures
+    )
+    for png in page.pictures.values():
+        assert_drawn(png)
+
+
+def test_the_mean_of_recorded_solutions_claims_no_more_than_one(said, lists, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        for stars, one in zip(lists, said, strict=True):
+            bag.solution(stars.mid_unix_s, one)
+    _, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out")
+    sigma = np.sqrt(np.mean([np.diag(one["covariance"]) for one in said], axis=0))
+    assert f"± {sigma[1]:.0f} m N {sigma[0]:.0f} m E" in page.text
+
+
+def test_a_solver_that_said_something_else_is_remarked(said, lists, tilts, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        bag.camera(FOCAL_PX, 1000, 700)
+        bag.tilts(tilts)
+        for stars, one in zip(lists, said, strict=True):
+            bag.stars(stars)
+            bag.solution(stars.mid_unix_s, one)
+    status, _, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert (status, errors) == (0, [])
+    status, page, errors = report(capsys, tmp_path / "bag", tmp_path / "out", "--misalignment", 0.3, 0.2, 0.1)
+    assert status == 0
+    assert "another A3" in page.text and "another A3" in errors[0]
+
+
+def test_stars_without_tilts_give_no_fix_and_say_why(lists, tmp_path, capsys):
+    bag = record(tmp_path / "bag", lists[:2], None)
+    status, page, errors = report(capsys, bag, tmp_path / "out")
+    assert (status, len(errors)) == (1, 1)
+    assert "no usable tilt in it" in page.text and "2 no tilt" in page.text
+
+
+def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        bag.camera(FOCAL_PX, 1000, 700)
+        for stars in lists:
+            bag.stars(stars)
+        bag.tilts(tilts)
+        wrong = [{"flags": 2}, {"x": float("nan")}, {"y": 1.0}, {"covariance": np.array([1.0, 0, 0, -1.0])}]
+        for stars in lists:
+            for k, broken in enumerate(wrong):
+                at = stars.mid_unix_s + 0.01 * k
+                bag.write("tilt", bag.message("Tilt", at, **{"x": 0.1, "y": 0.1} | broken), at)
+    status, page, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert status == 0
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert f"{4 * len(lists)} tilts of the bag were left out" in errors[0]
+
+
+def test_a_bag_without_a_camera_takes_the_options(night, lists, tilts, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        bag.tilts(tilts)
+        for stars in lists:
+            bag.stars(stars)
+    status, _, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert (status, len(errors)) == (2, 1)
+    assert "focal" in errors[0]
+    status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", *OPTICS)
+    assert status == 0
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+
+
+def without_definitions(bag):
+    """As a recorder before Iron leaves a db3."""
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as db:
+        db.execute("DELETE FROM message_definitions")
+        db.execute("DROP TABLE message_definitions")
+        db.execute("UPDATE schema SET schema_version = 3")
+    db.close()
+    return bag
+
+
+def test_definitions_a_bag_lacks_come_from_the_workspace(night, lists, tilts, tmp_path, capsys, monkeypatch):
+    bag = without_definitions(record(tmp_path / "bag", lists, tilts, plugin=StoragePlugin.SQLITE3))
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "")
+    status, _, errors = report(capsys, bag, tmp_path / "out")
+    assert (status, len(errors)) == (2, 1)
+    assert "does not hold the definition of starpos_interfaces/msg/" in errors[0]
+    prefix = tmp_path / "workspace"
+    typestore()
+    shutil.copytree(
+        RECORDED.parents[2] / "starpos_interfaces" / "msg", prefix / "share/starpos_interfaces/msg"
+    )
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{prefix}")
+    status, page, _ = report(capsys, bag, tmp_path / "out")
+    assert status == 0
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "metadata", "other"])
+def test_what_is_no_bag_is_refused_in_one_line(damage, lists, tilts, tmp_path, capsys):
+    bag = record(tmp_path / "bag", lists, tilts) if damage != "other" else tmp_path / "bag"
+    if damage == "other":
+        with Recorder(bag) as other:
+            other.camera(FOCAL_PX, 1000, 700)
+    elif damage == "metadata":
+        (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2\n")
+    else:
+        (file,) = bag.glob("*.mcap")
+        whole = file.read_bytes()
+        file.write_bytes(whole[: len(whole) // 2] if damage == "cut" else b"\0" * 1000)
+    status, _, errors = report(capsys, bag, tmp_path / "out")
+    assert (status, len(errors)) == (2, 1)
+    assert str(bag) in errors[0]
+
+
+def test_broken_star_lists_cost_their_frame_only(night, lists, tilts, tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as bag:
+        bag.camera(FOCAL_PX, 1000, 700)
+        bag.tilts(tilts)
+        for stars in lists:
+            bag.stars(stars)
+        at = lists[-1].mid_unix_s + 1
+        rows = [bag.message("Star", x=float("nan"), y=3.0, flux=1.0, snr=1.0)]
+        bag.write("stars", bag.message("StarArray", at, width=1000, height=700, stars=rows), at)
+    status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert status == 0
+    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert "7: 6 with a fix, 1 bad input" in page.text
+
+
+def test_without_rosbags_the_pip_line_is_said(lists, tilts, tmp_path, capsys, monkeypatch):
+    from starpos.cli import report as command
+
+    bag = record(tmp_path / "bag", lists, tilts)
+    monkeypatch.setattr(command, "find_spec", lambda name: None if name == "rosbags" else name)
+    status, _, errors = report(capsys, bag, tmp_path / "out")
+    assert (status, len(errors)) == (2, 1)
+    assert "pip install 'starpos[report]'" in errors[0]
