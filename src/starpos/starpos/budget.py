@@ -201,5 +201,5 @@ def _of_inclinometer(
             level * errors.temperature_rad_per_c * (warmer if np.isfinite(warmer) else 0.0),
             ALWAYS,
         ),
-        ErrorTerm("tilt scale", level * theta * errors.scale, ALWAYS),
+        ErrorTerm("tilt scale", level * (theta - mounting.calibrated_tilt) * errors.scale, ALWAYS),
     )

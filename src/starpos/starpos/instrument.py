@@ -25,13 +25,15 @@ class Calibration:
 
     misalignment_deg: A3 = R3(rz) R2(ry) R1(rx), active, C into S.  covariance_arcsec2 (3, 3): of A3 as a small rotation
     about S's axes, the inclinometer's zero included.  utc_unix_s, temperature_c: when it was found and how warm the
-    inclinometer was, NaN where nobody knows; from `frames` frames; older than valid_days it is stale.
+    inclinometer was, NaN where nobody knows; tilt_deg: how it leaned, from which on an error of its scale counts; from
+    `frames` frames; older than valid_days it is stale.
     """
 
     misalignment_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     covariance_arcsec2: tuple = tuple(map(tuple, np.eye(3) * UNSTATED_CALIBRATION_ARCSEC**2))
     utc_unix_s: float = float("nan")
     temperature_c: float = float("nan")
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
     frames: int = 0
     valid_days: float = float("inf")
 
@@ -39,11 +41,12 @@ class Calibration:
         for name, numbers in (
             ("misalignment_deg", self.misalignment_deg),
             ("calibration's covariance", np.ravel(self.covariance_arcsec2)),
+            ("calibration's tilt_deg", self.tilt_deg),
         ):
             if not np.isfinite(np.asarray(numbers, float)).all():
                 raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
-        if len(self.misalignment_deg) != 3:
-            raise InstrumentError("misalignment_deg is three numbers")
+        if len(self.misalignment_deg) != 3 or len(self.tilt_deg) != 2:
+            raise InstrumentError("misalignment_deg is three numbers, tilt_deg of a calibration two")
         covariance = np.asarray(self.covariance_arcsec2, float)
         if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
             raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
@@ -73,6 +76,18 @@ class Calibration:
         rx, ry = np.arctan2(a3[2, 1], a3[2, 2]), np.arcsin(np.clip(-a3[2, 0], -1, 1))
         rz = np.arctan2(a3[1, 0], a3[0, 0])
         return replace(self, misalignment_deg=tuple(float(x) for x in np.degrees([rx, ry, rz])))
+
+    @property
+    def angle_covariance_deg2(self) -> np.ndarray:
+        """(3, 3): of misalignment_deg, from that about S's axes; near ry = 90 deg it grows without bound."""
+        step = 1e-7
+        around = [
+            [self.turned_to(rotation.from_vector(s * axis) @ self.a3).misalignment_deg for s in (-step, step)]
+            for axis in np.eye(3)
+        ]
+        differences = np.array([np.subtract(after, before) for before, after in around])
+        slope = ((differences + 180) % 360 - 180).T / np.degrees(2 * step)
+        return slope @ np.asarray(self.covariance_arcsec2) @ slope.T / 3600**2
 
     def check_age(self, utc_unix_s: float) -> None:
         """InstrumentError where it is too old, or too new, for a frame of that time."""
@@ -148,6 +163,7 @@ class Instrument:
             self.inclinometer,
             c.utc_unix_s,
             c.temperature_c,
+            tuple(np.radians(c.tilt_deg)),
         )
 
 

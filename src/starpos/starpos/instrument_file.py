@@ -45,7 +45,7 @@ def read(path) -> Instrument:
     misalignment_deg: [rx, ry, rz]
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
-    calibrated: {utc, temperature_c, frames, valid_days}  which `starpos calibrate` writes
+    calibrated: {utc, temperature_c, tilt_deg, frames, valid_days}   which `starpos calibrate` writes
     link_to_camera: [[..], [..], [..]]
     tilt_noise_deg: 0.0035                               of one reading; the others are of the zero and of the angle
     tilt_quantum_deg: 0.0005
@@ -78,6 +78,7 @@ def write(path, instrument: Instrument, comment: str = "") -> None:
     content["calibration_covariance_arcsec2"] = np.asarray(c.covariance_arcsec2, float).tolist()
     if not math.isnan(c.utc_unix_s):
         content["calibrated"] = {"utc": utc_text(c.utc_unix_s), "frames": int(c.frames)}
+        content["calibrated"]["tilt_deg"] = [float(t) for t in c.tilt_deg]
         if not math.isnan(c.temperature_c):
             content["calibrated"]["temperature_c"] = float(c.temperature_c)
         if math.isfinite(c.valid_days):
@@ -152,14 +153,16 @@ def _calibration(content: dict) -> Calibration:
         return calibration
     if not isinstance(about, dict):
         raise InstrumentError(
-            f"calibrated is {_short(about)}: give {{utc, temperature_c, frames, valid_days}}"
+            f"calibrated is {_short(about)}: give {{utc, temperature_c, tilt_deg, frames, valid_days}}"
         )
-    _refuse_others(about, ("utc", "temperature_c", "frames", "valid_days"))
+    _refuse_others(about, ("utc", "temperature_c", "tilt_deg", "frames", "valid_days"))
     try:
         utc = unix_of(str(about.get("utc")))
     except TimeError as e:
         raise InstrumentError(f"calibrated: {e}") from None
     more = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
+    if "tilt_deg" in about:
+        more["tilt_deg"] = _row(about["tilt_deg"], "tilt_deg")
     frames = about.get("frames", 0)
     if not isinstance(frames, int) or frames < 0:
         raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")

@@ -14,7 +14,7 @@ class Mounting:
 
     calibration_covariance (3, 3) rad2: of A3 as a small rotation about S's axes, the inclinometer's zero included
     (only the sum of the two matters), as of calibrated_unix_s and calibrated_temperature_c; NaN: not known, then what the
-    zero wandered till now is taken for a part of it.
+    zero wandered till now is taken for a part of it.  An error of the scale counts from calibrated_tilt on.
     """
 
     a3: np.ndarray
@@ -23,3 +23,4 @@ class Mounting:
     inclinometer: InclinometerErrors = EXACT
     calibrated_unix_s: float = float("nan")
     calibrated_temperature_c: float = float("nan")
+    calibrated_tilt: tuple[float, float] = (0.0, 0.0)  # rad

@@ -150,6 +150,7 @@ class Solver:
             state = earth_state(stars.mid_unix_s)
             if callable(tilt):
                 tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0)
+            self.instrument.calibration.check_age(stars.mid_unix_s)
             camera = self._camera(stars.width, stars.height)
             g = a2_matrix(tilt.theta_x, tilt.theta_y) @ self.instrument.mounting.a3
             begin = time.perf_counter()

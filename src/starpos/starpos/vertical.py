@@ -59,6 +59,12 @@ class Geodetic:
     deflection: Deflection
 
 
+def astronomic(latitude: float, longitude: float, d: Deflection) -> tuple[float, float]:
+    """Astronomic latitude, longitude (rad) of a geodetic place: what `geodetic` undoes."""
+    east = d.eta_arcsec * ARCSEC / max(np.cos(latitude), 1e-9)
+    return latitude + d.xi_arcsec * ARCSEC, longitude + east
+
+
 def geodetic(
     latitude: float, longitude: float, heading: float, covariance: np.ndarray, vertical: Vertical
 ) -> Geodetic:

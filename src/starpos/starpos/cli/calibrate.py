@@ -2,6 +2,7 @@
 """`starpos calibrate`: what the stars tell of the instrument, written where the other commands read it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from starpos import camera_yaml, catalogue
 from starpos.atmosphere import Atmosphere
+from starpos.camera import Camera
 from starpos.camera_from_sky import FromSky
 from starpos.camera_from_sky import calibrate as camera_from_sky
-from starpos.cli import common
-from starpos.errors import CalibrationError, FrameError, InstrumentError, StarposError
+from starpos.cli import calibrate_site, common
+from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.inclinometer import TiltLog, a2_matrix, read_tilt_csv
 from starpos.instrument import Instrument
 from starpos.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
@@ -37,18 +39,21 @@ def define(parser) -> None:
         "--instrument", metavar="FILE", help="instrument file (YAML): the camera to begin with, A3"
     )
     common.add_optics(parser)
+    common.add_misalignment(parser)
     parser.add_argument(
         "--tilt",
         metavar="CSV",
         help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]: refraction is undone",
     )
     common.add_air(parser)
+    calibrate_site.define(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
-    if args.camera is None:
-        raise InstrumentError("nothing to calibrate: give --camera OUT.yaml")
+    if args.camera is None and args.site is None:
+        raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
+    calibrate_site.check(args)
     if args.map is not None and find_spec("matplotlib") is None:
         raise InstrumentError(
             "--map draws with matplotlib, which is not here: pip install 'starpos[picture]'"
@@ -57,10 +62,13 @@ def run(args) -> int:
     if not frames:
         return common.UNREADABLE
     instrument = common.instrument_of(args, frames[0])
-    tilts = None if args.tilt is None else read_tilt_csv(args.tilt)
+    tilts = None if args.tilt is None else read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
     try:
-        _camera(args, frames, instrument, tilts)
-    except CalibrationError as e:
+        if args.camera is not None:
+            instrument = replace(instrument, camera=_camera(args, frames, instrument, tilts))
+        if args.site is not None:
+            calibrate_site.run(args, frames, instrument, tilts)
+    except (CalibrationError, FixError) as e:
         common.complain("calibrate", e)
         return common.UNREADABLE if unreadable else NOTHING
     return common.UNREADABLE if unreadable else 0
@@ -79,7 +87,7 @@ def _stars_of_all(args) -> tuple[list[Stars], bool]:
     return frames, unreadable
 
 
-def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None) -> None:
+def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None) -> Camera:
     """--camera: fit, write, draw and print it."""
     air = common.atmosphere_of(args)
     given = instrument.camera_for(frames[0].width, frames[0].height)
@@ -100,6 +108,7 @@ def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | 
         common.print_json(_json_of(found, args.camera))
     else:
         print(about, end="")
+    return found.fit.camera
 
 
 def _levelled(frames: Sequence[Stars], instrument: Instrument, tilts: TiltLog):

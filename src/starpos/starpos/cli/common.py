@@ -33,6 +33,16 @@ def add_optics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pixel-um", type=float, metavar="UM", help="pixel size")
 
 
+def add_misalignment(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--misalignment",
+        type=float,
+        nargs=3,
+        metavar=("RX", "RY", "RZ"),
+        help="A3 in deg: camera to inclinometer",
+    )
+
+
 def add_size(parser: argparse.ArgumentParser) -> None:
     """Frame size; with it the optics are the paper's where they are not given."""
     size = {"type": number(16, 100_000, int), "metavar": ("W", "H"), "nargs": 2, "default": (5616, 3744)}

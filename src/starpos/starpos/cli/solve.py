@@ -30,13 +30,7 @@ def define(parser) -> None:
         "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
     )
     common.add_optics(parser)
-    parser.add_argument(
-        "--misalignment",
-        type=float,
-        nargs=3,
-        metavar=("RX", "RY", "RZ"),
-        help="A3 in deg: camera to inclinometer",
-    )
+    common.add_misalignment(parser)
     common.add_air(parser)
     common.add_vertical(parser)
     parser.add_argument(

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A3 from frames: at a known place, or (see turning.py) at several headings of an unknown one."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.errors import FixError
+from starpos.fix import Fix
+from starpos.inclinometer import Tilt
+from starpos.instrument import ARCSEC, Calibration, Instrument
+from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
+from starpos.progress import Progress, quiet
+from starpos.sky import Site
+from starpos.solve import Solution, Solver
+from starpos.stars import Stars
+
+ROUNDS = 4
+SETTLED_RAD = np.radians(0.02 / 3600)
+OF_PLACE = (
+    "catalogue",
+    "refraction",
+    "clock",
+    "ut1",
+    "pole",
+)  # terms that move the zenith of all frames alike
+VALID_DAYS = 365.0
+
+Tilts = Callable[[float, float], Tilt]
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """The instrument with its A3, and each frame solved with it.
+
+    plumb_stddev_arcsec: of the plumb line in the camera, the worse of two axes.  The fixes hold A3 for unknown: what they
+    say of the place they say without the calibration that was made of them.
+    """
+
+    instrument: Instrument
+    plumb_stddev_arcsec: float
+    solutions: tuple[Solution, ...]
+
+    @property
+    def fixes(self) -> list[Fix]:
+        return [s.fix for s in self.solutions if s.fix]
+
+
+def calibrate_at(
+    solver: Solver,
+    frames: Sequence[Stars],
+    tilt: Tilts,
+    site: Site,
+    site_stddev_arcsec: float = 0.0,
+    turn_stddev_deg: float = 180.0,
+    progress: Progress = quiet,
+) -> Calibrated:
+    """A3 from one or more frames at a known astronomic place; the solver's A3 need not be near.
+
+    tilt: of (mid_unix_s, exposure_s).  One lean of the instrument tells A3 but for its turn about the plumb line, which
+    only a fix at another lean needs; the covariance says so.  turn_stddev_deg: how well the solver's A3 has it.  FixError
+    without a fix, or where the frames do not agree.
+    """
+
+    def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> Plumb:
+        common = sum(np.trace(t.covariance[:2, :2]) / 2 for f in fixes for t in f.terms if t.name in OF_PLACE)
+        sigma = np.hypot(site_stddev_arcsec * ARCSEC, np.sqrt(common / len(fixes)) / EARTH_RADIUS_M)
+        return hang(readings, a3, site.enu[2], float(sigma), np.radians(turn_stddev_deg))
+
+    found = calibrate(solver, frames, tilt, find, fewest=1, progress=progress)
+    if not found.fixes:
+        raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
+    return found
+
+
+def calibrate(
+    solver: Solver,
+    frames: Sequence[Stars],
+    tilt: Tilts,
+    find: Callable[[Readings, np.ndarray, list[Fix]], Plumb],
+    fewest: int,
+    progress: Progress = quiet,
+) -> Calibrated:
+    """Solve the frames and `find` A3 from what they say, until it stands still; from fewer fixes it stays what it was."""
+    unknown = Calibration.of(solver.instrument.calibration.misalignment_deg, UNKNOWN_ARCSEC)
+    solver = _with(solver, unknown)
+    solutions: list[Solution | None] = [None] * len(frames)
+    plumb = readings = None
+    for k in range(ROUNDS):
+        for n, stars in enumerate(frames):
+            known = solutions[n].standing if solutions[n] else None
+            solutions[n] = solver.solve(stars, tilt, known)
+            progress("calibrating", (k + (n + 1) / len(frames)) / ROUNDS)
+        solved = [s for s in solutions if s.fix]
+        if len(solved) < fewest:
+            break
+        readings, a3 = Readings.of(solved), solver.instrument.mounting.a3
+        plumb = find(readings, a3, [s.fix for s in solved])
+        moved = np.linalg.norm(rotation.to_small_vector(plumb.a3 @ a3.T)[:2])
+        solver = _with(solver, unknown.turned_to(plumb.a3))
+        if moved < SETTLED_RAD:
+            break
+    progress("calibrating", 1.0)
+    if plumb is None:
+        return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
+    error = float(plumb.stddev_across(readings.mean_plumb) / ARCSEC)
+    instrument = replace(solver.instrument, calibration=_dated(plumb, solved))
+    return Calibrated(instrument, error, tuple(solutions))
+
+
+def _with(solver: Solver, calibration: Calibration) -> Solver:
+    return replace(solver, instrument=replace(solver.instrument, calibration=calibration))
+
+
+def _dated(plumb: Plumb, solved: list[Solution]) -> Calibration:
+    """As of the middle of the frames."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no temperature at all
+        temperature_c = float(np.nanmean([s.tilt.temperature_c for s in solved]))
+    tilts = np.mean([[s.tilt.theta_x, s.tilt.theta_y] for s in solved], axis=0)
+    found = Calibration(
+        covariance_arcsec2=tuple(map(tuple, (plumb.covariance / ARCSEC**2).tolist())),
+        utc_unix_s=float(np.mean([s.fix.utc_unix_s for s in solved])),
+        temperature_c=temperature_c,
+        tilt_deg=tuple(np.degrees(tilts).tolist()),
+        frames=len(solved),
+        valid_days=VALID_DAYS,
+    )
+    return found.turned_to(plumb.a3)

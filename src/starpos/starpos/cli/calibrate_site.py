@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos calibrate --site`: A3 at a known place, written into an instrument file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from starpos import catalogue, instrument_file
+from starpos.calibration import Calibrated, calibrate_at
+from starpos.cli import common
+from starpos.errors import InstrumentError
+from starpos.inclinometer import TiltLog
+from starpos.instrument import Instrument
+from starpos.sky import Site
+from starpos.solve import Solver
+from starpos.stars import Stars
+from starpos.vertical import astronomic
+
+
+def define(parser) -> None:
+    parser.add_argument(
+        "--site",
+        type=float,
+        nargs=2,
+        metavar=("LAT", "LON"),
+        help="find A3 at this place, deg, by gravity (as a fix has them); needs --tilt and -o",
+    )
+    parser.add_argument(
+        "--geodetic",
+        action="store_true",
+        help="--site is on WGS 84, as a map or a receiver has it: the deflection of the vertical is put on",
+    )
+    common.add_vertical(parser)
+    parser.add_argument(
+        "--turn-stddev",
+        type=common.number(1e-6, 180),
+        default=180.0,
+        metavar="DEG",
+        help="how well the given A3 has its turn about the plumb line, which one lean does not tell (180)",
+    )
+    parser.add_argument("-o", "--output", metavar="OUT", help="write the instrument file (YAML) with A3")
+    parser.add_argument(
+        "--valid-days",
+        type=common.number(0.01, 1e5),
+        metavar="DAYS",
+        help="after which the calibration is refused (365)",
+    )
+
+
+def check(args) -> None:
+    """InstrumentError for a call that does not hold together."""
+    if args.site is None:
+        if args.output is not None or args.geodetic:
+            raise InstrumentError(
+                "-o and --geodetic are for a calibration at a known place: give --site LAT LON"
+            )
+        return
+    if args.output is None or args.tilt is None:
+        raise InstrumentError(
+            "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml"
+        )
+    latitude, longitude = args.site
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
+        raise InstrumentError(f"--site {latitude:g} {longitude:g}: give latitude and longitude in deg")
+
+
+def run(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> None:
+    """Find, write and print it; FixError where the frames do not tell."""
+    solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args))
+    site, stddev_arcsec = _site(args)
+    found = calibrate_at(
+        solver, frames, tilts.average, site, stddev_arcsec, args.turn_stddev, common.ProgressBar()
+    )
+    for solution in found.solutions:
+        if solution.fix is None:
+            common.complain("calibrate", f"left out: {solution.message}")
+    calibration = found.instrument.calibration
+    if args.valid_days is not None:
+        calibration = replace(calibration, valid_days=args.valid_days)
+    found = replace(found, instrument=replace(found.instrument, calibration=calibration))
+    about = _about(found, site)
+    instrument_file.write(Path(args.output), found.instrument, about)
+    if args.json:
+        common.print_json(_json_of(found, args.output))
+    else:
+        print(about, end="")
+
+
+def _site(args) -> tuple[Site, float]:
+    """Astronomic place, and how well that is known, arcsec."""
+    if not args.geodetic:
+        return Site(*args.site), 0.0
+    d = common.vertical_of(args).at(*np.radians(args.site))
+    return Site(*np.degrees(astronomic(*np.radians(args.site), d))), d.stddev_arcsec
+
+
+def _about(found: Calibrated, site: Site) -> str:
+    c = found.instrument.calibration
+    turns = np.sqrt(np.linalg.eigvalsh(np.asarray(c.covariance_arcsec2))) / 3600
+    lines = [
+        f"A3 of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} (by gravity): "
+        "{:.5f} {:.5f} {:.5f} deg".format(*c.misalignment_deg),
+        f"the plumb line in the camera is known to {found.plumb_stddev_arcsec:.2f} arcsec; "
+        f"at another lean, A3's turn about it counts, known to {turns[-1]:.2g} deg",
+    ]
+    if turns[-1] > 1:
+        lines.append("to tell that turn as well, lean the instrument by some degrees between the frames")
+    return "\n".join(lines) + "\n"
+
+
+def _json_of(found: Calibrated, path: str) -> dict:
+    c = found.instrument.calibration
+    return {
+        "instrument": path,
+        "misalignment_deg": c.misalignment_deg,
+        "covariance_arcsec2": np.asarray(c.covariance_arcsec2),
+        "plumb_stddev_arcsec": found.plumb_stddev_arcsec,
+        "frames": c.frames,
+    }

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The plumb line in the camera: A3 from attitudes among the stars and tilts, the zenith known or not.
+
+Each frame's stars give the attitude R of the camera on the Earth whatever A3 is.  The zenith is one direction of the
+Earth, z = R^T A3^T s, with s the plumb line as the inclinometer reads it: an A3 that is wrong turns with the instrument
+and takes z round a circle, the right one keeps it still.  Of A3's tilts and the inclinometer's zero only the sum matters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from starpos import rotation
+from starpos.errors import FixError
+from starpos.fix import Fix
+from starpos.inclinometer import a2_matrix
+from starpos.solve import Solution
+
+UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
+ROBUST_SIGMA = 3.0  # beyond it a frame pulls no harder
+TURNS_TRIED = 8
+LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are believed to
+AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
+AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
+SAME_AXIS = 1e-9  # share of the axis' weight below which the headings do not tell it
+MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
+EARTH_RADIUS_M = 6.371e6
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Of K frames: to_camera (K, 3, 3), ITRS into C; plumb (K, 3), up as the inclinometer says in S; heading (K,) rad;
+    sigma (K,) rad, of the zenith from each frame alone."""
+
+    to_camera: np.ndarray
+    plumb: np.ndarray
+    heading: np.ndarray
+    sigma: np.ndarray
+
+    @classmethod
+    def of(cls, solved: Sequence[Solution]) -> "Readings":
+        """From solutions with a fix."""
+        middle = float(np.mean([s.fix.utc_unix_s for s in solved]))
+        return cls(
+            np.array([s.fix.camera_to_itrs.T for s in solved]),
+            np.array([a2_matrix(s.tilt.theta_x, s.tilt.theta_y)[2] for s in solved]),
+            np.array([s.fix.heading for s in solved]),
+            np.array([_own_sigma(s.fix, middle) for s in solved]),
+        )
+
+    @property
+    def mean_plumb(self) -> np.ndarray:
+        return self.plumb.sum(0) / np.linalg.norm(self.plumb.sum(0))
+
+
+def _own_sigma(fix: Fix, middle_unix_s: float) -> float:
+    """Of one frame's zenith, rad, one axis, without what all frames share."""
+    wandered = [t.walk_s * abs(fix.utc_unix_s - middle_unix_s) * t.factor @ t.factor.T for t in fix.terms]
+    covariance = sum(t.covariance for t in fix.terms if not t.common) + sum(wandered)
+    return float(np.sqrt(np.trace(covariance[:2, :2]) / 2)) / EARTH_RADIUS_M
+
+
+@dataclass(frozen=True)
+class Plumb:
+    """a3 (3, 3) with covariance (3, 3) rad2 about S's axes, and the zenith (3,) in ITRS with its sigma, rad.
+
+    cost: half the robust chi-square.
+    """
+
+    a3: np.ndarray
+    covariance: np.ndarray
+    zenith: np.ndarray
+    zenith_sigma: float
+    cost: float
+
+    def stddev_across(self, plumb: np.ndarray) -> float:
+        """Error of the direction that A3 takes to `plumb` (3,), the worse of two axes, rad."""
+        across = np.linalg.svd(plumb[None])[2][1:]
+        return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
+
+
+def level(readings: Readings, given: np.ndarray) -> Plumb:
+    """A3 that keeps the zenith still, wherever it is; the nearest to `given` (3, 3) as far as they do not tell.
+
+    Its turn about the plumb line is told by the instrument's lean alone, if there is any: all of them are tried.  Raises
+    FixError where two answers are as good, or the frames have no one zenith.
+    """
+    mean = readings.mean_plumb
+    start = _axis_of_turn(readings, given)
+    if not _leans(readings):
+        found = _fitted(readings, start, _Known())
+        _check_scatter(found, readings)
+        return found
+    found = [_fitted(readings, start, _Known()) for start in _turns(mean, start)]
+    best = min(found, key=_cost)
+    _check_scatter(best, readings)
+    as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
+    apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
+    if apart > AMBIGUOUS_SIGMA * best.zenith_sigma:
+        lean = np.degrees(np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max())
+        raise FixError(
+            f"the instrument leans by {lean:.2f} deg from one heading to the other, and these headings do not tell which "
+            "way its inclinometer faces: level it better, or turn it to three headings or more"
+        )
+    return best
+
+
+def hang(
+    readings: Readings, given: np.ndarray, zenith: np.ndarray, zenith_sigma: float, turn_sigma: float
+) -> Plumb:
+    """A3 under a known zenith (3,), good to zenith_sigma rad; the nearest to `given` as far as they do not tell.
+
+    turn_sigma: how well `given` has the turn about the plumb line, rad.  FixError where the frames do not agree with it
+    and each other.
+    """
+    mean = readings.mean_plumb
+    up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
+    start = _shortest_turn(given @ (up / np.linalg.norm(up)), mean) @ given
+    known = _Known(zenith, max(zenith_sigma, 1e-12), turn_sigma)
+    starts = _turns(mean, start) if turn_sigma > np.radians(20) else [start]
+    found = [_fitted(readings, start, known) for start in starts]
+    best = min(found, key=_cost)
+    if found[0].cost < best.cost + AS_GOOD:
+        best = found[0]
+    _check_scatter(best, readings)
+    return best
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What A3 is fitted under: the zenith (3,), or None, and its error; the error of the start's turn about the plumb
+    line; rad."""
+
+    zenith: np.ndarray | None = None
+    zenith_sigma: float = np.inf
+    turn_sigma: float = np.pi
+
+
+def _cost(plumb: Plumb) -> float:
+    return plumb.cost
+
+
+def _turns(axis: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
+    """`start` and what it is turned about an axis of S."""
+    angles = np.arange(TURNS_TRIED) * (2 * np.pi / TURNS_TRIED)
+    return [rotation.from_vector(axis * angle) @ start for angle in angles]
+
+
+def _check_scatter(found: Plumb, readings: Readings) -> None:
+    freedom = 2 * len(readings.sigma) - 5
+    if freedom > 0 and 2 * found.cost / freedom > MOST_SCATTER:
+        raise FixError(
+            f"{len(readings.sigma)} frames do not agree on one zenith (chi-square {2 * found.cost / freedom:.0f} a "
+            "degree of freedom): the instrument was moved between them, or its inclinometer or clock was disturbed"
+        )
+
+
+def _leans(readings: Readings) -> bool:
+    """Whether the plumb line in S goes round with the heading by more than its noise."""
+    off, heading = readings.plumb - readings.mean_plumb, readings.heading
+    weight = 1 / readings.sigma[:, None]
+    constant = np.ones((len(off), 1)) * weight
+    round_ = np.stack([np.ones(len(off)), np.cos(heading), np.sin(heading)], -1) * weight
+    still, going = (np.linalg.lstsq(d, off * weight, rcond=1e-6)[0] for d in (constant, round_))
+    better = np.sum((off * weight - constant @ still) ** 2) - np.sum((off * weight - round_ @ going) ** 2)
+    return bool(better > LEAN_CHI2)
+
+
+def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
+    """Robust least squares for A3, from `start`, and the zenith, which may be known with a sigma.
+
+    The residual is that of the readings, which err, against the stars' plumb line, which hardly does.  A3's tilts are
+    held to UNKNOWN_ARCSEC.
+    """
+    to_camera, plumb, mean = readings.to_camera, readings.plumb, readings.mean_plumb
+    middle = known.zenith
+    if middle is None:
+        middle = np.einsum("kji,jl,kl->i", to_camera, start.T, plumb)
+    middle = middle / np.linalg.norm(middle)
+    across = np.linalg.svd(middle[None])[2][1:]  # two axes across the zenith
+    turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T  # across the plumb line in S, and about it
+    loose = np.radians(UNKNOWN_ARCSEC[0] / 3600)
+
+    def whitened(p):
+        a3 = rotation.from_vector(turns @ p[:3]) @ start
+        zenith = middle + p[3:] @ across
+        off = (plumb - to_camera @ (zenith / np.linalg.norm(zenith)) @ a3.T) @ turns[:, :2]
+        return np.concatenate(
+            [
+                (off / readings.sigma[:, None]).ravel(),
+                p[:2] / loose,
+                p[2:3] / known.turn_sigma,
+                p[3:] / known.zenith_sigma,
+            ]
+        )
+
+    found = least_squares(
+        whitened, np.zeros(5), "3-point", loss="huber", f_scale=ROBUST_SIGMA, x_scale=[1e-4, 1e-4, 1e-2, 1e-5, 1e-5],
+        xtol=1e-14, ftol=1e-14,
+    )  # fmt: skip
+    whole = turns @ np.linalg.inv(found.jac.T @ found.jac)[:3, :3] @ turns.T
+    # without the turn about the plumb line, which may be as good as unknown
+    told = np.delete(found.jac, 2, 1)
+    zenith = np.linalg.inv(told.T @ told)[2:, 2:]
+    return Plumb(
+        rotation.from_vector(turns @ found.x[:3]) @ start,
+        (whole + whole.T) / 2,
+        middle + found.x[3:] @ across,
+        float(np.sqrt(np.linalg.eigvalsh(zenith)[-1])),
+        float(found.cost),
+    )
+
+
+def _axis_of_turn(readings: Readings, given: np.ndarray) -> np.ndarray:
+    """A3 (3, 3), the nearest to `given` whose plumb line is the direction of C that all frames have at one zenith."""
+    mean = readings.mean_plumb
+    _, strength, directions = np.linalg.svd(np.mean(readings.to_camera, 0).T)
+    if strength[0] - strength[1] < SAME_AXIS:  # one heading: any direction is
+        return given
+    up = directions[0] * np.sign(directions[0] @ given.T @ mean)
+    return _shortest_turn(given @ up, mean) @ given
+
+
+def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, 3): takes the unit vector a to b."""
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:
+        return np.eye(3) if a @ b > 0 else rotation.from_vector(np.pi * np.linalg.svd(a[None])[2][1])
+    return rotation.from_vector(axis / sine * np.arctan2(sine, a @ b))
