@@ -73,7 +73,7 @@ def run(args) -> int:
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
         files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
-    write(Path(args.out), files | {"index.html": html.encode()})
+    write(Path(args.out), files | {"index.html": html.encode(errors="replace")})
     print(Path(args.out) / "index.html")
     return 0 if any(n.combined for n in nights) else NO_FIX
 

@@ -24,7 +24,7 @@ def draw_health(figure, night: Night) -> None:
     )
     panels[0].plot(at, [s.stars_matched for s in shots], color=BLUE, label="in the fix", **many)
     panels[0].set_ylabel("stars")
-    panels[0].set_ylim(bottom=0)
+    panels[0].set_ylim(0, 1.15 * max(1, *(s.stars_detected for s in shots)))
     _legend(panels[0])
     residual = np.array([s.residual_arcsec for s in shots])
     panels[1].plot(at, residual, color=BLUE, **many)

@@ -31,6 +31,7 @@ h1 { font-size: 1.6rem; margin: .4rem 0; } h2 { font-size: 1.3rem; margin: 2.4re
 table { border-collapse: collapse; width: 100%; background: var(--card); font-variant-numeric: tabular-nums; }
 th, td { text-align: left; vertical-align: top; padding: .4rem .7rem; border: 1px solid var(--line); }
 th { font-weight: 600; width: 13rem; } thead th { width: auto; }
+.wide table { overflow-wrap: normal; } a { color: inherit; }
 .figures { display: grid; gap: 1.2rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 36rem), 1fr)); }
 figure { margin: 0; padding: .8rem; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
 figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; } figure div { overflow-x: auto; }
@@ -51,6 +52,10 @@ def page(
     parts = [f"<h1>{escape(title)}</h1>"]
     if len(nights) > 1:
         parts += [_table_of_nights(nights), _figures(overall)]
+        if not any(each):
+            parts.append(
+                '<p class="soft">Too many nights for the figures of each: report on fewer to see them.</p>'
+            )
     for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
         if len(nights) > 1:
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')

@@ -81,7 +81,7 @@ def draw_scatter(figure, night: Night) -> None:
     limit = 1.12 * max(*reach, 0.01)
     axes.set(xlim=(-limit, limit), ylim=(-limit, limit), xlabel="east, m", ylabel="north, m")
     axes.set_aspect("equal")
-    figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=9, frameon=False)
 
 
 def _ellipses(axes, covariance: np.ndarray, colour: str, label: str, fill: bool) -> None:
@@ -132,8 +132,7 @@ def draw_budget(figure, night: Night) -> None:
         axes.set_xlim(low, top * 12)
         axes.set_xlabel(title)
     panels[0].set_yticks(np.arange(len(names)), [n.replace(" (", "\n(") for n in names])
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=9, frameon=False)
+    panels[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=9, frameon=False)
 
 
 def _short(value: float) -> str:

@@ -44,23 +44,23 @@ def draw_sky(figure, night: Night, catalogue: Catalogue) -> None:
     rings = np.linspace(0, reach, 4)[1:]
     axes.set_rgrids(rings, [f"{r:.3g}°" for r in rings], angle=22.5, fontsize=8, color=GREY)
     axes.grid(alpha=0.3, lw=0.6)
-    _legend(figure)
+    _legend(axes)
 
 
-def _legend(figure) -> None:
+def _legend(axes) -> None:
     from matplotlib.lines import Line2D
 
     def dot(colour, magnitude, text, **more):
         size = np.sqrt(_dot(np.array([magnitude]))[0])
         return Line2D([], [], ls="none", marker="o", color=colour, ms=size, mew=0, label=text, **more)
 
-    figure.legend(
+    axes.legend(
         handles=[
             Line2D([], [], color=ORANGE, marker="+", ms=7, lw=1.3, label="a frame and its centre"),
             *(dot(BLUE, m, f"identified, V {m}") for m in (6, 8, 10)),
             dot(GREY, 3, "bright star, V 3", alpha=0.6),
         ],
-        loc="outside lower center", ncols=3, fontsize=9, frameon=False,
+        loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, fontsize=9, frameon=False,
     )  # fmt: skip
 
 

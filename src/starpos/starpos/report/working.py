@@ -2,6 +2,7 @@
 """Exposures to a Night: every frame solved, all of them averaged."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from starpos.atmosphere import Atmosphere
 from starpos.average import average
 from starpos.budget import heading_of, place_of
 from starpos.catalogue import Catalogue
-from starpos.errors import FixError
+from starpos.errors import FixError, StarposError
 from starpos.fix import Fix
 from starpos.inclinometer import a2_matrix
 from starpos.instrument import Instrument
@@ -49,15 +50,21 @@ class Workshop:
 def worked(exposures: Exposures, shop: Workshop) -> Night:
     """The night of these exposures; InstrumentError where no frame can have one."""
     solve = _turned if shop.self_calibrate else _one_by_one
-    shots, fixes, instrument, remarks = [], [], None, ()
+    shots, fixes, instrument, remarks, extrapolated_days = [], [], None, (), 0.0
     for done, (exposure, solution, used, said) in enumerate(solve(exposures, shop), 1):
         shots.append(_shot(exposure, solution))
         if solution.fix:
             fixes.append(solution.fix)
             instrument = used
+            extrapolated_days = max(extrapolated_days, solution.extrapolated_days)
         remarks = (*remarks, *said)
         shop.progress(exposures.name[:20], done / exposures.count)
     combined, why_not, said = _combined(fixes, shots)
+    if extrapolated_days > 0:
+        said.append(
+            f"the Earth's rotation is extrapolated {extrapolated_days:.0f} days beyond the IERS table, which the budget "
+            "holds as ut1: upgrade astropy-iers-data"
+        )
     night = Night(
         exposures.name,
         exposures.origin,
@@ -74,12 +81,18 @@ def worked(exposures: Exposures, shop: Workshop) -> Night:
 
 def _one_by_one(exposures: Exposures, shop: Workshop) -> Iterator:
     """(Exposure, Solution, Instrument, remarks) of each frame."""
-    standing = None
+    standing, prepared = None, set()
     for exposure in exposures.read():
         if not isinstance(exposure.stars, Stars):
             yield exposure, _unreadable(exposure), None, ()
             continue
         solver = shop.solver(exposure.stars, exposure.clock_stddev_s)
+        if (exposure.stars.width, exposure.stars.height) not in prepared:
+            prepared.add((exposure.stars.width, exposure.stars.height))
+            with suppress(StarposError):  # which the frame will say
+                solver.prepare(
+                    exposure.stars.width, exposure.stars.height
+                )  # or the first frame's time holds it
         solution = solver.solve(exposure.stars, exposures.tilt, standing)
         standing = solution.standing or standing
         yield exposure, solution, solver.instrument, ()
