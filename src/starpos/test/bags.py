@@ -89,10 +89,10 @@ class Recorder:
             for name, (e, n, h) in solved["budget"].items()
             if "geodetic" not in name
         ]
-        given = {
-            k: solved[k]
-            for k in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading")
-        }
+        given = {k: solved[k] for k in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic")}
+        given |= {"xi": solved["xi_arcsec"], "eta": solved["eta_arcsec"]}
+        turned = solved["eta_arcsec"] / 3600 * np.tan(np.radians(solved["latitude_geodetic"]))
+        given["heading"] = solved["heading"] - turned  # geodetic, as the node's
         given |= {k: np.ravel(solved[k]).astype(float) for k in ("covariance", "covariance_geodetic")}
         given |= {k: solved[k] for k in ("stars_detected", "stars_matched", "log_odds")}
         made = self.message("Solution", unix_s, budget=terms, residual=solved["residual_arcsec"], **given)

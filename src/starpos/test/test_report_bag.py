@@ -136,6 +136,9 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
     assert status == 0
     latitude, longitude = (np.mean([one[k] for one in said]) for k in ("latitude", "longitude"))
     assert f"{latitude:+.6f}°, {longitude:+.6f}° ± " in page.text
+    assert f"heading {np.mean([one['heading'] for one in said]):.4f} ±" in page.text
+    ground = [np.mean([one[f"{k}_geodetic"] for one in said]) for k in ("latitude", "longitude")]
+    assert "{:+.6f}°, {:+.6f}° ±".format(*ground) in page.text
     assert "as the solver recorded it" in page.text and "none of the sky fits <its> stars" in page.text
     assert "7: 6 with a fix, 1 not identified" in page.text
     assert any("upper bound" in line for line in errors)

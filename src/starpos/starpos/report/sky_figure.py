@@ -26,19 +26,19 @@ def draw_sky(figure, night: Night, catalogue: Catalogue) -> None:
     place = night.combined or night.fixed[0][1].place
     site = Site(np.degrees(place.latitude), np.degrees(place.longitude), night.atmosphere)
     shots = [s for s in night.shots if pointed(s)]
-    centres = np.concatenate([_seen(site, earth_state(s.utc_unix_s), _axes(s.pointing)[2:]) for s in shots])
+    centres = np.concatenate([seen(site, earth_state(s.utc_unix_s), _axes(s.pointing)[2:]) for s in shots])
     shown = _different(shots, centres)
-    outlines = [_seen(site, earth_state(s.utc_unix_s), _outline(s)) for s in shown]
+    outlines = [seen(site, earth_state(s.utc_unix_s), _outline(s)) for s in shown]
     reach = _reach(np.concatenate(outlines))
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     _bright(axes, site, earth_state(np.median([s.utc_unix_s for s in shots])), catalogue, reach)
     for shot, outline in zip(shown, outlines, strict=True):
-        axes.plot(*_polar(outline), color=ORANGE, lw=1.3)
+        axes.plot(*polar(outline), color=ORANGE, lw=1.3)
         if len(shot.xy):
-            stars = _seen(site, earth_state(shot.utc_unix_s), _looking(shot, shot.xy))
-            axes.scatter(*_polar(stars), s=_dot(shot.magnitudes), color=BLUE, lw=0, zorder=3)
-    axes.plot(*_polar(centres), "+", color=ORANGE, ms=7, mew=1.4, zorder=4)
+            stars = seen(site, earth_state(shot.utc_unix_s), looking(shot, shot.xy))
+            axes.scatter(*polar(stars), s=_dot(shot.magnitudes), color=BLUE, lw=0, zorder=3)
+    axes.plot(*polar(centres), "+", color=ORANGE, ms=7, mew=1.4, zorder=4)
     axes.set_rlim(0, reach)
     axes.set_xticks(np.radians(np.arange(0, 360, 45)), ["N", "NE", "E", "SE", "S", "SW", "W", "NW"])
     rings = np.linspace(0, reach, 4)[1:]
@@ -73,18 +73,18 @@ def _bright(axes, site: Site, state: EarthState, catalogue: Catalogue, reach: fl
     """The brightest stars of the part of the sky that is shown."""
     index = site.overhead(catalogue, state, np.array([0.0, 0.0, 1.0]), np.radians(reach), 6.5)[:BRIGHT]
     v = site.observed(catalogue, index, state)
-    theta, r = _polar(v)
+    theta, r = polar(v)
     inside = r < reach
     size = _dot(catalogue.vmag(index))
     axes.scatter(theta[inside], r[inside], s=size[inside], color=GREY, alpha=0.6, lw=0, zorder=2)
 
 
-def _polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth in rad and zenith distance in deg."""
     return np.arctan2(enu[:, 0], enu[:, 1]), np.degrees(np.arctan2(np.hypot(enu[:, 0], enu[:, 1]), enu[:, 2]))
 
 
-def _seen(site: Site, state: EarthState, icrs: np.ndarray) -> np.ndarray:
+def seen(site: Site, state: EarthState, icrs: np.ndarray) -> np.ndarray:
     """Refracted directions (N, 3) in ENU of ICRS directions."""
     v = state.to_itrs(icrs) + station_velocity(site.enu[2])
     return site.atmosphere.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ site.enu.T)
@@ -99,7 +99,7 @@ def _axes(a: Attitude) -> np.ndarray:
     return np.stack([-x if a.mirrored else x, -(cr * north + sr * east), [cd * ca, cd * sa, sd]])
 
 
-def _looking(shot: Shot, xy: np.ndarray) -> np.ndarray:
+def looking(shot: Shot, xy: np.ndarray) -> np.ndarray:
     """ICRS directions (N, 3) of pixels, without distortion."""
     centre = (np.array(shot.size) - 1) / 2
     plane = (xy - centre) / shot.pointing.focal_px
@@ -112,7 +112,7 @@ def _outline(shot: Shot) -> np.ndarray:
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]], float) - 0.5
     steps = np.linspace(0, 1, 9)[:-1, None]
     sides = [a + (b - a) * steps for a, b in pairwise(corners)]
-    return _looking(shot, np.concatenate([*sides, corners[:1]]))
+    return looking(shot, np.concatenate([*sides, corners[:1]]))
 
 
 def _different(shots: Sequence[Shot], centres: np.ndarray) -> list[Shot]:
@@ -128,5 +128,5 @@ def _different(shots: Sequence[Shot], centres: np.ndarray) -> list[Shot]:
 
 
 def _reach(enu: np.ndarray) -> float:
-    furthest = 1.08 * _polar(enu)[1].max()
+    furthest = 1.08 * polar(enu)[1].max()
     return next((r for r in REACHES_DEG if r >= furthest), 90)
