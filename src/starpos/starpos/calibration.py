@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A3 from frames: at a known place, or (see turning.py) at several headings of an unknown one."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -97,7 +96,8 @@ def calibrate(
         solved = [s for s in solutions if s.fix]
         if len(solved) < fewest:
             break
-        readings, a3 = Readings.of(solved), solver.instrument.mounting.a3
+        readings, a3 = Readings.of(solved, solver.instrument.inclinometer), solver.instrument.mounting.a3
+        unknown = replace(unknown, temperature_c=_mean_temperature_c(solved), tilt_deg=_mean_tilt_deg(solved))
         plumb = find(readings, a3, [s.fix for s in solved])
         moved = np.linalg.norm(rotation.to_small_vector(plumb.a3 @ a3.T)[:2])
         solver = _with(solver, unknown.turned_to(plumb.a3))
@@ -117,16 +117,22 @@ def _with(solver: Solver, calibration: Calibration) -> Solver:
 
 def _dated(plumb: Plumb, solved: list[Solution]) -> Calibration:
     """As of the middle of the frames."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # no temperature at all
-        temperature_c = float(np.nanmean([s.tilt.temperature_c for s in solved]))
-    tilts = np.mean([[s.tilt.theta_x, s.tilt.theta_y] for s in solved], axis=0)
     found = Calibration(
         covariance_arcsec2=tuple(map(tuple, (plumb.covariance / ARCSEC**2).tolist())),
         utc_unix_s=float(np.mean([s.fix.utc_unix_s for s in solved])),
-        temperature_c=temperature_c,
-        tilt_deg=tuple(np.degrees(tilts).tolist()),
+        temperature_c=_mean_temperature_c(solved),
+        tilt_deg=_mean_tilt_deg(solved),
         frames=len(solved),
         valid_days=VALID_DAYS,
     )
     return found.turned_to(plumb.a3)
+
+
+def _mean_temperature_c(solved: list[Solution]) -> float:
+    known = [s.tilt.temperature_c for s in solved if np.isfinite(s.tilt.temperature_c)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _mean_tilt_deg(solved: list[Solution]) -> tuple[float, float]:
+    x, y = np.degrees(np.mean([[s.tilt.theta_x, s.tilt.theta_y] for s in solved], axis=0))
+    return float(x), float(y)

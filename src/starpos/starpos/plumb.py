@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from starpos import rotation
 from starpos.errors import FixError
 from starpos.fix import Fix
-from starpos.inclinometer import a2_matrix
+from starpos.inclinometer import InclinometerErrors, a2_matrix
 from starpos.solve import Solution
 
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
@@ -26,28 +25,32 @@ AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two
 AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
 SAME_AXIS = 1e-9  # share of the axis' weight below which the headings do not tell it
 MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
+MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
 EARTH_RADIUS_M = 6.371e6
 
 
 @dataclass(frozen=True)
 class Readings:
     """Of K frames: to_camera (K, 3, 3), ITRS into C; plumb (K, 3), up as the inclinometer says in S; heading (K,) rad;
-    sigma (K,) rad, of the zenith from each frame alone."""
+    sigma (K,) rad, of the zenith from each frame alone; wandering (K, 3, M): what errors of the inclinometer that frames
+    share, of 1 sigma each, do to `plumb`, beside its zero."""
 
     to_camera: np.ndarray
     plumb: np.ndarray
     heading: np.ndarray
     sigma: np.ndarray
+    wandering: np.ndarray
 
     @classmethod
-    def of(cls, solved: Sequence[Solution]) -> "Readings":
+    def of(cls, solved: Sequence[Solution], errors: InclinometerErrors) -> "Readings":
         """From solutions with a fix."""
-        middle = float(np.mean([s.fix.utc_unix_s for s in solved]))
+        plumb = np.array([a2_matrix(s.tilt.theta_x, s.tilt.theta_y)[2] for s in solved])
         return cls(
             np.array([s.fix.camera_to_itrs.T for s in solved]),
-            np.array([a2_matrix(s.tilt.theta_x, s.tilt.theta_y)[2] for s in solved]),
+            plumb,
             np.array([s.fix.heading for s in solved]),
-            np.array([_own_sigma(s.fix, middle) for s in solved]),
+            np.array([_own_sigma(s.fix) for s in solved]),
+            _wandering(solved, plumb, errors),
         )
 
     @property
@@ -55,11 +58,28 @@ class Readings:
         return self.plumb.sum(0) / np.linalg.norm(self.plumb.sum(0))
 
 
-def _own_sigma(fix: Fix, middle_unix_s: float) -> float:
+def _own_sigma(fix: Fix) -> float:
     """Of one frame's zenith, rad, one axis, without what all frames share."""
-    wandered = [t.walk_s * abs(fix.utc_unix_s - middle_unix_s) * t.factor @ t.factor.T for t in fix.terms]
-    covariance = sum(t.covariance for t in fix.terms if not t.common) + sum(wandered)
-    return float(np.sqrt(np.trace(covariance[:2, :2]) / 2)) / EARTH_RADIUS_M
+    covariance = sum(t.covariance for t in fix.terms if not t.common)[:2, :2]
+    return float(np.sqrt(np.trace(covariance) / 2)) / EARTH_RADIUS_M
+
+
+def _wandering(solved: Sequence[Solution], plumb: np.ndarray, errors: InclinometerErrors) -> np.ndarray:
+    """Scale, temperature and time (as a slope over all) of each axis, counted from their means."""
+    hours = np.array([s.fix.utc_unix_s for s in solved]) / 3600
+    warm = np.array([s.tilt.temperature_c for s in solved])
+    theta = np.array([[s.tilt.theta_x, s.tilt.theta_y] for s in solved])
+    late = (hours - hours.mean()) / max(np.sqrt(np.ptp(hours)), 1e-9)
+    warm = warm - np.mean(warm) if np.isfinite(warm).all() else np.zeros(len(warm))
+    known = np.stack([late * errors.drift_rad_per_sqrt_hour, warm * errors.temperature_rad_per_c], -1)
+    columns = []
+    for axis in range(2):
+        for off in (*known.T, (theta[:, axis] - theta[:, axis].mean()) * errors.scale):
+            moved = np.zeros_like(plumb)
+            moved[:, axis] = np.cos(theta[:, axis])
+            moved[:, 2] = -plumb[:, axis] * moved[:, axis] / plumb[:, 2]
+            columns.append(moved * off[:, None])
+    return np.stack(columns, -1)
 
 
 @dataclass(frozen=True)
@@ -117,7 +137,7 @@ def hang(
     """
     mean = readings.mean_plumb
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
-    start = _shortest_turn(given @ (up / np.linalg.norm(up)), mean) @ given
+    start = rotation.shortest_turn(given @ (up / np.linalg.norm(up)), mean) @ given
     known = _Known(zenith, max(zenith_sigma, 1e-12), turn_sigma)
     starts = _turns(mean, start) if turn_sigma > np.radians(20) else [start]
     found = [_fitted(readings, start, known) for start in starts]
@@ -169,47 +189,55 @@ def _leans(readings: Readings) -> bool:
 
 
 def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
-    """Robust least squares for A3, from `start`, and the zenith, which may be known with a sigma.
+    """A3, the zenith and the errors of the inclinometer: robust Gauss-Newton from `start`.
 
     The residual is that of the readings, which err, against the stars' plumb line, which hardly does.  A3's tilts are
     held to UNKNOWN_ARCSEC.
     """
-    to_camera, plumb, mean = readings.to_camera, readings.plumb, readings.mean_plumb
-    middle = known.zenith
-    if middle is None:
-        middle = np.einsum("kji,jl,kl->i", to_camera, start.T, plumb)
-    middle = middle / np.linalg.norm(middle)
-    across = np.linalg.svd(middle[None])[2][1:]  # two axes across the zenith
+    to_camera, mean = readings.to_camera, readings.mean_plumb
+    zenith = known.zenith
+    if zenith is None:
+        zenith = np.einsum("kji,jl,kl->i", to_camera, start.T, readings.plumb)
+    zenith = zenith / np.linalg.norm(zenith)
+    across = np.linalg.svd(zenith[None])[2][1:]  # two axes across the zenith
     turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T  # across the plumb line in S, and about it
+    wandering = -np.einsum("kim,ij->kjm", readings.wandering, turns[:, :2])
+    more = wandering.shape[2]
     loose = np.radians(UNKNOWN_ARCSEC[0] / 3600)
-
-    def whitened(p):
-        a3 = rotation.from_vector(turns @ p[:3]) @ start
-        zenith = middle + p[3:] @ across
-        off = (plumb - to_camera @ (zenith / np.linalg.norm(zenith)) @ a3.T) @ turns[:, :2]
-        return np.concatenate(
+    prior = 1 / np.array([loose, loose, known.turn_sigma, *[known.zenith_sigma] * 2, *[1.0] * more])
+    a3, p = start, np.zeros(5 + more)
+    for _ in range(MOST_STEPS):
+        up = zenith + p[3:5] @ across
+        length = np.linalg.norm(up)
+        read = to_camera @ (up / length) @ a3.T
+        off = (readings.plumb - read) @ turns[:, :2] + wandering @ p[5:]
+        slope = np.concatenate(
             [
-                (off / readings.sigma[:, None]).ravel(),
-                p[:2] / loose,
-                p[2:3] / known.turn_sigma,
-                p[3:] / known.zenith_sigma,
-            ]
-        )
-
-    found = least_squares(
-        whitened, np.zeros(5), "3-point", loss="huber", f_scale=ROBUST_SIGMA, x_scale=[1e-4, 1e-4, 1e-2, 1e-5, 1e-5],
-        xtol=1e-14, ftol=1e-14,
-    )  # fmt: skip
-    whole = turns @ np.linalg.inv(found.jac.T @ found.jac)[:3, :3] @ turns.T
+                -np.einsum("kij,il->klj", np.cross(turns.T, read[:, None]).swapaxes(1, 2), turns[:, :2]),
+                -np.einsum("kij,il->klj", np.einsum("ab,kbc,dc->kad", a3, to_camera, across) / length, turns[:, :2]),
+                wandering,
+            ],
+            2,
+        ) / readings.sigma[:, None, None]  # fmt: skip
+        off = off / readings.sigma[:, None]
+        weight = np.sqrt(np.minimum(1.0, ROBUST_SIGMA / np.maximum(np.abs(off), 1e-300)))
+        design = np.vstack([(slope * weight[..., None]).reshape(-1, 5 + more), np.diag(prior)])
+        step = -np.linalg.lstsq(design, np.concatenate([(off * weight).ravel(), p * prior]), rcond=None)[0]
+        step *= min(1.0, LONGEST_STEP / np.linalg.norm(step[:5]))
+        a3, p = rotation.from_vector(turns @ step[:3]) @ a3, p + step
+        if np.abs(step[:5]).max() < SETTLED_RAD:
+            break
+    size = np.abs(off)
+    robust = np.where(size > ROBUST_SIGMA, ROBUST_SIGMA * (2 * size - ROBUST_SIGMA), size**2)
+    whole = turns @ np.linalg.inv(design.T @ design)[:3, :3] @ turns.T
     # without the turn about the plumb line, which may be as good as unknown
-    told = np.delete(found.jac, 2, 1)
-    zenith = np.linalg.inv(told.T @ told)[2:, 2:]
+    told = np.delete(design, 2, 1)
     return Plumb(
-        rotation.from_vector(turns @ found.x[:3]) @ start,
+        a3,
         (whole + whole.T) / 2,
-        middle + found.x[3:] @ across,
-        float(np.sqrt(np.linalg.eigvalsh(zenith)[-1])),
-        float(found.cost),
+        zenith + p[3:5] @ across,
+        float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
+        float(robust.sum() + np.sum((p * prior) ** 2)) / 2,
     )
 
 
@@ -220,13 +248,4 @@ def _axis_of_turn(readings: Readings, given: np.ndarray) -> np.ndarray:
     if strength[0] - strength[1] < SAME_AXIS:  # one heading: any direction is
         return given
     up = directions[0] * np.sign(directions[0] @ given.T @ mean)
-    return _shortest_turn(given @ up, mean) @ given
-
-
-def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, 3): takes the unit vector a to b."""
-    axis = np.cross(a, b)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12:
-        return np.eye(3) if a @ b > 0 else rotation.from_vector(np.pi * np.linalg.svd(a[None])[2][1])
-    return rotation.from_vector(axis / sine * np.arctan2(sine, a @ b))
+    return rotation.shortest_turn(given @ up, mean) @ given

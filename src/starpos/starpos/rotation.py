@@ -12,6 +12,11 @@ def full_turn(angle: float) -> float:
     return 0.0 if turned >= 2 * np.pi else turned
 
 
+def half_turn(angle: float) -> float:
+    """An angle in [-pi, pi)."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
 def about_axis(axis: int, angle: float) -> np.ndarray:
     """Rotation about coordinate axis 0, 1 or 2."""
     c, s = np.cos(angle), np.sin(angle)
@@ -36,6 +41,15 @@ def from_vector(v) -> np.ndarray:
             [c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)],
         ]
     )
+
+
+def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, 3): takes the unit vector a to b."""
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:
+        return np.eye(3) if a @ b > 0 else from_vector(np.pi * np.linalg.svd(a[None])[2][1])
+    return from_vector(axis / sine * np.arctan2(sine, a @ b))
 
 
 def to_small_vector(r: np.ndarray) -> np.ndarray:

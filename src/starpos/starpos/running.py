@@ -14,7 +14,7 @@ import numpy as np
 from starpos.budget import ErrorTerm, symmetric_root
 from starpos.earth import curvature_radii_m
 from starpos.fix import Fix
-from starpos.rotation import full_turn
+from starpos.rotation import full_turn, half_turn
 
 UNIT = np.array([1.0, 1.0, 1e-6])  # m and rad, brought to like sizes
 UNKNOWN = 1e14  # variance, in those units, of what is not known at all
@@ -191,11 +191,6 @@ class Running:
         values, vectors = np.linalg.eigh(beyond)
         values = np.maximum(values, 1e-3 * np.trace(part.sources.sum(0)[:2, :2]))
         return float(np.sqrt(np.sum((apart @ vectors) ** 2 / values)))
-
-
-def half_turn(angle: float) -> float:
-    """An angle in [-pi, pi)."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _zenith(latitude: float, longitude: float) -> np.ndarray:

@@ -23,7 +23,6 @@ FWHM_PER_SIGMA = 2.354820045
 STAMP_SIGMAS = 5.0
 STRIP_PX = 1 << 20
 CENTROID_FLOOR_PX, DETECTED_SNR = 0.02, 6.0
-TILT_QUANTUM_RAD = np.radians(0.0035 / 8)
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,16 @@ class Optics:
 
 @dataclass(frozen=True)
 class TiltErrors:
-    """Errors of one inclinometer reading: white noise, zero of the two axes, drift of the zero per hour; rad."""
+    """Errors of one inclinometer reading: white noise, zero of the two axes, drift of the zero per hour, step; rad.
+
+    scale: of the angle itself, by axis.
+    """
 
     noise: float = np.radians(0.0035)
     zero: tuple[float, float] = (0.0, 0.0)
     drift_hour: tuple[float, float] = (0.0, 0.0)
+    scale: tuple[float, float] = (0.0, 0.0)
+    quantum: float = np.radians(0.0035 / 8)
 
 
 @dataclass(frozen=True)
@@ -160,9 +164,10 @@ def _star_light(camera: Camera, optics: Optics, stars: Exposed) -> tuple[np.ndar
 def read_tilt(scene: Scene, hours: float, rng) -> tuple[float, float]:
     """One inclinometer reading (rad), `hours` after its zero was true."""
     e = scene.tilt_errors
-    theta = np.array(scene.tilt) + e.zero + hours * np.asarray(e.drift_hour) + rng.normal(0, 1, 2) * e.noise
-    if e.noise:
-        theta = np.round(theta / TILT_QUANTUM_RAD) * TILT_QUANTUM_RAD
+    theta = np.array(scene.tilt) * (1 + np.asarray(e.scale)) + e.zero + hours * np.asarray(e.drift_hour)
+    theta += rng.normal(0, 1, 2) * e.noise
+    if e.quantum:
+        theta = np.round(theta / e.quantum) * e.quantum
     return float(theta[0]), float(theta[1])
 
 
@@ -183,7 +188,11 @@ def scene_of(
         Instrument(focal_px, calibration=Calibration(misalignment_deg)),
         Site(latitude_deg, longitude_deg, atmosphere),
         *pointing_deg,
-        tilt_errors=TiltErrors(np.radians(tilt_noise_deg), tuple(np.radians(tilt_zero_deg))),
+        tilt_errors=TiltErrors(
+            np.radians(tilt_noise_deg),
+            tuple(np.radians(tilt_zero_deg)),
+            quantum=np.radians(tilt_noise_deg / 8),
+        ),
     )
 
 

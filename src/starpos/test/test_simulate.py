@@ -151,7 +151,7 @@ def test_tilt_errors(rng):
     readings = np.array([read_tilt(scene, 2.0, rng) for _ in range(3000)]) - scene.tilt
     assert readings.mean(0) == pytest.approx([4e-3, -1e-3], abs=1e-5)
     assert readings.std(0) == pytest.approx([1e-4, 1e-4], rel=0.06)
-    exact = replace(scene, tilt_errors=TiltErrors(0.0))
+    exact = replace(scene, tilt_errors=TiltErrors(0.0, quantum=0.0))
     assert read_tilt(exact, 5.0, rng) == pytest.approx(scene.tilt, abs=1e-15)
 
 

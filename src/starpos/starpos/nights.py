@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole nights at random, worked as a user would, against their truth: the paper's fifty, and whether claims are true.
+
+Nothing that is drawn is told to the instrument but its size: where it stands, how camera and inclinometer are fixed to
+each other, the inclinometer's zero, wandering, scale and temperature, the air, the clock, the Earth's rotation, the
+errors of the catalogue.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.atmosphere import Atmosphere
+from starpos.average import Average, average
+from starpos.calibration import calibrate_at
+from starpos.camera import Camera
+from starpos.catalogue import EPOCH, MAS, Catalogue
+from starpos.earth import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
+from starpos.errors import StarposError
+from starpos.inclinometer import InclinometerErrors, TiltLog
+from starpos.instrument import Calibration, Instrument
+from starpos.rotation import half_turn
+from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
+from starpos.sky import Site, camera_to_enu
+from starpos.solve import Solver
+from starpos.stars import Stars
+from starpos.turning import turn
+from starpos.vertical import Deflection, geodetic
+
+CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
+EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
+FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0  # 2016 to 2026
+LEAN_DEG = 0.05  # how far off the plumb line a turn by hand is, 1 sigma
+ARCSEC = np.radians(1 / 3600)
+SCA100T = InclinometerErrors()
+
+
+def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
+    """One that is as steady as it is quiet."""
+    noise = noise_arcsec * ARCSEC
+    return InclinometerErrors(noise, noise / 8, noise, noise, SCA100T.scale)
+
+
+@dataclass(frozen=True)
+class World:
+    """What is so, and what the instrument is told of it.
+
+    scene: the instrument at its place, by the catalogue `sky`, its errors included; site: where it stands by gravity;
+    clock_s: its stamps less UTC; warmth_c: temperature less the one at which its zero is what it is.
+    """
+
+    scene: Scene
+    site: Site
+    sky: Catalogue
+    clock_s: float
+    per_c: np.ndarray  # (2,) rad
+    told: Instrument
+    air: Atmosphere
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One night: east, north (m) and heading (rad) off, by gravity and on the ground, with what was claimed of them."""
+
+    kind: str
+    off: np.ndarray
+    covariance: np.ndarray
+    off_ground: np.ndarray
+    covariance_ground: np.ndarray
+    trouble: str = ""
+
+    @property
+    def position_nees(self) -> float:
+        """2 on average, of true claims."""
+        return float(self.off[:2] @ np.linalg.solve(self.covariance[:2, :2], self.off[:2]))
+
+    @property
+    def ground_nees(self) -> float:
+        """The same of the geodetic position."""
+        m = self.off_ground[:2]
+        return float(m @ np.linalg.solve(self.covariance_ground[:2, :2], m))
+
+    @property
+    def heading_nees(self) -> float:
+        """1 on average."""
+        return float(self.off[2] ** 2 / self.covariance[2, 2])
+
+
+@dataclass
+class Zero:
+    """An inclinometer's zero as it wanders."""
+
+    errors: InclinometerErrors
+    rng: np.random.Generator
+    now_s: float
+    rad: np.ndarray = field(default_factory=lambda: np.zeros(2))
+
+    def at(self, unix_s: float) -> np.ndarray:
+        """(2,) rad; times must not go back."""
+        hours = max(unix_s - self.now_s, 0.0) / 3600
+        self.rad = self.rad + self.rng.normal(0, 1, 2) * self.errors.drift_rad_per_sqrt_hour * np.sqrt(hours)
+        self.now_s = max(self.now_s, unix_s)
+        return self.rad
+
+
+def draw(rng: np.random.Generator, catalogue: Catalogue, errors: InclinometerErrors, clock_stddev_s: float):
+    """A World at a random time and place, and that time."""
+    begin = rng.uniform(FIRST_UNIX_S, LAST_UNIX_S)
+    year = EPOCH + (begin - 946728000.0) / (365.25 * DAY_S)
+    altitude, roll = rng.uniform(70, 86), rng.uniform(0, 360)
+    azimuth = rng.uniform(0, 360)
+    truth = Calibration().turned_to(_mounted(rng, camera_to_enu(azimuth, altitude, roll)[2]))
+    told = Instrument(CAMERA.fx, inclinometer=errors, clock_stddev_s=clock_stddev_s)
+    air = rng.choice([Atmosphere(88000.0, 12.0, 0.3), Atmosphere.measured(None, None)])
+    scene = Scene(
+        CAMERA,
+        replace(told, calibration=truth),
+        Site(0.0, 0.0),
+        azimuth,
+        altitude,
+        roll,
+        tilt_errors=TiltErrors(
+            errors.noise_rad,
+            tuple(rng.normal(0, np.radians(0.1), 2)),
+            scale=tuple(rng.normal(0, errors.scale, 2)),
+            quantum=errors.quantum_rad,
+        ),
+    )
+    world = World(
+        scene,
+        Site(0.0, 0.0),
+        _with_errors(catalogue, year, rng),
+        float(rng.normal(0, clock_stddev_s)),
+        rng.normal(0, errors.temperature_rad_per_c, 2),
+        told,
+        air,
+    )
+    return at_place(world, rng, begin), begin
+
+
+def at_place(world: World, rng: np.random.Generator, unix_s: float) -> World:
+    """The same instrument at another place, in other air, the Earth turned by what the tables err."""
+    latitude = np.degrees(np.arcsin(rng.uniform(np.sin(np.radians(-66)), np.sin(np.radians(66)))))
+    longitude = rng.uniform(-180, 180)
+    air = world.air
+    pressure = np.clip(rng.normal(air.pressure_pa, air.pressure_stddev_pa), 40e3, 115e3)
+    temperature = np.clip(rng.normal(air.temperature_c, air.temperature_stddev_c), -50, 50)
+    true_air = replace(air, pressure_pa=float(pressure), temperature_c=float(temperature))
+    orientation = earth_orientation(unix_s)
+    east = rng.normal(0, orientation.ut1_sigma_s) * ROTATION_RAD_S
+    pole = rng.normal(0, orientation.pole_sigma, 2)
+    seen = Site(
+        latitude + np.degrees(pole[1]),
+        longitude + np.degrees(east + pole[0] / np.cos(np.radians(latitude))),
+        true_air,
+    )
+    return replace(world, scene=replace(world.scene, site=seen), site=Site(latitude, longitude))
+
+
+def _mounted(rng: np.random.Generator, up: np.ndarray) -> np.ndarray:
+    """A3 (3, 3) of an inclinometer that stands upright to 2 deg, and faces anywhere, while the camera has `up` (3,)."""
+    x, y = np.sin(np.radians(rng.normal(0, 1, 2)))
+    plumb = np.array([x, y, np.sqrt(1 - x * x - y * y)])
+    return rotation.from_vector(plumb * rng.uniform(0, 2 * np.pi)) @ rotation.shortest_turn(up, plumb)
+
+
+def _with_errors(catalogue: Catalogue, year: float, rng: np.random.Generator) -> Catalogue:
+    """The sky as it is: every star off its catalogue place by an error of the size stated for the year."""
+    n = len(catalogue)
+    sigma = catalogue.sigma(np.arange(n), year) / MAS
+    east, north = rng.normal(0, 1, (2, n)) * sigma
+    dec = catalogue.dec_mas * MAS
+    ra = catalogue.ra_mas + np.round(east / np.maximum(np.cos(dec), 1e-3)).astype(catalogue.ra_mas.dtype)
+    return replace(
+        catalogue, ra_mas=ra, dec_mas=catalogue.dec_mas + np.round(north).astype(catalogue.dec_mas.dtype)
+    )
+
+
+def photograph(
+    world: World, zero: Zero, begin: float, turns_deg: Sequence[float], frames: int, rng: np.random.Generator
+) -> tuple[list[Stars], TiltLog, float]:
+    """Frames at each heading, turned by hand in between; the inclinometer's readings; the last heading (rad)."""
+    stars, rows, now = [], [], begin
+    warmth, trend = rng.normal(0, 2.0), rng.normal(0, 1.0)  # deg C, and an hour
+    for turned in turns_deg:
+        lean = rng.normal(0, LEAN_DEG, 2)
+        scene = world.scene
+        scene = replace(
+            scene,
+            azimuth_deg=scene.azimuth_deg + turned,
+            altitude_deg=scene.altitude_deg + lean[0],
+            roll_deg=scene.roll_deg + lean[1],
+        )
+        for _ in range(frames):
+            light = expose(scene, world.sky, now, EXPOSURE_S, rng)
+            stars.append(detected(scene, light, now + EXPOSURE_S / 2 + world.clock_s, EXPOSURE_S, rng))
+            warm = warmth + trend * (now - begin) / 3600
+            off = zero.at(now) + scene.tilt_errors.zero + warm * world.per_c
+            shaky = replace(scene, tilt_errors=replace(scene.tilt_errors, zero=tuple(off)))
+            for k in range(READINGS):
+                moment = now + (k + 0.5) * EXPOSURE_S / READINGS + world.clock_s
+                rows.append((moment, *read_tilt(shaky, 0.0, rng), 15.0 + warm))
+            now += CADENCE_S
+        now += TURN_S
+    return stars, TiltLog.of(*np.array(rows).T, world.told.inclinometer.noise_rad), scene.heading
+
+
+def turned_night(
+    rng: np.random.Generator,
+    catalogue: Catalogue,
+    errors: InclinometerErrors = SCA100T,
+    headings: int = 4,
+    frames: int = 25,
+    clock_stddev_s: float = 0.01,
+) -> Outcome:
+    """Re-mounted somewhere and turned on the spot, A3 unknown."""
+    world, begin = draw(rng, catalogue, errors, clock_stddev_s)
+    turns = np.arange(headings) * 360 / headings
+    stars, tilts, heading = photograph(world, Zero(errors, rng, begin), begin, turns, frames, rng)
+    solver = Solver(world.told, catalogue, world.air)
+
+    def answer():
+        return average(turn(solver, stars, tilts.average).fixes)
+
+    return _outcome("turned", answer, world.site, heading, rng)
+
+
+def calibrated_night(
+    rng: np.random.Generator,
+    catalogue: Catalogue,
+    errors: InclinometerErrors = SCA100T,
+    frames: int = 6,
+    clock_stddev_s: float = 0.01,
+) -> Outcome:
+    """Calibrated at a known place at two leans, then days later at another, in other air, leaning otherwise."""
+    world, begin = draw(rng, catalogue, errors, clock_stddev_s)
+    zero = Zero(errors, rng, begin)
+    stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)
+    lower = replace(world, scene=replace(world.scene, altitude_deg=world.scene.altitude_deg - 5))
+    more, readings, _ = photograph(lower, zero, begin + 3600, [0.0], frames, rng)
+    tilts = TiltLog(
+        *(np.concatenate(pair) for pair in zip(vars(tilts).values(), vars(readings).values(), strict=True))
+    )
+    solver = Solver(world.told, catalogue, world.air)
+    later = begin + DAY_S * rng.uniform(0.1, 20)
+    there = at_place(world, rng, later)
+    there = replace(
+        there, scene=replace(there.scene, altitude_deg=there.scene.altitude_deg + rng.normal(0, 1.0))
+    )
+
+    shots, levels, heading = photograph(there, zero, later, [0.0], frames, rng)
+
+    def answer():
+        found = calibrate_at(solver, stars + more, tilts.average, world.site)
+        ready = replace(solver, instrument=found.instrument)
+        solutions = [ready.solve(s, levels.average) for s in shots]
+        return average([s.fix for s in solutions if s.fix])
+
+    return _outcome("calibrated", answer, there.site, heading, rng)
+
+
+def _outcome(kind: str, answer, site: Site, heading: float, rng: np.random.Generator) -> Outcome:
+    """What came of it, against the truth."""
+    try:
+        a: Average = answer()
+    except StarposError as e:
+        nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
+        return Outcome(kind, *nothing, *nothing, str(e))
+    unknown = Deflection()
+    xi, eta = rng.normal(0, unknown.stddev_arcsec, 2)
+    phi, lam = np.radians([site.latitude_deg, site.longitude_deg])
+    true = geodetic(phi, lam, heading, np.zeros((3, 3)), Deflection(xi, eta, 0.0))
+    said = geodetic(a.latitude, a.longitude, a.heading, a.covariance, unknown)
+    return Outcome(
+        kind,
+        _apart(a.latitude - phi, a.longitude - lam, a.heading - heading, phi),
+        a.covariance,
+        _apart(
+            said.latitude - true.latitude, said.longitude - true.longitude, said.heading - true.heading, phi
+        ),
+        said.covariance,
+    )
+
+
+def _apart(latitude: float, longitude: float, heading: float, phi: float) -> np.ndarray:
+    prime, meridian = curvature_radii_m(phi)
+    return np.array([half_turn(longitude) * prime * np.cos(phi), latitude * meridian, half_turn(heading)])
