@@ -277,3 +277,20 @@ def test_without_rosbags_the_pip_line_is_said(lists, tilts, tmp_path, capsys, mo
     status, _, errors = report(capsys, bag, tmp_path / "out")
     assert (status, len(errors)) == (2, 1)
     assert "pip install 'starpos[report]'" in errors[0]
+
+
+def test_solutions_of_nonsense_are_no_fix_and_no_crash(said, lists, tmp_path, capsys):
+    inf, nan = float("inf"), float("nan")
+    wrong = [{"latitude": 1e6}, {"longitude": nan}, {"covariance": [[-1.0, 0, 0], [0, 1, 0], [0, 0, 1]]},
+             {"heading": inf}, {"residual_arcsec": inf}]  # fmt: skip
+    with Recorder(tmp_path / "bag") as bag:
+        for k, broken in enumerate(wrong):
+            bag.solution(lists[0].mid_unix_s + k, said[0] | broken)
+        bag.solution(0.0, said[0])
+        huge = {"tilt_samples": 1, "identify_seconds": 1e300, "right_ascension": 1.0, "focal_px": -1.0}
+        bag.write("solver/solution", bag.message("Solution", 1e9, status=200, **huge), 1e9)
+    status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out")
+    assert status == 0
+    assert "7: 2 with a fix, 5 bad input" in page.text
+    for png in page.pictures.values():
+        assert_drawn(png)

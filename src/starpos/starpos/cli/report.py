@@ -84,7 +84,7 @@ def _night(path: Path, args) -> Night:
     from starpos.report.working import Workshop, worked
 
     shop = Workshop(
-        lambda stars: common.instrument_of(args, stars),
+        _once_a_size(lambda stars: common.instrument_of(args, stars)),
         catalogue.load(),
         common.atmosphere_of(args),
         common.vertical_of(args),
@@ -102,7 +102,7 @@ def _night(path: Path, args) -> Night:
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
     found = bag.read(path, args.namespace, _tilt_noise(args), shop.progress)
-    return recorded.night(found, replace(shop, instrument_for=_with_camera(args, found)))
+    return recorded.night(found, replace(shop, instrument_for=_once_a_size(_with_camera(args, found))))
 
 
 def _tilt_noise(args) -> float:
@@ -113,6 +113,19 @@ def _tilt_noise(args) -> float:
 def _instrument(args) -> Instrument:
     """What the options say besides the camera."""
     return common.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
+
+
+def _once_a_size(instrument_for):
+    """The same, asked for the first frame of each size only."""
+    known = {}
+
+    def remembered(stars: Stars) -> Instrument:
+        size = stars.width, stars.height
+        if size not in known:
+            known[size] = instrument_for(stars)
+        return known[size]
+
+    return remembered
 
 
 def _with_camera(args, found):

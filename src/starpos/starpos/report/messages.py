@@ -87,7 +87,9 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
     unit = np.array([1.0, 1.0, np.radians(1.0)])
     covariance = np.asarray(m.covariance, float).reshape(3, 3) * np.outer(unit, unit)
     angles = np.radians([m.latitude, m.longitude, m.heading])
-    if status is Status.OK and np.isfinite(angles).all() and np.isfinite(covariance).all():
+    sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and abs(m.eta) < 3600
+    sane &= bool(np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all())
+    if status is Status.OK and sane:
         heading = angles[2] + m.eta * ARCSEC * np.tan(np.radians(m.latitude_geodetic))
         terms = tuple(
             ErrorTerm(
@@ -96,6 +98,7 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
                 ALWAYS if t.common else None,
             )
             for t in m.budget
+            if np.isfinite([t.east, t.north, t.heading]).all()
         )
         place = Place(utc, float(angles[0]), float(angles[1]), full_turn(heading), covariance, terms)
     elif status is Status.OK:
@@ -113,11 +116,16 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
         size=next(iter(cameras)) if len(cameras) == 1 else None,
         stars_detected=int(m.stars_detected),
         stars_matched=int(m.stars_matched),
-        residual_arcsec=float(m.residual),
-        tilt=(m.tilt.x, m.tilt.y) if m.tilt_samples else NO_TILT,
-        identify_s=float(m.identify_seconds),
-        fix_s=float(m.fix_seconds),
+        residual_arcsec=_finite(m.residual),
+        tilt=(_finite(m.tilt.x), _finite(m.tilt.y)) if m.tilt_samples else NO_TILT,
+        identify_s=_finite(m.identify_seconds),
+        fix_s=_finite(m.fix_seconds),
     )
+
+
+def _finite(value: float) -> float:
+    """NaN for what no instrument says."""
+    return float(value) if abs(value) < 1e9 else float("nan")
 
 
 def deflection_of(m) -> Deflection | None:

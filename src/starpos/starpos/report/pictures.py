@@ -2,12 +2,14 @@
 """Which figures a night has, each with what one sees in it and what would be suspicious."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from starpos import residual_map
 from starpos.catalogue import Catalogue
+from starpos.errors import TimeError
 from starpos.report import frame_figures, measures, place_figures, sky_figure
 from starpos.report.night import Night
 from starpos.report.style import figures_of, new_figure, png_of
@@ -29,8 +31,9 @@ def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
         yield from _of_place(night)
         if (over := frame_figures.overlaid(night)) is not None:
             yield _residuals(*over)
-        if any(frame_figures.pointed(s) for s in night.shots):
-            yield _drawn("sky", "Where the camera looked", _sky_caption(), 6.4,
+        with suppress(TimeError):  # of a recorded solution that no table of the Earth's rotation knows
+            if any(frame_figures.pointed(s) for s in night.shots):
+                yield _drawn("sky", "Where the camera looked", _sky_caption(), 6.4,
                          lambda f: sky_figure.draw_sky(f, night, catalogue))  # fmt: skip
     if night.shots:
         yield _drawn("health", "Frame by frame", HEALTH, 6.4, lambda f: frame_figures.draw_health(f, night))

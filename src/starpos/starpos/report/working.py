@@ -50,18 +50,19 @@ class Workshop:
 def worked(exposures: Exposures, shop: Workshop) -> Night:
     """The night of these exposures; InstrumentError where no frame can have one."""
     solve = _turned if shop.self_calibrate else _one_by_one
-    shots, fixes, instrument, remarks, extrapolated_days = [], [], None, (), 0.0
+    shots, fixes, instrument, remarks, extrapolated_days = [], [], None, [], 0.0
     for done, (exposure, solution, used, said) in enumerate(solve(exposures, shop), 1):
         shots.append(_shot(exposure, solution))
         if solution.fix:
             fixes.append(solution.fix)
             instrument = used
             extrapolated_days = max(extrapolated_days, solution.extrapolated_days)
-        remarks = (*remarks, *said)
+        remarks += said
         shop.progress(exposures.name[:20], done / exposures.count)
     combined, why_not, said = _combined(fixes, shots)
+    remarks += said
     if extrapolated_days > 0:
-        said.append(
+        remarks.append(
             f"the Earth's rotation is extrapolated {extrapolated_days:.0f} days beyond the IERS table, which the budget "
             "holds as ut1: upgrade astropy-iers-data"
         )
@@ -74,7 +75,7 @@ def worked(exposures: Exposures, shop: Workshop) -> Night:
         shop.vertical,
         shop.atmosphere,
         exposures.truth,
-        remarks=(*remarks, *said),
+        remarks=tuple(remarks),
     )
     return replace(night, steady=_steady(night, instrument)) if combined else night
 
@@ -87,12 +88,11 @@ def _one_by_one(exposures: Exposures, shop: Workshop) -> Iterator:
             yield exposure, _unreadable(exposure), None, ()
             continue
         solver = shop.solver(exposure.stars, exposure.clock_stddev_s)
-        if (exposure.stars.width, exposure.stars.height) not in prepared:
-            prepared.add((exposure.stars.width, exposure.stars.height))
-            with suppress(StarposError):  # which the frame will say
-                solver.prepare(
-                    exposure.stars.width, exposure.stars.height
-                )  # or the first frame's time holds it
+        size = exposure.stars.width, exposure.stars.height
+        if size not in prepared:  # else the time of the first frame would hold the building of the triangles
+            prepared.add(size)
+            with suppress(StarposError):  # which the frame itself will say
+                solver.prepare(*size)
         solution = solver.solve(exposure.stars, exposures.tilt, standing)
         standing = solution.standing or standing
         yield exposure, solution, solver.instrument, ()
