@@ -31,7 +31,7 @@ h1 { font-size: 1.6rem; margin: .4rem 0; } h2 { font-size: 1.3rem; margin: 2.4re
 table { border-collapse: collapse; width: 100%; background: var(--card); font-variant-numeric: tabular-nums; }
 th, td { text-align: left; vertical-align: top; padding: .4rem .7rem; border: 1px solid var(--line); }
 th { font-weight: 600; width: 13rem; } thead th { width: auto; }
-.wide table { overflow-wrap: normal; } a { color: inherit; }
+.wide { margin-bottom: 1.2rem; } .wide table { white-space: nowrap; } a { color: inherit; }
 .figures { display: grid; gap: 1.2rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 36rem), 1fr)); }
 figure { margin: 0; padding: .8rem; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
 figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; } figure div { overflow-x: auto; }
@@ -190,21 +190,30 @@ def _names(night: Night) -> str:
 
 
 def _table_of_nights(nights: Sequence[Night]) -> str:
-    head = "".join(
-        f"<th>{t}</th>" for t in ("", "Night", "Latitude, longitude", "1 sigma N, E", "Error", "Frames")
+    titles = (
+        "",
+        "Night",
+        "Latitude, longitude",
+        "1 sigma N, E",
+        "Error N, E",
+        "Latitude, longitude",
+        "Frames",
     )
     rows = []
     for number, n in enumerate(nights, 1):
-        cells = ["", "", ""]
+        cells = ['<span class="bad">no position</span>', "", "", ""]
         if n.combined:
             east, north, _ = n.combined.sigma
-            place = f"{_degrees(n.combined.latitude)}, {_degrees(n.combined.longitude)}"
-            cells = [place, f"{north:.0f} m, {east:.0f} m", _error(n) if n.truth else ""]
-        else:
-            cells[0] = f'<span class="bad">{escape(n.why_not)}</span>'
+            cells[0] = f"{_degrees(n.combined.latitude)}, {_degrees(n.combined.longitude)}"
+            cells[1] = f"{north:.0f} m, {east:.0f} m"
+        if n.combined and n.truth:
+            east, north = measures.offset_m(n.combined, n.truth.latitude, n.truth.longitude)
+            cells[2] = f"{north:+.0f} m, {east:+.0f} m"
+            cells[3] = ", ".join(f"{v:+.2f}&Prime;" for v in measures.error_arcsec(n))
         name = f'<a href="#night{number}">{escape(n.name)}</a>'
         row = [str(number), name, *cells, f"{len(n.fixed)} of {len(n.shots)}"]
         rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>")
+    head = "".join(f"<th>{t}</th>" for t in titles)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n' + "\n".join(rows) + "</table></div>"
 
 
