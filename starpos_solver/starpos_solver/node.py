@@ -2,10 +2,9 @@
 """The node `solver`: stars and tilts in, `fix`, `heading/imu` and `solver/solution` out."""
 
 import math
-import threading
 import traceback
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
@@ -19,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from starpos import catalogue
 from starpos.camera import Camera
-from starpos.errors import StarposError
+from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.geoid import Geoid
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
@@ -27,18 +26,21 @@ from starpos.solve import Solution as Answer
 from starpos.solve import Solver, Status
 from starpos.standing import Standing
 from starpos.stars import Stars
+from starpos.vertical import Geodetic
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
 from starpos_common.messages import message_to_camera, message_to_stars
 from starpos_common.parameters import declare
 from starpos_interfaces.msg import Solution, StarArray, Tilt
-from starpos_interfaces.srv import Solve
-from starpos_solver import outputs, parameters
+from starpos_interfaces.srv import SaveCalibration, Solve
+from starpos_solver import outputs, parameters, reports, saving
+from starpos_solver.calibrating import Calibrating
+from starpos_solver.memory import Seen, with_stamp
 from starpos_solver.tilts import TiltBuffer
+from starpos_solver.worker import Outcome, Worker
 
 WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
 POLL_S = 0.02
-STALE_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -50,20 +52,12 @@ class Waiting:
     since_ns: int
 
 
-@dataclass(frozen=True)
-class Made:
-    """What the thread made of a camera: a solver, or why there is none."""
-
-    camera: Camera
-    solver: Solver | None
-    trouble: str
-
-
 class SolverNode(Node):
     """See README.md."""
 
     def __init__(self):
         super().__init__("solver")
+        self._camera: Camera | None = None
         self._known: Instrument | None = None
         self._known_url = ""
         self._geoid: Geoid | None = None
@@ -75,10 +69,8 @@ class SolverNode(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
-        self._camera: Camera | None = None
         self._solver: Solver | None = None
-        self._preparing: threading.Thread | None = None
-        self._made: Made | None = None
+        self._preparing = Worker(self)
         self._trouble = ""  # why there is no solver
         self._latest: Waiting | None = None
         self._answer: Answer | None = None
@@ -92,6 +84,7 @@ class SolverNode(Node):
         qos = QoSProfile(depth=10)
         override = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
         self._fix = self.create_publisher(NavSatFix, "fix", qos, **override)
+        self._fix_averaged = self.create_publisher(NavSatFix, "fix_averaged", qos, **override)
         self._imu = self.create_publisher(Imu, "heading/imu", qos, **override)
         self._solution = self.create_publisher(Solution, "solver/solution", qos, **override)
         self.create_subscription(CameraInfo, "camera/camera_info", self._on_camera, qos, **override)
@@ -99,14 +92,19 @@ class SolverNode(Node):
         self.create_subscription(StarArray, "stars", self._on_stars, qos, **override)
         self.create_service(Solve, "solver/solve", self._on_solve)
         self.create_service(Trigger, "solver/reset", self._on_reset)
-        self._prepared = self.create_guard_condition(self._on_prepared)
+        self.create_service(SaveCalibration, "solver/save_calibration", self._on_save_calibration)
+        self._calibrating = Calibrating(self, self._values, self._solver_now, self._remake_solver)
         group = MutuallyExclusiveCallbackGroup()
         self._poll = self.create_timer(
             POLL_S, self._work, callback_group=group, clock=self._steady, autostart=False
         )
-        self._diagnostics = Diagnostics(
-            self, {"Solution": self._report_solution, "Inputs": self._report_inputs}, self._values["frame_id"]
-        )
+        tasks = {
+            "Solution": self._report_solution,
+            "Inputs": self._report_inputs,
+            "Calibration": self._calibrating.report,
+            "Average": self._calibrating.average.report,
+        }
+        self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -116,6 +114,8 @@ class SolverNode(Node):
             known = self._known
             if values["calibration_url"] != self._known_url:
                 known = parameters.known_instrument(values["calibration_url"])
+                if self._camera is not None:
+                    parameters.check_camera(known, values["calibration_url"], self._camera)
             parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0), known)
             parameters.atmosphere_of(values)
             grid = self._geoid
@@ -131,7 +131,16 @@ class SolverNode(Node):
             self._read_instrument()
         if "deflection.geoid" in names:
             self._read_geoid()
-        if self._solver is not None and self._camera is not None:
+        self._calibrating.parameters_set(names)
+        self._remake_solver()
+
+    def _remake_solver(self):
+        """With the parameters and the calibration of now."""
+        if self._camera is None or self._preparing.busy:
+            return
+        if self._solver is None:
+            self._prepare(self._camera)
+        else:
             self._solver = self._make_solver(self._camera)
 
     def _read_instrument(self):
@@ -144,8 +153,9 @@ class SolverNode(Node):
         self._geoid = parameters.geoid_file(self._geoid_name)
 
     def _make_solver(self, camera: Camera) -> Solver:
+        parameters.check_camera(self._known, self._known_url, camera)
         return Solver(
-            parameters.instrument_of(self._values, camera, self._known),
+            parameters.instrument_of(self._values, camera, self._known, self._calibrating.found),
             self._catalogue,
             parameters.atmosphere_of(self._values),
             self._values["min_stars"],
@@ -168,38 +178,29 @@ class SolverNode(Node):
         if camera == self._camera:
             return
         self._camera, self._solver, self._trouble, self._standing = camera, None, "", None
-        if self._preparing is None:
+        self._calibrating.camera_changed()
+        if not self._preparing.busy:
             self._prepare(camera)
 
     def _prepare(self, camera: Camera):
         """Have the triangles of this field ready; they may have to be built, which must not hold up the node."""
 
-        def work():
-            try:
-                solver = self._make_solver(camera)
-                solver.prepare(camera.width, camera.height)
-                self._made = Made(camera, solver, "")
-            except StarposError as e:
-                self._made = Made(camera, None, str(e))
-            except Exception as e:  # or the node would wait for the triangles for ever
-                self._made = Made(
-                    camera, None, f"the triangles of this field cannot be made ({type(e).__name__}: {e})"
-                )
-            self._prepared.trigger()
+        def work() -> Solver:
+            solver = self._make_solver(camera)
+            solver.prepare(camera.width, camera.height)
+            return solver
 
-        self._preparing = threading.Thread(target=work, daemon=True)
-        self._preparing.start()
+        self._preparing.run(work).add_done_callback(lambda f: self._on_prepared(camera, f.result()))
 
-    def _on_prepared(self):
-        made, self._preparing = self._made, None
-        if made.camera != self._camera:  # another one has come meanwhile
+    def _on_prepared(self, camera: Camera, made: Outcome):
+        if camera != self._camera:  # another one has come meanwhile
             self._prepare(self._camera)
             return
-        self._solver, self._trouble = made.solver, made.trouble
+        self._solver, self._trouble = made.value, made.trouble
         if self._trouble:
             self._log_change(self._trouble, good=False)
         else:
-            self._apply(frozenset())  # with the parameters of now
+            self._remake_solver()  # with the parameters of now
         self._work()
 
     def _on_tilt(self, message: Tilt):
@@ -222,6 +223,9 @@ class SolverNode(Node):
         self._seen("stars")
         try:
             stars = message_to_stars(message)
+            if not 0 <= message.stamp_stddev < math.inf:
+                stddev = message.stamp_stddev
+                raise FrameError(f"stars: stamp_stddev is {stddev} s: it must be 0 (unknown) or more")
         except StarposError as e:
             self._publish(message.header, Answer(Status.BAD_INPUT, str(e), "stars", None, len(message.stars)))
             return
@@ -248,7 +252,7 @@ class SolverNode(Node):
 
     def _ready(self, frame: Waiting) -> bool:
         waited_s = (self._steady.now().nanoseconds - frame.since_ns) * 1e-9
-        if self._preparing is not None:
+        if self._preparing.busy:
             return False
         if self._solver is None or frame.stars.mid_unix_s is None:
             return (
@@ -265,32 +269,44 @@ class SolverNode(Node):
 
     def _solve(self, frame: Waiting):
         self._latest = frame
-        self._publish(frame.message.header, self._answer_to(frame, self._standing))
+        answer = self._answer_to(frame, self._standing)
+        self._publish(frame.message.header, answer)
+        if self._solver is not None:
+            self._learn(frame, answer)
+
+    def _solver_now(self) -> Solver:
+        """InstrumentError with the reason while there is none."""
+        if self._solver is not None:
+            return self._solver
+        topic = self.resolve_topic_name("camera/camera_info")
+        waiting = f"{topic}: no camera calibration has arrived: start the camera"
+        if self._preparing.busy:
+            waiting = "the triangles of this field are being built"
+        raise InstrumentError(self._trouble or waiting)
 
     def _answer_to(self, frame: Waiting, standing: Standing | None) -> Answer:
         stars = frame.stars
-        if self._solver is None:
-            topic = self.resolve_topic_name("camera/camera_info")
-            waiting = f"{topic}: no camera calibration has arrived: start the camera"
-            if self._preparing:
-                waiting = "the triangles of this field are being built"
-            reason = self._trouble or waiting
-            return Answer.failed(stars, Status.BAD_INPUT, reason)
-        solver = self._solver
-        stamp_stddev = frame.message.stamp_stddev
-        if not 0 <= stamp_stddev < math.inf:
-            reason = f"stars: stamp_stddev is {stamp_stddev} s: it must be 0 (unknown) or more"
-            return Answer.failed(stars, Status.BAD_INPUT, reason)
-        if stamp_stddev > 0:
-            clock = math.hypot(solver.instrument.clock_stddev_s, stamp_stddev)
-            solver = replace(solver, instrument=replace(solver.instrument, clock_stddev_s=clock))
         try:
+            solver = with_stamp(self._solver_now(), frame.message.stamp_stddev)
             return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing)
+        except InstrumentError as e:
+            return Answer.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:  # a defect costs this frame, not the night
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
             return Answer.failed(
                 stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
             )
+
+    def _learn(self, frame: Waiting, answer: Answer):
+        """What a calibration and the average take from a frame, also from one that a stale calibration refuses."""
+        stars = frame.stars
+        try:
+            tilt = answer.tilt or self._tilts.average(stars.mid_unix_s or math.nan, self._span(stars))
+        except StarposError:
+            return
+        self._calibrating.learn(Seen(stars, tilt, frame.message.stamp_stddev), answer.fix)
+        if answer.ok:
+            self._fix_averaged.publish(self._averaged(frame.message.header))
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -312,8 +328,19 @@ class SolverNode(Node):
         message = outputs.solution(header, answer, ground)
         if self._solver is None and self._camera is None:
             message.status = Solution.NO_CAMERA
-        fix = outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
-        return message, fix, outputs.imu(header, answer, ground) if ground else None
+        return (
+            message,
+            self._nav_sat_fix(header, ground),
+            outputs.imu(header, answer, ground) if ground else None,
+        )
+
+    def _averaged(self, about: Header) -> NavSatFix:
+        header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
+        vertical = parameters.vertical_of(self._values, self._geoid)
+        return self._nav_sat_fix(header, outputs.average_on_ground(self._calibrating.average.place, vertical))
+
+    def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
+        return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
 
     def _log_change(self, sentence: str, good: bool, state: object = None):
         state = state or sentence
@@ -341,35 +368,35 @@ class SolverNode(Node):
         self._tilts.clear()
         self._waiting.clear()
         self._latest = self._answer = self._standing = None
-        response.success, response.message = True, "tilts, frames that wait and the last fix are forgotten"
+        self._calibrating.forget()
+        response.success = True
+        response.message = "tilts, frames and the place are forgotten; a calibration that was found is not"
+        return response
+
+    def _on_save_calibration(self, request, response):
+        url = self._values["calibration_url"]
+        try:
+            instrument = self._solver_now().instrument
+            if self._calibrating.unknown:
+                raise InstrumentError("the calibration in use is not known: calibrate first")
+            written = saving.save(request.path, url, instrument)
+        except StarposError as e:
+            response.message = str(e)
+            return response
+        if written == saving.path_of(url):  # what a restart would read
+            self._known = instrument
+        response.success, response.message = True, f"{written}: the calibration in use is written"
         return response
 
     # diagnostics -----------------------------------------------------------------------------------------------------
 
     def _report_solution(self) -> Report:
-        a = self._answer
-        if a is None:
-            waiting = "building the triangles of this field" if self._preparing else "no frame yet"
+        if self._answer is None:
+            waiting = "building the triangles of this field" if self._preparing.busy else "no frame yet"
             return Report(Level.WARN, self._trouble or waiting, self._counts)
-        values = self._counts | {"status": a.status.value, "stars detected": a.stars_detected}
-        values |= {"stars matched": len(a.names), "identify (s)": a.identify_s, "fit (s)": a.fix_s}
-        if a.fix:
-            east, north, _ = a.fix.covariance.diagonal() ** 0.5
-            values |= {
-                "sigma east (m)": float(east),
-                "sigma north (m)": float(north),
-                "residual (arcsec)": a.fix.residual_arcsec,
-            }
-        if a.extrapolated_days > 0:
-            old = f"UT1 is extrapolated by {a.extrapolated_days:.0f} days: upgrade astropy-iers-data"
-            return Report(Level.WARN, old if a.ok else a.message, values)
-        return Report(Level.OK if a.ok else Level.WARN, a.message, values)
+        return reports.of_solution(self._answer, self._counts)
 
     def _report_inputs(self) -> Report:
         now = self._steady.now().nanoseconds
         ages = {name: (now - seen) * 1e-9 for name, seen in self._last_seen_ns.items()}
-        missing = [name for name in ("camera_info", "stars", "tilt") if ages.get(name, 1e9) > STALE_S]
-        values = {f"{name} age (s)": age for name, age in ages.items()} | {"tilts kept": len(self._tilts)}
-        if missing:
-            return Report(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
-        return Report(Level.OK, "all inputs arrive", values)
+        return reports.of_inputs(ages, len(self._tilts))

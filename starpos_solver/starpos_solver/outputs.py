@@ -8,13 +8,13 @@ from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
 from starpos import rotation
+from starpos.average import Average
 from starpos.solve import Solution as Answer
 from starpos.solve import Status
 from starpos.vertical import ARCSEC, Geodetic, Vertical, geodetic
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces.msg import ErrorTerm, Solution
 
-NO_CAMERA = "no camera"
 STATUS = {
     Status.OK: Solution.OK,
     Status.TOO_FEW_STARS: Solution.TOO_FEW_STARS,
@@ -33,6 +33,11 @@ def on_ground(answer: Answer, vertical: Vertical) -> Geodetic | None:
     """The geodetic position of an answer; None without a fix."""
     fix = answer.fix
     return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical) if fix else None
+
+
+def average_on_ground(place: Average, vertical: Vertical) -> Geodetic:
+    """The geodetic position of an average."""
+    return geodetic(place.latitude, place.longitude, place.heading, place.covariance, vertical)
 
 
 def nav_sat_fix(

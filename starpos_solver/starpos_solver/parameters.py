@@ -8,13 +8,16 @@ from dataclasses import replace
 from starpos import geoid, instrument, instrument_file
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
-from starpos.errors import GeoidError
+from starpos.errors import GeoidError, InstrumentError
 from starpos.geoid import Geoid
 from starpos.instrument import Calibration, Instrument
+from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos_common.parameters import Parameter
+from starpos_solver import saving
 
 NAN = math.nan
+SAME_FOCAL = 0.05  # of the focal length, by which that of one camera may change
 
 PARAMETERS = (
     Parameter("frame_id", "starpos_link", "Frame of fix and heading: x forward, y left, z up."),
@@ -22,7 +25,8 @@ PARAMETERS = (
         "calibration_url",
         "",
         "Instrument file (YAML): misalignment and its error, mount, tilt noise, clock; '' uses the next two parameters. "
-        "A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km.",
+        "A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km. One whose focal length "
+        "is 5 % from camera_info's is refused.",
     ),
     Parameter(
         "misalignment",
@@ -37,6 +41,38 @@ PARAMETERS = (
         instrument.UNSTATED_CALIBRATION_ARCSEC,
         "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. Too small "
         "makes fixes claim more than they hold.",
+        "arcsec",
+        0.0,
+        36000.0,
+    ),
+    Parameter(
+        "calibration_frames",
+        100,
+        "Newest frames kept for solver/calibrate. Few leave the tilts' noise in A3; many take seconds to work out.",
+        "",
+        1,
+        1000,
+    ),
+    Parameter(
+        "calibration_turn_stddev",
+        180.0,
+        "How well the misalignment in use has its turn about the plumb line when solver/calibrate begins; frames at one "
+        "lean do not tell it. 180 is not at all: then fixes at another lean claim little. Too small makes them wrong.",
+        "deg",
+        0.000001,
+        180.0,
+    ),
+    Parameter(
+        "self_calibration",
+        False,
+        "Take the misalignment for unknown and find it whenever the instrument has been turned on the spot to four "
+        "headings or more; until then fixes carry an error of 10 deg. Needs a solver/reset after driving on, until it "
+        "has found it once.",
+    ),
+    Parameter(
+        "self_calibration_limit",
+        60.0,
+        "Error of the plumb line in the camera up to which what turning on the spot tells is used; 1 arcsec is 31 m.",
         "arcsec",
         0.0,
         36000.0,
@@ -117,20 +153,27 @@ PARAMETERS = (
 )
 
 
-def instrument_of(values: Mapping, camera: Camera, known: Instrument | None) -> Instrument:
+def instrument_of(
+    values: Mapping, camera: Camera, known: Instrument | None, found: Calibration | None = None
+) -> Instrument:
     """The Instrument of an instrument file (`known`, None without one) or of the parameters, with camera_info's camera.
 
-    clock_stddev and tilt_stddev win over the file where they are set.
+    clock_stddev and tilt_stddev win over the file where they are set, and the calibration that frames have told (`found`)
+    over both; self_calibration makes the others unknown.
     """
     if known is None:
         known = Instrument(
             camera.fx,
             calibration=Calibration.of(values["misalignment"], (values["misalignment_stddev"],) * 3),
         )
+    calibration = found or known.calibration
+    if values["self_calibration"] and found is None:
+        calibration = Calibration.of(calibration.misalignment_deg, UNKNOWN_ARCSEC)
     clock, tilt = values["clock_stddev"], values["tilt_stddev"]
     errors = known.inclinometer
     return replace(
         known,
+        calibration=calibration,
         camera=camera,
         focal_px=camera.fx,
         clock_stddev_s=known.clock_stddev_s if math.isnan(clock) else clock,
@@ -140,7 +183,16 @@ def instrument_of(values: Mapping, camera: Camera, known: Instrument | None) -> 
 
 def known_instrument(url: str) -> Instrument | None:
     """The Instrument that calibration_url names, None for ''; InstrumentError with the reason where it is broken."""
-    return instrument_file.read(url.removeprefix("file://")) if url else None
+    return instrument_file.read(saving.path_of(url)) if url else None
+
+
+def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
+    """InstrumentError where the instrument file (`known`, from `url`) is of a camera that is not this one."""
+    if known is None or abs(known.focal_px / camera.fx - 1) <= SAME_FOCAL:
+        return
+    raise InstrumentError(
+        f"{url}: it is of another camera: its focal length is {known.focal_px:.0f} px, camera_info's {camera.fx:.0f}"
+    )
 
 
 def atmosphere_of(values: Mapping) -> Atmosphere:

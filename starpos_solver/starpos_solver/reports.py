@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the solver says of its frames and its inputs in /diagnostics."""
+
+from collections.abc import Mapping
+
+from starpos.solve import Solution as Answer
+from starpos_common.diagnostics import Level
+from starpos_common.diagnostics import Status as Report
+
+STALE_S = 5.0
+
+
+def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
+    """The newest frame's."""
+    values = counts | {"status": answer.status.value, "stars detected": answer.stars_detected}
+    values |= {
+        "stars matched": len(answer.names),
+        "identify (s)": answer.identify_s,
+        "fit (s)": answer.fix_s,
+    }
+    if answer.fix:
+        east, north, _ = answer.fix.covariance.diagonal() ** 0.5
+        values |= {
+            "sigma east (m)": float(east),
+            "sigma north (m)": float(north),
+            "residual (arcsec)": answer.fix.residual_arcsec,
+        }
+    if answer.extrapolated_days > 0:
+        old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
+        return Report(Level.WARN, old if answer.ok else answer.message, values)
+    return Report(Level.OK if answer.ok else Level.WARN, answer.message, values)
+
+
+def of_inputs(ages_s: Mapping[str, float], tilts_kept: int) -> Report:
+    """ages_s: how long ago the last message of each input came that has come at all."""
+    missing = [name for name in ("camera_info", "stars", "tilt") if ages_s.get(name, 1e9) > STALE_S]
+    values = {f"{name} age (s)": age for name, age in ages_s.items()} | {"tilts kept": tilts_kept}
+    if missing:
+        return Report(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
+    return Report(Level.OK, "all inputs arrive", values)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where solver/save_calibration may write."""
+
+from pathlib import Path
+
+from starpos import instrument_file
+from starpos.errors import InstrumentError
+from starpos.instrument import Instrument
+
+
+def path_of(url: str) -> Path:
+    """The file that calibration_url, or a request, names."""
+    return Path(url.removeprefix("file://"))
+
+
+def save(path: str, calibration_url: str, instrument: Instrument) -> Path:
+    """Write an instrument file, at `path` or else where calibration_url says; its Path.
+
+    InstrumentError where it cannot be written, or there is something else already.
+    """
+    if not path and not calibration_url:
+        raise InstrumentError("there is no file to write: give a path, or set calibration_url")
+    if path and not path_of(path).is_absolute():
+        raise InstrumentError(
+            f"{path}: give a full path, from / on: the node would write it into the folder it was started in"
+        )
+    where = path_of(path or calibration_url)
+    try:
+        occupied = where.exists()
+    except (OSError, ValueError) as e:
+        raise InstrumentError(f"{where}: the file cannot be written there ({e})") from None
+    if occupied:
+        try:
+            instrument_file.read(where)
+        except InstrumentError as e:
+            raise InstrumentError(f"it would replace what is no instrument file: {e}") from None
+    instrument_file.write(where, instrument)
+    return where
