@@ -14,13 +14,25 @@ from starpos.catalogue import Catalogue
 from starpos.earth import earth_motion
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.identification import Identification, Pointing, Sky, identify_directions
-from starpos.intrinsics import Intrinsics, Sighting, check_invertible, check_sound, fit_camera, unbent
+from starpos.intrinsics import (
+    PARAMETERS,
+    Intrinsics,
+    Sighting,
+    check_invertible,
+    check_sound,
+    fewest_stars,
+    fit_camera,
+    unbent,
+)
 from starpos.progress import Progress, quiet
 from starpos.solve import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
 from starpos.stars import Stars
 
-FIRST = ("fx", "fy", "k1")  # what the first, coarse matches may tell
-ROUNDS = 4  # of the finer ones
+# what the coarse matches of the first rounds may tell: a term too many, and the corners' wrong matches make it come true
+FREE = (("fx", "fy", "k1"), ("fx", "fy", "cx", "cy", "k1"), ("fx", "fy", "cx", "cy", "k1", "k2"))
+# Of few stars nearly all must fit: a wrong lens leaves some over, which of many do not matter
+FEW, NEARLY_ALL = 2 * fewest_stars(), 0.9
+ROUNDS = 5  # the most, of those in which all may
 SETTLED_SHARE = 0.002  # of the stars: so few more are no reason for another round
 
 
@@ -55,24 +67,29 @@ def calibrate(
     table = triangles.cached(catalogue, given.half_diagonal_rad, progress)
     skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
     camera, known, before = given, {}, 0
-    for k in range(1 + ROUNDS):
+    for k, free in enumerate((*FREE, *[PARAMETERS] * ROUNDS)):
         sightings = {}
         for n, frame in enumerate(skies):
             if sighting := frame.sighting(camera, atmosphere, known.get(n)):
                 sightings[n] = sighting
-            progress("camera", (k + (n + 1) / len(skies)) / (1 + ROUNDS))
+            progress("camera", (k + (n + 1) / len(skies)) / (len(FREE) + ROUNDS))
         if not sightings:
             raise CalibrationError(
                 f"none of the sky fits any of the {len(frames)} frames: check the focal length ({given.fx:.0f} px given, "
                 "3 % is allowed), clouds and exposure"
             )
-        fit = fit_camera(list(sightings.values()), given, atmosphere, **({} if k else {"free": FIRST}))
+        fit = fit_camera(list(sightings.values()), given, atmosphere, free)
         check_invertible(fit.camera)
         camera, known = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
         count = sum(len(s.xy) for s in sightings.values())
-        if k and abs(count - before) <= SETTLED_SHARE * count:
+        if k >= len(FREE) and abs(count - before) <= SETTLED_SHARE * count:
             break
         before = count
+    there = sum(len(skies[n].stars) for n in sightings)
+    if count < FEW and len(fit.xy) < NEARLY_ALL * there:
+        raise CalibrationError(
+            f"{len(fit.xy)} of {there} stars fit one camera, too few to be sure of it: give frames with {FEW} or more"
+        )
     check_sound(fit, given)
     progress("camera", 1.0)
     return FromSky(fit, tuple(sightings))

@@ -28,7 +28,7 @@ UNLEVELLED = 1.25, 0.3  # of the shrinking at the zenith: taken, and 1 sigma an 
 UNTIMED = 1e-4  # that and less is the scale changed by aberration, which needs a time
 TOLD = 0.5  # of the prior's sigma: below it the sky has told a parameter
 BEYOND_PRIOR = 5.0  # sigma: no camera as it was given
-FEWEST_STARS = 20
+STARS_EACH = 3  # for each free parameter; with fewer one wrong match in a corner can pass for a lens
 MAX_SCATTER_PX = 1.5
 MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6  # the last in sigma of the priors
 STEP_RAD = 1e-6  # of the numerical derivatives for the attitudes
@@ -122,10 +122,10 @@ def fit_camera(
     Raises CalibrationError where the stars are too few or do not agree; whether they agree well enough and on a camera
     that can be is for `check_sound` to say.
     """
-    count = sum(len(s.xy) for s in sightings)
-    if count < FEWEST_STARS:
+    count, fewest = sum(len(s.xy) for s in sightings), fewest_stars(free)
+    if count < fewest:
         raise CalibrationError(
-            f"{count} identified stars are too few for a camera: give frames with {FEWEST_STARS} at least"
+            f"{count} identified stars are too few for a camera: give frames with {fewest} at least"
         )
     problem = _Problem.of(sightings, given, atmosphere, free)
     fitted = _settled(problem)
@@ -146,6 +146,11 @@ def fit_camera(
         float(np.sqrt(fitted.jitter2)),
         int((~keep).sum()),
     )
+
+
+def fewest_stars(free: Sequence[str] = PARAMETERS) -> int:
+    """How many a camera needs of which these are free; an attitude counts for one."""
+    return STARS_EACH * (len(free) + 1)
 
 
 def check_sound(fitted: Intrinsics, given: Camera) -> None:
@@ -376,7 +381,7 @@ def _settled(problem: _Problem) -> _Settled:
     keep, jitter2, settled = np.ones(len(problem.xy), bool), 0.0, False
     unknowns = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
     for _ in range(MAX_ROUNDS):
-        if keep.sum() < max(FEWEST_STARS, 0.5 * len(keep)):
+        if keep.sum() < 0.5 * len(keep):
             raise CalibrationError(
                 f"only {int(keep.sum())} of {len(keep)} identified stars agree on one camera: check that the frames are "
                 "of one"

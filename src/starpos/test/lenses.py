@@ -58,14 +58,14 @@ def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighti
     return made
 
 
-def night(camera, frames, catalogue, rng, limit_mag, air=AIR, altitude=(60, 89)):
+def night(camera, frames, catalogue, rng, limit_mag, air=AIR, altitude=(60, 89), roll=(-180, 180)):
     """Star lists of a simulated sky, and C into L of each."""
     lists, levels = [], []
     base = scene_of(size=(camera.width, camera.height), focal_px=camera.fx, atmosphere=air)
     for k in range(frames):
         scene = replace(
             base, camera=camera, azimuth_deg=rng.uniform(0, 360), altitude_deg=rng.uniform(*altitude),
-            roll_deg=rng.uniform(-180, 180), optics=Optics(limit_mag=limit_mag, fwhm_px=2.2, sky_mag_arcsec2=20.0),
+            roll_deg=rng.uniform(*roll), optics=Optics(limit_mag=limit_mag, fwhm_px=2.2, sky_mag_arcsec2=20.0),
         )  # fmt: skip
         start = START + 60 * k
         exposed = expose(scene, catalogue, start, EXPOSURE, rng)

@@ -16,7 +16,7 @@ from starpos.detection import detect
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.intrinsics import rms
 from starpos.reading import read_frame
-from starpos.stars import Stars, no_stars
+from starpos.stars import SATURATED, Stars, no_stars
 
 
 def flipped(stars: Stars) -> Stars:
@@ -56,6 +56,42 @@ def test_lenses_that_shift_the_corner_by_many_px(corner, catalogue, rng):
     assert len(fit.xy) > 0.96 * sum(map(len, lists))
     reach = np.hypot(*(fit.xy - np.array(given.centre_px)).T).max()
     assert reach > 0.95 * np.hypot(*given.centre_px)
+
+
+def test_low_over_the_horizon_where_refraction_bends_the_field(catalogue, rng):
+    true = random_camera(3.4, rng)
+    lists, levels = night(true, 4, catalogue, rng, FIELDS[3.4][2], altitude=(12, 16))
+    fit = calibrate(lists, levels, ideal(3.4), catalogue, AIR).fit
+    assert np.abs((fit.values - values(true)) / fit.sigma).max() < 4
+    assert len(fit.xy) > 0.95 * sum(map(len, lists))
+
+
+def test_wide_lenses_from_one_frame_of_few_stars_are_true_or_refused(catalogue, rng):
+    """As many stars as are just enough, 6 % of distortion: wrong matches in the corners must not pass for a lens."""
+    solved = 0
+    for corner in np.repeat([-0.06, 0.06], 12):
+        true = replace(random_camera(25, rng), distortion=(k1_of(ideal(25), corner), 0.0, 0.0, 0.0, 0.0))
+        lists, levels = night(true, 1, catalogue, rng, 5.9)
+        try:
+            fit = calibrate(lists, levels, ideal(25), catalogue, AIR).fit
+        except CalibrationError:
+            continue
+        solved += 1
+        assert np.abs((fit.values - values(true)) / fit.sigma).max() < 5
+        assert np.abs(prediction_errors(true, fit.camera)).max() < 6 * fit.worst_sigma_px
+    assert solved > 3
+
+
+def test_images_that_are_unsound_are_left_out_where_there_are_others(wide, catalogue, rng):
+    true, lists, levels = wide
+    spoiled = []
+    for stars in lists:
+        bad = rng.random(len(stars)) < 0.3
+        spoiled.append(replace(stars, x=stars.x + 0.15 * bad, flags=np.where(bad, SATURATED, stars.flags)))
+    fit = calibrate(spoiled, levels, ideal(25), catalogue, AIR).fit
+    assert np.abs((fit.values - values(true)) / fit.sigma).max() < 4
+    assert fit.scatter_px < 0.03
+    assert len(fit.xy) < 0.8 * sum(map(len, lists))
 
 
 def test_a_focal_length_three_percent_off(wide, catalogue):

@@ -11,27 +11,32 @@ from lenses import FIELDS, night, random_camera, values
 
 from starpos import camera_yaml
 from starpos.cli import main
+from starpos.instrument import Calibration
 from starpos.intrinsics import PARAMETERS
 from starpos.night import write_stars
 from starpos.utc import utc_text
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
+INSTRUMENT = "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncamera: {}\n"
 OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10")  # 2750 px: 25 deg
 
 
 @pytest.fixture(scope="module")
 def skies(tmp_path_factory, catalogue):
-    """A camera, the folder of four star lists of it and of their tilts; C is the inclinometer's frame."""
+    """A camera that looks 45 deg up from a level inclinometer, the folder of four star lists of it, of their tilts and of
+    the instrument as it is said to be."""
     rng = np.random.default_rng(26)
     true = random_camera(25, rng)
-    lists, levels = night(true, 4, catalogue, rng, FIELDS[25][2])
+    lists, levels = night(true, 4, catalogue, rng, FIELDS[25][2], altitude=(43, 47), roll=(-5, 5))
+    a3 = Calibration((-45.0, 0.0, 0.0)).a3
     folder = tmp_path_factory.mktemp("skies")
     tilts = ["utc_unix_s,theta_x_deg,theta_y_deg"]
     for k, (stars, level) in enumerate(zip(lists, levels, strict=True)):
         write_stars(folder / f"{k}.csv", stars, utc_text(stars.mid_unix_s - stars.exposure_s / 2).rstrip("Z"))
-        x, y = np.degrees(np.arcsin(level[2, :2]))
+        x, y = np.degrees(np.arcsin((a3 @ level[2])[:2]))
         tilts.append(f"{stars.mid_unix_s},{x:.7f},{y:.7f}")
     (folder / "tilt.csv").write_text("\n".join(tilts) + "\n")
+    (folder / "instrument.yaml").write_text(INSTRUMENT.format("{focal_mm: 27.5, pixel_um: 10}"))
     return true, folder
 
 
@@ -53,11 +58,15 @@ def frames(folder: Path) -> list[Path]:
     return sorted(folder.glob("?.csv"))
 
 
+def level(folder: Path, instrument="instrument.yaml") -> tuple:
+    return "--tilt", folder / "tilt.csv", "--instrument", folder / instrument, *AIR
+
+
 def test_the_file_holds_the_camera_the_table_says_how_well(skies, run, tmp_path):
     true, folder = skies
     out = tmp_path / "new" / "camera.yaml"
     status, said, errors = run(
-        "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", *OPTICS, *AIR, "--camera", out, "--map",
+        "calibrate", *frames(folder), *level(folder), "--camera", out, "--map",
         tmp_path / "map.png",
     )  # fmt: skip
     assert (status, errors) == (0, [])
@@ -80,7 +89,7 @@ def test_the_file_holds_the_camera_the_table_says_how_well(skies, run, tmp_path)
 def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
     true, folder = skies
     status, said, errors = run(
-        "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", *OPTICS, *AIR, "--camera",
+        "calibrate", *frames(folder), *level(folder), "--camera",
         tmp_path / "camera.yaml", "--json",
     )  # fmt: skip
     assert (status, errors) == (0, [])
@@ -98,12 +107,21 @@ def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
     assert answer["rms_px"] < 0.3 * answer["rms_before_px"]
 
     instrument = tmp_path / "instrument.yaml"
-    instrument.write_text("starpos_instrument: 1\ncamera: {calibration: camera.yaml}\n")
+    instrument.write_text(INSTRUMENT.format("{calibration: camera.yaml}"))
     status, said, _ = run(
         "solve", *frames(folder), "--tilt", folder / "tilt.csv", "--instrument", instrument, *AIR, "--json"
     )
     assert status == 0
-    ideal = run("solve", *frames(folder), "--tilt", folder / "tilt.csv", *OPTICS, *AIR, "--json")[1]
+    ideal = run(
+        "solve",
+        *frames(folder),
+        "--tilt",
+        folder / "tilt.csv",
+        "--instrument",
+        folder / "instrument.yaml",
+        *AIR,
+        "--json",
+    )[1]
     better, worse = (json.loads(text.splitlines()[0])["residual_arcsec"] for text in (said, ideal))
     assert better < 0.5 * worse
     # and to begin with, where it stays what it is
