@@ -98,9 +98,9 @@ class _Track:
     def touched(self) -> "_Track":
         return replace(self, running=self.running.heading_unknown(), poses=self.poses + 1, in_pose=0)
 
-    def add(self, f: Fix) -> "_Track | None":
-        """With one more fix; None where it is too far off."""
-        running, sigmas = self.running.add(f)
+    def add(self, f: Fix, pose: Fix) -> "_Track | None":
+        """With one more fix of a pose; None where it is too far off."""
+        running, sigmas = self.running.add(f, pose)
         if sigmas > GATE_SIGMA:
             return None
         n = self.frames + 1
@@ -136,18 +136,18 @@ class Averager:
     def add(self, f: Fix) -> None:
         """One more fix, later than those before."""
         if self._track is None:
-            self._track, self._last, self._pose = _Track.before(f).add(f), f, f
+            self._track, self._last, self._pose = _Track.before(f).add(f, f), f, f
             return
         slipped = self._slipped(f)
         if not slipped and self._touched(f):
             self._turn(f)
         self._last = f
-        before, with_it = self._track, None if slipped else self._track.add(f)
-        rival = self._rival.add(f) if self._rival else None
+        before, with_it = self._track, None if slipped else self._track.add(f, self._pose)
+        rival = self._rival.add(f, self._pose) if self._rival else None
         if with_it is not None:
             self._track, self._disbelieved = with_it, 0
             if self._rival is not None and rival is None:  # it began with a wrong one
-                rival = before.rival(f).add(f) if self._rival_turned else None
+                rival = before.rival(f).add(f, self._pose) if self._rival_turned else None
             self._rival = rival
             if rival is not None and self._is_elsewhere(rival):
                 self._move(f)
@@ -156,7 +156,7 @@ class Averager:
         self._disbelieved += 1
         if rival is None:
             self._rival_turned &= self._rival is not None
-            rival, self._disbelieved = before.rival(f).add(f), 1
+            rival, self._disbelieved = before.rival(f).add(f, self._pose), 1
         self._rival = rival
         # of a camera nobody touched it takes the majority to say that the average is wrong
         if self._disbelieved >= MOVED_FIXES if self._rival_turned else rival.frames > self._track.in_pose:

@@ -24,6 +24,7 @@ class ErrorTerm:
     Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  shared: None
     where the error is new in every frame; else keys, and frames whose terms have one in common have the same m errors:
     ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a second, for an error that wanders.
+    posed: the factor is the same as long as nobody touches the camera; that it differs is noise.
     """
 
     name: str
@@ -31,6 +32,7 @@ class ErrorTerm:
     shared: tuple | None = None
     variance: float = 1.0
     walk_s: float = 0.0
+    posed: bool = False
 
     @property
     def covariance(self) -> np.ndarray:
@@ -163,7 +165,7 @@ def error_terms(
     return (
         ErrorTerm("centroids", of_stars(stars.centroids)),
         ErrorTerm("catalogue", of_stars(stars.catalogue), ALWAYS),
-        ErrorTerm("calibration", calibration, ALWAYS),
+        ErrorTerm("calibration", calibration, ALWAYS, posed=True),
         *_of_inclinometer(sensitivity.level @ _levelling(tilt, a2), tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], ALWAYS),
         ErrorTerm("clock", second_of_time * clock_stddev_s, ALWAYS),
@@ -195,11 +197,14 @@ def _of_inclinometer(
             ALWAYS,
             variance=since_s if np.isfinite(since_s) else 0.0,
             walk_s=1.0,
+            posed=True,
         ),
         ErrorTerm(
             "tilt temperature",
             level * errors.temperature_rad_per_c * (warmer if np.isfinite(warmer) else 0.0),
             ALWAYS,
         ),
-        ErrorTerm("tilt scale", level * (theta - mounting.calibrated_tilt) * errors.scale, ALWAYS),
+        ErrorTerm(
+            "tilt scale", level * (theta - mounting.calibrated_tilt) * errors.scale, ALWAYS, posed=True
+        ),
     )

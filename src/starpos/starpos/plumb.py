@@ -206,8 +206,8 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
     loose = np.radians(UNKNOWN_ARCSEC[0] / 3600)
     prior = 1 / np.array([loose, loose, known.turn_sigma, *[known.zenith_sigma] * 2, *[1.0] * more])
     a3, p = start, np.zeros(5 + more)
+    up = zenith
     for _ in range(MOST_STEPS):
-        up = zenith + p[3:5] @ across
         length = np.linalg.norm(up)
         read = to_camera @ (up / length) @ a3.T
         off = (readings.plumb - read) @ turns[:, :2] + wandering @ p[5:]
@@ -220,11 +220,14 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
             2,
         ) / readings.sigma[:, None, None]  # fmt: skip
         off = off / readings.sigma[:, None]
-        weight = np.sqrt(np.minimum(1.0, ROBUST_SIGMA / np.maximum(np.abs(off), 1e-300)))
+        # far from the answer all residuals are large, and none is an outlier
+        limit = max(ROBUST_SIGMA, 2 * float(np.median(np.abs(off))))
+        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-300)))
         design = np.vstack([(slope * weight[..., None]).reshape(-1, 5 + more), np.diag(prior)])
         step = -np.linalg.lstsq(design, np.concatenate([(off * weight).ravel(), p * prior]), rcond=None)[0]
         step *= min(1.0, LONGEST_STEP / np.linalg.norm(step[:5]))
         a3, p = rotation.from_vector(turns @ step[:3]) @ a3, p + step
+        up = zenith + p[3:5] @ across
         if np.abs(step[:5]).max() < SETTLED_RAD:
             break
     size = np.abs(off)
@@ -235,7 +238,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
     return Plumb(
         a3,
         (whole + whole.T) / 2,
-        zenith + p[3:5] @ across,
+        up / np.linalg.norm(up),
         float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
         float(robust.sum() + np.sum((p * prior) ** 2)) / 2,
     )

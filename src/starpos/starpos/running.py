@@ -17,7 +17,6 @@ from starpos.fix import Fix
 from starpos.rotation import full_turn, half_turn
 
 UNIT = np.array([1.0, 1.0, 1e-6])  # m and rad, brought to like sizes
-UNKNOWN = 1e14  # variance, in those units, of what is not known at all
 HUBER_SIGMA = 4.0  # a fix further off pulls no harder
 
 
@@ -76,8 +75,8 @@ class Plane:
 class Running:
     """What the fixes so far say.
 
-    state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own; sources
-    (T + 1, n, n): covariance of the state's error by each of the T terms of a fix, and by what is not known yet; keys: of
+    state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own; known (3,): which
+    of the first three are; sources (T, n, n): covariance of the state's error by each of the T terms of a fix; keys: of
     each term's shared error, the frames it holds for; columns: its place in the state.
     """
 
@@ -86,6 +85,7 @@ class Running:
     columns: tuple[slice, ...]
     keys: tuple[tuple, ...]
     state: np.ndarray
+    known: np.ndarray
     sources: np.ndarray
     utc_unix_s: float  # of the last fix
 
@@ -97,55 +97,73 @@ class Running:
             width = 0 if t.shared is None else t.factor.shape[1]
             columns.append(slice(n, n + width))
             n += width
-        sources = np.zeros((len(f.terms) + 1, n, n))
-        empty = cls(
-            Plane.at(f), tuple(t.name for t in f.terms), tuple(columns), ((),) * len(f.terms), np.zeros(n), sources,
+        names, sources = tuple(t.name for t in f.terms), np.zeros((len(f.terms), n, n))
+        return cls(
+            Plane.at(f),
+            names,
+            tuple(columns),
+            ((),) * len(names),
+            np.zeros(n),
+            np.zeros(3, bool),
+            sources,
             f.utc_unix_s,
-        )  # fmt: skip
-        return empty.forget(slice(0, 3))  # place and heading
+        )
 
-    def forget(self, which: slice) -> "Running":
-        """The same, with a part of the state unknown."""
-        sources = self.sources.copy()
+    def forget(self, unknown: tuple[bool, bool, bool]) -> "Running":
+        """The same, with east, north or heading unknown."""
+        which, sources = np.flatnonzero(unknown), self.sources.copy()
         sources[:, which, :] = sources[:, :, which] = 0.0
-        sources[-1, which, which] = np.eye(which.stop - which.start) * UNKNOWN
-        return replace(self, sources=sources)
+        return replace(self, sources=sources, known=self.known & ~np.array(unknown))
 
     def heading_unknown(self) -> "Running":
         """The same place, the instrument turned."""
-        return self.forget(slice(2, 3))
+        return self.forget((False, False, True))
 
     def elsewhere(self, f: Fix) -> "Running":
         """The same instrument, with all that is known of its errors, at an unknown place in the plane of a fix."""
-        return replace(self.forget(slice(0, 3)), plane=Plane.at(f))
+        return replace(self.forget((True, True, True)), plane=Plane.at(f))
 
-    def add(self, f: Fix) -> tuple["Running", float]:
-        """With one more fix, and how many sigma that was from what was expected of it."""
+    def add(self, f: Fix, pose: Fix) -> tuple["Running", float]:
+        """With one more fix, and how many sigma that was from what was expected of it.  pose: the first of its pose."""
         now, own = self._at(f)
-        n, covariance = len(now.state), now.sources.sum(0)
-        seen = np.zeros((3, n))
-        seen[:, :3] = np.eye(3)
-        noise = np.zeros((len(own), 3, 3))
+        shared, noise = np.zeros((3, len(now.state))), np.zeros((len(own), 3, 3))
         for k, t in enumerate(f.terms):
-            factor = self.plane.turned(f, t.factor)
+            like = pose if t.posed else f
+            factor = self.plane.turned(like, like.terms[k].factor)
             if own[k]:
                 noise[k] = t.variance * factor @ factor.T
             else:
-                seen[:, now.columns[k]] = factor
-        across = covariance @ seen.T
-        spread = seen @ across + noise.sum(0)
-        rest = self.plane.seen(f) - seen @ now.state
-        rest[2] = half_turn(rest[2] * UNIT[2]) / UNIT[2]
-        sigmas = float(np.sqrt(rest @ np.linalg.solve(spread, rest)))
-        if sigmas > HUBER_SIGMA:
-            spread += noise.sum(0) * (sigmas / HUBER_SIGMA - 1)
-            noise *= sigmas / HUBER_SIGMA
-        gain = np.linalg.solve(spread, across.T).T
-        kept = np.eye(n) - gain @ seen
-        sources = kept @ now.sources @ kept.T
-        sources[:-1] += gain @ noise @ gain.T
+                shared[:, now.columns[k]] = factor
+        seen, sigmas = self.plane.seen(f), 0.0
+        known, which = self.known, np.flatnonzero(self.known)
+        kept, brought = (
+            np.eye(len(now.state)),
+            np.zeros((len(now.state), 3)),
+        )  # of the state's error, and of the fix's
+        state = now.state
+        if known.any():
+            told = shared[known]
+            told[np.arange(len(which)), which] = 1.0
+            across = now.sources.sum(0) @ told.T
+            rest = seen[known] - told @ state
+            if known[2]:
+                rest[-1] = half_turn(rest[-1] * UNIT[2]) / UNIT[2]
+            spread, own_spread = told @ across, noise.sum(0)[np.ix_(known, known)]
+            sigmas = float(np.sqrt(rest @ np.linalg.solve(spread + own_spread, rest)))
+            noise *= max(1.0, sigmas / HUBER_SIGMA)
+            gain = np.linalg.solve(spread + own_spread * max(1.0, sigmas / HUBER_SIGMA), across.T).T
+            kept -= gain @ told
+            brought[:, known] = gain
+            state = state + gain @ rest
+        for k in np.flatnonzero(
+            ~known
+        ):  # what was not known is now what the fix says, less the shared errors
+            state[k] = seen[k] - shared[k] @ state
+            kept[k] = -shared[k] @ kept
+            brought[k] = np.eye(3)[k] - shared[k] @ brought
+        sources = kept @ now.sources @ kept.T + brought @ noise @ brought.T
         sources = (sources + sources.swapaxes(1, 2)) / 2
-        return replace(now, state=now.state + gain @ rest, sources=sources), sigmas
+        return replace(now, state=state, sources=sources, known=np.ones(3, bool)), sigmas
 
     def _at(self, f: Fix) -> tuple["Running", np.ndarray]:
         """The shared errors as they are at the time of a fix; and which of its terms are all its own (T,)."""
@@ -180,7 +198,7 @@ class Running:
         latitude, _ = self.plane.place(self.state[:2] * UNIT[:2])
         return tuple(
             ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), t.shared)
-            for t, source in zip(like, self.sources[:-1], strict=True)
+            for t, source in zip(like, self.sources, strict=True)
         )
 
     def sigmas_apart(self, part: "Running") -> float:

@@ -167,7 +167,8 @@ def dense(made):
     seen = np.array([plane.seen(f) * UNIT for f in made])
     whole = np.zeros((n, 3, n, 3))
     for k, term in enumerate(made[0].terms):
-        factors = [plane.turned(f, f.terms[k].factor) * UNIT[:, None] for f in made]
+        like = [made[0] if term.posed else f for f in made]  # they are of one pose
+        factors = [plane.turned(f, f.terms[k].factor) * UNIT[:, None] for f in like]
         for i, f in enumerate(made):
             for j, g in enumerate(made):
                 a, b = f.terms[k].shared, g.terms[k].shared

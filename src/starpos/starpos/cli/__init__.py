@@ -18,7 +18,7 @@ COMMANDS = {
     "report": "nights on one page: stability, scatter, residuals, sky, error budget",
     "simulate": "write a night of frames and tilts from a place you choose",
     "catalogue": "build the star catalogue, or say what it and its triangles hold",
-    "montecarlo": "identify random fields with false stars, and count: the paper's table",
+    "montecarlo": "identify random fields and work random nights, and count: the paper's tables",
 }
 BAD_CALL = 2
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos montecarlo`: the paper's table of identified random fields, on this program."""
+"""`starpos montecarlo`: the paper's table of identified random fields, on this program; whole nights as well."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos import catalogue, montecarlo
 from starpos.camera import Camera
-from starpos.cli import common
+from starpos.cli import common, montecarlo_nights
 from starpos.errors import FrameError
 from starpos.instrument import Instrument
 from starpos.solve import Solver
@@ -74,6 +74,7 @@ def define(parser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
     parser.set_defaults(run=run)
+    montecarlo_nights.define(parser.add_subparsers(dest="experiment", metavar="[nights|honesty]"))
 
 
 def run(args) -> int:
