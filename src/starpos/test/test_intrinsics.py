@@ -66,6 +66,14 @@ def test_what_the_prior_holds_stays_near_its_middle(rng):
     assert rms(moved) < 0.5
 
 
+def test_the_end_does_not_depend_on_the_beginning(rng):
+    true = random_camera(3.4, rng)
+    near = sightings(true, 2, 40, rng, sigma=0.3)
+    far = [replace(s, attitude=rotation.from_vector([3e-3, -2e-3, 0.02]) @ s.attitude) for s in near]
+    a, b = (fit_camera(s, ideal(3.4), VACUUM) for s in (near, far))
+    assert (np.abs(a.values - b.values) < 1e-3 * a.sigma).all()
+
+
 def test_more_frames_tell_more_and_one_frame_is_enough(rng):
     true = random_camera(11, rng)
     frames = sightings(true, 16, 80, rng)
