@@ -18,7 +18,7 @@ from starpos.calibration import Calibrated, calibrate_at
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix import Fix
 from starpos.instrument import Calibration
-from starpos.plumb import UNKNOWN_ARCSEC
+from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC
 from starpos.sky import Site
 from starpos.solve import Solver
 from starpos.turning import turn
@@ -31,6 +31,7 @@ from starpos_solver.worker import Outcome, Worker
 
 # Fewer headings hold no check that they are of one place; a service's caller says that they are.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
+WIDE_RAD = np.radians(600 / 3600)  # its square is 2 arcsec
 OF_CALIBRATION = {"misalignment", "misalignment_stddev", "calibration_url"}
 OF_AVERAGE = OF_CALIBRATION | {
     "self_calibration",
@@ -98,7 +99,7 @@ class Calibrating:
         self._recent.add(seen)
         if fix is None:
             return
-        if self.unknown and not self._poses.stands(fix):  # so large an error is not told apart step by step
+        if _is_wide(fix) and not self._poses.stands(fix):
             self.average.begin_anew()
         news = self.average.add(fix)
         # while A3 is not known to be right, turning looks like moving
@@ -214,7 +215,7 @@ class Calibrating:
         poses = self._poses.frames()
         if len(poses) < 2:
             raise FixError(
-                f"the instrument has stood at {len(poses)} headings here: turn it on the spot, to "
+                f"the instrument has stood at {_headings(len(poses))} here: turn it on the spot, to "
                 f"{FEWEST_HEADINGS} headings or more"
             )
         solver = of_worst_stamp(self._solver(), poses)
@@ -226,7 +227,7 @@ class Calibrating:
         if self._again:
             return
         if len(self._poses) < FEWEST_BY_ITSELF:
-            self._said = f"{len(self._poses)} headings here, {FEWEST_BY_ITSELF} are needed"
+            self._said = f"{_headings(len(self._poses))} so far, {FEWEST_BY_ITSELF} are needed"
             return
         try:
             job, era = self._on_the_spot(), self._era
@@ -313,6 +314,12 @@ class Calibrating:
         return Report(Level.OK, self._said or "that of the parameters", values)
 
 
+def _is_wide(fix: Fix) -> bool:
+    """Whether A3 may be so wrong that a linear filter does not tell its error from the place."""
+    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name == "calibration")
+    return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)
+
+
 def _turn(solver: Solver, poses: list[Seen]) -> Turned:
     """FixError where the poses are not of one place or tell none."""
     calibrated = turn(solver, [p.stars for p in poses], tilts_of(poses))
@@ -337,6 +344,10 @@ def _about(found: Calibrated) -> str:
         "A3 of {} frames is {:.5f} {:.5f} {:.5f} deg{}; the plumb line in the camera is known to {:.2f} arcsec, the turn "
         "about it, which counts at another lean, to {:.2g} deg"
     ).format(c.frames, *c.misalignment_deg, left_out, found.plumb_stddev_arcsec, turn_deg)
+
+
+def _headings(count: int) -> str:
+    return f"{count} heading{'s' if count != 1 else ''}"
 
 
 def _with_a3(response, found: Calibrated):
