@@ -16,6 +16,7 @@ SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
 NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20  # readings close in time that tell the noise
 OUTLIER_SIGMA, REST = 6.0, 6.0  # readings further out are left out; more scatter than this is no rest
 SIGMA_PER_MAD = 1.4826
+KEPT, KEPT_VARIANCE = 0.8, 0.4377  # the smaller part of a Gaussian's deviations, and the variance of that
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
@@ -150,7 +151,9 @@ class TiltLog:
         steps = np.diff(np.stack([self.theta_x, self.theta_y], -1)[order], axis=0)[near]
         steps = steps[np.isfinite(steps).all(1)]
         stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
-        found = float(SIGMA_PER_MAD * np.median(np.abs(steps), axis=0).max() / np.sqrt(2) / stated)
+        # without the largest, not by the median, which jumps from step to step of coarse readings
+        size = np.sort(np.abs(steps), axis=0)[: int(np.ceil(KEPT * len(steps)))]
+        found = float(np.sqrt((size**2).mean(0).max() / KEPT_VARIANCE / 2) / stated)
         return found if found > 1 + 4 / np.sqrt(len(steps)) else 1.0  # three times the estimate's own error
 
     def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:

@@ -35,11 +35,7 @@ def define(parser) -> None:
     parser.add_argument(
         "--map", metavar="PNG", help="draw where the stars lie off the given and the fitted camera (--camera)"
     )
-    parser.add_argument(
-        "--instrument", metavar="FILE", help="instrument file (YAML): the camera to begin with, A3"
-    )
-    common.add_optics(parser)
-    common.add_misalignment(parser)
+    common.add_instrument(parser)
     parser.add_argument(
         "--tilt",
         metavar="CSV",

@@ -33,7 +33,12 @@ def add_optics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pixel-um", type=float, metavar="UM", help="pixel size")
 
 
-def add_misalignment(parser: argparse.ArgumentParser) -> None:
+def add_instrument(parser: argparse.ArgumentParser) -> None:
+    """What `instrument_of` reads."""
+    parser.add_argument(
+        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
+    )
+    add_optics(parser)
     parser.add_argument(
         "--misalignment",
         type=float,

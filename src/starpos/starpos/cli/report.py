@@ -30,17 +30,7 @@ def define(parser) -> None:
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
     )
     parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
-    parser.add_argument(
-        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
-    )
-    common.add_optics(parser)
-    parser.add_argument(
-        "--misalignment",
-        type=float,
-        nargs=3,
-        metavar=("RX", "RY", "RZ"),
-        help="A3 in deg: camera to inclinometer",
-    )
+    common.add_instrument(parser)
     common.add_air(parser)
     common.add_vertical(parser)
     parser.add_argument(

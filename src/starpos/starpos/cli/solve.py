@@ -26,11 +26,7 @@ def define(parser) -> None:
     parser.add_argument(
         "--tilt", required=True, metavar="CSV", help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]"
     )
-    parser.add_argument(
-        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
-    )
-    common.add_optics(parser)
-    common.add_misalignment(parser)
+    common.add_instrument(parser)
     common.add_air(parser)
     common.add_vertical(parser)
     parser.add_argument(
