@@ -123,18 +123,26 @@ def symmetric_root(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StarErrors:
-    """Errors of a fix's stars: gain (3, N, 2), rad of A4 for a pixel of each star; covariances (N, 2, 2) in px2."""
+    """Errors of a fix's stars: gain (3, N, 2), rad of A4 for a pixel of each star; covariances (N, 2, 2) in px2.
+
+    same_stars: keys that frames with the same stars, and so the same errors of the catalogue, have in common.
+    """
 
     gain: np.ndarray
     centroids: np.ndarray
     catalogue: np.ndarray
+    same_stars: tuple
 
     @classmethod
-    def of(cls, slope: np.ndarray, centroids: np.ndarray, catalogue: np.ndarray) -> "StarErrors":
+    def of(
+        cls, slope: np.ndarray, centroids: np.ndarray, catalogue: np.ndarray, same_stars: tuple
+    ) -> "StarErrors":
         """Of weighted least squares; slope (N, 2, P): px for each parameter, of which the first three turn A4."""
         weighted = np.linalg.solve(centroids + catalogue, slope)
         normal = np.einsum("nki,nkj->ij", slope, weighted)
-        return cls(np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3], centroids, catalogue)
+        return cls(
+            np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3], centroids, catalogue, same_stars
+        )
 
     def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """(3, 3) rad2 of A4 from independent covariances (N, 2, 2)."""
@@ -164,7 +172,7 @@ def error_terms(
     calibration = sensitivity.level @ a2 @ symmetric_root(mounting.calibration_covariance)
     return (
         ErrorTerm("centroids", of_stars(stars.centroids)),
-        ErrorTerm("catalogue", of_stars(stars.catalogue), ALWAYS),
+        ErrorTerm("catalogue", of_stars(stars.catalogue), stars.same_stars),
         ErrorTerm("calibration", calibration, ALWAYS, posed=True),
         *_of_inclinometer(sensitivity.level @ _levelling(tilt, a2), tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], ALWAYS),

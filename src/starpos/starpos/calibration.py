@@ -27,6 +27,7 @@ OF_PLACE = (
     "pole",
 )  # terms that move the zenith of all frames alike
 VALID_DAYS = 365.0
+MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
 
 Tilts = Callable[[float, float], Tilt]
 
@@ -104,6 +105,13 @@ def calibrate(
         if moved < SETTLED_RAD:
             break
     progress("calibrating", 1.0)
+    if (
+        plumb is not None and plumb.scatter > MOST_SCATTER
+    ):  # not before: with a wrong A3 the errors are not known either
+        raise FixError(
+            f"{len(solved)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
+            "instrument was moved between them, or its inclinometer or clock was disturbed"
+        )
     if plumb is None:
         return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
     error = float(plumb.stddev_across(readings.mean_plumb) / ARCSEC)

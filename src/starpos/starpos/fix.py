@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.atmosphere import Atmosphere, Refraction
-from starpos.budget import ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
+from starpos.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
 from starpos.camera import Camera
 from starpos.earth import EarthState, station_velocity
 from starpos.errors import FixError
@@ -24,18 +24,20 @@ MAX_SCATTER = 0.003  # of the frame's diagonal: identified stars that scatter mo
 MIN_STARS = 3
 STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
 STEP_REFRACTION = 0.01
+MARKS = 20  # stars that tell whether two frames have the same ones
 SETTLED, MOST_STEPS = 1e-13, 20  # rad, and share of the scale, below which a step no longer counts
 
 
 @dataclass(frozen=True)
 class MatchedStars:
     """Identified stars: xy (N, 2) px and covariance_px2 (N, 2, 2) on the frame; places (N, 3), ICRS directions at the
-    date, and place_sigma (N,) rad, one axis."""
+    date, and place_sigma (N,) rad, one axis; index (N,): which stars of the catalogue, None where nobody knows."""
 
     xy: np.ndarray
     covariance_px2: np.ndarray
     places: np.ndarray
     place_sigma: np.ndarray
+    index: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,8 @@ def solve_fix(
             f"the identified stars lie {np.sqrt(jitter2):.1f} px off the best attitude: check the camera's distortion"
         )
     centroids = stars.covariance_px2[keep] + np.eye(2) * jitter2
-    errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep])
+    same_stars = ALWAYS if stars.index is None else tuple(stars.index[keep][:MARKS].tolist())
+    errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep], same_stars)
     terms = _terms(problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s)
     residual = problem.residual(state)[keep]
     place = place_of(state.a4)

@@ -24,7 +24,6 @@ LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are b
 AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
 AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
 SAME_AXIS = 1e-9  # share of the axis' weight below which the headings do not tell it
-MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
 MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
 EARTH_RADIUS_M = 6.371e6
 
@@ -86,7 +85,7 @@ def _wandering(solved: Sequence[Solution], plumb: np.ndarray, errors: Inclinomet
 class Plumb:
     """a3 (3, 3) with covariance (3, 3) rad2 about S's axes, and the zenith (3,) in ITRS with its sigma, rad.
 
-    cost: half the robust chi-square.
+    cost: half the robust chi-square; scatter: chi-square a degree of freedom, 1 of frames that have one zenith.
     """
 
     a3: np.ndarray
@@ -94,6 +93,7 @@ class Plumb:
     zenith: np.ndarray
     zenith_sigma: float
     cost: float
+    scatter: float
 
     def stddev_across(self, plumb: np.ndarray) -> float:
         """Error of the direction that A3 takes to `plumb` (3,), the worse of two axes, rad."""
@@ -105,17 +105,14 @@ def level(readings: Readings, given: np.ndarray) -> Plumb:
     """A3 that keeps the zenith still, wherever it is; the nearest to `given` (3, 3) as far as they do not tell.
 
     Its turn about the plumb line is told by the instrument's lean alone, if there is any: all of them are tried.  Raises
-    FixError where two answers are as good, or the frames have no one zenith.
+    FixError where two answers are as good.
     """
     mean = readings.mean_plumb
     start = _axis_of_turn(readings, given)
     if not _leans(readings):
-        found = _fitted(readings, start, _Known())
-        _check_scatter(found, readings)
-        return found
+        return _fitted(readings, start, _Known())
     found = [_fitted(readings, start, _Known()) for start in _turns(mean, start)]
     best = min(found, key=_cost)
-    _check_scatter(best, readings)
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
     if apart > AMBIGUOUS_SIGMA * best.zenith_sigma:
@@ -132,8 +129,7 @@ def hang(
 ) -> Plumb:
     """A3 under a known zenith (3,), good to zenith_sigma rad; the nearest to `given` as far as they do not tell.
 
-    turn_sigma: how well `given` has the turn about the plumb line, rad.  FixError where the frames do not agree with it
-    and each other.
+    turn_sigma: how well `given` has the turn about the plumb line, rad.
     """
     mean = readings.mean_plumb
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
@@ -144,7 +140,6 @@ def hang(
     best = min(found, key=_cost)
     if found[0].cost < best.cost + AS_GOOD:
         best = found[0]
-    _check_scatter(best, readings)
     return best
 
 
@@ -166,15 +161,6 @@ def _turns(axis: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
     """`start` and what it is turned about an axis of S."""
     angles = np.arange(TURNS_TRIED) * (2 * np.pi / TURNS_TRIED)
     return [rotation.from_vector(axis * angle) @ start for angle in angles]
-
-
-def _check_scatter(found: Plumb, readings: Readings) -> None:
-    freedom = 2 * len(readings.sigma) - 5
-    if freedom > 0 and 2 * found.cost / freedom > MOST_SCATTER:
-        raise FixError(
-            f"{len(readings.sigma)} frames do not agree on one zenith (chi-square {2 * found.cost / freedom:.0f} a "
-            "degree of freedom): the instrument was moved between them, or its inclinometer or clock was disturbed"
-        )
 
 
 def _leans(readings: Readings) -> bool:
@@ -232,6 +218,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
             break
     size = np.abs(off)
     robust = np.where(size > ROBUST_SIGMA, ROBUST_SIGMA * (2 * size - ROBUST_SIGMA), size**2)
+    cost = float(robust.sum() + np.sum((p * prior) ** 2)) / 2
     whole = turns @ np.linalg.inv(design.T @ design)[:3, :3] @ turns.T
     # without the turn about the plumb line, which may be as good as unknown
     told = np.delete(design, 2, 1)
@@ -240,7 +227,8 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
         (whole + whole.T) / 2,
         up / np.linalg.norm(up),
         float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
-        float(robust.sum() + np.sum((p * prior) ** 2)) / 2,
+        cost,
+        2 * cost / max(2 * len(readings.sigma) - 5, 1),
     )
 
 

@@ -206,6 +206,7 @@ class Solver:
             stars.covariance[star],
             self.catalogue.directions(index, state.year),
             np.hypot(self.catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
+            index,
         )
         fix = solve_fix(
             matched,

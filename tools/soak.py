@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A day of the solver as installed, as fast as it answers: its memory and its CPU time a frame, and whether they grow.
+
+    python tools/soak.py [FRAMES]          17280: a day of one frame every 5 s
+
+Exit status 0; 1 where the memory of the last half has grown by more than 2 MB against the half before.
+"""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+DAY, WARM, ALLOWED_MB = 17280, 500, 2.0
+
+
+def main() -> int:
+    from domain_coordinator import domain_id
+    from graph import Graph
+    from shots import SOLVER, shoot
+
+    frames = int(sys.argv[1]) if len(sys.argv) > 1 else DAY
+    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        graph = Graph()
+        try:
+            solver = graph.start(Path(folder) / "log", "starpos_solver", "solver", *SOLVER)
+            graph.wait_for_solver()
+            graph.answer(shoot())
+            sizes, begin_s = [], 0.0
+            for k in range(frames):
+                shot = shoot()
+                answer = graph.answer(shot)[0]
+                assert answer.status == answer.OK, answer.status_text
+                for kept in (graph.solutions, graph.fixes, graph.imus, graph.diagnostics):
+                    kept.clear()
+                if k == WARM:
+                    begin_s = cpu_s(solver.process.pid)
+                if k >= WARM:
+                    sizes.append(memory_mb(solver.process.pid))
+                if k % max(1, frames // 20) == 0:
+                    print(f"{k:6d} frames  {memory_mb(solver.process.pid):7.1f} MB", flush=True)
+            each_ms = 1e3 * (cpu_s(solver.process.pid) - begin_s) / max(1, frames - WARM - 1)
+        finally:
+            graph.close()
+    half = len(sizes) // 2
+    grown = max(sizes[half:]) - max(sizes[:half])
+    print(
+        f"{frames} frames: {each_ms:.1f} ms of CPU each; the last half's memory {grown:+.2f} MB against the first's"
+    )
+    return int(grown > ALLOWED_MB)
+
+
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
