@@ -27,7 +27,6 @@ class Averaging:
     """
 
     def __init__(self):
-        self._moved = 0
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -35,6 +34,7 @@ class Averaging:
         self._averager = Averager()
         self._turned: Average | None = None
         self._news = News.USED
+        self._moved = 0
 
     def turned_on_the_spot(self, place: Average, fixes: Sequence[Fix]) -> None:
         """`place` is what a turn gave; its fixes, solved again with the A3 found, tell when later ones are elsewhere."""
@@ -63,7 +63,7 @@ class Averaging:
             self._news = News.LEFT_OUT if left_out else News.USED
             return self._news
         if self._turned is not None:  # the averager holds the fixes of the turn, which A3 is of
-            self.begin_anew()
+            self._averager, self._turned = Averager(), None
             self._averager.add(fix)
         self._moved += 1
         self._news = News.MOVED
