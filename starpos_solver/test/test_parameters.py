@@ -9,9 +9,11 @@ import pytest
 
 from starpos.camera import Camera
 from starpos.errors import GeoidError, InstrumentError
+from starpos.instrument import Calibration, Instrument
 from starpos_solver.parameters import (
     PARAMETERS,
     atmosphere_of,
+    check_camera,
     geoid_file,
     instrument_of,
     known_instrument,
@@ -55,6 +57,29 @@ def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):
     assert instrument_of(values(tilt_stddev=1.0), CAMERA, known).inclinometer.noise_rad == pytest.approx(
         math.radians(1)
     )
+
+
+def test_what_frames_have_told_wins_over_file_and_parameters():
+    found = Calibration.of((3.0, 2.0, 1.0), (1.0,) * 3)
+    for known in (None, Instrument(1000.0)):
+        for mode in (False, True):
+            assert instrument_of(values(self_calibration=mode), CAMERA, known, found).calibration == found
+
+
+def test_in_self_calibration_the_misalignment_is_unknown():
+    given = values(self_calibration=True, misalignment=(1.0, 2.0, 3.0))
+    calibration = instrument_of(given, CAMERA, None).calibration
+    assert calibration.misalignment_deg == (1.0, 2.0, 3.0)
+    assert np.sqrt(np.diag(calibration.covariance_arcsec2)).min() >= 36000
+
+
+def test_an_instrument_file_of_another_camera_is_told_by_its_focal_length():
+    check_camera(None, "", CAMERA)
+    for factor in (0.96, 1.0, 1.04):
+        check_camera(Instrument(1000.0 * factor), "a.yaml", CAMERA)
+    for factor in (0.1, 0.94, 1.06):
+        with pytest.raises(InstrumentError, match=r"a\.yaml.*another camera"):
+            check_camera(Instrument(1000.0 * factor), "a.yaml", CAMERA)
 
 
 def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes, tilts and frames as the solver would have them, made by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.fix import Fix
+from starpos.inclinometer import Tilt
+from starpos.sky import Site, camera_to_enu
+from starpos.stars import Stars
+from starpos_solver.memory import Seen
+
+T0 = 1_793_642_400.0
+NOISE = math.radians(0.0035)
+
+
+def tilt_at(seconds: float, x_deg=1.0, y_deg=-2.0, sigma=NOISE, samples=5) -> Tilt:
+    covariance = np.eye(2) * sigma**2 / samples
+    return Tilt(math.radians(x_deg), math.radians(y_deg), covariance, T0 + seconds, samples)
+
+
+def seen_at(seconds: float, stars=3, **tilt) -> Seen:
+    """A frame whose stars are nothing of the sky."""
+    xy = np.arange(stars, dtype=float)
+    covariance = np.tile(np.eye(2) * 0.01, (stars, 1, 1))
+    flux = np.arange(stars, 0, -1.0)
+    made = Stars(xy, xy, flux, flux, covariance, np.zeros(stars), 100, 80, T0 + seconds, 0.5, "stars")
+    return Seen(made, tilt_at(seconds, **tilt))
+
+
+def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, calibration_m=10.0) -> Fix:
+    """Of an instrument at longitude 10 deg that stands exactly as it says."""
+    site = Site(latitude_deg, 10.0)
+    attitude = camera_to_enu(azimuth_deg, 80.0, 0.0)
+    link = attitude @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    rows = np.array([1.0, 1.0, 1e-6, 1e-7, 1e-7, 1e-6])
+    turn = rotation.about_axis(2, -math.radians(azimuth_deg))[
+        :2, :2
+    ]  # a slip of the mount turns with the instrument
+    slip = np.zeros((6, 2))
+    slip[:2] = turn * calibration_m
+    terms = (ErrorTerm("tilt", np.diag(rows * noise_m)), ErrorTerm("calibration", slip, ALWAYS))
+    return Fix(T0 + seconds, math.radians(latitude_deg), math.radians(10.0), heading_of(link), link, terms,
+               np.arange(3), np.zeros((3, 2)), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05, site.enu.T @ attitude,
+               1e-6)  # fmt: skip
+
+
+def north_of(fix: Fix, metres: float) -> Fix:
+    """The same, if the inclinometer errs by so much."""
+    return replace(fix, latitude=fix.latitude + metres / 6.371e6)
