@@ -264,17 +264,20 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
 def picture(watcher: Watcher, errors: np.ndarray, covariance: np.ndarray, path: Path) -> bool:
     """Draw the fixes and the frame that was kept; False where none was, or its stars were not heard."""
     from starpos import picture
-    from starpos_common.messages import message_to_frame
+    from starpos.annotate import Identified, annotate
+    from starpos_common.messages import message_to_frame, message_to_stars
 
     frame, place = watcher.pictured, watcher.place
     if frame is None or _stamp(frame) not in watcher.stars:
         return False
-    solution, stars = watcher.solutions[_stamp(frame)], watcher.stars[_stamp(frame)].stars
-    xy = np.array([(stars[k].x, stars[k].y) for k in solution.indices])
+    solution, stars = watcher.solutions[_stamp(frame)], message_to_stars(watcher.stars[_stamp(frame)])
+    known = Identified(solution.indices, solution.ids, solution.magnitudes)
+    shown = annotate(message_to_frame(frame), stars, known)
     title = (
         f"starpos at {place.latitude:+.4f} {place.longitude:+.4f}: {len(errors)} frames of {EXPOSURE_S:g} s"
     )
-    picture.draw(path, errors, covariance[:2, :2], title, message_to_frame(frame).pixels, xy, solution.ids)
+    about = f"a frame and its {len(solution.ids)} identified stars"
+    picture.draw(path, errors, covariance[:2, :2], title, shown, about)
     return True
 
 
