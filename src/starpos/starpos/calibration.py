@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos import rotation
 from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt
@@ -19,15 +18,10 @@ from starpos.stars import Stars
 
 ROUNDS = 4
 SETTLED_RAD = np.radians(0.02 / 3600)
-OF_PLACE = (
-    "catalogue",
-    "refraction",
-    "clock",
-    "ut1",
-    "pole",
-)  # terms that move the zenith of all frames alike
+OF_PLACE = ("refraction", "clock", "ut1", "pole")  # terms that move the zenith of all frames alike
 VALID_DAYS = 365.0
 MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
+OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25  # frames further off are left out, up to this share of all
 
 Tilts = Callable[[float, float], Tilt]
 
@@ -70,6 +64,8 @@ def calibrate_at(
         sigma = np.hypot(site_stddev_arcsec * ARCSEC, np.sqrt(common / len(fixes)) / EARTH_RADIUS_M)
         return hang(readings, a3, site.enu[2], float(sigma), np.radians(turn_stddev_deg))
 
+    if not frames:
+        raise FixError("there is no frame to calibrate from: give at least one")
     found = calibrate(solver, frames, tilt, find, fewest=1, progress=progress)
     if not found.fixes:
         raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
@@ -88,7 +84,7 @@ def calibrate(
     unknown = Calibration.of(solver.instrument.calibration.misalignment_deg, UNKNOWN_ARCSEC)
     solver = _with(solver, unknown)
     solutions: list[Solution | None] = [None] * len(frames)
-    plumb = readings = None
+    plumb, sound = None, []
     for k in range(ROUNDS):
         for n, stars in enumerate(frames):
             known = solutions[n].standing if solutions[n] else None
@@ -97,26 +93,42 @@ def calibrate(
         solved = [s for s in solutions if s.fix]
         if len(solved) < fewest:
             break
-        readings, a3 = Readings.of(solved, solver.instrument.inclinometer), solver.instrument.mounting.a3
-        unknown = replace(unknown, temperature_c=_mean_temperature_c(solved), tilt_deg=_mean_tilt_deg(solved))
-        plumb = find(readings, a3, [s.fix for s in solved])
-        moved = np.linalg.norm(rotation.to_small_vector(plumb.a3 @ a3.T)[:2])
+        a3 = solver.instrument.mounting.a3
+        plumb, sound = _found(find, solved, solver.instrument)
+        unknown = replace(unknown, temperature_c=_mean_temperature_c(sound), tilt_deg=_mean_tilt_deg(sound))
         solver = _with(solver, unknown.turned_to(plumb.a3))
-        if moved < SETTLED_RAD:
+        if np.linalg.norm(plumb.a3[2] - a3[2]) < SETTLED_RAD:  # a turn about the plumb line changes no fix
             break
     progress("calibrating", 1.0)
-    if (
-        plumb is not None and plumb.scatter > MOST_SCATTER
-    ):  # not before: with a wrong A3 the errors are not known either
-        raise FixError(
-            f"{len(solved)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
-            "instrument was moved between them, or its inclinometer or clock was disturbed"
-        )
     if plumb is None:
         return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
-    error = float(plumb.stddev_across(readings.mean_plumb) / ARCSEC)
-    instrument = replace(solver.instrument, calibration=_dated(plumb, solved))
+    if plumb.scatter > MOST_SCATTER:  # not before: with a wrong A3 the errors are not known either
+        raise FixError(
+            f"{len(sound)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
+            "instrument was moved between them, or its inclinometer or clock was disturbed"
+        )
+    plumb = _as_scattered(plumb, len(sound))
+    mean_plumb = Readings.of(sound, solver.instrument.inclinometer).mean_plumb
+    error = float(plumb.stddev_across(mean_plumb) / ARCSEC)
+    instrument = replace(solver.instrument, calibration=_dated(plumb, sound))
     return Calibrated(instrument, error, tuple(solutions))
+
+
+def _found(find: Callable, solved: list[Solution], instrument: Instrument) -> tuple[Plumb, list[Solution]]:
+    """What `find` makes of the frames that agree with each other, and these."""
+    a3, errors = instrument.mounting.a3, instrument.inclinometer
+    plumb = find(Readings.of(solved, errors), a3, [s.fix for s in solved])
+    sound = [s for s, off in zip(solved, plumb.off, strict=True) if off < OUTLIER_SIGMA]
+    if not 0 < len(solved) - len(sound) <= MOST_OUTLIERS * len(solved):
+        return plumb, solved
+    return find(Readings.of(sound, errors), a3, [s.fix for s in sound]), sound
+
+
+def _as_scattered(plumb: Plumb, frames: int) -> Plumb:
+    """With the error that frames have which scatter clearly more than they say."""
+    if plumb.scatter < 1 + 2 * np.sqrt(2 / max(2 * frames - 5, 1)):
+        return plumb
+    return replace(plumb, covariance=plumb.covariance * plumb.scatter)
 
 
 def _with(solver: Solver, calibration: Calibration) -> Solver:

@@ -6,6 +6,7 @@ Earth, z = R^T A3^T s, with s the plumb line as the inclinometer reads it: an A3
 and takes z round a circle, the right one keeps it still.  Of A3's tilts and the inclinometer's zero only the sum matters.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,7 +49,7 @@ class Readings:
             np.array([s.fix.camera_to_itrs.T for s in solved]),
             plumb,
             np.array([s.fix.heading for s in solved]),
-            np.array([_own_sigma(s.fix) for s in solved]),
+            _own_sigma([s.fix for s in solved]),
             _wandering(solved, plumb, errors),
         )
 
@@ -57,10 +58,22 @@ class Readings:
         return self.plumb.sum(0) / np.linalg.norm(self.plumb.sum(0))
 
 
-def _own_sigma(fix: Fix) -> float:
-    """Of one frame's zenith, rad, one axis, without what all frames share."""
-    covariance = sum(t.covariance for t in fix.terms if not t.common)[:2, :2]
-    return float(np.sqrt(np.trace(covariance) / 2)) / EARTH_RADIUS_M
+def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
+    """Of each frame's zenith (K,), rad, one axis, without what all frames share.
+
+    An error that some share (one reading, the same stars) counts in each as if it were its own and so much larger that
+    together they know no more of the zenith than one of them.
+    """
+    terms = [[(k, t) for k, t in enumerate(f.terms) if not t.common] for f in fixes]
+    frames = Counter((k, key) for of in terms for k, t in of for key in t.shared or ())
+    variance = [
+        sum(
+            np.trace(t.covariance[:2, :2]) / 2 * max((frames[k, key] for key in t.shared or ()), default=1)
+            for k, t in of
+        )
+        for of in terms
+    ]
+    return np.sqrt(variance) / EARTH_RADIUS_M
 
 
 def _wandering(solved: Sequence[Solution], plumb: np.ndarray, errors: InclinometerErrors) -> np.ndarray:
@@ -85,7 +98,8 @@ def _wandering(solved: Sequence[Solution], plumb: np.ndarray, errors: Inclinomet
 class Plumb:
     """a3 (3, 3) with covariance (3, 3) rad2 about S's axes, and the zenith (3,) in ITRS with its sigma, rad.
 
-    cost: half the robust chi-square; scatter: chi-square a degree of freedom, 1 of frames that have one zenith.
+    cost: half the robust chi-square; scatter: chi-square a degree of freedom, 1 of frames that have one zenith; off (K,):
+    how far each frame is from it, in its own sigma.
     """
 
     a3: np.ndarray
@@ -94,6 +108,7 @@ class Plumb:
     zenith_sigma: float
     cost: float
     scatter: float
+    off: np.ndarray
 
     def stddev_across(self, plumb: np.ndarray) -> float:
         """Error of the direction that A3 takes to `plumb` (3,), the worse of two axes, rad."""
@@ -111,7 +126,9 @@ def level(readings: Readings, given: np.ndarray) -> Plumb:
     start = _axis_of_turn(readings, given)
     if not _leans(readings):
         return _fitted(readings, start, _Known())
-    found = [_fitted(readings, start, _Known()) for start in _turns(mean, start)]
+    found = [
+        _fitted(readings, start, _Known()) for _, start in _turns(mean, start)
+    ]  # each near its own start
     best = min(found, key=_cost)
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
@@ -135,8 +152,8 @@ def hang(
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
     start = rotation.shortest_turn(given @ (up / np.linalg.norm(up)), mean) @ given
     known = _Known(zenith, max(zenith_sigma, 1e-12), turn_sigma)
-    starts = _turns(mean, start) if turn_sigma > np.radians(20) else [start]
-    found = [_fitted(readings, start, known) for start in starts]
+    starts = _turns(mean, start) if turn_sigma > np.radians(20) else [(0.0, start)]
+    found = [_fitted(readings, start, known, angle) for angle, start in starts]
     best = min(found, key=_cost)
     if found[0].cost < best.cost + AS_GOOD:
         best = found[0]
@@ -145,7 +162,7 @@ def hang(
 
 @dataclass(frozen=True)
 class _Known:
-    """What A3 is fitted under: the zenith (3,), or None, and its error; the error of the start's turn about the plumb
+    """What A3 is fitted under: the zenith (3,), or None, and its error; the error of the given A3's turn about the plumb
     line; rad."""
 
     zenith: np.ndarray | None = None
@@ -157,10 +174,10 @@ def _cost(plumb: Plumb) -> float:
     return plumb.cost
 
 
-def _turns(axis: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
-    """`start` and what it is turned about an axis of S."""
-    angles = np.arange(TURNS_TRIED) * (2 * np.pi / TURNS_TRIED)
-    return [rotation.from_vector(axis * angle) @ start for angle in angles]
+def _turns(axis: np.ndarray, start: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """`start` and what it is turned about an axis of S, with the angle."""
+    angles = [rotation.half_turn(k * 2 * np.pi / TURNS_TRIED) for k in range(TURNS_TRIED)]
+    return [(angle, rotation.from_vector(axis * angle) @ start) for angle in angles]
 
 
 def _leans(readings: Readings) -> bool:
@@ -174,8 +191,9 @@ def _leans(readings: Readings) -> bool:
     return bool(better > LEAN_CHI2)
 
 
-def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
-    """A3, the zenith and the errors of the inclinometer: robust Gauss-Newton from `start`.
+def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float = 0.0) -> Plumb:
+    """A3, the zenith and the errors of the inclinometer: robust Gauss-Newton from `start`, which is the given A3 `turned`
+    by so many rad about the plumb line.
 
     The residual is that of the readings, which err, against the stars' plumb line, which hardly does.  A3's tilts are
     held to UNKNOWN_ARCSEC.
@@ -192,6 +210,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
     loose = np.radians(UNKNOWN_ARCSEC[0] / 3600)
     prior = 1 / np.array([loose, loose, known.turn_sigma, *[known.zenith_sigma] * 2, *[1.0] * more])
     a3, p = start, np.zeros(5 + more)
+    p[2] = turned
     up = zenith
     for _ in range(MOST_STEPS):
         length = np.linalg.norm(up)
@@ -229,6 +248,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known) -> Plumb:
         float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
         cost,
         2 * cost / max(2 * len(readings.sigma) - 5, 1),
+        np.hypot(*off.T),
     )
 
 
