@@ -2,13 +2,14 @@
 """`starpos solve`: position and heading of frames with their tilts, each and all together."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue
+from starpos import catalogue, instrument_file
 from starpos.average import Average, average
 from starpos.cli import common
-from starpos.errors import FixError, FrameError
+from starpos.errors import FixError, FrameError, InstrumentError
 from starpos.fix import Fix
 from starpos.inclinometer import TiltLog, read_tilt_csv
 from starpos.solve import Solution, Solver, Status
@@ -34,10 +35,15 @@ def define(parser) -> None:
         action="store_true",
         help="frames of one place at several headings: find A3 too, whatever it is",
     )
+    parser.add_argument(
+        "--save", metavar="OUT", help="write the instrument file (YAML) with the A3 of --self-calibrate"
+    )
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
+    if args.save is not None and not args.self_calibrate:
+        raise InstrumentError("--save writes what --self-calibrate finds: give both")
     vertical = common.vertical_of(args)
     solved, unreadable = [], False
     for path, answer in (_turned if args.self_calibrate else _one_by_one)(args):
@@ -82,12 +88,12 @@ def _turned(args):
             item = common.stars_of(item)
         rows.append((path, item))
     frames = [stars for _, stars in rows if isinstance(stars, Stars)]
-    answers = iter(_of_turn(solver, frames, tilts) if frames else ())
+    answers = iter(_of_turn(solver, frames, tilts, args.save) if frames else ())
     for path, item in rows:
         yield path, next(answers) if isinstance(item, Stars) else item
 
 
-def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[Solution]:
+def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog, save: str | None) -> Sequence[Solution]:
     try:
         turned = turn(solver, frames, tilts.average, solver.progress)
     except FixError as e:
@@ -95,6 +101,8 @@ def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[So
     angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
+    if save is not None and turned.fixes:
+        instrument_file.write(Path(save), turned.instrument, f"A3 by turning on the spot: {error}")
     return turned.solutions
 
 
