@@ -19,6 +19,7 @@ from starpos.utc import utc_text
 from starpos.vertical import Vertical, geodetic
 
 NO_FIX = 1
+WORTH_SAVING_ARCSEC = 600.0
 COUNTS = ("frames", "poses", "left_out", "moved")  # of an average
 
 
@@ -101,7 +102,11 @@ def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog, save: str | No
     angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
-    if save is not None and turned.fixes:
+    if save is not None and turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
+        common.complain(
+            "solve", f"{save}: not written, the headings hardly tell A3: turn the instrument further"
+        )
+    elif save is not None:
         instrument_file.write(Path(save), turned.instrument, f"A3 by turning on the spot: {error}")
     return turned.solutions
 

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos solve --self-calibrate` on a night whose A3 nobody tells it, and the instrument file it leaves."""
+
+import json
+
+import pytest
+from test_cli import AIR, PLACE, WIDE, objects, run
+
+from starpos.cli import main
+from starpos.instrument_file import read
+
+
+def simulated(folder, *more):
+    place = [f"--{k}={v}" for k, v in PLACE.items()]
+    size = ("--size", "1000", "700")
+    command = ["simulate", str(folder), "--stars-only", *size, *WIDE, *place, *AIR, *more]
+    assert main([*command, "--misalignment", "1.5", "-2", "130", "--tilt-zero", "0.2", "-0.1"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("turned"), "-n", "8", "--turn", "45")
+
+
+def solve(capsys, folder, *more):
+    frames = sorted(folder.glob("stars_*.csv"))
+    return run(capsys, "solve", *frames, "--tilt", folder / "tilt.csv", *AIR, *more)
+
+
+def arcsec_off(combined):
+    return [abs(combined[k] - PLACE[k]) * 3600 for k in PLACE]
+
+
+def test_the_place_is_found_and_a3_saved_for_another_night(turned, tmp_path, capsys):
+    saved = tmp_path / "mine.yaml"
+    status, out, errors = solve(capsys, turned, *WIDE, "--self-calibrate", "--save", saved, "--json")
+    *each, combined = objects(out)
+    assert status == 0 and len(each) == 8
+    assert max(arcsec_off(combined)) < 4 * max(combined["sigma_north_m"], combined["sigma_east_m"]) / 20
+    assert combined["sigma_north_m"] < 400
+    assert any("calibrated: --misalignment" in line for line in errors)
+    assert read(saved).calibration.frames == 8
+
+    later = simulated(tmp_path / "later", "-n", "4", "--seed", "9", "--azimuth", "100")
+    status, out, errors = solve(capsys, later, "--instrument", saved, "--json")
+    combined = objects(out)[-1]
+    assert (status, errors) == (0, [])
+    sigma = max(combined["sigma_north_m"], combined["sigma_east_m"])
+    assert max(arcsec_off(combined)) < 4 * sigma / 20
+    assert 10 < sigma < 600
+
+
+def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys):
+    still = simulated(tmp_path / "still", "-n", "2")
+    status, out, errors = solve(
+        capsys, still, *WIDE, "--self-calibrate", "--save", tmp_path / "no.yaml", "--json"
+    )
+    assert status == 0 and json.loads(out.splitlines()[-1])["sigma_north_m"] > 1e5
+    assert any("not written" in line for line in errors) and not (tmp_path / "no.yaml").exists()
+
+
+def test_save_needs_self_calibrate(turned, tmp_path, capsys):
+    status, _, errors = solve(capsys, turned, *WIDE, "--save", tmp_path / "no.yaml")
+    assert status == 2 and "give both" in errors[0]
