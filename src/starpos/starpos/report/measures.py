@@ -9,7 +9,7 @@ from starpos.earth import curvature_radii_m
 from starpos.report.night import Night, Place, Truth
 
 ARCSEC = np.radians(1 / 3600)
-OUTLIER_SIGMA = 5.0
+OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
 FEWEST_FOR_OUTLIERS = 5
 SIGMA_PER_MAD = 1.4826
 SAME_TIME_S = 0.01
@@ -56,11 +56,12 @@ def stability(night: Night) -> Stability:
         true = _true_headings(night)
         heading_from = "truth" if true is not None else ""
         away[:, 2] = np.nan if true is None else turn(seen[:, 2] - true)
+    sigma = np.array([_own_sigma(p) for p in places])
     return Stability(
         np.array([k for k, _ in night.fixed]),
         away / ARCSEC,
-        np.array([_own_sigma(p) for p in places]) / ARCSEC,
-        _outliers(away[:, :2]),
+        sigma / ARCSEC,
+        _outliers(away[:, :2], sigma[:, :2]),
         heading_from,
     )
 
@@ -68,12 +69,12 @@ def stability(night: Night) -> Stability:
 def steadiness(night: Night) -> Stability:
     """The same with one tilt for all frames: what stars and air do alone."""
     away = _from_mean(night.steady)
-    without_tilt = [_own_sigma(s.place, without="tilt") for _, s in night.fixed]
+    without_tilt = np.array([_own_sigma(s.place, without="tilt") for _, s in night.fixed])
     return Stability(
         np.array([k for k, _ in night.fixed]),
         away / ARCSEC,
-        np.array(without_tilt) / ARCSEC,
-        _outliers(away[:, :2]),
+        without_tilt / ARCSEC,
+        _outliers(away[:, :2], without_tilt[:, :2]),
         "mean",
     )
 
@@ -139,11 +140,13 @@ def _angles(covariance: np.ndarray, latitude: float) -> np.ndarray:
     return np.array([north / meridian, east / (prime * max(np.cos(latitude), 1e-9)), heading])
 
 
-def _outliers(away: np.ndarray) -> np.ndarray:
+def _outliers(away: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Far off the scatter of all, and further than their own claims (N, 2) allow."""
     if len(away) < FEWEST_FOR_OUTLIERS:
         return np.zeros(len(away), bool)
     far = np.abs(away - np.median(away, axis=0))
-    return (far > OUTLIER_SIGMA * (SIGMA_PER_MAD * np.median(far, axis=0) + 1e-12)).any(1)
+    wide = OUTLIER_SIGMA * (SIGMA_PER_MAD * np.median(far, axis=0) + 1e-12)
+    return ((far > wide) & (far > CLAIMED_SIGMA * sigma)).any(1)
 
 
 def _true_headings(night: Night) -> np.ndarray | None:

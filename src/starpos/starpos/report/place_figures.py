@@ -115,7 +115,9 @@ def draw_budget(figure, night: Night) -> None:
         axes.grid(axis="y", visible=False)
         values = [[shares.get(n, np.zeros(3))[k] for n in names] for _, shares, _ in places]
         top = np.nanmax(values, initial=1e-9)
-        low = max(top * 1e-4, min((v for row in values for v in row if v > 0), default=top) / 2)
+        # three decades below whichever is smaller, a frame or the average: an A3 that nobody knew would hide the rest
+        highest = [np.nanmax(row, initial=1e-9) for row in values]
+        low = max(min(highest) * 1e-3, min((v for row in values for v in row if v > 0), default=top) / 2)
         for j, ((label, _, colour), row) in enumerate(zip(places, values, strict=True)):
             at = np.arange(len(names)) + (len(places) / 2 - 0.5 - j) * height
             axes.barh(at, np.maximum(np.nan_to_num(row), low), height, color=colour, label=label)
