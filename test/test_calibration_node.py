@@ -162,6 +162,17 @@ def test_the_mode_is_wide_until_the_headings_tell_and_right_then(graph, solver):
     assert sigmas(SITE, average.latitude, average.longitude, average.position_covariance) < 4
 
 
+def test_a_calibration_of_another_camera_info_counts_as_unknown(graph, solver):
+    headings(graph, [40, 220], 1, instrument=WRONG)
+    assert calibrate(graph).success
+    shot = shoot(instrument=WRONG)
+    shot.info.k[2] += 20.0
+    wide = graph.answer(shot)[0]
+    assert wide.status == Solution.OK and sigma_m(wide.covariance) > 100e3
+    assert "not known" in save(graph, "/nowhere/x.yaml").message
+    assert "only 1 of 2" in calibrate(graph, frames=2).message
+
+
 @pytest.mark.parametrize(
     ("path", "words"),
     [

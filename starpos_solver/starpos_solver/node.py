@@ -17,6 +17,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from starpos import catalogue
+from starpos.average import Average
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.geoid import Geoid
@@ -304,9 +305,13 @@ class SolverNode(Node):
             tilt = answer.tilt or self._tilts.average(stars.mid_unix_s or math.nan, self._span(stars))
         except StarposError:
             return
-        self._calibrating.learn(Seen(stars, tilt, frame.message.stamp_stddev), answer.fix)
-        if answer.ok:
-            self._fix_averaged.publish(self._averaged(frame.message.header))
+        try:
+            self._calibrating.learn(Seen(stars, tilt, frame.message.stamp_stddev), answer.fix)
+        except Exception:  # fix and heading go on without
+            self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
+        place = self._calibrating.average.place
+        if answer.ok and place is not None:
+            self._fix_averaged.publish(self._averaged(frame.message.header, place))
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -334,10 +339,10 @@ class SolverNode(Node):
             outputs.imu(header, answer, ground) if ground else None,
         )
 
-    def _averaged(self, about: Header) -> NavSatFix:
+    def _averaged(self, about: Header, place: Average) -> NavSatFix:
         header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
         vertical = parameters.vertical_of(self._values, self._geoid)
-        return self._nav_sat_fix(header, outputs.average_on_ground(self._calibrating.average.place, vertical))
+        return self._nav_sat_fix(header, outputs.average_on_ground(place, vertical))
 
     def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
         return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])

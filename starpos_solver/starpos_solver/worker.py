@@ -4,9 +4,11 @@
 import threading
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -49,7 +51,8 @@ class Worker:
         except Exception as e:  # a defect costs this job, not the node
             self._node.get_logger().error(traceback.format_exc())
             self._outcome = Outcome(trouble=f"it failed ({type(e).__name__}: {e})")
-        self._ended.trigger()
+        with suppress(InvalidHandle):  # the node has ended meanwhile
+            self._ended.trigger()
 
     def _on_ended(self):
         future, self._future = self._future, None
