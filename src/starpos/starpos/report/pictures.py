@@ -103,8 +103,8 @@ def _stability_caption(s: measures.Stability, text: str) -> str:
     found = int(s.outlier.sum())
     numbers = ", ".join(map(str, s.number[s.outlier][:8])) + (" ..." if found > 8 else "")
     which = f"{found} (frames {numbers})" if found else "none"
-    return f"{text} Outliers, more than {measures.OUTLIER_SIGMA:g} robust sigma off and "
-        f"{measures.CLAIMED_SIGMA:g} of their own: {which}."
+    far, own = measures.OUTLIER_SIGMA, measures.CLAIMED_SIGMA
+    return f"{text} Outliers, more than {far:g} robust sigma off and {own:g} of their own: {which}."
 
 
 def _scatter_caption(night: Night) -> str:
