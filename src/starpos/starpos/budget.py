@@ -169,17 +169,32 @@ def error_terms(
     second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
     pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
     a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
-    calibration = sensitivity.level @ a2 @ symmetric_root(mounting.calibration_covariance)
+    levelling = _levelling(tilt, a2)
+    calibration = np.hstack(
+        [a2 @ symmetric_root(mounting.calibration_covariance), levelling @ _far_turn(tilt, mounting)]
+    )
     return (
         ErrorTerm("centroids", of_stars(stars.centroids)),
         ErrorTerm("catalogue", of_stars(stars.catalogue), stars.same_stars),
-        ErrorTerm("calibration", calibration, ALWAYS, posed=True),
-        *_of_inclinometer(sensitivity.level @ _levelling(tilt, a2), tilt, mounting, earth.utc_unix_s),
+        ErrorTerm("calibration", sensitivity.level @ calibration, ALWAYS, posed=True),
+        *_of_inclinometer(sensitivity.level @ levelling, tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], ALWAYS),
         ErrorTerm("clock", second_of_time * clock_stddev_s, ALWAYS),
         ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, ALWAYS),
         ErrorTerm("pole", pole, ALWAYS),
     )
+
+
+def _far_turn(tilt: Tilt, mounting: Mounting) -> np.ndarray:
+    """(2, 1) rad of theta_x, theta_y: what an A3 that is turned far about the plumb line makes of a lean beside the small
+    rotation, which moves it sideways only: it comes out shorter by the turn's cosine.
+    """
+    up = a2_matrix(*mounting.calibrated_tilt)[2]
+    variance = up @ mounting.calibration_covariance @ up
+    # mean of (1 - cos)^2 of a Gaussian turn
+    shorter2 = 1.5 - 2 * np.exp(-variance / 2) + np.exp(-2 * variance) / 2
+    lean = np.array([tilt.theta_x, tilt.theta_y]) - mounting.calibrated_tilt
+    return lean[:, None] * np.sqrt(max(shorter2, 0.0))
 
 
 def _levelling(tilt: Tilt, a2: np.ndarray) -> np.ndarray:

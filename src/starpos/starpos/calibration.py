@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.errors import FixError
 from starpos.fix import Fix
-from starpos.inclinometer import Tilt
+from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import ARCSEC, Calibration, Instrument
 from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
@@ -21,6 +21,7 @@ SETTLED_RAD = np.radians(0.02 / 3600)
 OF_PLACE = ("refraction", "clock", "ut1", "pole")  # terms that move the zenith of all frames alike
 VALID_DAYS = 365.0
 MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
+TURN_SIGMA = 3.0  # by which the fixes hold what the leans told of A3's turn: they are of the same tilts
 OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25  # frames further off are left out, up to this share of all
 
 Tilts = Callable[[float, float], Tilt]
@@ -95,9 +96,10 @@ def calibrate(
             break
         a3 = solver.instrument.mounting.a3
         plumb, sound = _found(find, solved, solver.instrument)
-        unknown = replace(unknown, temperature_c=_mean_temperature_c(sound), tilt_deg=_mean_tilt_deg(sound))
-        solver = _with(solver, unknown.turned_to(plumb.a3))
-        if np.linalg.norm(plumb.a3[2] - a3[2]) < SETTLED_RAD:  # a turn about the plumb line changes no fix
+        solver = _with(solver, _unknown(plumb, sound))
+        if (
+            k and np.linalg.norm(plumb.a3[2] - a3[2]) < SETTLED_RAD
+        ):  # a turn about the plumb line changes no fix
             break
     progress("calibrating", 1.0)
     if plumb is None:
@@ -122,6 +124,22 @@ def _found(find: Callable, solved: list[Solution], instrument: Instrument) -> tu
     if not 0 < len(solved) - len(sound) <= MOST_OUTLIERS * len(solved):
         return plumb, solved
     return find(Readings.of(sound, errors), a3, [s.fix for s in sound]), sound
+
+
+def _unknown(plumb: Plumb, sound: list[Solution]) -> Calibration:
+    """A3 as the fixes hold it: unknown, but for its turn about the plumb line where the leans told it; an unknown one
+    makes an error of every lean."""
+    tilt_deg = _mean_tilt_deg(sound)
+    up = a2_matrix(*np.radians(tilt_deg))[2]
+    turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
+    across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
+    covariance = np.eye(3) * across**2 + np.outer(up, up) * (about**2 - across**2)
+    held = Calibration(
+        covariance_arcsec2=tuple(map(tuple, covariance.tolist())),
+        temperature_c=_mean_temperature_c(sound),
+        tilt_deg=tilt_deg,
+    )
+    return held.turned_to(plumb.a3)
 
 
 def _as_scattered(plumb: Plumb, frames: int) -> Plumb:

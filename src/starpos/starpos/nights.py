@@ -105,17 +105,23 @@ class Zero:
         return self.rad
 
 
-def draw(rng: np.random.Generator, catalogue: Catalogue, errors: InclinometerErrors, clock_stddev_s: float):
+def draw(
+    rng: np.random.Generator,
+    catalogue: Catalogue,
+    errors: InclinometerErrors,
+    clock_stddev_s: float,
+    camera: Camera,
+) -> tuple[World, float]:
     """A World at a random time and place, and that time."""
     begin = rng.uniform(FIRST_UNIX_S, LAST_UNIX_S)
     year = EPOCH + (begin - 946728000.0) / (365.25 * DAY_S)
     altitude, roll = rng.uniform(70, 86), rng.uniform(0, 360)
     azimuth = rng.uniform(0, 360)
     truth = Calibration().turned_to(_mounted(rng, camera_to_enu(azimuth, altitude, roll)[2]))
-    told = Instrument(CAMERA.fx, inclinometer=errors, clock_stddev_s=clock_stddev_s)
+    told = Instrument(camera.fx, inclinometer=errors, clock_stddev_s=clock_stddev_s)
     air = rng.choice([Atmosphere(88000.0, 12.0, 0.3), Atmosphere.measured(None, None)])
     scene = Scene(
-        CAMERA,
+        camera,
         replace(told, calibration=truth),
         Site(0.0, 0.0),
         azimuth,
@@ -214,9 +220,10 @@ def turned_night(
     headings: int = 4,
     frames: int = 25,
     clock_stddev_s: float = 0.01,
+    camera: Camera = CAMERA,
 ) -> Outcome:
     """Re-mounted somewhere and turned on the spot, A3 unknown."""
-    world, begin = draw(rng, catalogue, errors, clock_stddev_s)
+    world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     turns = np.arange(headings) * 360 / headings
     stars, tilts, heading = photograph(world, Zero(errors, rng, begin), begin, turns, frames, rng)
     solver = Solver(world.told, catalogue, world.air)
@@ -233,9 +240,10 @@ def calibrated_night(
     errors: InclinometerErrors = SCA100T,
     frames: int = 6,
     clock_stddev_s: float = 0.01,
+    camera: Camera = CAMERA,
 ) -> Outcome:
     """Calibrated at a known place at two leans, then days later at another, in other air, leaning otherwise."""
-    world, begin = draw(rng, catalogue, errors, clock_stddev_s)
+    world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     zero = Zero(errors, rng, begin)
     stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)
     lower = replace(world, scene=replace(world.scene, altitude_deg=world.scene.altitude_deg - 5))

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A3 at a known place, and what an instrument calibrated there claims elsewhere, against simulated truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import START
+from sites import TRUE_A3_DEG, a3_error, shots
+
+from starpos.average import average
+from starpos.calibration import VALID_DAYS, calibrate_at
+from starpos.earth import DAY_S, curvature_radii_m
+from starpos.errors import FixError
+from starpos.inclinometer import InclinometerErrors
+from starpos.instrument import Calibration
+from starpos.solve import Status
+from starpos.stars import no_stars
+
+NOISE_ARCSEC = 12.6  # of one reading
+
+
+def found_at(shot, catalogue, given=(0.0, 0.0, 0.0), **more):
+    return calibrate_at(shot.solver(catalogue, given), shot.frames, shot.tilt, shot.scene.site, **more)
+
+
+def stddev(calibration) -> np.ndarray:
+    return np.sqrt(np.diag(calibration.covariance_arcsec2))
+
+
+def solved(shot, found, catalogue):
+    """The first frame of these shots with a calibrated instrument, and how far that is off, in m and in sigma."""
+    solver = replace(shot.solver(catalogue), instrument=found.instrument)
+    solution = solver.solve(shot.frames[0], shot.tilt)
+    assert solution.status is Status.OK, solution.message
+    f = solution.fix
+    phi, lam = np.radians([shot.scene.site.latitude_deg, shot.scene.site.longitude_deg])
+    prime, meridian = curvature_radii_m(phi)
+    off = np.array([(f.longitude - lam) * prime * np.cos(phi), (f.latitude - phi) * meridian])
+    return f, np.linalg.norm(off), np.sqrt(off @ np.linalg.solve(f.covariance[:2, :2], off))
+
+
+def sigma_m(f) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(f.covariance[:2, :2])[-1]))
+
+
+def budget_m(f, name) -> np.ndarray:
+    (term,) = (t for t in f.terms if t.name == name)
+    return np.sqrt(np.diag(term.covariance)[:2])
+
+
+@pytest.mark.parametrize("frames", [1, 5])
+def test_one_lean_is_right_at_that_lean_and_wide_at_another(catalogue, rng, frames):
+    shot = shots(catalogue, rng, [0.0] * frames)
+    found = found_at(shot, catalogue)
+    assert found.plumb_stddev_arcsec == pytest.approx(NOISE_ARCSEC / np.sqrt(frames), rel=0.1)
+    assert np.sqrt(np.linalg.eigvalsh(found.instrument.calibration.covariance_arcsec2)[-1]) > 90 * 3600
+    same, metres, sigmas = solved(shots(catalogue, rng, [0.0], start=START + 900), found, catalogue)
+    assert sigmas < 4
+    # the noise of both readings, 390 m each, and the lean by which they differ turned by nobody knows what
+    assert metres < 4 * 390 * np.sqrt(1 + 1 / frames)
+    assert sigma_m(same) < 3000
+    for lean in (
+        -4.0,
+        4.0,
+    ):  # as wide as the turn is unknown: sideways and, beyond half a turn, along the lean
+        there = shots(catalogue, rng, [lean], start=START + 900)
+        other, metres, sigmas = solved(there, found, catalogue)
+        assert sigmas < 3
+        assert metres > 100e3
+        assert np.sqrt(np.linalg.eigvalsh(other.covariance[:2, :2])[0]) > 0.3 * metres
+
+
+@pytest.mark.parametrize("given", [(0.0, 0.0, 0.0), (-5.0, 5.0, -50.0)])
+def test_two_leans_tell_all_of_a3(catalogue, rng, given):
+    shot = shots(catalogue, rng, [0.0, 0.0, 6.0, 6.0])
+    found = found_at(shot, catalogue, given)
+    off, chi2 = a3_error(shot, found.instrument.calibration)
+    assert np.all(np.abs(off) < 4 * stddev(found.instrument.calibration))
+    assert chi2 < 25
+    # 12.6 arcsec / sqrt(2) at both ends of 6 deg, of which one axis across tells the turn
+    turn = np.sqrt(np.linalg.eigvalsh(found.instrument.calibration.covariance_arcsec2)[-1])
+    assert turn == pytest.approx(NOISE_ARCSEC / np.sin(np.radians(6)), rel=0.3)
+    elsewhere, metres, sigmas = solved(shots(catalogue, rng, [-3.0], start=START + 900), found, catalogue)
+    assert sigmas < 4
+    assert metres < 4 * sigma_m(elsewhere) < 4 * 1200
+
+
+def test_a3_errs_as_its_covariance_says(catalogue):
+    """Chi-squares of 30 calibrations average to the 3 that three angles have."""
+    chi2 = []
+    for seed in range(30):
+        shot = shots(catalogue, np.random.default_rng(seed), [0.0, 5.0, -4.0])
+        chi2.append(a3_error(shot, found_at(shot, catalogue).instrument.calibration)[1])
+    assert np.mean(chi2) == pytest.approx(3, abs=3.5 * np.sqrt(6 / 30))
+
+
+@pytest.mark.parametrize("off_deg", [0.02, 0.1, 1.0, -20.0])
+@pytest.mark.parametrize("which", [0, 4, 9])
+def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, off_deg, which):
+    """Refused or carried along, a reading that is degrees off cost the calibration; its frame is left out instead."""
+    leans = [0.0] * 5 + [5.0] * 5
+    sound = shots(catalogue, np.random.default_rng(7), leans)
+    expected = found_at(sound, catalogue).instrument.calibration
+    shot = shots(catalogue, np.random.default_rng(7), leans)
+    shot.spoil(which, off_deg)
+    found = found_at(shot, catalogue).instrument.calibration
+    off, chi2 = a3_error(shot, found)
+    moved = np.abs(off - a3_error(sound, expected)[0])
+    if abs(off_deg) < 0.05:  # six sigma: it is hardly one, and pulls as hard as three
+        assert chi2 < 20
+        return
+    assert np.all(moved < stddev(expected))
+    assert found.frames == 9
+    assert stddev(found) == pytest.approx(stddev(expected), rel=0.25)
+
+
+@pytest.mark.parametrize("bad", [[0], [0, 1], [1, 2, 3]])
+def test_frames_that_do_not_agree(catalogue, rng, bad):
+    """Of two or four frames it cannot be told which are right, or only if all but one are."""
+    shot = shots(catalogue, rng, [0.0] * max(2, 2 * len(bad)))
+    for k in bad:
+        shot.spoil(k, 0.2 * (k + 1))
+    with pytest.raises(FixError, match="frames do not agree on one zenith .* moved between them") as e:
+        found_at(shot, catalogue)
+    assert "\n" not in str(e.value)
+
+
+def test_frames_that_scatter_more_than_they_say_claim_less(catalogue):
+    """A mount that creeps by 24 arcsec from frame to frame, which nobody told."""
+    calm, creeping = (shots(catalogue, np.random.default_rng(3), [0.0] * 8) for _ in range(2))
+    rng = np.random.default_rng(4)
+    for k in range(8):
+        creeping.spoil(k, rng.normal(0, 24 / 3600))
+    claims = [found_at(s, catalogue).plumb_stddev_arcsec for s in (calm, creeping)]
+    assert claims[0] == pytest.approx(NOISE_ARCSEC / np.sqrt(8), rel=0.1)
+    assert 1.3 < claims[1] / claims[0] < 4
+
+
+def test_frames_of_one_reading_know_no_more_than_one(catalogue, rng):
+    shot = shots(catalogue, rng, [0.0] * 6)
+    first = shot.tilts[shot.frames[0].mid_unix_s]
+    shot.tilts = dict.fromkeys(shot.tilts, replace(first, times=(START,)))
+    assert found_at(shot, catalogue).plumb_stddev_arcsec == pytest.approx(NOISE_ARCSEC, rel=0.1)
+
+
+def test_without_a_fix_there_is_no_calibration(catalogue, rng):
+    shot = shots(catalogue, rng)
+    solver = shot.solver(catalogue)
+    with pytest.raises(FixError, match="there is no frame"):
+        calibrate_at(solver, [], shot.tilt, shot.scene.site)
+    shot.frames = [no_stars(1000, 700, START, 0.5)]
+    with pytest.raises(FixError, match="no frame has a fix to calibrate from: .*0 stars detected"):
+        calibrate_at(solver, shot.frames, lambda *_: next(iter(shot.tilts.values())), shot.scene.site)
+
+
+def test_frames_without_a_fix_are_left_out(catalogue, rng):
+    shot = shots(catalogue, rng, [0.0] * 3)
+    empty = no_stars(1000, 700, START + 7, 0.5)
+    shot.tilts[START + 7] = shot.tilts[shot.frames[0].mid_unix_s]
+    shot.frames.insert(1, empty)
+    found = found_at(shot, catalogue)
+    assert [s.status for s in found.solutions] == [Status.OK, Status.TOO_FEW_STARS, Status.OK, Status.OK]
+    assert found.instrument.calibration.frames == len(found.fixes) == 3
+
+
+def test_a_site_that_is_not_known_well(catalogue, rng):
+    shot = shots(catalogue, rng, [0.0] * 9)
+    sharp, blunt = (found_at(shot, catalogue, site_stddev_arcsec=s).plumb_stddev_arcsec for s in (0.0, 30.0))
+    assert sharp == pytest.approx(NOISE_ARCSEC / 3, rel=0.1)
+    assert blunt == pytest.approx(np.hypot(sharp, 30.0), rel=0.05)
+
+
+def test_a_site_that_is_off_moves_a3_by_as_much(catalogue):
+    """18.5 arcsec of latitude: the plumb line is that far off, and a fix lands on the site that was said."""
+    shot = shots(catalogue, np.random.default_rng(5), [0.0] * 4, noise_deg=1e-5)
+    site = replace(shot.scene.site, latitude_deg=shot.scene.site.latitude_deg + 18.5 / 3600)
+    found = calibrate_at(shot.solver(catalogue), shot.frames, shot.tilt, site)
+    up = shot.scene.attitude[2]
+    said = found.instrument.calibration.a3.T @ shot.true_a3 @ up
+    assert np.degrees(np.arccos(said @ up)) * 3600 == pytest.approx(18.5, abs=0.3)
+    f, _, _ = solved(shot, found, catalogue)
+    assert np.degrees(f.latitude) == pytest.approx(site.latitude_deg, abs=0.3 / 3600)
+    assert np.degrees(f.longitude) == pytest.approx(site.longitude_deg, abs=0.3 / 3600)
+
+
+@pytest.mark.parametrize("a3_deg", [(1.0, -2.0, 180.0), (0.5, 0.5, -179.9999), (-2.0, 1.0, 179.99999)])
+@pytest.mark.parametrize("given", [(0.0, 0.0, 0.0), (0.0, 0.0, 179.9)])
+def test_a_camera_the_other_way_round_than_the_inclinometer(catalogue, rng, a3_deg, given):
+    shot = shots(catalogue, rng, [0.0, 5.0, -5.0], a3_deg)
+    found = found_at(shot, catalogue, given)
+    assert a3_error(shot, found.instrument.calibration)[1] < 25
+    assert solved(shot, found, catalogue)[2] < 4
+
+
+def test_an_inclinometer_at_a_right_angle_to_the_camera(catalogue, rng):
+    """A camera that looks along the inclinometer's X'... leaning as it does at 78 deg by 12: ry near 78 of 90 deg."""
+    shot = shots(catalogue, rng, [0.0, 3.0], (0.0, 20.0, 10.0))
+    found = found_at(shot, catalogue)
+    assert a3_error(shot, found.instrument.calibration)[1] < 25
+
+
+def test_what_is_said_of_the_turn_holds_where_the_leans_tell_little(catalogue, rng):
+    shot = shots(catalogue, rng, [0.0] * 4)
+    near = (1.5, -2.0, 128.0)
+    told = found_at(shot, catalogue, near, turn_stddev_deg=2.0).instrument.calibration
+    turn = np.sqrt(np.linalg.eigvalsh(told.covariance_arcsec2)[-1]) / 3600
+    assert turn == pytest.approx(2.0, rel=0.02)
+    assert told.misalignment_deg[2] == pytest.approx(128.0, abs=0.2)  # as it was said to be
+    assert a3_error(shot, told)[1] < 16
+    # against leans that tell it to 0.04 deg it has nothing to say
+    leaning = shots(catalogue, rng, [0.0, 0.0, 6.0, 6.0])
+    free, held = (
+        found_at(leaning, catalogue, near, turn_stddev_deg=t).instrument.calibration for t in (180, 2.0)
+    )
+    assert held.misalignment_deg[2] == pytest.approx(free.misalignment_deg[2], abs=0.01)
+
+
+def test_a_turn_said_wide_counts_from_what_was_said(catalogue):
+    """Leans that tell the turn to some 20 deg, and one said to be good to 30: between the two, not at a turn in between
+    that nobody named."""
+    shot = shots(catalogue, np.random.default_rng(2), [0.0, 0.01])
+    for said in (130.0, 100.0, 40.0):
+        c = found_at(shot, catalogue, (1.5, -2.0, said), turn_stddev_deg=30.0).instrument.calibration
+        turn = np.sqrt(np.linalg.eigvalsh(c.covariance_arcsec2)[-1]) / 3600
+        assert turn < 30.5
+        assert abs((c.misalignment_deg[2] - said + 180) % 360 - 180) < 3 * 30
+
+
+def test_time_temperature_tilt_and_number_are_recorded(catalogue, rng):
+    shot = shots(catalogue, rng, [0.0, 4.0])
+    for mid, t in shot.tilts.items():
+        shot.tilts[mid] = replace(t, temperature_c=10.0 + (mid - START - 0.25) / 10)  # 10 and 12
+    c = found_at(shot, catalogue).instrument.calibration
+    mids = list(shot.tilts)
+    assert c.utc_unix_s == pytest.approx(np.mean(mids), abs=1e-6)
+    assert c.temperature_c == pytest.approx(11.0)
+    tilts = np.degrees([[t.theta_x, t.theta_y] for t in shot.tilts.values()])
+    assert c.tilt_deg == pytest.approx(tilts.mean(0))
+    assert (c.frames, c.valid_days) == (2, VALID_DAYS)
+    silent = shots(catalogue, rng)
+    assert np.isnan(found_at(silent, catalogue).instrument.calibration.temperature_c)
+
+
+def test_what_the_calibration_costs_elsewhere_and_later(catalogue, rng):
+    """Numbers worked out by hand from the inclinometer's: 2 arcsec / sqrt(h), 3 arcsec / deg C, 1e-4 of the angle."""
+    shot = shots(catalogue, rng, [0.0, 0.0])
+    for mid, t in shot.tilts.items():
+        shot.tilts[mid] = replace(t, temperature_c=10.0)
+    found = found_at(shot, catalogue)
+    arcsec_m = 30.9
+    for days, warmer, lean in ((0.25, 0.0, 0.0), (4.0, 10.0, 0.0), (9.0, -5.0, -6.0)):
+        there = shots(
+            catalogue, rng, [lean], start=START + days * DAY_S, latitude_deg=-20.0, longitude_deg=130.0
+        )
+        for mid, t in there.tilts.items():
+            there.tilts[mid] = replace(t, temperature_c=10.0 + warmer)
+        f, metres, sigmas = solved(there, found, catalogue)
+        assert sigmas < 4
+        flat = (
+            0.06 * arcsec_m
+        )  # A2's axes at some degrees of lean, and the radii of the Earth, are not quite one
+        drift = 2.0 * np.sqrt(24 * days) * arcsec_m
+        assert budget_m(f, "tilt drift") == pytest.approx(drift, rel=0.05)
+        assert budget_m(f, "tilt temperature") == pytest.approx(3.0 * abs(warmer) * arcsec_m, rel=0.05)
+        scale = 1e-4 * abs(lean) * 3600 * arcsec_m
+        assert np.linalg.norm(budget_m(f, "tilt scale")) == pytest.approx(scale, rel=0.05, abs=flat)
+        assert metres < 4 * sigma_m(f)
+
+
+def test_a_stale_calibration_is_refused_in_words(catalogue, rng):
+    shot = shots(catalogue, rng)
+    found = found_at(shot, catalogue)
+    for days, ok in ((VALID_DAYS - 1, True), (VALID_DAYS + 1, False), (-VALID_DAYS - 1, False)):
+        later = shots(catalogue, rng, start=START - days * DAY_S)  # the past is in all tables
+        solver = replace(shot.solver(catalogue), instrument=found.instrument)
+        solution = solver.solve(later.frames[0], later.tilt)
+        assert (solution.status is Status.OK) == ok
+        if not ok:
+            assert solution.status is Status.BAD_INPUT
+            assert "2026-11-02T18:00:00" in solution.message
+            assert "calibrate again" in solution.message
+
+
+def test_an_old_calibration_does_not_stop_a_new_one(catalogue, rng):
+    shot = shots(catalogue, rng)
+    stale = replace(Calibration(TRUE_A3_DEG), utc_unix_s=START - 900 * DAY_S, valid_days=10.0)
+    solver = shot.solver(catalogue)
+    solver = replace(solver, instrument=replace(solver.instrument, calibration=stale))
+    found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site)
+    assert found.instrument.calibration.utc_unix_s == shot.frames[0].mid_unix_s
+
+
+def test_the_fixes_of_a_calibration_do_not_know_its_place(catalogue, rng):
+    """They were made with an A3 that came of the site: to average them is not to measure it."""
+    found = found_at(shots(catalogue, rng, [0.0] * 3), catalogue)
+    assert np.sqrt(np.diag(average(found.fixes).covariance)[:2]).min() > 100e3
+
+
+def test_a_steadier_inclinometer_is_taken_at_its_word(catalogue):
+    """0.1 arcsec: A3 to a fraction of an arcsec, and true."""
+    noise = 0.1 / 3600
+    shot = shots(catalogue, np.random.default_rng(11), [0.0, 0.0, 4.0, 4.0], noise_deg=noise)
+    errors = InclinometerErrors(np.radians(noise), np.radians(noise) / 8, 0.0, 0.0, 0.0)
+    solver = shot.solver(catalogue)
+    solver = replace(solver, instrument=replace(solver.instrument, inclinometer=errors, clock_stddev_s=0.0))
+    found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site)
+    assert found.plumb_stddev_arcsec < 0.3
+    assert a3_error(shot, found.instrument.calibration)[1] < 25
