@@ -241,6 +241,8 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
     one = np.array(solutions[-1].covariance).reshape(3, 3)
     variance = np.zeros(2)
     for term in solutions[-1].budget:  # what is new in every frame averages, the rest stays
+        if term.name == "deflection":  # of the geodetic position, which has no part in this
+            continue
         share = 1 if term.common else len(solutions)
         variance += np.array([term.east, term.north]) ** 2 / share
     mean, sigma = errors.mean(0), np.sqrt(variance)

@@ -25,6 +25,7 @@ STATUS = {
     Status.BAD_INPUT: Solution.BAD_INPUT,
     Status.POOR_FIT: Solution.POOR_FIT,
 }
+DEFLECTION = "deflection"  # in the budget, though of the geodetic position only
 UNKNOWN_ALTITUDE_VARIANCE = 1e8  # m2; a NaN would make consumers drop the whole matrix
 NAN = math.nan
 
@@ -116,11 +117,11 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None) -> Solutio
     message.covariance = (fix.covariance * np.outer(degrees, degrees)).ravel()
     message.covariance_geodetic = (ground.covariance * np.outer(degrees, degrees)).ravel()
     message.heading_stddev = math.sqrt(message.covariance_geodetic[8])
-    for term in fix.terms:
-        east, north, heading = (np.sqrt(np.diag(term.covariance)[:3]) * degrees).tolist()
-        message.budget.append(
-            ErrorTerm(name=term.name, east=east, north=north, heading=heading, common=term.common)
-        )
+    sources = [(t.name, t.covariance[:3, :3], t.common) for t in fix.terms]
+    sources.append((DEFLECTION, ground.covariance - fix.covariance, True))
+    for name, covariance, common in sources:
+        east, north, heading = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) * degrees).tolist()
+        message.budget.append(ErrorTerm(name=name, east=east, north=north, heading=heading, common=common))
     message.refraction = fix.refraction_arcsec
     message.diurnal_aberration = fix.diurnal_aberration_arcsec
     message.ut1_minus_utc = fix.ut1_minus_utc_s

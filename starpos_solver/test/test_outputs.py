@@ -150,3 +150,15 @@ def test_without_a_fix_every_number_that_is_missing_is_nan():
 def test_every_status_has_a_code_of_the_message():
     assert set(outputs.STATUS) == set(Status)
     assert len(set(outputs.STATUS.values())) == len(Status)
+
+
+def test_the_budget_adds_up_and_the_deflection_to_the_geodetic_covariance():
+    answer = answer_facing(30.0)
+    message = outputs.solution(Header(), answer, outputs.on_ground(answer, Deflection(1.0, 2.0, 3.0)))
+    *others, deflection = message.budget
+    assert deflection.name == "deflection" and deflection.common
+    variance = np.sum([[t.east**2, t.north**2, t.heading**2] for t in others], axis=0)
+    np.testing.assert_allclose(variance, np.diag(np.reshape(message.covariance, (3, 3))), rtol=1e-9)
+    variance += np.square([deflection.east, deflection.north, deflection.heading])
+    np.testing.assert_allclose(variance, np.diag(np.reshape(message.covariance_geodetic, (3, 3))), rtol=1e-9)
+    assert deflection.north == pytest.approx(3 * 30.84, rel=0.01)

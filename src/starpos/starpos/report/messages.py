@@ -98,7 +98,7 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
                 ALWAYS if t.common else None,
             )
             for t in m.budget
-            if np.isfinite([t.east, t.north, t.heading]).all()
+            if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
         )
         place = Place(utc, float(angles[0]), float(angles[1]), full_turn(heading), covariance, terms)
     elif status is Status.OK:
