@@ -9,7 +9,7 @@ import numpy as np
 from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, a2_matrix
-from starpos.instrument import ARCSEC, Calibration, Instrument
+from starpos.instrument import ARCSEC, MOST_C, Calibration, Instrument
 from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky import Site
@@ -167,7 +167,7 @@ def _dated(plumb: Plumb, solved: list[Solution]) -> Calibration:
 
 
 def _mean_temperature_c(solved: list[Solution]) -> float:
-    known = [s.tilt.temperature_c for s in solved if np.isfinite(s.tilt.temperature_c)]
+    known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MOST_C]  # NaN is not
     return float(np.mean(known)) if known else float("nan")
 
 

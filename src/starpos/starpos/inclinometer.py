@@ -65,9 +65,9 @@ class InclinometerErrors:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0):
+            if not 0 <= value <= 1:
                 raise InstrumentError(
-                    f"the inclinometer's {name} is {value}: it must be a finite number of 0 or more"
+                    f"the inclinometer's {name} is {value:g}: it must be a finite number from 0 to 1"
                 )
 
     def undithered_rad(self, tilt: Tilt) -> float:

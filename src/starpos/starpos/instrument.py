@@ -9,13 +9,18 @@ from starpos import rotation
 from starpos.camera import Camera
 from starpos.earth import DAY_S
 from starpos.errors import InstrumentError
-from starpos.inclinometer import InclinometerErrors
+from starpos.inclinometer import LIMIT_RAD, InclinometerErrors
 from starpos.mounting import Mounting
 from starpos.utc import utc_text
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (DESIGN section 2)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 UNSTATED_CALIBRATION_ARCSEC = 5.0  # 1 sigma a axis of an A3 given without its error
+MOST_ARCSEC, MOST_C = (
+    1e7,
+    200.0,
+)  # an error of some turns says that nothing is known; no inclinometer is so hot
+MOST_CLOCK_S = 86400.0
 ARCSEC = np.radians(1 / 3600)
 
 
@@ -47,7 +52,21 @@ class Calibration:
                 raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
         if len(self.misalignment_deg) != 3 or len(self.tilt_deg) != 2:
             raise InstrumentError("misalignment_deg is three numbers, tilt_deg of a calibration two")
+        if max(abs(angle) for angle in self.misalignment_deg) > 360:
+            raise InstrumentError(
+                "an angle of misalignment_deg is beyond 360 deg: give A3's three angles in deg"
+            )
+        if max(abs(angle) for angle in self.tilt_deg) > np.degrees(LIMIT_RAD):
+            raise InstrumentError(
+                "tilt_deg of the calibration is beyond 30 deg, which no inclinometer here measures"
+            )
+        if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MOST_C):
+            raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")
         covariance = np.asarray(self.covariance_arcsec2, float)
+        if np.abs(covariance).max() > MOST_ARCSEC**2:
+            raise InstrumentError(
+                f"the calibration's covariance is beyond any turn: give variances of at most {MOST_ARCSEC**2:g} arcsec2"
+            )
         if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
             raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
         if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
@@ -60,8 +79,12 @@ class Calibration:
         """From three angles and the errors (3,) about S's axes; InstrumentError where they are none."""
         if len(stddev_arcsec) != 3:
             raise InstrumentError("calibration_stddev_arcsec is three numbers")
-        if not np.isfinite(stddev_arcsec).all() or min(stddev_arcsec) < 0:
-            raise InstrumentError("calibration_stddev_arcsec must be finite numbers of 0 or more")
+        if not (
+            np.isfinite(stddev_arcsec).all() and 0 <= min(stddev_arcsec) <= max(stddev_arcsec) <= MOST_ARCSEC
+        ):
+            raise InstrumentError(
+                f"calibration_stddev_arcsec must be finite numbers of 0 or more, at most {MOST_ARCSEC:g}"
+            )
         covariance = np.diag(np.square(np.asarray(stddev_arcsec, float)))
         return cls(tuple(misalignment_deg), tuple(map(tuple, covariance.tolist())))
 
@@ -126,8 +149,10 @@ class Instrument:
             raise InstrumentError(
                 f"focal length {self.focal_px:g} px: must be positive (focal_mm * 1000 / pixel_um)"
             )
-        if self.clock_stddev_s < 0:
-            raise InstrumentError("clock_stddev_s of the instrument is negative: it must be 0 or more")
+        if not 0 <= self.clock_stddev_s <= MOST_CLOCK_S:
+            raise InstrumentError(
+                f"clock_stddev_s of the instrument is {self.clock_stddev_s:g}: it must be 0 or more, at most a day"
+            )
         if self.inclinometer.noise_rad <= 0:  # against 0 no instrument is ever at rest
             raise InstrumentError(
                 f"the inclinometer's noise (tilt_noise_deg) is {np.degrees(self.inclinometer.noise_rad):g} deg: must be "
@@ -136,6 +161,7 @@ class Instrument:
         link = np.asarray(self.link_to_camera, float)
         if (
             link.shape != (3, 3)
+            or np.abs(link).max() > 2  # whose squares may be beyond floats
             or not np.allclose(link @ link.T, np.eye(3), atol=1e-6)
             or np.linalg.det(link) < 0
         ):

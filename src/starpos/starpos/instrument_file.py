@@ -17,6 +17,7 @@ from starpos.instrument import Calibration, Instrument, focal_px_of
 from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
+MOST_FRAMES = 1 << 31
 INCLINOMETER = {  # key, field, unit in rad or 1
     "tilt_noise_deg": ("noise_rad", math.radians(1)),
     "tilt_quantum_deg": ("quantum_rad", math.radians(1)),
@@ -98,7 +99,7 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
     errors = {
-        name: _number(content, key) * unit for key, (name, unit) in INCLINOMETER.items() if key in content
+        name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content
     }
     instrument = replace(instrument, inclinometer=InclinometerErrors(**errors))
     if "clock_stddev_s" in content:
@@ -164,7 +165,7 @@ def _calibration(content: dict) -> Calibration:
     if "tilt_deg" in about:
         more["tilt_deg"] = _row(about["tilt_deg"], "tilt_deg")
     frames = about.get("frames", 0)
-    if not isinstance(frames, int) or frames < 0:
+    if isinstance(frames, bool) or not isinstance(frames, int) or not 0 <= frames < MOST_FRAMES:
         raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
 
@@ -190,6 +191,14 @@ def _number(mapping: dict, key: str) -> float:
         raise InstrumentError(f"{key} is missing: give a number") from None
     except (TypeError, ValueError, OverflowError):
         raise InstrumentError(f"{key} is {_short(mapping[key])}: give a number") from None
+
+
+def _error(mapping: dict, key: str, unit: float) -> float:
+    """In rad, or as a share."""
+    given = _number(mapping, key)
+    if not 0 <= given * unit <= 1:
+        raise InstrumentError(f"{key} is {given:g}: give a finite number from 0 to {1 / unit:.4g}")
+    return given * unit
 
 
 def _row(numbers: list, key: str) -> tuple[float, ...]:

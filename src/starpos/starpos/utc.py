@@ -19,8 +19,8 @@ def unix_of(utc: str) -> float:
     """Unix seconds of an ISO 8601 time, UTC unless it says otherwise; TimeError if it is none."""
     try:
         moment = datetime.datetime.fromisoformat(utc.replace("Z", "+00:00"))
-    except ValueError:
+        if moment.tzinfo is None:
+            moment = moment.replace(tzinfo=datetime.timezone.utc)
+        return moment.astimezone(datetime.timezone.utc).timestamp()
+    except (ValueError, OverflowError):  # OverflowError: year 0 or 10000, once its zone is taken off
         raise TimeError(f"{utc!r} is no time: write it like 2026-11-02T18:00:00") from None
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=datetime.timezone.utc)
-    return moment.timestamp()
