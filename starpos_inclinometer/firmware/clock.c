@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "clock.h"
+
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <util/atomic.h>
+
+#include "board.h"
+
+static volatile uint32_t milliseconds;
+
+ISR(TIMER1_COMPA_vect)
+{
+    milliseconds++;
+}
+
+void clock_init(void)
+{
+    OCR1A = F_CPU / 1000 - 1;
+    TCCR1B = _BV(WGM12) | _BV(CS10); // clear on compare match, no prescaler
+    TIMSK |= _BV(OCIE1A);
+}
+
+uint32_t clock_ms(void)
+{
+    uint32_t now;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { now = milliseconds; }
+    return now;
+}

@@ -1,0 +1,254 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "mcu.h"
+
+#include <string.h>
+
+#include "avr_eeprom.h"
+#include "avr_ioport.h"
+#include "avr_uart.h"
+#include "complain.h"
+#include "sim_avr.h"
+#include "sim_elf.h"
+
+// ATmega8, addresses in data space (data sheet, register summary).
+enum { SPCR = 0x2D, SPSR = 0x2E, SPDR = 0x2F, MCUCSR = 0x54 };
+#define SPIF 0x80
+#define PIN_AD7730_CS 2
+#define PIN_SCA100T_CS 1
+#define PIN_RDY 2
+#define MODE_3 0x0C // CPOL, CPHA
+#define BYTE_CYCLES (16 * 13 * 10) // of the UART at UBRR 12
+#define LOOP_ADDRESS 0x1FF0
+
+struct mcu mcu;
+
+static avr_t *avr;
+static avr_irq_t *rdy;
+static bool ad7730_selected;
+static char input[256];
+static size_t input_length;
+static bool input_running;
+
+static char said[1024];
+
+void complain(const char *what)
+{
+    if (strstr(said, what) || strlen(said) + strlen(what) + 3 > sizeof said)
+        return;
+    if (*said)
+        strcat(said, "; ");
+    strcat(said, what);
+}
+
+const char *complaints(void)
+{
+    return said;
+}
+
+double mcu_now(void)
+{
+    return (double)avr->cycle / MCU_HZ;
+}
+
+static avr_cycle_count_t cycle_at(double seconds)
+{
+    return seconds * MCU_HZ + 1;
+}
+
+// The converter's next event, as a timer of the simulated MCU.
+
+static avr_cycle_count_t on_adc(avr_t *which, avr_cycle_count_t when, void *unused);
+
+static void follow_adc(void)
+{
+    avr_raise_irq(rdy, !mcu.adc.ready);
+    double next = adc_next_event(&mcu.adc);
+    avr_cycle_timer_cancel(avr, on_adc, NULL);
+    if (next) {
+        avr_cycle_count_t at = cycle_at(next);
+        avr_cycle_timer_register(avr, at > avr->cycle ? at - avr->cycle : 1, on_adc, NULL);
+    }
+}
+
+static avr_cycle_count_t on_adc(avr_t *which, avr_cycle_count_t when, void *unused)
+{
+    (void)which, (void)when, (void)unused;
+    adc_event(&mcu.adc, &mcu.sensor, mcu_now());
+    follow_adc();
+    return 0;
+}
+
+// SPI master. simavr's own takes 100 us a byte whatever the clock, and tells nobody the mode.
+
+static int spi_divisor(void)
+{
+    static const int DIVISORS[] = {4, 16, 64, 128};
+    return DIVISORS[avr->data[SPCR] & 3] / (avr->data[SPSR] & 1 ? 2 : 1);
+}
+
+static avr_cycle_count_t on_spi(avr_t *which, avr_cycle_count_t when, void *unused)
+{
+    (void)which, (void)when, (void)unused;
+    uint8_t out = avr->data[SPDR], in = 0xFF;
+    unsigned mode = avr->data[SPCR] & MODE_3;
+    if (ad7730_selected && mcu.sensor.selected)
+        complain("two chips selected at a time");
+    if (ad7730_selected) {
+        if (mode != MODE_3)
+            complain("AD7730 in another SPI mode than 3");
+        in = adc_transfer(&mcu.adc, out, mcu_now());
+        follow_adc();
+    } else if (mcu.sensor.selected) {
+        if (mode != 0)
+            complain("SCA100T in another SPI mode than 0");
+        if (MCU_HZ / spi_divisor() > 500000)
+            complain("SCA100T clocked faster than 500 kHz");
+        in = sensor_transfer(&mcu.sensor, out);
+    } else {
+        complain("an SPI transfer to nobody");
+    }
+    avr->data[SPDR] = in;
+    avr->data[SPSR] |= SPIF;
+    return 0;
+}
+
+static void spi_write(avr_t *which, avr_io_addr_t address, uint8_t value, void *unused)
+{
+    (void)unused;
+    which->data[address] = value;
+    which->data[SPSR] &= ~SPIF;
+    avr_cycle_timer_register(which, 8 * spi_divisor(), on_spi, NULL);
+}
+
+static uint8_t spi_read(avr_t *which, avr_io_addr_t address, void *unused)
+{
+    (void)unused;
+    which->data[SPSR] &= ~SPIF;
+    return which->data[address];
+}
+
+static void on_ad7730_cs(struct avr_irq_t *irq, uint32_t level, void *unused)
+{
+    (void)irq, (void)unused;
+    ad7730_selected = !(level & 1);
+}
+
+static void on_sca100t_cs(struct avr_irq_t *irq, uint32_t level, void *unused)
+{
+    (void)irq, (void)unused;
+    sensor_select(&mcu.sensor, !(level & 1), mcu_now());
+}
+
+// UART.
+
+static void on_sent(struct avr_irq_t *irq, uint32_t byte, void *unused)
+{
+    (void)irq, (void)unused;
+    if (byte == '$')
+        mcu.line_at = mcu_now();
+    mcu.sent(byte);
+}
+
+static avr_cycle_count_t on_input(avr_t *which, avr_cycle_count_t when, void *unused)
+{
+    (void)which, (void)unused;
+    input_running = input_length > 0;
+    if (!input_running)
+        return 0;
+    avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT), (uint8_t)input[0]);
+    memmove(input, input + 1, --input_length);
+    return when + BYTE_CYCLES;
+}
+
+size_t mcu_receive(const char *bytes, size_t count)
+{
+    if (count > sizeof input - input_length)
+        count = sizeof input - input_length;
+    memcpy(input + input_length, bytes, count);
+    input_length += count;
+    if (input_length && !input_running) {
+        input_running = true;
+        avr_cycle_timer_register(avr, BYTE_CYCLES, on_input, NULL);
+    }
+    return count;
+}
+
+// Resets. simavr forgets all timers at one, and calls this module.
+
+static void on_reset(struct avr_io_t *io)
+{
+    (void)io;
+    mcu.reset_at = mcu_now();
+    ad7730_selected = false;
+    input_length = 0;
+    input_running = false;
+    follow_adc();
+}
+
+void mcu_reset(bool power)
+{
+    if (power) {
+        adc_power_on(&mcu.adc);
+        mcu.sensor.selected = false;
+    }
+    avr_reset(avr);
+    avr->data[MCUCSR] = power ? 0x01 : 0x02; // PORF, EXTRF
+}
+
+void mcu_hang(void)
+{
+    avr->sreg[S_I] = 0;
+    avr->pc = LOOP_ADDRESS;
+    avr->state = cpu_Running;
+}
+
+bool mcu_init(const char *elf, uint32_t unit)
+{
+    static avr_io_t module = {.kind = "board", .reset = on_reset};
+    elf_firmware_t firmware = {0};
+    if (elf_read_firmware(elf, &firmware) != 0)
+        return false;
+    avr = avr_make_mcu_by_name("atmega8");
+    avr_init(avr);
+    avr->frequency = MCU_HZ;
+    avr_load_firmware(avr, &firmware);
+    avr->flash[LOOP_ADDRESS] = 0xFF; // rjmp .-2
+    avr->flash[LOOP_ADDRESS + 1] = 0xCF;
+    avr_eeprom_desc_t serial = {.ee = (uint8_t *)&unit, .offset = 0, .size = sizeof unit};
+    avr_ioctl(avr, AVR_IOCTL_EEPROM_SET, &serial);
+
+    avr->io[AVR_DATA_TO_IO(SPDR)].w.c = spi_write;
+    avr->io[AVR_DATA_TO_IO(SPDR)].r.c = spi_read;
+    uint32_t flags = 0;
+    avr_ioctl(avr, AVR_IOCTL_UART_GET_FLAGS('0'), &flags);
+    flags &= ~(AVR_UART_FLAG_POLL_SLEEP | AVR_UART_FLAG_STDIO);
+    avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
+    avr_irq_t *portb = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('B'), 0);
+    avr_irq_register_notify(portb + PIN_AD7730_CS, on_ad7730_cs, NULL);
+    avr_irq_register_notify(portb + PIN_SCA100T_CS, on_sca100t_cs, NULL);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_sent, NULL);
+    rdy = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), PIN_RDY);
+    avr_register_io(avr, &module);
+
+    sensor_init(&mcu.sensor);
+    mcu_reset(true);
+    return true;
+}
+
+static void no_sleep(avr_t *which, avr_cycle_count_t cycles)
+{
+    (void)which;
+    mcu.asleep += (double)cycles / MCU_HZ; // the caller waits for the time to come, not this
+}
+
+bool mcu_run(double until)
+{
+    avr->sleep = no_sleep;
+    avr_cycle_count_t end = cycle_at(until);
+    while (avr->cycle < end) {
+        int state = avr_run(avr);
+        if (state == cpu_Crashed || state == cpu_Done)
+            return false;
+    }
+    return true;
+}
