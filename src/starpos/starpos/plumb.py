@@ -19,7 +19,7 @@ from starpos.inclinometer import InclinometerErrors, a2_matrix
 from starpos.solve import Solution
 
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
-ROBUST_SIGMA = 3.0  # beyond it a frame pulls no harder
+ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10  # beyond it a frame pulls no harder
 TURNS_TRIED = 8
 LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are believed to
 AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
@@ -136,7 +136,7 @@ def level(readings: Readings, given: np.ndarray) -> Plumb:
         lean = np.degrees(np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max())
         raise FixError(
             f"the instrument leans by {lean:.2f} deg from one heading to the other, and these headings do not tell which "
-            "way its inclinometer faces: level it better, or turn it to three headings or more"
+            "way its inclinometer faces: level it better, or add a frame with one foot raised by as much or more"
         )
     return best
 
@@ -181,14 +181,41 @@ def _turns(axis: np.ndarray, start: np.ndarray) -> list[tuple[float, np.ndarray]
 
 
 def _leans(readings: Readings) -> bool:
-    """Whether the plumb line in S goes round with the heading by more than its noise."""
-    off, heading = readings.plumb - readings.mean_plumb, readings.heading
-    weight = 1 / readings.sigma[:, None]
-    constant = np.ones((len(off), 1)) * weight
-    round_ = np.stack([np.ones(len(off)), np.cos(heading), np.sin(heading)], -1) * weight
-    still, going = (np.linalg.lstsq(d, off * weight, rcond=1e-6)[0] for d in (constant, round_))
-    better = np.sum((off * weight - constant @ still) ** 2) - np.sum((off * weight - round_ @ going) ** 2)
-    return bool(better > LEAN_CHI2)
+    """Whether the plumb line in S goes round with the heading by more than its noise and its zero's wandering."""
+    heading, one = readings.heading, np.ones(len(readings.heading))
+    still, going = (
+        _chi2_of(readings, np.stack(c, -1)) for c in ((one,), (one, np.cos(heading), np.sin(heading)))
+    )
+    return still - going > LEAN_CHI2
+
+
+def _chi2_of(readings: Readings, columns: np.ndarray) -> float:
+    """What columns (K, n) for each axis of S leave of the plumb line, robustly: one reading far off is no lean."""
+    weight, more = 1 / readings.sigma, readings.wandering.shape[2]
+    off = np.append(((readings.plumb - readings.mean_plumb) * weight[:, None]).ravel(), np.zeros(more))
+    design = np.hstack([np.kron(columns, np.eye(3)), readings.wandering.reshape(-1, more)])
+    design = np.vstack(
+        [design * np.repeat(weight, 3)[:, None], np.eye(more, design.shape[1], design.shape[1] - more)]
+    )
+    pull = np.ones(len(off))
+    for _ in range(ROBUST_ROUNDS):
+        rest = off - design @ np.linalg.lstsq(design * pull[:, None], off * pull, rcond=1e-9)[0]
+        size = np.linalg.norm(rest[: len(rest) - more].reshape(-1, 3), axis=1)
+        pull = np.append(np.repeat(_huber(size), 3), np.ones(more))
+    return float(_robust(size).sum() + np.sum(rest[len(rest) - more :] ** 2))
+
+
+def _huber(off: np.ndarray) -> np.ndarray:
+    """Square root of the weight of residuals in sigma: beyond the limit they pull no harder."""
+    # far from the answer all residuals are large, and none is an outlier
+    limit = max(ROBUST_SIGMA, 2 * float(np.median(np.abs(off))))
+    return np.sqrt(np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-300)))
+
+
+def _robust(off: np.ndarray) -> np.ndarray:
+    """The share of residuals in sigma in the robust chi-square."""
+    size = np.abs(off)
+    return np.where(size > ROBUST_SIGMA, ROBUST_SIGMA * (2 * size - ROBUST_SIGMA), size**2)
 
 
 def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float = 0.0) -> Plumb:
@@ -225,9 +252,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
             2,
         ) / readings.sigma[:, None, None]  # fmt: skip
         off = off / readings.sigma[:, None]
-        # far from the answer all residuals are large, and none is an outlier
-        limit = max(ROBUST_SIGMA, 2 * float(np.median(np.abs(off))))
-        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-300)))
+        weight = _huber(off)
         design = np.vstack([(slope * weight[..., None]).reshape(-1, 5 + more), np.diag(prior)])
         step = -np.linalg.lstsq(design, np.concatenate([(off * weight).ravel(), p * prior]), rcond=None)[0]
         step *= min(1.0, LONGEST_STEP / np.linalg.norm(step[:5]))
@@ -235,9 +260,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
         up = zenith + p[3:5] @ across
         if np.abs(step[:5]).max() < SETTLED_RAD:
             break
-    size = np.abs(off)
-    robust = np.where(size > ROBUST_SIGMA, ROBUST_SIGMA * (2 * size - ROBUST_SIGMA), size**2)
-    cost = float(robust.sum() + np.sum((p * prior) ** 2)) / 2
+    cost = float(_robust(off).sum() + np.sum((p * prior) ** 2)) / 2
     whole = turns @ np.linalg.inv(design.T @ design)[:3, :3] @ turns.T
     # without the turn about the plumb line, which may be as good as unknown
     told = np.delete(design, 2, 1)
