@@ -6,19 +6,19 @@ Both share what they must forget, and when: an average is of one instrument, pos
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
-from starpos.average import Average, average
+from starpos.average import Average, Averager, average
 from starpos.calibration import Calibrated, calibrate_at
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix import Fix
 from starpos.instrument import Calibration
-from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC
+from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.sky import Site
 from starpos.solve import Solver
 from starpos.turning import turn
@@ -31,7 +31,7 @@ from starpos_solver.worker import Outcome, Worker
 
 # Fewer headings hold no check that they are of one place; a service's caller says that they are.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
-WIDE_RAD = np.radians(600 / 3600)  # its square is 2 arcsec
+BETTER = 0.8  # of its error, by which a calibration must be to take the place of one that the solver has found itself
 OF_CALIBRATION = {"misalignment", "misalignment_stddev", "calibration_url"}
 OF_AVERAGE = OF_CALIBRATION | {
     "self_calibration",
@@ -45,11 +45,10 @@ OF_AVERAGE = OF_CALIBRATION | {
 
 @dataclass(frozen=True)
 class Turned:
-    """What headings on the spot tell: A3, the place, and the fixes solved with that A3."""
+    """What headings on the spot tell: A3 and the place."""
 
     calibrated: Calibrated
     place: Average
-    fixes: list[Fix]
 
 
 class Calibrating:
@@ -73,7 +72,7 @@ class Calibrating:
         self._worker = Worker(node)
         self._running: Future | None = None
         self._asked = self._again = False  # by a service; to turn once more when there is time
-        self._said = ""
+        self._about = self._said = ""  # of `found`; of the last turn by itself
         group = ReentrantCallbackGroup()  # so that an answer which is awaited holds up nothing
         node.create_service(Calibrate, "solver/calibrate", self._on_calibrate, callback_group=group)
         node.create_service(
@@ -84,7 +83,12 @@ class Calibrating:
     def unknown(self) -> bool:
         """Whether fixes carry the error of an A3 of which nothing is known."""
         given = self.found is None and not self._values["self_calibration"]
-        return math.isnan(self._plumb_arcsec) and not given
+        return not self._is_told and not given
+
+    @property
+    def _is_told(self) -> bool:
+        """Whether frames have told how A3 is, and how well."""
+        return not math.isnan(self._plumb_arcsec)
 
     # what happens to the node ----------------------------------------------------------------------------------------
 
@@ -99,19 +103,21 @@ class Calibrating:
         self._recent.add(seen)
         if fix is None:
             return
-        if _is_wide(fix) and not self._poses.stands(fix):
-            self.average.begin_anew()
         news = self.average.add(fix)
         # while A3 is not known to be right, turning looks like moving
-        known = not math.isnan(self._plumb_arcsec)
-        if known and news is News.MOVED:
+        if self._is_told and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
-        if known and news is News.LEFT_OUT:
+        if self._is_told and news is News.LEFT_OUT:
             return
         told_more = self._poses.add(seen, fix)
         if self._values["self_calibration"] and (told_more or self._again):
             self._turn_by_itself()
+
+    def _moved_on(self, since_unix_s: float):
+        self._era += 1
+        self._poses.forget_before(since_unix_s)
+        self.average.begin_anew()
 
     def forget(self) -> None:
         """The frames and the place; not what they have told of the instrument."""
@@ -142,12 +148,15 @@ class Calibrating:
 
     def _drop(self, instead: Calibration | None):
         self._era += 1
-        self.found, self._plumb_arcsec, self._said = instead, math.nan, ""
+        self.found, self._plumb_arcsec = instead, math.nan
+        self._about = self._said = ""
 
     def _adopt(self, calibrated: Calibrated):
         self._era += 1
         self.found = calibrated.instrument.calibration
         self._plumb_arcsec = calibrated.plumb_stddev_arcsec
+        self._about = _about(calibrated)
+        self._log.info(self._about)
         self.average.begin_anew()
         self._changed()
 
@@ -160,9 +169,7 @@ class Calibrating:
         if outcome.trouble:
             return response
         self._adopt(outcome.value)
-        response.success = True
-        response.message = self._said = _about(outcome.value)
-        self._log.info(response.message)
+        response.success, response.message = True, self._about
         return _with_a3(response, outcome.value)
 
     def _at_known_place(self, request) -> Callable[[], Calibrated]:
@@ -202,7 +209,7 @@ class Calibrating:
         response.message = self._why_not(turned, FEWEST_HEADINGS)
         if not response.message:
             self._adopt_turned(turned)
-            response.success, response.message = True, _about(turned.calibrated)
+            response.success, response.message = True, self._about
         place = turned.place
         response.headings = place.frames
         response.plumb_stddev = turned.calibrated.plumb_stddev_arcsec / 3600
@@ -240,10 +247,12 @@ class Calibrating:
         if era == self._era:
             said = outcome.trouble or self._why_not(outcome.value, FEWEST_BY_ITSELF)
             if not said and not self._is_better(outcome.value.calibrated):
-                said = "the calibration in use is better than what the headings here tell"
+                said = "the headings here tell the calibration in use no better"
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
+            elif outcome.trouble and self._is_told:  # the newest heading is where it no longer holds together
+                self._moved_on(self._newest_unix_s)
         if self._again:
             self._turn_by_itself()
 
@@ -263,19 +272,19 @@ class Calibrating:
         return ""
 
     def _is_better(self, calibrated: Calibrated) -> bool:
-        """Than what is in use, whose zero wanders."""
-        if math.isnan(self._plumb_arcsec):
+        """Than what is in use, whose zero wanders; by so much that the average should begin anew for it."""
+        if not self._is_told:
             return True
         now = calibrated.instrument.calibration.utc_unix_s
         hours = abs(now - self.found.utc_unix_s) / 3600
         drift = np.degrees(calibrated.instrument.inclinometer.drift_rad_per_sqrt_hour) * 3600
-        return calibrated.plumb_stddev_arcsec <= math.hypot(self._plumb_arcsec, drift * math.sqrt(hours))
+        return calibrated.plumb_stddev_arcsec < BETTER * math.hypot(
+            self._plumb_arcsec, drift * math.sqrt(hours)
+        )
 
     def _adopt_turned(self, turned: Turned):
         self._adopt(turned.calibrated)
-        self.average.turned_on_the_spot(turned.place, turned.fixes)
-        self._said = _about(turned.calibrated)
-        self._log.info(self._said)
+        self.average.turned_on_the_spot(turned.place)
 
     # work ------------------------------------------------------------------------------------------------------------
 
@@ -306,18 +315,13 @@ class Calibrating:
         """For /diagnostics."""
         values = {"frames kept": len(self._recent), "headings": len(self._poses)}
         values |= {"self-calibration": self._values["self_calibration"], "working": self._worker.busy}
-        if not math.isnan(self._plumb_arcsec):
+        values |= {"last turn on the spot": self._said}
+        if self._is_told:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
             sentence = "camera against inclinometer is not known: " + (self._said or "turn it on the spot")
             return Report(Level.WARN, sentence, values)
-        return Report(Level.OK, self._said or "that of the parameters", values)
-
-
-def _is_wide(fix: Fix) -> bool:
-    """Whether A3 may be so wrong that a linear filter does not tell its error from the place."""
-    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name == "calibration")
-    return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)
+        return Report(Level.OK, self._about or "that of the parameters", values)
 
 
 def _turn(solver: Solver, poses: list[Seen]) -> Turned:
@@ -330,9 +334,20 @@ def _turn(solver: Solver, poses: list[Seen]) -> Turned:
         raise FixError(
             "the headings are of more than one place: call solver/reset, and turn the instrument on the spot"
         )
-    found = replace(solver, instrument=calibrated.instrument)
-    solved = [found.solve(p.stars, p.tilt) for p in poses]
-    return Turned(calibrated, place, [s.fix for s in solved if s.fix])
+    if _newest_is_off(calibrated.fixes):
+        raise FixError(
+            "the newest heading does not fit the others: the instrument has moved, then call solver/reset, or its tilt "
+            "was wrong"
+        )
+    return Turned(calibrated, place)
+
+
+def _newest_is_off(fixes: list[Fix]) -> bool:
+    averager = Averager()
+    for fix in sorted(fixes, key=lambda f: f.utc_unix_s):
+        before = averager.average
+        averager.add(fix)
+    return before is not None and averager.average.left_out > before.left_out
 
 
 def _about(found: Calibrated) -> str:

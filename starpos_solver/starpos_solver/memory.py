@@ -52,6 +52,13 @@ class RecentFrames:
         self._frames.clear()
 
 
+def touched(fix: Fix, first: Fix) -> bool:
+    """Whether the camera has turned against the Earth since the first fix of its pose."""
+    turned = np.linalg.norm(fix.camera_to_itrs - first.camera_to_itrs) / np.sqrt(2)
+    sigma = np.hypot(fix.attitude_sigma, first.attitude_sigma)
+    return bool(turned > max(POSE_RAD, POSE_SIGMA * sigma))
+
+
 @dataclass
 class _Pose:
     """A camera that stands still against the Earth since `first`."""
@@ -60,11 +67,6 @@ class _Pose:
     newest: Seen
     frames: int = 0
     tilts: deque[Tilt] = field(default_factory=lambda: deque(maxlen=MOST_TILTS))
-
-    def holds(self, fix: Fix) -> bool:
-        turned = np.linalg.norm(fix.camera_to_itrs - self.first.camera_to_itrs) / np.sqrt(2)
-        sigma = np.hypot(fix.attitude_sigma, self.first.attitude_sigma)
-        return bool(turned <= max(POSE_RAD, POSE_SIGMA * sigma))
 
     def add(self, seen: Seen) -> None:
         self.newest = seen
@@ -81,13 +83,9 @@ class Poses:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def stands(self, fix: Fix) -> bool:
-        """Whether the camera is where its last frame had it."""
-        return bool(self._poses) and self._poses[-1].holds(fix)
-
     def add(self, seen: Seen, fix: Fix) -> bool:
         """One more frame; whether this is worth a look at all of them: a new pose, or one with twice the frames."""
-        if not self.stands(fix):
+        if not self._poses or touched(fix, self._poses[-1].first):
             self._poses.append(_Pose(fix, seen))
         pose = self._poses[-1]
         pose.add(seen)
