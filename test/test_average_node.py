@@ -69,7 +69,9 @@ def test_the_average_of_one_frame_is_its_fix(graph, solver, averaged):
 def test_it_converges_and_its_sigma_falls_as_noise_does(graph, solver, averaged, tmp_path):
     path = tmp_path / "instrument.yaml"
     known = Calibration.of((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
-    instrument_file.write(path, Instrument(FULL_FOCAL_PX, None, known, inclinometer=InclinometerErrors(scale=0.0)))
+    instrument_file.write(
+        path, Instrument(FULL_FOCAL_PX, None, known, inclinometer=InclinometerErrors(scale=0.0))
+    )
     assert graph.set("solver", calibration_url=str(path)) == (True, "")
     one = average_after(graph, averaged, noisy())
     many = average_after(graph, averaged, *(noisy() for _ in range(15)))
@@ -84,7 +86,9 @@ def test_it_converges_and_its_sigma_falls_as_noise_does(graph, solver, averaged,
 
 
 def test_it_is_geodetic_as_the_fix_is(graph, solver, averaged):
-    assert graph.set("solver", deflection__xi=10.0, deflection__eta=-5.0, deflection__stddev=2.0, altitude=2410.0)[0]
+    assert graph.set(
+        "solver", deflection__xi=10.0, deflection__eta=-5.0, deflection__stddev=2.0, altitude=2410.0
+    )[0]
     shot = noisy()
     average = average_after(graph, averaged, shot)
     fix = graph.fixes[shot.stamp][-1]
@@ -94,13 +98,20 @@ def test_it_is_geodetic_as_the_fix_is(graph, solver, averaged):
     assert (astronomic.latitude - average.latitude) * 3600 == pytest.approx(10, abs=1e-3)
     plain = average.position_covariance[4] - astronomic.covariance[4]
     assert plain == pytest.approx((2 * 30.8) ** 2, rel=0.02)
-    assert graph.set("solver", deflection__xi=0, deflection__eta=0, deflection__stddev=0, altitude=math.nan)[0]
+    assert graph.set("solver", deflection__xi=0, deflection__eta=0, deflection__stddev=0, altitude=math.nan)[
+        0
+    ]
 
 
 def test_a_burst_of_bad_tilts_does_not_move_it(graph, solver, averaged):
     before = average_after(graph, averaged, *(noisy() for _ in range(8)))
     bad = average_after(graph, averaged, *(noisy(off_deg=0.05) for _ in range(4)))
-    assert np.hypot(*(moved_m(SITE, bad.latitude, bad.longitude) - moved_m(SITE, before.latitude, before.longitude))) < 1
+    assert (
+        np.hypot(
+            *(moved_m(SITE, bad.latitude, bad.longitude) - moved_m(SITE, before.latitude, before.longitude))
+        )
+        < 1
+    )
     state = graph.state("solver: Average", "left out")
     assert state.level == b"\x01" and {v.key: v.value for v in state.values}["left out"] == "4"
     check_place(average_after(graph, averaged, *(noisy() for _ in range(2))))
