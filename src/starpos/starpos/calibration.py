@@ -10,7 +10,7 @@ from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import ARCSEC, MOST_C, Calibration, Instrument
-from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
+from starpos.plumb import EARTH_RADIUS_M, MOST_SCATTER, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky import Site
 from starpos.solve import Solution, Solver
@@ -20,7 +20,6 @@ ROUNDS = 4
 SETTLED_RAD = np.radians(0.02 / 3600)
 OF_PLACE = ("refraction", "clock", "ut1", "pole")  # terms that move the zenith of all frames alike
 VALID_DAYS = 365.0
-MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
 TURN_SIGMA = 3.0  # by which the fixes hold what the leans told of A3's turn: they are of the same tilts
 OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25  # frames further off are left out, up to this share of all
 

@@ -21,6 +21,7 @@ from starpos.solve import Solution
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
 ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10  # beyond it a frame pulls no harder
 TURNS_TRIED = 8
+MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
 LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are believed to
 AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
 AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
@@ -124,12 +125,15 @@ def level(readings: Readings, given: np.ndarray) -> Plumb:
     """
     mean = readings.mean_plumb
     start = _axis_of_turn(readings, given)
-    if not _leans(readings):
-        return _fitted(readings, start, _Known())
-    found = [
-        _fitted(readings, start, _Known()) for _, start in _turns(mean, start)
-    ]  # each near its own start
+    nearest = _fitted(readings, start, _Known())
+    leans = _leans(readings)
+    if nearest.scatter < MOST_SCATTER and not leans:
+        return nearest
+    # each held near its own start
+    found = [_fitted(readings, start, _Known()) for _, start in _turns(mean, start)]
     best = min(found, key=_cost)
+    if not leans:  # half a turn from its answer the search may have stood still
+        return best if best.scatter < MOST_SCATTER else nearest
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
     if apart > AMBIGUOUS_SIGMA * best.zenith_sigma:
@@ -238,7 +242,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
     prior = 1 / np.array([loose, loose, known.turn_sigma, *[known.zenith_sigma] * 2, *[1.0] * more])
     a3, p = start, np.zeros(5 + more)
     p[2] = turned
-    up = zenith
+    up, best = zenith, np.inf
     for _ in range(MOST_STEPS):
         length = np.linalg.norm(up)
         read = to_camera @ (up / length) @ a3.T
@@ -254,13 +258,16 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
         off = off / readings.sigma[:, None]
         weight = _huber(off)
         design = np.vstack([(slope * weight[..., None]).reshape(-1, 5 + more), np.diag(prior)])
+        cost = float(_robust(off).sum() + np.sum((p * prior) ** 2)) / 2
+        if cost < best:  # where the headings hardly differ, later steps may lead away again
+            best, answer = cost, (a3, up, off, design)
         step = -np.linalg.lstsq(design, np.concatenate([(off * weight).ravel(), p * prior]), rcond=None)[0]
         step *= min(1.0, LONGEST_STEP / np.linalg.norm(step[:5]))
         a3, p = rotation.from_vector(turns @ step[:3]) @ a3, p + step
         up = zenith + p[3:5] @ across
         if np.abs(step[:5]).max() < SETTLED_RAD:
             break
-    cost = float(_robust(off).sum() + np.sum((p * prior) ** 2)) / 2
+    a3, up, off, design = answer
     whole = turns @ np.linalg.inv(design.T @ design)[:3, :3] @ turns.T
     # without the turn about the plumb line, which may be as good as unknown
     told = np.delete(design, 2, 1)
@@ -269,8 +276,8 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
         (whole + whole.T) / 2,
         up / np.linalg.norm(up),
         float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
-        cost,
-        2 * cost / max(2 * len(readings.sigma) - 5, 1),
+        best,
+        2 * best / max(2 * len(readings.sigma) - 5, 1),
         np.hypot(*off.T),
     )
 
