@@ -55,6 +55,7 @@ static uint16_t sequence;
 static bool sampling;
 static uint32_t began;
 static uint8_t burst;
+static bool converted; // this burst
 static uint32_t sums[2];
 
 static uint32_t codes[2] = {CODE_ZERO, CODE_ZERO};
@@ -94,29 +95,34 @@ static void convert(void)
 
 static void begin_burst(void)
 {
-    step = 0;
-    if (phase == IDLE)
+    converted = false;
+    if (phase == IDLE) { // otherwise the converter is being set up
+        step = 0;
         convert();
+    }
 }
 
 static void on_ready(void)
 {
-    bool converted = phase == CONVERTING;
     if (ad7730_no_reference()) {
         reference_was_lost = true;
         status |= NO_REFERENCE;
     }
-    if (converted)
-        sums[CHANNELS[step]] += ad7730_data();
-    step++;
-    if (converted && step < CONVERSIONS) {
-        convert();
-    } else if (!converted && step < N_CALIBRATIONS) {
-        ad7730_start(CALIBRATIONS[step]);
+    if (phase == CALIBRATING) {
+        if (++step < N_CALIBRATIONS) {
+            ad7730_start(CALIBRATIONS[step]);
+            return;
+        }
     } else {
-        ad7730_start(AD7730_MODE_IDLE);
-        phase = IDLE;
+        sums[CHANNELS[step]] += ad7730_data();
+        if (++step < CONVERSIONS) {
+            convert();
+            return;
+        }
+        converted = true;
     }
+    ad7730_start(AD7730_MODE_IDLE);
+    phase = IDLE;
 }
 
 static void begin_sample(uint32_t now)
@@ -137,9 +143,9 @@ static void begin_sample(uint32_t now)
 // Whether the sample is complete.
 static bool end_burst(uint32_t now)
 {
-    if (phase != IDLE) {
+    if (!converted) {
         status |= ADC_TIMEOUT;
-        if (phase == CONVERTING || now - setup_began >= SETUP_MS)
+        if (phase == CONVERTING || (phase != IDLE && now - setup_began >= SETUP_MS))
             begin_setup(now);
     }
     if (++burst < bursts()) {

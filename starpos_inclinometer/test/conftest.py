@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An emulated device that tests plug in and pull out, and a place for its port."""
+"""An emulated device that tests plug in and pull out, and a place for its port; the firmware, built."""
 
 import threading
 
 import pytest
+from board import build
 
 from starpos_inclinometer.emulator import Emulator, Mcu
 
@@ -35,3 +36,9 @@ def bench(tmp_path):
     bench = Bench(tmp_path / "port")
     yield bench
     bench.unplug()
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory):
+    """The folder of the firmware and its emulated board; without what compiles them the tests of it skip."""
+    return build(tmp_path_factory.mktemp("firmware"))

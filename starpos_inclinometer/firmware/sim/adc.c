@@ -84,7 +84,7 @@ static void start(struct adc *a, double now)
         complain("AD7730 mode register: unipolar, 16 bits or a channel that is not wired");
     if (running(a) > FULL_SCALE || running(a) == STANDBY)
         complain("AD7730 mode register: an operating mode this board has no use for");
-    if (running(a) == ZERO_SCALE && !a->full_scale[channel(a) & 1])
+    if (running(a) == ZERO_SCALE && !a->full_scale[channel(a) & 1] && !a->reference_missing)
         complain("AD7730 zero-scale calibration before the full-scale one");
     a->ready = false;
     a->pulse = 0;

@@ -19,7 +19,8 @@
 
 static const char USAGE[] =
     "usage: inclinometer-sim ELF [--speed FACTOR] [--link PATH] [--unit HEX] [--tilt X Y]\n"
-    "Runs until its standard input ends. Its lines:\n"
+    "Runs until its standard input ends. FACTOR is 1 for real time; at 0 time passes by `run` only. Its lines:\n"
+    "  run MS [BYTES] once BYTES bytes altogether have come from the host\n"
     "  tilt X Y [RATE_X RATE_Y]   deg, and deg/s from now on\n"
     "  noise DEG      rms of the sensor within its bandwidth\n"
     "  temperature C\n"
@@ -33,10 +34,12 @@ static const char USAGE[] =
 
 #define SLICE_S 1e-3
 #define MAX_LAG_S 0.5 // more than that the time is not caught up
+#define PATIENCE_MS 1000 // with a host that does not read, or whose bytes are awaited
 
 static int master = -1;
 static FILE *answers; // standard output; simavr prints what it likes, so its own is elsewhere
 static volatile sig_atomic_t stopped;
+static unsigned long bytes_sent, bytes_received;
 
 static void stop(int number)
 {
@@ -60,8 +63,30 @@ static bool connected(void)
 
 static void sent(char byte)
 {
-    if (connected() && write(master, &byte, 1) < 0 && errno != EAGAIN && errno != EIO)
-        perror("inclinometer-sim");
+    struct pollfd writable = {.fd = master, .events = POLLOUT};
+    if (!connected())
+        return;
+    if (poll(&writable, 1, PATIENCE_MS) == 1 && write(master, &byte, 1) == 1)
+        bytes_sent++;
+}
+
+static void take_bytes(void)
+{
+    char bytes[64];
+    ssize_t n = read(master, bytes, sizeof bytes);
+    if (n > 0)
+        bytes_received += mcu_receive(bytes, n);
+}
+
+static bool await_bytes(unsigned long total)
+{
+    struct pollfd readable = {.fd = master, .events = POLLIN};
+    while (bytes_received < total) {
+        if (poll(&readable, 1, PATIENCE_MS) != 1)
+            return false;
+        take_bytes();
+    }
+    return true;
 }
 
 static const char *open_pty(void)
@@ -84,11 +109,11 @@ static void print_state(void)
     const struct adc *a = &mcu.adc;
     double now = mcu_now();
     fprintf(answers,
-           "{\"ms\": %.3f, \"line_ms\": %.3f, \"awake\": %.4f, \"mode\": %u, \"filter\": %u, \"dac\": %u, "
-           "\"calibrated\": %d, \"adc_resets\": %u, \"conversions\": %u, \"complaints\": \"%s\"}\n",
-           (now - mcu.reset_at) * 1e3, (mcu.line_at - mcu.reset_at) * 1e3, 1 - mcu.asleep / now, a->mode, a->filter,
+           "{\"ms\": %.3f, \"line_ms\": %.3f, \"awake_ms\": %.3f, \"mode\": %u, \"filter\": %u, \"dac\": %u, "
+           "\"calibrated\": %d, \"adc_resets\": %u, \"conversions\": %u, \"sent\": %lu, \"complaints\": \"%s\"}\n",
+           (now - mcu.reset_at) * 1e3, (mcu.line_at - mcu.reset_at) * 1e3, (now - mcu.asleep) * 1e3, a->mode, a->filter,
            a->dac, a->full_scale[0] && a->full_scale[1] && a->zero_scale[0] && a->zero_scale[1], a->resets,
-           a->conversions, complaints());
+           a->conversions, bytes_sent, complaints());
 }
 
 // Whether the command is one, with as many numbers as it takes.
@@ -104,6 +129,8 @@ static bool obey(const char *command)
         sensor_tilt(&mcu.sensor, mcu_now(), v[0] * deg, v[1] * deg, v[2] * deg, v[3] * deg);
     else if (!strcmp(name, "noise") && n == 1)
         mcu.sensor.noise_rad = v[0] * deg;
+    else if (!strcmp(name, "run") && (n == 1 || n == 2))
+        return await_bytes(v[1]) && mcu_run(mcu_now() + v[0] * 1e-3);
     else if (!strcmp(name, "temperature") && n == 1)
         mcu.sensor.celsius = v[0];
     else if (!strcmp(name, "freeze") && n == 1)
@@ -147,29 +174,29 @@ static bool take_commands(void)
     return length < sizeof text - 1;
 }
 
-static void take_bytes(void)
+// Until the time that is due by the wall's clock; false: the MCU crashed.
+static bool follow_wall(double *began, double speed, bool *late)
 {
-    char bytes[64];
-    ssize_t n = read(master, bytes, sizeof bytes);
-    if (n > 0)
-        mcu_receive(bytes, n);
+    double due = (wall() - *began) * speed, now = mcu_now();
+    if (due - now > MAX_LAG_S * speed) {
+        *began += (due - now) / speed - MAX_LAG_S;
+        due = now + MAX_LAG_S * speed;
+    }
+    bool runs = mcu_run(fmin(due, now + 20 * SLICE_S));
+    *late = mcu_now() < due - SLICE_S * speed;
+    return runs;
 }
 
 static int run(double speed)
 {
-    double began = wall() - mcu_now() / speed;
+    double began = wall();
     while (!stopped) {
-        double due = (wall() - began) * speed, now = mcu_now();
-        if (due - now > MAX_LAG_S * speed) {
-            began += (due - now) / speed - MAX_LAG_S;
-            due = now + MAX_LAG_S * speed;
-        }
-        if (!mcu_run(fmin(due, now + 20 * SLICE_S)))
+        bool late = false;
+        if (speed && !follow_wall(&began, speed, &late))
             return 1;
-        bool late = mcu_now() < due - SLICE_S * speed;
         struct pollfd watched[] = {{.fd = STDIN_FILENO, .events = POLLIN},
-                                   {.fd = connected() ? master : -1, .events = POLLIN}};
-        if (poll(watched, 2, late ? 0 : SLICE_S * 1e3) < 0 && errno != EINTR)
+                                   {.fd = speed && connected() ? master : -1, .events = POLLIN}};
+        if (poll(watched, 2, late ? 0 : speed ? SLICE_S * 1e3 : -1) < 0 && errno != EINTR)
             return 1;
         if (watched[0].revents && !take_commands())
             break;
@@ -199,7 +226,7 @@ int main(int argc, char **argv)
         else
             elf = NULL, i = argc;
     }
-    if (!elf || !(speed > 0)) {
+    if (!elf || !(speed >= 0)) {
         fputs(USAGE, stderr);
         return 2;
     }

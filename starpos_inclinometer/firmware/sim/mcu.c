@@ -11,7 +11,8 @@
 #include "sim_elf.h"
 
 // ATmega8, addresses in data space (data sheet, register summary).
-enum { SPCR = 0x2D, SPSR = 0x2E, SPDR = 0x2F, MCUCSR = 0x54 };
+enum { UBRRL = 0x29, UCSRA = 0x2B, SPCR = 0x2D, SPSR = 0x2E, SPDR = 0x2F, MCUCSR = 0x54 };
+#define U2X 0x02
 #define SPIF 0x80
 #define PIN_AD7730_CS 2
 #define PIN_SCA100T_CS 1
@@ -25,7 +26,7 @@ struct mcu mcu;
 static avr_t *avr;
 static avr_irq_t *rdy;
 static bool ad7730_selected;
-static char input[256];
+static char input[4096];
 static size_t input_length;
 static bool input_running;
 
@@ -144,6 +145,8 @@ static void on_sca100t_cs(struct avr_irq_t *irq, uint32_t level, void *unused)
 static void on_sent(struct avr_irq_t *irq, uint32_t byte, void *unused)
 {
     (void)irq, (void)unused;
+    if (avr->data[UBRRL] != 12 || (avr->data[UCSRA] & U2X))
+        complain("UART at another speed than 38400 baud");
     if (byte == '$')
         mcu.line_at = mcu_now();
     mcu.sent(byte);
@@ -191,8 +194,9 @@ void mcu_reset(bool power)
         adc_power_on(&mcu.adc);
         mcu.sensor.selected = false;
     }
+    uint8_t causes = avr->data[MCUCSR]; // those before stay until they are cleared
     avr_reset(avr);
-    avr->data[MCUCSR] = power ? 0x01 : 0x02; // PORF, EXTRF
+    avr->data[MCUCSR] = power ? 0x01 : causes | 0x02; // PORF, EXTRF
 }
 
 void mcu_hang(void)

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The driver and the node on the firmware's line in real time, as they would be on the device's."""
+
+import math
+import signal
+import threading
+
+import pytest
+from board import Board
+from diagnostic_msgs.msg import DiagnosticArray
+
+from starpos_common.testing import Listener, Process, take_domain
+from starpos_inclinometer.link import Phase, SerialLink
+from starpos_interfaces.msg import Tilt
+
+WAIT_S = 20.0
+TILT_DEG = (3.0, -11.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain():
+    take_domain()
+
+
+@pytest.fixture
+def board(built):
+    board = Board(built, "--unit", "2A", "--tilt", *map(str, TILT_DEG), speed=1)
+    yield board
+    assert board.close() == ""
+
+
+def test_the_link_sets_the_rate_again_after_a_reset_and_counts(board):
+    event, samples = threading.Condition(), []
+
+    def wake():
+        with event:
+            samples.extend(link.take())
+            event.notify_all()
+
+    def wait(condition):
+        with event:
+            assert event.wait_for(condition, WAIT_S), link.state()
+        return link.state()
+
+    link = SerialLink(board.path, 50, wake=wake)
+    link.start()
+    try:
+        state = wait(lambda: len(samples) >= 40 and link.state().identity is not None)
+        assert (state.phase, state.identity.unit, state.identity.rate_hz) == (Phase.RECEIVING, 0x2A, 50)
+        board.tell("hang")
+        state = wait(lambda: link.state().counts.restarts == 1)
+        state = wait(lambda: link.state().identity is not None and link.state().identity.rate_hz == 50)
+        link.set_rate(20)
+        state = wait(lambda: link.state().identity is not None and link.state().identity.rate_hz == 20)
+        board.tell("freeze 1")
+        wait(lambda: samples[-1].sample.status == 1)
+        board.tell("freeze 0")
+        state = wait(lambda: samples[-1].sample.status == 0)
+    finally:
+        link.stop()
+    assert state.counts.crc_errors == state.counts.malformed == state.counts.lost == 0
+    assert (state.connections, state.counts.restarts, state.dropped) == (1, 1, 0)
+
+
+def test_the_node_publishes_the_tilt_of_the_device(board):
+    listener = Listener()
+    tilts = listener.hear(Tilt, "tilt", 100)
+    reports = listener.hear(DiagnosticArray, "/diagnostics")
+
+    def report():
+        return next(s for s in reversed(reports[-1].status) if s.name == "inclinometer: Link")
+
+    node = Process("starpos_inclinometer.main", "inclinometer", [f"port:={board.path}", "rate:=50"])
+    try:
+        listener.wait(lambda: len(tilts) >= 100)
+        n = len(tilts)
+        mean = [math.degrees(sum(getattr(t, axis) for t in tilts) / n) for axis in "xy"]
+        # Neighbours share the sensor's noise, which is of 18 Hz: about every second one is independent.
+        assert mean == pytest.approx(TILT_DEG, abs=4 * 0.0042 / math.sqrt(n / 2))
+        assert {t.flags for t in tilts[1:]} == {0}
+        assert tilts[-1].temperature == pytest.approx(20, abs=0.5)
+        stamps = [t.header.stamp.sec + t.header.stamp.nanosec * 1e-9 for t in tilts[-50:]]
+        assert (stamps[-1] - stamps[0]) / 49 == pytest.approx(0.02, abs=0.0005)
+        listener.wait(lambda: reports and report().level == b"\x00")
+        values = {v.key: v.value for v in report().values}
+        assert (values["unit"], values["firmware"], values["checksum errors"]) == ("0000002A", "1.0", "0")
+        board.tell("reference 0")
+        listener.wait(lambda: tilts[-1].flags & Tilt.STUCK and report().level == b"\x02")
+        board.tell("reference 1")
+        listener.wait(lambda: tilts[-1].flags == 0 and report().level == b"\x00")
+        assert node.end(signal.SIGTERM)[0] == 0
+    finally:
+        node.kill()
+        listener.close()
