@@ -17,10 +17,7 @@ from starpos.fix import Fix
 from starpos.running import Running
 
 GATE_SIGMA = 6.0  # further off a fix is not of this place, or wrong
-MOVED_FIXES, MOVED_SIGMA = (
-    3,
-    5.5,
-)  # so many fixes of a turned camera, so far from the average, are another place
+MOVED_FIXES, MOVED_SIGMA = 3, 4.5  # so many fixes of a turned camera, so far off, are another place
 RIVAL_FIXES = 10  # a rival is replaced by a newer one no sooner
 HIGHEST_LATITUDE = np.radians(89.0)
 POSE_RAD, POSE_SIGMA = (
