@@ -26,7 +26,7 @@ CAMERA_NAME = "camera"  # the node's
 
 
 def define(parser) -> None:
-    common.add_frames(parser)
+    common.add_frames(parser, "one JSON object for --camera and one for --site instead of text")
     parser.add_argument(
         "--camera",
         metavar="OUT",
@@ -61,7 +61,8 @@ def run(args) -> int:
     tilts = None if args.tilt is None else read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
     try:
         if args.camera is not None:
-            instrument = replace(instrument, camera=_camera(args, frames, instrument, tilts))
+            camera = _camera(args, frames, instrument, tilts)
+            instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.site is not None:
             calibrate_site.run(args, frames, instrument, tilts)
     except (CalibrationError, FixError) as e:

@@ -35,7 +35,6 @@ def define(parser) -> None:
     parser.add_argument(
         "--turn-stddev",
         type=common.number(1e-6, 180),
-        default=180.0,
         metavar="DEG",
         help="how well the given A3 has its turn about the plumb line, which one lean does not tell (180)",
     )
@@ -50,12 +49,18 @@ def define(parser) -> None:
 
 def check(args) -> None:
     """InstrumentError for a call that does not hold together."""
+    deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid) != (None,) * 4
     if args.site is None:
-        if args.output is not None or args.geodetic:
+        if deflection or args.geodetic or (args.output, args.valid_days, args.turn_stddev) != (None,) * 3:
             raise InstrumentError(
-                "-o and --geodetic are for a calibration at a known place: give --site LAT LON"
+                "-o, --geodetic, --turn-stddev, --valid-days and the deflection are for a calibration at a known place: "
+                "give --site LAT LON"
             )
         return
+    if deflection and not args.geodetic:
+        raise InstrumentError(
+            "--xi, --eta, --deflection-stddev and --geoid are of a place on WGS 84: say --geodetic, or leave them out"
+        )
     if args.output is None or args.tilt is None:
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml"
@@ -69,9 +74,8 @@ def run(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> No
     """Find, write and print it; FixError where the frames do not tell."""
     solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args))
     site, stddev_arcsec = _site(args)
-    found = calibrate_at(
-        solver, frames, tilts.average, site, stddev_arcsec, args.turn_stddev, common.ProgressBar()
-    )
+    turn_deg = 180.0 if args.turn_stddev is None else args.turn_stddev
+    found = calibrate_at(solver, frames, tilts.average, site, stddev_arcsec, turn_deg, common.ProgressBar())
     for solution in found.solutions:
         if solution.fix is None:
             common.complain("calibrate", f"left out: {solution.message}")

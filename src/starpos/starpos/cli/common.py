@@ -21,11 +21,13 @@ from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 GIVEN_STDDEV_ARCSEC = 1.0  # of a deflection given by hand without its error
 
 
-def add_frames(parser: argparse.ArgumentParser) -> None:
+def add_frames(
+    parser: argparse.ArgumentParser, json_help: str = "one JSON object a frame instead of a table"
+) -> None:
     parser.add_argument(
         "frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object a frame instead of a table")
+    parser.add_argument("--json", action="store_true", help=json_help)
 
 
 def add_optics(parser: argparse.ArgumentParser) -> None:
