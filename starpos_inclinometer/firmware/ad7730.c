@@ -69,6 +69,11 @@ bool ad7730_no_reference(void)
     return read(AD7730_STATUS, 1) & AD7730_STATUS_NOREF;
 }
 
+bool ad7730_runs(uint16_t mode)
+{
+    return read(AD7730_MODE, 2) == (mode | AD7730_MODE_INPUT);
+}
+
 uint32_t ad7730_data(void)
 {
     return read(AD7730_DATA, 3);

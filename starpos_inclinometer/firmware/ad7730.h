@@ -51,4 +51,5 @@ void ad7730_configure(void);  // the filter register; the DAC register adds no o
 void ad7730_start(uint16_t mode); // a calibration, conversions or none: one of the modes, and a channel
 bool ad7730_ready(void);          // what was started last has a result
 bool ad7730_no_reference(void);
+bool ad7730_runs(uint16_t mode); // whether the mode register still holds what ad7730_start put there
 uint32_t ad7730_data(void); // 24 bits, offset binary

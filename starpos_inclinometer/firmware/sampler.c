@@ -21,17 +21,22 @@
 #define WINDOW_MS 20 // of a burst: the period of the highest rate
 #define CONVERSIONS 4
 #define PER_CHANNEL (CONVERSIONS / 2)
-#define TRANSFERS_US 150 // reading a conversion and starting the next one, measured
+#define TRANSFERS_US 250 // reading a conversion and starting the next one, measured
+#define BEGIN_US 250     // from the tick to the first conversion, measured
 #define BURST_US (CONVERSIONS * (AD7730_SETTLING_PERIODS * AD7730_PERIOD_NS / 1000 + TRANSFERS_US))
-#define HALF_BURST_MS ((BURST_US / 2 + 500) / 1000)
+#define HALF_BURST_MS ((BEGIN_US + BURST_US / 2 + 500) / 1000)
 #define SENDING_MS 1 // from the tick to the first byte of the line: 0.92, measured
 // Even if a conversion took one period more than it should, a burst would end in time.
-_Static_assert(BURST_US + CONVERSIONS * AD7730_PERIOD_NS / 1000 < WINDOW_MS * 1000UL, "a burst must fit its window");
+_Static_assert(BEGIN_US + BURST_US + CONVERSIONS * AD7730_PERIOD_NS / 1000 < WINDOW_MS * 1000UL, "a burst must fit its window");
 
 #define RESET_MS 2
 #define SETUP_MS (RESET_MS + AD7730_CALIBRATION_MS + 50) // with a margin for both clocks
 
 static const uint8_t CHANNELS[CONVERSIONS] = {0, 1, 1, 0};
+static const uint16_t CONVERT[] = {
+    AD7730_MODE_CONTINUOUS | AD7730_MODE_CHANNEL_1,
+    AD7730_MODE_CONTINUOUS | AD7730_MODE_CHANNEL_2,
+};
 
 // Full scale before zero scale is a full self-calibration (table XVII, p. 22).
 static const uint16_t CALIBRATIONS[] = {
@@ -89,7 +94,7 @@ static void configure(void)
 
 static void convert(void)
 {
-    ad7730_start(AD7730_MODE_CONTINUOUS | (CHANNELS[step] ? AD7730_MODE_CHANNEL_2 : AD7730_MODE_CHANNEL_1));
+    ad7730_start(CONVERT[CHANNELS[step]]);
     phase = CONVERTING;
 }
 
@@ -102,7 +107,7 @@ static void begin_burst(void)
     }
 }
 
-static void on_ready(void)
+static void on_ready(uint32_t now)
 {
     if (ad7730_no_reference()) {
         reference_was_lost = true;
@@ -115,6 +120,11 @@ static void on_ready(void)
         }
     } else {
         sums[CHANNELS[step]] += ad7730_data();
+        // Had a spike put the interface out of step, or reset the part, the codes would be anything.
+        if (!ad7730_runs(CONVERT[CHANNELS[step]])) {
+            begin_setup(now);
+            return;
+        }
         if (++step < CONVERSIONS) {
             convert();
             return;
@@ -198,7 +208,7 @@ void sampler_poll(void)
     if (phase == RESETTING && now - setup_began >= RESET_MS)
         configure();
     else if (ad7730_ready() && (phase == CALIBRATING || phase == CONVERTING))
-        on_ready();
+        on_ready(now);
     bool complete = sampling && now - began >= (uint16_t)WINDOW_MS * (burst + 1) && end_burst(now);
     uint32_t middle = began + middle_ms();
     if (complete)

@@ -84,7 +84,7 @@ def test_says_who_it_is_before_the_first_sample(start):
     board = start("--unit", "53494D00")
     board.connect()
     first, *rest = board.messages(BOOT_MS)
-    assert first == Identity(1, 0x0100, 0x53494D00, DEFAULT_RATE_HZ, 55)
+    assert first == Identity(1, 0x0100, 0x53494D00, DEFAULT_RATE_HZ, 54)
     assert [s.status for s in samples(rest)] == [Status.FIRST] + [0] * (len(rest) - 1)
     assert [s.sequence for s in samples(rest)] == list(range(len(rest)))
     assert board.messages(50, protocol.identify_command()).count(first) == 1
@@ -187,6 +187,20 @@ def test_a_converter_that_a_spike_has_reset_never_sends_an_uncalibrated_code_unf
     assert not board.tell("adc")["calibrated"]
     got = samples(board.messages(2000))
     assert Status.ADC_TIMEOUT in {s.status for s in got} and got[-1].status == 0
+    assert np.abs(angles([s for s in got if not s.status]) - [20, -20]).max() < 0.005
+
+
+def test_an_interface_out_of_step_is_noticed_before_a_wrong_code_is_sent(board):
+    board.tell("noise 0")
+    board.tell("tilt 20 -20")
+    at_rate(board, 50)
+    got = []
+    for after in range(1, 50):  # bytes: a burst has less
+        got += board.messages(500)
+        assert samples(got)[-1].status == 0
+        board.tell(f"slip {after}")
+    got = samples(got + board.messages(500))
+    assert got[-1].status == 0 and sum(s.status != 0 for s in got) > 200
     assert np.abs(angles([s for s in got if not s.status]) - [20, -20]).max() < 0.005
 
 

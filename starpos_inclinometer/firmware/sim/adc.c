@@ -20,6 +20,13 @@ enum { COMMUNICATIONS, DATA, MODE, FILTER, DAC, OFFSET, GAIN, TEST };
 static const uint8_t BYTES[] = {1, 3, 2, 3, 1, 3, 3, 3};
 enum { IDLE, CONTINUOUS, SINGLE, STANDBY, ZERO_SCALE, FULL_SCALE };
 
+// With its interface out of step the converter cannot know what the firmware meant.
+static void object(const struct adc *a, const char *what)
+{
+    if (!a->slipped)
+        complain(what);
+}
+
 static unsigned running(const struct adc *a)
 {
     return a->mode >> 13;
@@ -71,21 +78,21 @@ static void check_filter(const struct adc *a)
 {
     unsigned sf = a->filter >> 12, lowest[] = {150, 75, 40, 20}; // SKIP, CHP
     if (a->filter & 0xCC0)
-        complain("AD7730 filter register: a bit that must be 0 is 1");
+        object(a, "AD7730 filter register: a bit that must be 0 is 1");
     if (sf < lowest[(a->filter & 0x200 ? 2 : 0) + chopping(a)] || sf > 2048)
-        complain("AD7730 filter register: SF outside of table XV");
+        object(a, "AD7730 filter register: SF outside of table XV");
 }
 
 static void start(struct adc *a, double now)
 {
     if (a->mode & 0x0040)
-        complain("AD7730 mode register: a bit that must be 0 is 1");
+        object(a, "AD7730 mode register: a bit that must be 0 is 1");
     if ((a->mode & 0x1000) || channel(a) > 1 || !(a->mode & 0x0100))
-        complain("AD7730 mode register: unipolar, 16 bits or a channel that is not wired");
+        object(a, "AD7730 mode register: unipolar, 16 bits or a channel that is not wired");
     if (running(a) > FULL_SCALE || running(a) == STANDBY)
-        complain("AD7730 mode register: an operating mode this board has no use for");
+        object(a, "AD7730 mode register: an operating mode this board has no use for");
     if (running(a) == ZERO_SCALE && !a->full_scale[channel(a) & 1] && !a->reference_missing)
-        complain("AD7730 zero-scale calibration before the full-scale one");
+        object(a, "AD7730 zero-scale calibration before the full-scale one");
     a->ready = false;
     a->pulse = 0;
     a->began = now;
@@ -103,7 +110,7 @@ static void write(struct adc *a, double now)
     } else if (a->address == DAC) {
         a->dac = a->shift;
     } else {
-        complain("AD7730 write to a register that is the calibration's or no one's");
+        object(a, "AD7730 write to a register that is the calibration's or no one's");
     }
 }
 
@@ -121,7 +128,7 @@ static uint32_t value(const struct adc *a)
     case DAC:
         return a->dac;
     default:
-        complain("AD7730 read of a register the model has not");
+        object(a, "AD7730 read of a register the model has not");
         return 0;
     }
 }
@@ -131,15 +138,15 @@ static void communicate(struct adc *a, uint8_t in)
     if (in & 0x80)
         return; // WEN: nothing is written
     if (in & 0x48)
-        complain("AD7730 communications register: a bit that must be 0 is 1");
+        object(a, "AD7730 communications register: a bit that must be 0 is 1");
     if (in & 0x20)
-        complain("AD7730 continuous read, which the model has not");
+        object(a, "AD7730 continuous read, which the model has not");
     a->address = in & 7;
     a->reading = in & 0x10;
     a->left = BYTES[a->address];
     a->shift = a->reading ? value(a) << (24 - 8 * a->left) : 0;
     if (a->reading && a->address == DATA && !a->ready)
-        complain("AD7730 data read while RDY was high");
+        object(a, "AD7730 data read while RDY was high");
 }
 
 uint8_t adc_transfer(struct adc *a, uint8_t in, double now)
@@ -151,6 +158,10 @@ uint8_t adc_transfer(struct adc *a, uint8_t in, double now)
             a->ones = 0;
             return 0xFF;
         }
+    }
+    if (a->slips_after && !--a->slips_after) {
+        a->slipped = true;
+        a->left++;
     }
     if (!a->left) {
         communicate(a, in);

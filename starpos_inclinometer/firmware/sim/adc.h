@@ -20,6 +20,8 @@ struct adc {
     double began, next;                // of what is under way, s; next is 0 where nothing is
     double pulse;                      // s when RDY falls again after an update nobody read; 0: none
     bool frozen, reference_missing;
+    unsigned slips_after; // bytes, a spike on SCLK: the interface takes one more than it is given; 0: none
+    bool slipped;         // until a reset
     unsigned resets, conversions;
 };
 

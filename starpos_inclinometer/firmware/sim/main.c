@@ -28,6 +28,7 @@ static const char USAGE[] =
     "  reference 0|1  0: the converter's reference is open\n"
     "  sensor 0|1     0: the sensor does not answer on the SPI bus\n"
     "  adc            the converter alone is reset, as by a spike\n"
+    "  slip BYTES     after so many bytes its interface gets out of step, as by a spike\n"
     "  reset, power   the MCU by its pin; the whole board\n"
     "  hang           the MCU runs into an endless loop\n"
     "  state          what the board knows of itself\n";
@@ -141,6 +142,8 @@ static bool obey(const char *command)
         mcu.sensor.absent = !v[0];
     else if (!strcmp(name, "adc") && n == 0)
         adc_power_on(&mcu.adc);
+    else if (!strcmp(name, "slip") && n == 1)
+        mcu.adc.slips_after = v[0];
     else if ((!strcmp(name, "reset") || !strcmp(name, "power")) && n == 0)
         mcu_reset(*name == 'p');
     else if (!strcmp(name, "hang") && n == 0)
