@@ -53,10 +53,13 @@ class Average:
 
 
 def average(fixes: Sequence[Fix]) -> Average:
-    """The average of at least one fix, of the last place in time if there are several; the same frame twice counts once.
+    """The average of fixes, of the last place in time if there are several; the same frame twice counts once.
 
-    Raises FixError where as many were left out as were used, so that it cannot be told which are right.
+    Raises FixError where there is none, or where as many were left out as were used, so that it cannot be told which are
+    right.
     """
+    if not fixes:
+        raise FixError("there is no fix to average: none of the frames has one")
     averager = Averager()
     for f in sorted({(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values(), key=_time):
         averager.add(f)

@@ -130,6 +130,11 @@ def test_two_frames_of_two_places_have_no_average(rng):
         average(in_order(fixes(here, rng, [40.0]) + fixes(there, rng, [40.0])))
 
 
+def test_no_fix_has_no_average():
+    with pytest.raises(FixError, match="no fix to average"):
+        average([])
+
+
 def test_the_same_frame_given_twice_counts_once(rng):
     made = fixes(Field(), rng, [40.0] * 3)
     once, twice = average(made), average(made + made)
