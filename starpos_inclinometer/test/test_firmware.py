@@ -9,10 +9,11 @@ import math
 import random
 import re
 import subprocess
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from board import ELF, FIRMWARE, Board
+from board import ELF, FIRMWARE, SIM, Board
 
 from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import DEFAULT_RATE_HZ, Mcu
@@ -96,10 +97,13 @@ def test_a_unit_without_serial_number_says_0(board):
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 3, 7, 10, 16, 17, 30, 33, 49, 50])
 def test_takes_the_samples_of_its_rate(board, rate_hz):
+    at_rate(board, 49)  # fractions of milliseconds are its business alone
     identity = at_rate(board, rate_hz)
     assert identity.rate_hz == rate_hz
     seconds = 6
     data = board.run(1000 * seconds)
+    while not data.endswith(b"\r\n"):
+        data += board.run(1)
     got = samples(board.parser.feed(data))
     assert len(got) == pytest.approx(rate_hz * seconds, abs=2)
     steps = np.diff([s.milliseconds for s in got])
@@ -108,8 +112,16 @@ def test_takes_the_samples_of_its_rate(board, rate_hz):
     assert [s.status for s in got[1:]] == [0] * (len(got) - 1) and board.parser.counts.lost == 0
     assert len(data) <= protocol.SAMPLE_LINE * (rate_hz * seconds + 1)
     sent_ms = board.tell("state")["line_ms"]
-    last = samples(board.parser.feed(board.run(20)))[-1:] or got[-1:]  # its line may have been under way
-    assert sent_ms - last[-1].milliseconds == pytest.approx(identity.delay_ms, abs=0.3)
+    assert sent_ms - got[-1].milliseconds == pytest.approx(identity.delay_ms, abs=0.3)
+
+
+def test_the_rate_it_has_already_disturbs_no_sample(board):
+    at_rate(board, 5)
+    got = []
+    for _ in range(40):
+        got += samples(board.messages(50, protocol.rate_command(5)))
+    assert len(got) == pytest.approx(10, abs=1) and {s.status for s in got[1:]} == {0}
+    assert {b.milliseconds - a.milliseconds for a, b in pairwise(got)} == {200}
 
 
 @pytest.mark.parametrize("tilt", [(0, 0), (3, -20), (-29.9, 29.9), (12.3, 0.01), (30, -30)])
@@ -327,6 +339,13 @@ def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
     for sample in samples(got):
         assert bool(sample.status & Status.OVERRUN) == (sample.lost > 0)
     assert [s.status for s in samples(got)[-10:]] == [0] * 10
+
+
+def test_what_is_no_firmware_is_refused(built):
+    command = [built / SIM, __file__]
+    result = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert result.returncode == 1 and result.stderr.strip().endswith("not a firmware for the ATmega8")
+    assert result.stdout == ""
 
 
 def test_registers_are_the_data_sheets(board):

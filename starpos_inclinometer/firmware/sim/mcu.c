@@ -210,7 +210,7 @@ bool mcu_init(const char *elf, uint32_t unit)
 {
     static avr_io_t module = {.kind = "board", .reset = on_reset};
     elf_firmware_t firmware = {0};
-    if (elf_read_firmware(elf, &firmware) != 0)
+    if (elf_read_firmware(elf, &firmware) != 0 || !firmware.flashsize)
         return false;
     avr = avr_make_mcu_by_name("atmega8");
     avr_init(avr);
