@@ -26,8 +26,8 @@
 #define BURST_US (CONVERSIONS * (AD7730_SETTLING_PERIODS * AD7730_PERIOD_NS / 1000 + TRANSFERS_US))
 #define HALF_BURST_MS ((BEGIN_US + BURST_US / 2 + 500) / 1000)
 #define SENDING_MS 1 // from the tick to the first byte of the line: 0.92, measured
-// Even if a conversion took one period more than it should, a burst would end in time.
-_Static_assert(BEGIN_US + BURST_US + CONVERSIONS * AD7730_PERIOD_NS / 1000 < WINDOW_MS * 1000UL, "a burst must fit its window");
+#define SPARE_US (CONVERSIONS * AD7730_PERIOD_NS / 1000) // should each conversion take one period more
+_Static_assert(BEGIN_US + BURST_US + SPARE_US < WINDOW_MS * 1000UL, "a burst must fit its window");
 
 #define RESET_MS 2
 #define SETUP_MS (RESET_MS + AD7730_CALIBRATION_MS + 50) // with a margin for both clocks
@@ -150,7 +150,7 @@ static void begin_sample(uint32_t now)
     begin_burst();
 }
 
-// Whether the sample is complete.
+// Whether that was the sample's last.
 static bool end_burst(uint32_t now)
 {
     if (!converted) {
