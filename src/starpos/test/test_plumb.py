@@ -284,6 +284,19 @@ def test_a_weak_lean_and_a_wide_prior_meet_between_them():
     assert np.mean(chi2) == pytest.approx(1, abs=4 * np.sqrt(2 / 50))
 
 
+def test_the_prior_of_the_turn_counts_from_the_given_a3():
+    """Half a turn off by leans that tell it to 15 deg, and said to be good to 30: the answer lies between, towards the
+    leans; where every start had a prior of its own, it was theirs alone."""
+    lean = np.degrees(SCA100T / np.radians(15) * np.sqrt(2))
+    between = []
+    for seed in range(12):
+        made, truth = readings(np.random.default_rng(seed), (30, 30), leans=(0, lean))
+        given = rotation.from_vector(np.pi * made.mean_plumb) @ truth.a3
+        found = hang(made, given, truth.zenith, 0.0, np.radians(30))
+        between.append(np.degrees(np.arccos(np.clip((np.trace(found.a3 @ given.T) - 1) / 2, -1, 1))))
+    assert 90 < np.median(between) < 160
+
+
 def test_half_a_turn_of_a3_is_found_from_anywhere():
     """Half a turn off, the slope of the turn is nothing: a search from the given A3 alone would stay there."""
     for seed in range(10):
