@@ -226,7 +226,8 @@ class Calibrating:
                 f"{FEWEST_HEADINGS} headings or more"
             )
         solver = of_worst_stamp(self._solver(), poses)
-        return lambda: _turn(solver, poses)
+        turn_deg = self._values["calibration_turn_stddev"]
+        return lambda: _turn(solver, poses, turn_deg)
 
     def _turn_by_itself(self):
         """From the poses there are; when it is busy, from those there are then."""
@@ -324,9 +325,9 @@ class Calibrating:
         return Report(Level.OK, self._about or "that of the parameters", values)
 
 
-def _turn(solver: Solver, poses: list[Seen]) -> Turned:
+def _turn(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
     """FixError where the poses are not of one place or tell none."""
-    calibrated = turn(solver, [p.stars for p in poses], tilts_of(poses))
+    calibrated = turn(solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg)
     if not calibrated.fixes:
         raise FixError(f"no heading has a fix: {calibrated.solutions[0].message}")
     place = average(calibrated.fixes)

@@ -56,8 +56,9 @@ PARAMETERS = (
     Parameter(
         "calibration_turn_stddev",
         180.0,
-        "How well the misalignment in use has its turn about the plumb line when solver/calibrate begins; frames at one "
-        "lean do not tell it. 180 is not at all: then fixes at another lean claim little. Too small makes them wrong.",
+        "How well the misalignment in use has its turn about the plumb line (the way the inclinometer faces) when a "
+        "calibration begins; frames at one lean, or turned about one leaning axis, do not tell it. 180 is not at all: "
+        "then fixes at another lean, or of a leaning turn, claim little. Too small makes them wrong.",
         "deg",
         0.000001,
         180.0,

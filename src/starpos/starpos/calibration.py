@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos import rotation
+from starpos.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.earth import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, a2_matrix
@@ -108,6 +111,8 @@ def calibrate(
             f"{len(sound)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
             "instrument was moved between them, or its inclinometer or clock was disturbed"
         )
+    if plumb.astray:
+        solutions = [replace(s, fix=_strayed(s.fix, plumb.astray)) if s.fix else s for s in solutions]
     plumb = _as_scattered(plumb, len(sound))
     mean_plumb = Readings.of(sound, solver.instrument.inclinometer).mean_plumb
     error = float(plumb.stddev_across(mean_plumb) / ARCSEC)
@@ -132,6 +137,8 @@ def _unknown(plumb: Plumb, sound: list[Solution]) -> Calibration:
     up = a2_matrix(*np.radians(tilt_deg))[2]
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
+    if plumb.astray:  # then `_strayed` has it: the noise of single tilts would seem to tell it here
+        about = 0.0
     covariance = np.eye(3) * across**2 + np.outer(up, up) * (about**2 - across**2)
     held = Calibration(
         covariance_arcsec2=tuple(map(tuple, covariance.tolist())),
@@ -139,6 +146,26 @@ def _unknown(plumb: Plumb, sound: list[Solution]) -> Calibration:
         tilt_deg=tilt_deg,
     )
     return held.turned_to(plumb.a3)
+
+
+def _strayed(fix: Fix, astray: float) -> Fix:
+    """With an error of the zenith (rad) that is the same for all frames, whichever way they look."""
+    here, step = np.array([fix.latitude, fix.longitude]), 1e-6
+    link = Site(*np.degrees(here)).enu.T @ fix.link_to_enu
+    prime, meridian = curvature_radii_m(fix.latitude)
+    moves = (
+        (0.0, 1 / (prime * max(np.cos(fix.latitude), 1e-9))),
+        (1 / meridian, 0.0),
+    )  # rad for a metre east, north
+    columns = []
+    for metre, attitude in zip(
+        moves, ((0, 1 / prime, np.tan(fix.latitude) / prime), (-1 / meridian, 0, 0)), strict=True
+    ):
+        there = here + np.array(metre) * step * prime
+        turned = heading_of(Site(*np.degrees(there)).enu @ link) - fix.heading
+        columns.append([*np.eye(2)[len(columns)], rotation.half_turn(turned) / (step * prime), *attitude])
+    term = ErrorTerm("turn", np.array(columns).T * astray * EARTH_RADIUS_M, ALWAYS)
+    return replace(fix, terms=(*fix.terms, term))
 
 
 def _as_scattered(plumb: Plumb, frames: int) -> Plumb:

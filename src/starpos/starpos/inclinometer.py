@@ -150,6 +150,8 @@ class TiltLog:
             return 1.0
         steps = np.diff(np.stack([self.theta_x, self.theta_y], -1)[order], axis=0)[near]
         steps = steps[np.isfinite(steps).all(1)]
+        if len(steps) < ENOUGH_NEIGHBOURS:
+            return 1.0
         stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
         # without the largest, not by the median, which jumps from step to step of coarse readings
         size = np.sort(np.abs(steps), axis=0)[: int(np.ceil(KEPT * len(steps)))]

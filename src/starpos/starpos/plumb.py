@@ -8,7 +8,7 @@ and takes z round a circle, the right one keeps it still.  Of A3's tilts and the
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,8 @@ TURNS_TRIED = 8
 MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
 LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are believed to
 AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
+ANY_TURN = np.sqrt(1.5)  # root mean square of how far any turn takes a point on a circle, in radii, by axis
+NARROW_TURN = np.radians(20)  # within it no other turn need be tried
 AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
 SAME_AXIS = 1e-9  # share of the axis' weight below which the headings do not tell it
 MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
@@ -100,7 +102,8 @@ class Plumb:
     """a3 (3, 3) with covariance (3, 3) rad2 about S's axes, and the zenith (3,) in ITRS with its sigma, rad.
 
     cost: half the robust chi-square; scatter: chi-square a degree of freedom, 1 of frames that have one zenith; off (K,):
-    how far each frame is from it, in its own sigma.
+    how far each frame is from it, in its own sigma.  astray: rad, 1 sigma, by which the zenith may be off along with A3's
+    turn about a leaning axis, which no heading tells.
     """
 
     a3: np.ndarray
@@ -110,6 +113,7 @@ class Plumb:
     cost: float
     scatter: float
     off: np.ndarray
+    astray: float = 0.0
 
     def stddev_across(self, plumb: np.ndarray) -> float:
         """Error of the direction that A3 takes to `plumb` (3,), the worse of two axes, rad."""
@@ -117,32 +121,41 @@ class Plumb:
         return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
 
 
-def level(readings: Readings, given: np.ndarray) -> Plumb:
+def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> Plumb:
     """A3 that keeps the zenith still, wherever it is; the nearest to `given` (3, 3) as far as they do not tell.
 
-    Its turn about the plumb line is told by the instrument's lean alone, if there is any: all of them are tried.  Raises
-    FixError where two answers are as good.
+    turn_sigma: how well `given` has the turn about the plumb line, rad.  Beside that only a lean tells it that changes
+    otherwise than by turning about one leaning axis: A3 and the zenith turned about such an axis make the same readings.
+    Then the zenith is as uncertain as the lean times the turn.  Raises FixError where two answers are as good and further
+    apart than that.
     """
     mean = readings.mean_plumb
     start = _axis_of_turn(readings, given)
-    nearest = _fitted(readings, start, _Known())
+    known = _Known(turn_sigma=turn_sigma)
+    nearest = _fitted(readings, start, known)
     leans = _leans(readings)
     if nearest.scatter < MOST_SCATTER and not leans:
         return nearest
     # each held near its own start
-    found = [_fitted(readings, start, _Known()) for _, start in _turns(mean, start)]
+    starts = _turns(mean, start) if turn_sigma > NARROW_TURN else [(0.0, start)]
+    found = [_fitted(readings, start, known) for _, start in starts]
     best = min(found, key=_cost)
     if not leans:  # half a turn from its answer the search may have stood still
         return best if best.scatter < MOST_SCATTER else nearest
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
-    if apart > AMBIGUOUS_SIGMA * best.zenith_sigma:
-        lean = np.degrees(np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max())
+    lean = np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max()
+    turn = np.sqrt(mean @ best.covariance @ mean)
+    astray = lean * min(turn, ANY_TURN)
+    if apart > AMBIGUOUS_SIGMA * np.hypot(best.zenith_sigma, astray):
         raise FixError(
-            f"the instrument leans by {lean:.2f} deg from one heading to the other, and these headings do not tell which "
-            "way its inclinometer faces: level it better, or add a frame with one foot raised by as much or more"
+            f"the instrument leans by {np.degrees(lean):.2f} deg from one heading to the other, and these headings do "
+            "not tell which way its inclinometer faces, or one heading's tilts are off: level it better, or add a frame "
+            "with one foot raised by as much or more"
         )
-    return best
+    if nearest.cost < best.cost + AS_GOOD:
+        best = nearest
+    return replace(best, astray=astray) if astray > best.zenith_sigma / 2 else best
 
 
 def hang(
@@ -156,7 +169,7 @@ def hang(
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
     start = rotation.shortest_turn(given @ (up / np.linalg.norm(up)), mean) @ given
     known = _Known(zenith, max(zenith_sigma, 1e-12), turn_sigma)
-    starts = _turns(mean, start) if turn_sigma > np.radians(20) else [(0.0, start)]
+    starts = _turns(mean, start) if turn_sigma > NARROW_TURN else [(0.0, start)]
     found = [_fitted(readings, start, known, angle) for angle, start in starts]
     best = min(found, key=_cost)
     if found[0].cost < best.cost + AS_GOOD:

@@ -3,9 +3,11 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from starpos.calibration import Calibrated, calibrate
 from starpos.inclinometer import Tilt
-from starpos.plumb import level
+from starpos.plumb import Plumb, Readings, level
 from starpos.progress import Progress, quiet
 from starpos.solve import Solver
 from starpos.stars import Stars
@@ -15,14 +17,18 @@ def turn(
     solver: Solver,
     frames: Sequence[Stars],
     tilt: Callable[[float, float], Tilt],
+    turn_stddev_deg: float = 180.0,
     progress: Progress = quiet,
 ) -> Calibrated:
     """A3 and the place of frames of one place at several headings; the solver's A3 need not be near.
 
     tilt: of (mid_unix_s, exposure_s).  From fewer than two fixes A3 stays what it was.  The `average` of the fixes is the
-    place, and its covariance says how well the headings tell it and A3 apart.  FixError where the instrument leans and
-    the headings do not tell which way, or the frames have no one zenith.
+    place, and its covariance says how well the headings tell it and A3 apart.  turn_stddev_deg: how well the solver's A3
+    has its turn about the plumb line; it matters as far as the axis of the turn leans.  FixError where the instrument
+    leans and the headings leave two places, or the frames have no one zenith.
     """
-    return calibrate(
-        solver, frames, tilt, lambda readings, a3, _: level(readings, a3), fewest=2, progress=progress
-    )
+
+    def find(readings: Readings, a3: np.ndarray, _) -> Plumb:
+        return level(readings, a3, np.radians(turn_stddev_deg))
+
+    return calibrate(solver, frames, tilt, find, fewest=2, progress=progress)

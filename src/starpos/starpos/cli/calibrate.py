@@ -49,6 +49,8 @@ def define(parser) -> None:
 def run(args) -> int:
     if args.camera is None and args.site is None:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
+    if args.map is not None and args.camera is None:
+        raise InstrumentError("--map is of the camera: give --camera OUT.yaml too")
     calibrate_site.check(args)
     if args.map is not None and find_spec("matplotlib") is None:
         raise InstrumentError(

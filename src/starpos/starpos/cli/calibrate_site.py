@@ -32,12 +32,7 @@ def define(parser) -> None:
         help="--site is on WGS 84, as a map or a receiver has it: the deflection of the vertical is put on",
     )
     common.add_vertical(parser)
-    parser.add_argument(
-        "--turn-stddev",
-        type=common.number(1e-6, 180),
-        metavar="DEG",
-        help="how well the given A3 has its turn about the plumb line, which one lean does not tell (180)",
-    )
+    common.add_turn(parser)
     parser.add_argument("-o", "--output", metavar="OUT", help="write the instrument file (YAML) with A3")
     parser.add_argument(
         "--valid-days",
@@ -74,8 +69,9 @@ def run(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> No
     """Find, write and print it; FixError where the frames do not tell."""
     solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args))
     site, stddev_arcsec = _site(args)
-    turn_deg = 180.0 if args.turn_stddev is None else args.turn_stddev
-    found = calibrate_at(solver, frames, tilts.average, site, stddev_arcsec, turn_deg, common.ProgressBar())
+    found = calibrate_at(
+        solver, frames, tilts.average, site, stddev_arcsec, common.turn_of(args), common.ProgressBar()
+    )
     for solution in found.solutions:
         if solution.fix is None:
             common.complain("calibrate", f"left out: {solution.message}")

@@ -50,6 +50,35 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_turn(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--turn-stddev",
+        type=number(1e-6, 180),
+        metavar="DEG",
+        help="how well the given A3 has its turn about the plumb line, the way the inclinometer faces (180: not at all)",
+    )
+
+
+def turn_of(args: argparse.Namespace) -> float:
+    """deg; what --turn-stddev says."""
+    return 180.0 if args.turn_stddev is None else args.turn_stddev
+
+
+def add_self_calibration(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--self-calibrate",
+        action="store_true",
+        help="frames of one place at several headings: find A3 too, whatever it is",
+    )
+    add_turn(parser)
+
+
+def check_self_calibration(args: argparse.Namespace) -> None:
+    """InstrumentError for a turn's error that nothing would take note of."""
+    if args.turn_stddev is not None and not args.self_calibrate:
+        raise InstrumentError("--turn-stddev is for --self-calibrate: give both")
+
+
 def add_size(parser: argparse.ArgumentParser) -> None:
     """Frame size; with it the optics are the paper's where they are not given."""
     size = {"type": number(16, 100_000, int), "metavar": ("W", "H"), "nargs": 2, "default": (5616, 3744)}

@@ -33,15 +33,12 @@ def define(parser) -> None:
     common.add_instrument(parser)
     common.add_air(parser)
     common.add_vertical(parser)
-    parser.add_argument(
-        "--self-calibrate",
-        action="store_true",
-        help="frames of one place at several headings: find A3 too, whatever it is",
-    )
+    common.add_self_calibration(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
+    common.check_self_calibration(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
     from starpos.report.page import page
@@ -78,7 +75,7 @@ def _night(path: Path, args) -> Night:
         catalogue.load(),
         common.atmosphere_of(args),
         common.vertical_of(args),
-        args.self_calibrate,
+        common.turn_of(args) if args.self_calibrate else None,
         common.ProgressBar(),
     )
     if not path.exists():

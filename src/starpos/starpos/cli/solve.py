@@ -31,11 +31,7 @@ def define(parser) -> None:
     common.add_instrument(parser)
     common.add_air(parser)
     common.add_vertical(parser)
-    parser.add_argument(
-        "--self-calibrate",
-        action="store_true",
-        help="frames of one place at several headings: find A3 too, whatever it is",
-    )
+    common.add_self_calibration(parser)
     parser.add_argument(
         "--save", metavar="OUT", help="write the instrument file (YAML) with the A3 of --self-calibrate"
     )
@@ -43,6 +39,7 @@ def define(parser) -> None:
 
 
 def run(args) -> int:
+    common.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
     vertical = common.vertical_of(args)
@@ -89,25 +86,27 @@ def _turned(args):
             item = common.stars_of(item)
         rows.append((path, item))
     frames = [stars for _, stars in rows if isinstance(stars, Stars)]
-    answers = iter(_of_turn(solver, frames, tilts, args.save) if frames else ())
+    answers = iter(_of_turn(args, solver, frames, tilts) if frames else ())
     for path, item in rows:
         yield path, next(answers) if isinstance(item, Stars) else item
 
 
-def _of_turn(solver: Solver, frames: list[Stars], tilts: TiltLog, save: str | None) -> Sequence[Solution]:
+def _of_turn(args, solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[Solution]:
     try:
-        turned = turn(solver, frames, tilts.average, solver.progress)
+        turned = turn(solver, frames, tilts.average, common.turn_of(args), solver.progress)
     except FixError as e:
         return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames]
-    angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
-    common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
-    if save is not None and turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
+    if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
+        kept = "" if args.save is None else f" {args.save} is not written:"
         common.complain(
-            "solve", f"{save}: not written, the headings hardly tell A3: turn the instrument further"
+            "solve", f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further"
         )
-    elif save is not None:
-        instrument_file.write(Path(save), turned.instrument, f"A3 by turning on the spot: {error}")
+        return turned.solutions
+    angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
+    common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
+    if args.save is not None:
+        instrument_file.write(Path(args.save), turned.instrument, f"A3 by turning on the spot: {error}")
     return turned.solutions
 
 

@@ -36,7 +36,7 @@ class Workshop:
     catalogue: Catalogue
     atmosphere: Atmosphere
     vertical: Vertical
-    self_calibrate: bool = False
+    turn_stddev_deg: float | None = None
     progress: Progress = quiet
 
     def solver(self, stars: Stars, clock_stddev_s: float) -> Solver:
@@ -49,7 +49,7 @@ class Workshop:
 
 def worked(exposures: Exposures, shop: Workshop) -> Night:
     """The night of these exposures; InstrumentError where no frame can have one."""
-    solve = _turned if shop.self_calibrate else _one_by_one
+    solve = _one_by_one if shop.turn_stddev_deg is None else _turned
     shots, fixes, instrument, remarks, extrapolated_days = [], [], None, [], 0.0
     for done, (exposure, solution, used, said) in enumerate(solve(exposures, shop), 1):
         shots.append(_shot(exposure, solution))
@@ -107,7 +107,9 @@ def _turned(exposures: Exposures, shop: Workshop) -> Iterator:
         solver = shop.solver(good[0].stars, good[0].clock_stddev_s)
         instrument = solver.instrument
         try:
-            turned = turn(solver, [e.stars for e in good], exposures.tilt, shop.progress)
+            turned = turn(
+                solver, [e.stars for e in good], exposures.tilt, shop.turn_stddev_deg, shop.progress
+            )
             answers, instrument = iter(turned.solutions), turned.instrument
             angles = " ".join(f"{a:.5f}" for a in instrument.calibration.misalignment_deg)
             said = (
