@@ -30,6 +30,7 @@ POSE_RAD, POSE_SIGMA = (
 class Average:
     """The combined position and the heading of the last pose (rad), with the budget of its errors.
 
+    The heading is NaN where no fix of that pose was believed yet.
     frames: how many it is of, in how many poses; left_out: how many since its beginning were not believed.
     began_unix_s, utc_unix_s: of its first fix, and the mean of all.  moved: how many averages of other places there were
     before it.
@@ -48,8 +49,11 @@ class Average:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(3, 3) of east m, north m, heading rad."""
-        return sum(t.covariance for t in self.terms)[:3, :3]
+        """(3, 3) of east m, north m, heading rad; NaN in the heading's row and column where there is none."""
+        covariance = sum(t.covariance for t in self.terms)[:3, :3].copy()
+        if np.isnan(self.heading):
+            covariance[2] = covariance[:, 2] = np.nan
+        return covariance
 
 
 def average(fixes: Sequence[Fix]) -> Average:
@@ -83,7 +87,7 @@ class _Track:
 
     running: Running
     frames: int = 0
-    poses: int = 1
+    poses: int = 0
     in_pose: int = 0
     mean_unix_s: float = 0.0
     began_unix_s: float = float("nan")
@@ -97,7 +101,7 @@ class _Track:
         return _Track(self.running.elsewhere(f), began_unix_s=f.utc_unix_s)
 
     def touched(self) -> "_Track":
-        return replace(self, running=self.running.heading_unknown(), poses=self.poses + 1, in_pose=0)
+        return replace(self, running=self.running.heading_unknown(), in_pose=0)
 
     def add(self, f: Fix, pose: Fix) -> "_Track | None":
         """With one more fix of a pose; None where it is too far off."""
@@ -106,7 +110,10 @@ class _Track:
             return None
         n = self.frames + 1
         mean = self.mean_unix_s + (f.utc_unix_s - self.mean_unix_s) / n
-        return replace(self, running=running, frames=n, in_pose=self.in_pose + 1, mean_unix_s=mean)
+        poses = self.poses + (self.in_pose == 0)
+        return replace(
+            self, running=running, frames=n, poses=poses, in_pose=self.in_pose + 1, mean_unix_s=mean
+        )
 
 
 class Averager:

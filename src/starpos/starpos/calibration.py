@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammainccinv
 
 from starpos import rotation
 from starpos.budget import ALWAYS, ErrorTerm, heading_of
@@ -13,7 +14,7 @@ from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import ARCSEC, MOST_C, Calibration, Instrument
-from starpos.plumb import EARTH_RADIUS_M, MOST_SCATTER, UNKNOWN_ARCSEC, Plumb, Readings, hang
+from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky import Site
 from starpos.solve import Solution, Solver
@@ -23,6 +24,7 @@ ROUNDS = 4
 SETTLED_RAD = np.radians(0.02 / 3600)
 OF_PLACE = ("refraction", "clock", "ut1", "pole")  # terms that move the zenith of all frames alike
 VALID_DAYS = 365.0
+MOST_SCATTER = 4.0  # chi-square a degree of freedom of frames that have one zenith
 TURN_SIGMA = 3.0  # by which the fixes hold what the leans told of A3's turn: they are of the same tilts
 OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25  # frames further off are left out, up to this share of all
 
@@ -72,6 +74,11 @@ def calibrate_at(
     found = calibrate(solver, frames, tilt, find, fewest=1, progress=progress)
     if not found.fixes:
         raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
+    if min(f.camera_to_itrs[:, 2] @ site.enu[2] for f in found.fixes) < 0:
+        raise FixError(
+            "from the place that was given the camera would look into the ground: check latitude and longitude, their "
+            "order and signs, and the clock"
+        )
     return found
 
 
@@ -106,14 +113,18 @@ def calibrate(
     progress("calibrating", 1.0)
     if plumb is None:
         return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
-    if plumb.scatter > MOST_SCATTER:  # not before: with a wrong A3 the errors are not known either
+    if plumb.scatter > _most_scatter(
+        len(sound)
+    ):  # not before: with a wrong A3 the errors are not known either
         raise FixError(
             f"{len(sound)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
-            "instrument was moved between them, or its inclinometer or clock was disturbed"
+            "instrument was moved between them, its inclinometer or clock was disturbed, or the place given is wrong"
         )
+    if plumb.scatter > _usual_scatter(len(sound)):
+        plumb = replace(plumb, covariance=plumb.covariance * plumb.scatter)
+        solutions = [_scattered(s, plumb.scatter) for s in solutions]
     if plumb.astray:
         solutions = [replace(s, fix=_strayed(s.fix, plumb.astray)) if s.fix else s for s in solutions]
-    plumb = _as_scattered(plumb, len(sound))
     mean_plumb = Readings.of(sound, solver.instrument.inclinometer).mean_plumb
     error = float(plumb.stddev_across(mean_plumb) / ARCSEC)
     instrument = replace(solver.instrument, calibration=_dated(plumb, sound))
@@ -148,6 +159,22 @@ def _unknown(plumb: Plumb, sound: list[Solution]) -> Calibration:
     return held.turned_to(plumb.a3)
 
 
+def _most_scatter(frames: int) -> float:
+    """Chi-square a degree of freedom that sound frames may have; few may have more."""
+    freedom = max(2 * frames - 5, 1)
+    return max(MOST_SCATTER, 2 * float(gammainccinv(freedom / 2, 1e-9)) / freedom)
+
+
+def _scattered(solution: Solution, scatter: float) -> Solution:
+    """With the error of the tilt that the frames' scatter shows."""
+    if solution.fix is None:
+        return solution
+    terms = tuple(
+        replace(t, variance=t.variance * scatter) if t.name == "tilt" else t for t in solution.fix.terms
+    )
+    return replace(solution, fix=replace(solution.fix, terms=terms))
+
+
 def _strayed(fix: Fix, astray: float) -> Fix:
     """With an error of the zenith (rad) that is the same for all frames, whichever way they look."""
     here, step = np.array([fix.latitude, fix.longitude]), 1e-6
@@ -168,11 +195,9 @@ def _strayed(fix: Fix, astray: float) -> Fix:
     return replace(fix, terms=(*fix.terms, term))
 
 
-def _as_scattered(plumb: Plumb, frames: int) -> Plumb:
-    """With the error that frames have which scatter clearly more than they say."""
-    if plumb.scatter < 1 + 2 * np.sqrt(2 / max(2 * frames - 5, 1)):
-        return plumb
-    return replace(plumb, covariance=plumb.covariance * plumb.scatter)
+def _usual_scatter(frames: int) -> float:
+    """What is not clearly more than frames say of themselves."""
+    return 1 + 2 * np.sqrt(2 / max(2 * frames - 5, 1))
 
 
 def _with(solver: Solver, calibration: Calibration) -> Solver:

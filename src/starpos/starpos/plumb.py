@@ -25,6 +25,7 @@ MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one ze
 LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are believed to
 AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
 ANY_TURN = np.sqrt(1.5)  # root mean square of how far any turn takes a point on a circle, in radii, by axis
+TOLD_TURN = np.radians(10)
 NARROW_TURN = np.radians(20)  # within it no other turn need be tried
 AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
 SAME_AXIS = 1e-9  # share of the axis' weight below which the headings do not tell it
@@ -155,7 +156,8 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
         )
     if nearest.cost < best.cost + AS_GOOD:
         best = nearest
-    return replace(best, astray=astray) if astray > best.zenith_sigma / 2 else best
+    told = turn < min(turn_sigma / 2, TOLD_TURN)  # by leans of other kinds
+    return best if told or astray < best.zenith_sigma / 2 else replace(best, astray=astray)
 
 
 def hang(

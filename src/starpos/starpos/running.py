@@ -188,8 +188,10 @@ class Running:
 
     @property
     def place(self) -> tuple[float, float, float]:
-        """Latitude, longitude, heading (rad)."""
+        """Latitude, longitude, heading (rad; NaN where nothing is known of it since the camera was touched)."""
         latitude, longitude = self.plane.place(self.state[:2] * UNIT[:2])
+        if not self.known[2]:
+            return latitude, longitude, float("nan")
         heading = self.state[2] * UNIT[2] + self.plane.heading - self.plane.convergence(latitude, longitude)
         return latitude, longitude, full_turn(heading)
 

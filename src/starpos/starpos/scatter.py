@@ -4,7 +4,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import brentq
 
 OUTLIER_SIGMA = 5.0
 MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
@@ -46,4 +45,6 @@ def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callab
     if above(0.0) <= 0:
         return 0.0
     high = 8 * np.sum(residual**2) + 1e-12
+    from scipy.optimize import brentq  # slow to import: only where stars are fitted
+
     return float(brentq(above, 0.0, high, xtol=1e-12, rtol=1e-3)) if above(high) < 0 else float(high)

@@ -328,3 +328,16 @@ def test_memory_does_not_grow(rng):
         averager.add(read_at(replace(two[k % 2], utc_unix_s=UTC + k), UTC + k, UTC + k + 1))
         sizes.append(len(pickle.dumps(vars(averager))))
     assert max(sizes[100:]) <= max(sizes[:100])
+
+
+def test_the_heading_of_a_pose_that_nobody_believed_is_none(rng):
+    """The camera was turned, and the tilts since are wrong: it does not face where it did."""
+    field = Field()
+    before = fixes(field, rng, [40.0] * 8)
+    wrong = [spoiled(f, 5e4, 0.0) for f in fixes(field, rng, [160.0] * 2)]
+    a = average(in_order(before + wrong))
+    assert (a.poses, a.left_out) == (1, 2)
+    assert np.isnan(a.heading) and np.isnan(a.covariance[2]).all()
+    assert np.all(np.abs(moved_m(a, field)) < 4 * np.sqrt(np.diag(a.covariance)[:2]))
+    right = average(in_order(before + wrong + fixes(field, rng, [160.0])))
+    assert right.poses == 2 and turn(right.heading - field.heading) != 0

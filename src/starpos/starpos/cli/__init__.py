@@ -14,7 +14,7 @@ COMMANDS = {
     "solve": "position and heading of frames with their tilts",
     "detect": "the stars of frames",
     "identify": "where frames look, lost in space",
-    "calibrate": "the camera (and more of the instrument) from identified stars",
+    "calibrate": "A3 at a known place, or the camera, from identified stars",
     "report": "nights on one page: stability, scatter, residuals, sky, error budget",
     "simulate": "write a night of frames and tilts from a place you choose",
     "catalogue": "build the star catalogue, or say what it and its triangles hold",

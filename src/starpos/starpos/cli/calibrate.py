@@ -64,6 +64,10 @@ def run(args) -> int:
     try:
         if args.camera is not None:
             camera = _camera(args, frames, instrument, tilts)
+            if args.site is None:
+                common.complain(
+                    "calibrate", "an A3 belongs to the camera it was found with: find it again with this one"
+                )
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.site is not None:
             calibrate_site.run(args, frames, instrument, tilts)

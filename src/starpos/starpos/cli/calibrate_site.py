@@ -17,6 +17,8 @@ from starpos.solve import Solver
 from starpos.stars import Stars
 from starpos.vertical import astronomic
 
+UNKNOWN_DEG = 60.0  # an angle with such an error is any
+
 
 def define(parser) -> None:
     parser.add_argument(
@@ -102,7 +104,8 @@ def _about(found: Calibrated, site: Site) -> str:
         f"A3 of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} (by gravity): "
         "{:.5f} {:.5f} {:.5f} deg".format(*c.misalignment_deg),
         f"the plumb line in the camera is known to {found.plumb_stddev_arcsec:.2f} arcsec; "
-        f"at another lean, A3's turn about it counts, known to {turns[-1]:.2g} deg",
+        f"at another lean, A3's turn about it counts, "
+        + ("which is not known" if turns[-1] > UNKNOWN_DEG else f"known to {turns[-1]:.2g} deg"),
     ]
     if turns[-1] > 1:
         lines.append("to tell that turn as well, lean the instrument by some degrees between the frames")

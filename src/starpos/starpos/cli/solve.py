@@ -200,6 +200,8 @@ def _line(path: str, s: Solution) -> str:
 def _where(fix: Fix | Average) -> str:
     east, north, heading = np.sqrt(np.diag(_in_degrees(fix.covariance)))
     facing = f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
+    if np.isnan(fix.heading):
+        facing = "heading not known since the camera was touched"
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
