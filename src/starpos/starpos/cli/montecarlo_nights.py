@@ -111,7 +111,8 @@ def _nees(solved: list[Outcome]) -> np.ndarray:
     """Mean normalised errors squared of position by gravity, on the ground, and heading."""
     if not solved:
         return np.full(3, np.nan)
-    return np.mean([(o.position_nees, o.ground_nees, o.heading_nees) for o in solved], axis=0)
+    # of the rare night whose last pose nobody believed there is no heading
+    return np.nanmean([(o.position_nees, o.ground_nees, o.heading_nees) for o in solved], axis=0)
 
 
 def _errors(args) -> nights.InclinometerErrors:
