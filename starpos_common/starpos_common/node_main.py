@@ -5,8 +5,10 @@ Nothing heavy is imported before the signal handlers are in place, so that a sig
 exit too; an executable's module therefore imports its node inside `make_node`.
 """
 
+import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -32,6 +34,18 @@ def run(make_node, args=None) -> int:
         # launch sends a second SIGINT: it must not meet the default handler while the interpreter ends.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
+
+
+def leave(status: int) -> int:
+    """The status, for an executable whose node has threads; where one still works, end the process with it at once.
+
+    The interpreter would stop such a thread in the middle of compiled code, which may abort the process.
+    """
+    if len(threading.enumerate()) > 1:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status
 
 
 def _run(make_node, args, stopped) -> int:

@@ -123,3 +123,18 @@ def test_a_defect_in_a_callback_shows_its_traceback(start):
     status, err = end(start(spinning="raise KeyError('defect')"))
     assert status == 1
     assert "Traceback" in err and "KeyError: 'defect'" in err
+
+
+def test_a_thread_at_work_does_not_hold_up_the_end():
+    """Nor is it torn down by the interpreter, in whatever it does."""
+    script = (
+        "import atexit, sys, threading, time\n"
+        "from starpos_common.node_main import leave\n"
+        "atexit.register(print, 'torn down')\n"
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+        "print('said')\n"
+        "sys.exit(leave(3))\n"
+    )
+    command = [sys.executable, "-c", script]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=30)
+    assert (ended.returncode, ended.stdout) == (3, "said\n")

@@ -4,11 +4,11 @@
 
 def solver() -> int:
     """The node."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import leave, run
 
     def make_node():
         from starpos_solver.node import SolverNode
 
         return SolverNode()
 
-    return run(make_node)
+    return leave(run(make_node))  # the triangles may be in the making
