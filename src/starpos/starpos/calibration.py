@@ -113,9 +113,8 @@ def calibrate(
     progress("calibrating", 1.0)
     if plumb is None:
         return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
-    if plumb.scatter > _most_scatter(
-        len(sound)
-    ):  # not before: with a wrong A3 the errors are not known either
+    # not before: with a wrong A3 the errors are not known either
+    if plumb.scatter > _most_scatter(len(sound)):
         raise FixError(
             f"{len(sound)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
             "instrument was moved between them, its inclinometer or clock was disturbed, or the place given is wrong"

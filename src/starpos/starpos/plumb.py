@@ -21,7 +21,7 @@ from starpos.solve import Solution
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
 ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10  # beyond it a frame pulls no harder
 TURNS_TRIED = 8
-MOST_SCATTER = 16.0  # chi-square a degree of freedom of frames that have one zenith
+FOUND_SCATTER = 16.0  # chi-square a degree of freedom above which the search stood still somewhere else
 LEAN_CHI2 = 25.0  # by which the tilts must follow the heading before they are believed to
 AMBIGUOUS_SIGMA = 4.0  # zeniths of equally good solutions further apart are two answers
 ANY_TURN = np.sqrt(1.5)  # root mean square of how far any turn takes a point on a circle, in radii, by axis
@@ -135,14 +135,14 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
     known = _Known(turn_sigma=turn_sigma)
     nearest = _fitted(readings, start, known)
     leans = _leans(readings)
-    if nearest.scatter < MOST_SCATTER and not leans:
+    if nearest.scatter < FOUND_SCATTER and not leans:
         return nearest
     # each held near its own start
     starts = _turns(mean, start) if turn_sigma > NARROW_TURN else [(0.0, start)]
     found = [_fitted(readings, start, known) for _, start in starts]
     best = min(found, key=_cost)
     if not leans:  # half a turn from its answer the search may have stood still
-        return best if best.scatter < MOST_SCATTER else nearest
+        return best if best.scatter < FOUND_SCATTER else nearest
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
     lean = np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max()

@@ -63,3 +63,24 @@ def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys)
 def test_save_needs_self_calibrate(turned, tmp_path, capsys):
     status, _, errors = solve(capsys, turned, *WIDE, "--save", tmp_path / "no.yaml")
     assert status == 2 and "give both" in errors[0]
+
+
+@pytest.mark.parametrize("command", [("solve", "--tilt", "t.csv"), ("report",)])
+def test_a_turn_that_nothing_would_use_is_refused(command, capsys):
+    status, _, errors = run(capsys, *command, "x.csv", "--turn-stddev", "2")
+    assert status == 2 and "--self-calibrate" in errors[0]
+
+
+def test_a_map_without_a_camera_is_refused(capsys):
+    status, _, errors = run(capsys, "calibrate", "x.csv", "--map", "m.png", "--site", "1", "2")
+    assert status == 2 and "--camera" in errors[0]
+
+
+def test_a_place_under_the_ground_is_refused(turned, tmp_path, capsys):
+    frames = sorted(turned.glob("stars_*.csv"))[:1]
+    site = ("--site", -PLACE["latitude"], PLACE["longitude"] + 180)
+    out = tmp_path / "no.yaml"
+    status, _, errors = run(
+        capsys, "calibrate", *frames, "--tilt", turned / "tilt.csv", *WIDE, *AIR, *site, "-o", out
+    )
+    assert status == 1 and "into the ground" in errors[-1] and not out.exists()
