@@ -19,7 +19,8 @@ from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS, path_of
-from starpos_camera.sources import Settings, Source, SourceEnded, source_class
+from starpos_camera.sources import Settings, Source, SourceEnded
+from starpos_camera.sources.registry import SOURCES
 from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera
@@ -28,7 +29,7 @@ from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 
 IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
-STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated")
+STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class CameraNode(Node):
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
                     "and pixel_um, until ~/set_camera_info is called."
                 )
-        self._source: Source = source_class(self._values["source"])(self._values, self._now_s)
+        self._source: Source = SOURCES[self._values["source"]](self._values, self._now_s)
 
         self._frames = self._failed = self._skipped = 0
         self._skipped_before = 0  # at the last report
@@ -273,4 +274,4 @@ def _settings(values) -> Settings:
 
 
 def _complaint(values) -> str | None:
-    return source_class(values["source"]).refusal(values, _settings(values))
+    return SOURCES[values["source"]].refusal(values, _settings(values))

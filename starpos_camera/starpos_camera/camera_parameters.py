@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the node `camera`."""
+"""The parameters of the node `camera`; those of a source stand in its module."""
 
 import math
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from starpos.errors import InstrumentError
+from starpos_camera.sources.registry import SOURCES
 from starpos_common.parameters import Parameter
 
-PARAMETERS = (
+COMMON = (
     Parameter(
         "source",
         "files",
         "Where frames come from. A simulated sky gives fixes that are not real: never on a working robot.",
-        choices=("files", "simulated"),
+        choices=tuple(SOURCES),
         read_only=True,
     ),
     Parameter(
@@ -48,6 +49,23 @@ PARAMETERS = (
         1e6,
     ),
     Parameter(
+        "command_lag",
+        0.0,
+        "From the command to the start of the exposure, of cameras that do not tell when it began. Longitudes come out "
+        "15 arcsec too far west for each second it is set too small: so it is found at a known place.",
+        "s",
+        -10.0,
+        60.0,
+    ),
+    Parameter(
+        "command_lag_stddev",
+        0.1,
+        "How much that lag varies from frame to frame; 0.1 s is 46 m at the equator.",
+        "s",
+        0.0,
+        60.0,
+    ),
+    Parameter(
         "calibration_url",
         "",
         "Calibration YAML of the camera (file:///... or a path), written by set_camera_info; without one the "
@@ -70,83 +88,8 @@ PARAMETERS = (
         0.1,
         1000.0,
     ),
-    Parameter(
-        "files.path",
-        "",
-        "Folder of frames (FITS, TIFF, PNG, raw), or a pattern like /nights/1/*.fits; played by name.",
-        read_only=True,
-    ),
-    Parameter("files.loop", False, "Begin again after the last frame.", read_only=True),
-    Parameter(
-        "files.restamp",
-        False,
-        "Stamp the frames with the node's clock instead of their own time. For frames without a time; old ones "
-        "restamped give a wrong longitude, 15 arcsec for each second.",
-        read_only=True,
-    ),
-    Parameter(
-        "simulated.latitude",
-        35.7046,
-        "Astronomic latitude of the simulated place.",
-        "deg",
-        -90.0,
-        90.0,
-    ),
-    Parameter(
-        "simulated.longitude",
-        51.4106,
-        "Astronomic longitude of the simulated place, east positive.",
-        "deg",
-        -180.0,
-        360.0,
-    ),
-    Parameter(
-        "simulated.azimuth",
-        40.0,
-        "Azimuth of the optical axis, clockwise from north.",
-        "deg",
-        -360.0,
-        360.0,
-    ),
-    Parameter(
-        "simulated.altitude",
-        78.0,
-        "Altitude of the optical axis above the horizon; below 60 deg the inclinometer is out of its range.",
-        "deg",
-        5.0,
-        90.0,
-    ),
-    Parameter(
-        "simulated.roll", 15.0, "Roll about the optical axis; 0: rows are level.", "deg", -360.0, 360.0
-    ),
-    Parameter(
-        "simulated.pressure",
-        101325.0,
-        "Air pressure of the simulated place; the solver's refraction.pressure has to agree.",
-        "Pa",
-        0.0,
-        120000.0,
-    ),
-    Parameter(
-        "simulated.temperature",
-        15.0,
-        "Air temperature of the simulated place; the solver's refraction.temperature has to agree.",
-        "deg C",
-        -100.0,
-        80.0,
-    ),
-    Parameter(
-        "simulated.humidity",
-        0.5,
-        "Relative humidity of the simulated place, 0 to 1; the solver's refraction.humidity has to agree.",
-        "",
-        0.0,
-        1.0,
-    ),
-    Parameter("simulated.width", 5616, "Width of the simulated frames.", "px", 16, 20000),
-    Parameter("simulated.height", 3744, "Height of the simulated frames.", "px", 16, 20000),
-    Parameter("simulated.seed", 1, "Seed of the simulated noise.", "", 0, 2**31 - 1, read_only=True),
 )
+PARAMETERS = (*COMMON, *(p for source in SOURCES.values() for p in source.parameters))
 
 
 def path_of(url: str) -> Path:

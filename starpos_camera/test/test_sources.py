@@ -10,7 +10,8 @@ from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.simulate import expose
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import Settings, SourceEnded, source_class
+from starpos_camera.sources import Settings, SourceEnded
+from starpos_camera.sources.registry import SOURCES
 from starpos_interfaces.msg import Capture
 
 NOW_S = 1793642400.0
@@ -24,8 +25,8 @@ def values(**changes):
 
 def make(**changes):
     v = values(**changes)
-    assert source_class(v["source"]).refusal(v, SETTINGS) is None
-    return source_class(v["source"])(v, lambda: NOW_S)
+    assert SOURCES[v["source"]].refusal(v, SETTINGS) is None
+    return SOURCES[v["source"]](v, lambda: NOW_S)
 
 
 def play(source, count):
@@ -92,7 +93,7 @@ def test_a_loop_of_nothing_but_bad_files_says_so(tmp_path):
 
 
 def test_files_refuse_what_they_cannot_do():
-    files = source_class("files")
+    files = SOURCES["files"]
     assert "files.path" in files.refusal(values(), SETTINGS)
     given = values(files__path="/x")
     assert files.refusal(given, SETTINGS) is None
@@ -138,4 +139,4 @@ def test_simulated_sky_follows_its_parameters(scene):
 )
 def test_simulated_sky_refuses_what_it_cannot_do(settings, changes, sentence):
     given = values(**(SMALL | changes))
-    assert sentence in source_class("simulated").refusal(given, settings)
+    assert sentence in SOURCES["simulated"].refusal(given, settings)

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where frames come from. Every camera is a Source; a new one is a module here and a line in `source_class`."""
+"""Where frames come from. Every camera is a Source; a new one is a module here and a line in `registry`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Protocol
 
 from starpos.camera import Camera
 from starpos.errors import StarposError
 from starpos.frame import Frame
+from starpos_common.parameters import Parameter
+
+
+class CaptureError(StarposError):
+    """The camera is not there, or gave no frame."""
 
 
 class SourceEnded(StarposError):
@@ -48,9 +54,11 @@ class Source(Protocol):
     """A camera. Made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
 
     Making one opens nothing and cannot fail for want of a device: `capture` opens what is not open, so that a
-    device may come, go and come back. All methods but `close` and `capture` return at once.
+    device may come, go and come back. All methods but `close` and `capture` return at once. The module imports what
+    only its own devices need (a vendor's library) where it is used: every node imports every source.
     """
 
+    parameters: Sequence[Parameter]  # each named `source.something`
     hardware_id: str
     waits_for_listener: bool  # True: nothing is captured before someone subscribes to the images
 
@@ -75,12 +83,10 @@ class Source(Protocol):
         """Release the device. Called once, after the last `capture` has returned."""
 
 
-def source_class(name: str) -> type[Source]:
-    """The class for a value of the parameter `source`; its module, which may be heavy, is imported here."""
-    if name == "files":
-        from starpos_camera.sources.files import Files
-
-        return Files
-    from starpos_camera.sources.simulated import Simulated
-
-    return Simulated
+def missing(module: str, package: str) -> str | None:
+    """For `refusal`: the sentence where an optional library is not installed, with the line that installs it."""
+    return (
+        None
+        if find_spec(module)
+        else f"this source needs the Python package {package}: pip install {package}"
+    )

@@ -10,9 +10,26 @@ from starpos.errors import FrameError
 from starpos.frame import Frame
 from starpos.reading import FITS, PICTURE, RAW, read_frame
 from starpos_camera.sources import Exposure, Settings, SourceEnded
+from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 SUFFIXES = FITS + PICTURE + RAW
+PARAMETERS = (
+    Parameter(
+        "files.path",
+        "",
+        "Folder of frames (FITS, TIFF, PNG, raw), or a pattern like /nights/1/*.fits; played by name.",
+        read_only=True,
+    ),
+    Parameter("files.loop", False, "Begin again after the last frame.", read_only=True),
+    Parameter(
+        "files.restamp",
+        False,
+        "Stamp the frames with the node's clock instead of their own time. For frames without a time; old ones "
+        "restamped give a wrong longitude, 15 arcsec for each second.",
+        read_only=True,
+    ),
+)
 
 
 class Files:
@@ -22,6 +39,7 @@ class Files:
     next one.
     """
 
+    parameters = PARAMETERS
     waits_for_listener = True  # else the first frames of a night are gone before the detector is up
 
     @staticmethod

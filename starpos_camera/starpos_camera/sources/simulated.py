@@ -6,21 +6,85 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from starpos.atmosphere import Atmosphere
-from starpos.catalogue import load as load_catalogue
 from starpos.instrument import focal_px_of
-from starpos.simulate import Scene, expose, render, scene_of
 from starpos_camera.sources import Exposure, Settings
+from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 DEFAULT_EXPOSURE_S = 0.5
 MAX_EXPOSURE_S = 10.0  # the time and the memory of a render grow with the length of the trails
 MAX_PIXELS = 100_000_000
 STAMP_ROUNDING_S = 1e-6
+PARAMETERS = (
+    Parameter(
+        "simulated.latitude",
+        35.7046,
+        "Astronomic latitude of the simulated place.",
+        "deg",
+        -90.0,
+        90.0,
+    ),
+    Parameter(
+        "simulated.longitude",
+        51.4106,
+        "Astronomic longitude of the simulated place, east positive.",
+        "deg",
+        -180.0,
+        360.0,
+    ),
+    Parameter(
+        "simulated.azimuth",
+        40.0,
+        "Azimuth of the optical axis, clockwise from north.",
+        "deg",
+        -360.0,
+        360.0,
+    ),
+    Parameter(
+        "simulated.altitude",
+        78.0,
+        "Altitude of the optical axis above the horizon; below 60 deg the inclinometer is out of its range.",
+        "deg",
+        5.0,
+        90.0,
+    ),
+    Parameter(
+        "simulated.roll", 15.0, "Roll about the optical axis; 0: rows are level.", "deg", -360.0, 360.0
+    ),
+    Parameter(
+        "simulated.pressure",
+        101325.0,
+        "Air pressure of the simulated place; the solver's refraction.pressure has to agree.",
+        "Pa",
+        0.0,
+        120000.0,
+    ),
+    Parameter(
+        "simulated.temperature",
+        15.0,
+        "Air temperature of the simulated place; the solver's refraction.temperature has to agree.",
+        "deg C",
+        -100.0,
+        80.0,
+    ),
+    Parameter(
+        "simulated.humidity",
+        0.5,
+        "Relative humidity of the simulated place, 0 to 1; the solver's refraction.humidity has to agree.",
+        "",
+        0.0,
+        1.0,
+    ),
+    Parameter("simulated.width", 5616, "Width of the simulated frames.", "px", 16, 20000),
+    Parameter("simulated.height", 3744, "Height of the simulated frames.", "px", 16, 20000),
+    Parameter("simulated.seed", 1, "Seed of the simulated noise.", "", 0, 2**31 - 1, read_only=True),
+)
 
 
 class Simulated:
     """Renders the exposure that has just ended, through an ideal camera."""
 
+    parameters = PARAMETERS
     waits_for_listener = False
 
     @staticmethod
@@ -48,6 +112,9 @@ class Simulated:
         """Nothing: the sky is always there."""
 
     def capture(self, settings: Settings) -> Exposure:
+        from starpos.catalogue import load as load_catalogue
+        from starpos.simulate import expose, render
+
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s
         scene = self._scene
@@ -62,8 +129,10 @@ class Simulated:
         """Nothing is held open."""
 
 
-def scene_from(values: Mapping) -> Scene:
-    """The scene of the node's parameters."""
+def scene_from(values: Mapping):
+    """The starpos.simulate.Scene of the node's parameters."""
+    from starpos.simulate import scene_of
+
     return scene_of(
         size=(values["simulated.width"], values["simulated.height"]),
         focal_px=focal_px_of(values["focal_mm"], values["pixel_um"]),
