@@ -40,3 +40,8 @@ class CalibrationError(StarposError):
 
 class FixError(StarposError):
     """The stars do not support a fix."""
+
+
+def one_line(error) -> str:
+    """What a library says of its trouble, short enough to stand in a sentence of ours."""
+    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -8,6 +8,7 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.stars import check_focal, check_size, check_times
 
+MAX_PIXELS = 200_000_000  # a header may claim anything; this much fits a small robot's memory
 PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 
 
@@ -59,3 +60,30 @@ class Frame:
     @property
     def height(self) -> int:
         return self.pixels.shape[0]
+
+
+def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
+    """uint8 or uint16 (h, w) of any real values by the rule of starpos.reading.read_frame; FrameError of others."""
+    if values.dtype.kind not in "uif":
+        raise FrameError(f"{place}: its pixels are {values.dtype}; give numbers.")
+    if values.dtype.kind == "u" and values.dtype.itemsize <= 2:
+        return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+    if values.dtype.kind == "f":
+        finite = np.isfinite(values)
+        if finite.mean() < 0.99:
+            raise FrameError(f"{place}: more than 1 % of its pixels are NaN or infinite; mask fewer of them.")
+        if not finite.all():
+            values = np.where(finite, values, np.median(values[finite]))
+    low, high = float(values.min()), float(values.max())
+    span = high - low
+    narrow = values.dtype.kind == "f" and 0 < span < 4096
+    if not np.isfinite(span):
+        raise FrameError(f"{place}: its pixels span {low:g} to {high:g}; rescale them to 16 bits.")
+    if low >= 0 and high <= 65535 and not narrow:
+        offset, scale = 0.0, 1.0
+    else:
+        offset, scale = low, (65535 / span if narrow or span > 65535 else 1.0)
+    out = np.empty(values.shape, np.uint16)
+    for row in range(0, len(values), 256):  # strips: a float64 copy of a whole frame is 170 MB
+        out[row : row + 256] = np.rint((values[row : row + 256].astype(np.float64) - offset) * scale)
+    return out

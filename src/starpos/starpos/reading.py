@@ -3,29 +3,23 @@
 
 import csv
 import json
-import re
 import stat
 import struct
-import warnings
 import zlib
 from pathlib import Path
 
 import numpy as np
 
-from starpos.errors import FrameError
-from starpos.frame import Frame
+from starpos.errors import FrameError, one_line
+from starpos.fits_frame import read_fits
+from starpos.frame import MAX_PIXELS, Frame, to_unsigned
+from starpos.frame_header import focal_px, times
 from starpos.stars import Stars
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff")
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 PNG = b"\x89PNG\r\n\x1a\n"
-START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
-KEYS = (*START, "TIME-OBS", "TIMESYS", "EXPTIME", "EXPOSURE", "BAYERPAT", "FOCALLEN", "XPIXSZ")
-SCALES = ("utc", "tai", "tt", "tdb")  # of TIMESYS; UT1 would need tables
-FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
-MAX_PIXELS = 200_000_000  # a header may claim anything; this much fits a small robot's memory
-MAX_EXPOSURE_S = 86400.0
 DEFAULT_SIGMA_PX = 0.1  # of a centroid whose file has no sigma
 
 
@@ -51,7 +45,7 @@ def read_frame(path) -> Frame | Stars:
         _check_file(path)
         return _reader_of(path)(path)
     except OSError as e:
-        reason = e.strerror or _one_line(e)
+        reason = e.strerror or one_line(e)
         raise FrameError(f"{path}: it cannot be read ({reason}); check its permissions and the disk.") from e
 
 
@@ -60,7 +54,7 @@ def _check_file(path):
     try:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a NUL in the name
-        raise FrameError(f"{_one_line(path)}: there is no such file; check the path.") from None
+        raise FrameError(f"{one_line(path)}: there is no such file; check the path.") from None
     if stat.S_ISDIR(status.st_mode):
         raise FrameError(f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}.")
     if not stat.S_ISREG(status.st_mode):
@@ -74,7 +68,7 @@ def _reader_of(path):
     """The function that reads files of this suffix."""
     suffix = path.suffix.lower()
     for suffixes, reader in (
-        (FITS, _read_fits),
+        (FITS, read_fits),
         (PICTURE, _read_picture),
         (RAW, _read_raw),
         ((".csv",), _read_csv),
@@ -85,121 +79,6 @@ def _reader_of(path):
     raise FrameError(f"{path}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
 
 
-def _read_fits(path):
-    from astropy.io import fits
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with fits.open(path, memmap=False, lazy_load_hdus=True) as hdus:
-                header, values = _first_image(hdus, path)
-    except (*FITS_TROUBLE, fits.VerifyError) as e:
-        raise FrameError(
-            f"{path}: this is not a whole FITS image ({_one_line(e)}); take or copy it again."
-        ) from e
-    pixels = _to_unsigned(values, path)
-    mid, exposure = _times(header, path)
-    pattern = str(header.get("BAYERPAT", "")).strip().lower()
-    if pattern not in ("", "rggb", "bggr", "grbg", "gbrg"):
-        raise FrameError(f"{path}: BAYERPAT is {pattern!r}; it must be RGGB, BGGR, GRBG or GBRG.")
-    return Frame(pixels, pattern, mid, exposure, str(path), _focal_px(header))
-
-
-def _first_image(hdus, path):
-    """Header (a dict of KEYS) and data (h, w) of the first HDU that holds an image."""
-    for hdu in hdus:
-        shape = [int(n) for n in hdu.shape] if hdu.is_image else []
-        if not shape:
-            continue
-        if len(shape) != 2 and not (len(shape) > 2 and max(shape[:-2]) == 1):
-            size = " x ".join(map(str, reversed(shape)))
-            raise FrameError(
-                f"{path}: the image has {len(shape)} axes ({size}); give one monochrome plane a file."
-            )
-        if min(shape) < 1 or shape[-1] * shape[-2] > MAX_PIXELS:
-            raise FrameError(
-                f"{path}: its header claims {shape[-1]} x {shape[-2]} pixels; a frame has 1 to {MAX_PIXELS}."
-            )
-        header = {key: hdu.header[key] for key in KEYS if key in hdu.header}
-        return header, np.asarray(hdu.data).reshape(shape[-2:])
-    raise FrameError(f"{path}: there is no image in this FITS file; give one that holds a frame.")
-
-
-def _to_unsigned(values, path):
-    """uint8 or uint16 (h, w) of any real values; the rule is read_frame's."""
-    if values.dtype.kind not in "uif":
-        raise FrameError(f"{path}: its pixels are {values.dtype}; give numbers.")
-    if values.dtype.kind == "u" and values.dtype.itemsize <= 2:
-        return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
-    if values.dtype.kind == "f":
-        finite = np.isfinite(values)
-        if finite.mean() < 0.99:
-            raise FrameError(f"{path}: more than 1 % of its pixels are NaN or infinite; mask fewer of them.")
-        if not finite.all():
-            values = np.where(finite, values, np.median(values[finite]))
-    low, high = float(values.min()), float(values.max())
-    span = high - low
-    narrow = values.dtype.kind == "f" and 0 < span < 4096
-    if not np.isfinite(span):
-        raise FrameError(f"{path}: its pixels span {low:g} to {high:g}; rescale them to 16 bits.")
-    if low >= 0 and high <= 65535 and not narrow:
-        offset, scale = 0.0, 1.0
-    else:
-        offset, scale = low, (65535 / span if narrow or span > 65535 else 1.0)
-    out = np.empty(values.shape, np.uint16)
-    for row in range(0, len(values), 256):  # strips: a float64 copy of a whole frame is 170 MB
-        out[row : row + 256] = np.rint((values[row : row + 256].astype(np.float64) - offset) * scale)
-    return out
-
-
-def _times(header, path):
-    """Middle of the exposure (Unix time, UTC) and its length in s, each None where the header has none."""
-    exposure = next((header[k] for k in ("EXPTIME", "EXPOSURE") if header.get(k) not in (None, "")), None)
-    if exposure is not None:
-        try:
-            exposure = float(exposure)
-        except (TypeError, ValueError, OverflowError):
-            exposure = np.nan
-        if not 0 <= exposure <= MAX_EXPOSURE_S:
-            raise FrameError(
-                f"{path}: its exposure (EXPTIME) is not 0 to {MAX_EXPOSURE_S:.0f} s; correct the header."
-            )
-    key = next((k for k in START if header.get(k) not in (None, "")), None)
-    if key is None or exposure is None:
-        return None, exposure
-    start = header[key]
-    if key == "DATE-OBS" and "T" not in str(start) and header.get("TIME-OBS"):
-        start = f"{start}T{header['TIME-OBS']}"
-    if isinstance(start, str) and re.fullmatch(r"\d{4}-\d\d-\d\d", start.strip()):
-        return None, exposure  # a day without an hour is no time
-    scale = str(header.get("TIMESYS", "UTC")).strip().lower()
-    if scale not in SCALES:
-        raise FrameError(f"{path}: its TIMESYS is {scale!r}; it must be one of {', '.join(SCALES)}.")
-    return _middle(start, exposure, scale, f"{path}: its {key}"), exposure
-
-
-def _middle(start, exposure_s, scale, what):
-    """Unix time of start (ISO 8601 text or an MJD) + exposure / 2, counted in TAI: safe at a leap second."""
-    from astropy.utils import iers
-
-    iers.conf.auto_download = False  # before astropy.time is imported, which looks for leap seconds
-    from astropy.time import Time, TimeDelta
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if isinstance(start, str):
-                begin = Time(start.strip().removesuffix("Z"), format="isot", scale=scale)
-            else:
-                begin = Time(float(start), format="mjd", scale=scale)
-            unix = float((begin.utc + TimeDelta(exposure_s / 2, format="sec")).unix)
-    except (ValueError, TypeError, OverflowError):
-        unix = np.nan
-    if not np.isfinite(unix):
-        raise FrameError(f"{what} is {start!r}, which is no time; write it like 2026-11-02T18:00:00.000.")
-    return unix
-
-
 def why_no_time(source: str) -> str:
     """What a frame lacks whose mid_unix_s is None, and what to do: by the suffix of the file it came from."""
     suffix = Path(source).suffix.lower()
@@ -208,15 +87,6 @@ def why_no_time(source: str) -> str:
     if suffix in (*FITS, ".csv"):
         return "its header needs DATE-OBS with an hour, and EXPTIME: add them"
     return "its header stamp is missing: set it to the middle of the exposure, UTC"
-
-
-def _focal_px(header):
-    """FOCALLEN (mm) / XPIXSZ (um) in px; None where one is missing or senseless: it is but a hint."""
-    try:
-        focal = float(header["FOCALLEN"]) * 1000.0 / float(header["XPIXSZ"])
-    except (KeyError, TypeError, ValueError, ArithmeticError):
-        return None
-    return focal if np.isfinite(focal) and focal > 0 else None
 
 
 def _read_picture(path):
@@ -241,7 +111,7 @@ def _read_picture(path):
             pixels = (pixels >> 8).astype(np.uint8)
         pixels = np.ascontiguousarray(pixels)
     if pixels.ndim == 2:
-        pixels = _to_unsigned(pixels, path)
+        pixels = to_unsigned(pixels, path)
     return Frame(pixels, source=str(path))
 
 
@@ -310,12 +180,12 @@ def _read_raw(path):
             colours = raw.color_desc.decode("ascii", "replace")
             pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
     except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError) as e:
-        raise FrameError(f"{path}: this is not a whole raw file ({_one_line(e)}); copy it again.") from e
+        raise FrameError(f"{path}: this is not a whole raw file ({one_line(e)}); copy it again.") from e
     if pattern not in ("rggb", "bggr", "grbg", "gbrg"):
         raise FrameError(
             f"{path}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
         )
-    return Frame(_to_unsigned(pixels, path), pattern, source=str(path))
+    return Frame(to_unsigned(pixels, path), pattern, source=str(path))
 
 
 def _read_csv(path):
@@ -337,7 +207,7 @@ def _read_csv(path):
     try:
         rows = [row for row in csv.reader(rest.splitlines()) if row]
     except csv.Error as e:
-        raise FrameError(f"{path}: this is not a CSV ({_one_line(e)}); write one star a line.") from None
+        raise FrameError(f"{path}: this is not a CSV ({one_line(e)}); write one star a line.") from None
     names = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "flux"} <= set(names):
         raise FrameError(
@@ -356,7 +226,7 @@ def _read_csv(path):
             f"{path}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
         )
     order = np.argsort(-column["flux"], kind="stable")
-    mid, exposure = _times(header, path)
+    mid, exposure = times(header, path)
     return Stars(
         x=column["x"][order],
         y=column["y"][order],
@@ -369,9 +239,5 @@ def _read_csv(path):
         mid_unix_s=mid,
         exposure_s=exposure,
         source=str(path),
-        focal_px=_focal_px(header),
+        focal_px=focal_px(header),
     )
-
-
-def _one_line(error):
-    return " ".join(str(error).split())[:120] or type(error).__name__

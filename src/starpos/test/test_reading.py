@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 
 from starpos.errors import FrameError
+from starpos.fits_frame import decode_fits
 from starpos.frame import Frame
 from starpos.reading import read_frame
 
@@ -305,3 +306,13 @@ def test_a_file_that_may_not_be_opened(tmp_path):
     loop.symlink_to(loop)
     with pytest.raises(FrameError, match="cannot be read"):
         read_frame(loop)
+
+
+def test_the_bytes_of_a_fits_file_are_read_like_the_file_and_short_ones_refused(tmp_path):
+    data = write_fits(tmp_path / "a.fits", np.tile(PIXELS, (50, 50)), **NIGHT).read_bytes()
+    frame = decode_fits(data, "the camera's frame")
+    assert np.array_equal(frame.pixels, read_frame(tmp_path / "a.fits").pixels)
+    assert (frame.mid_unix_s, frame.source) == (unix(2026, 11, 2, 18) + 0.375, "the camera's frame")
+    for length in (0, 100, 2880, 2881, len(data) - 2880):
+        with pytest.raises(FrameError, match=r"^the camera's frame: .*\.$"):
+            decode_fits(data[:length], "the camera's frame")

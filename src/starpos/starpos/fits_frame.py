@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FITS to frames, from a file or from the bytes of one that a camera's driver has sent."""
+
+import io
+import warnings
+
+import numpy as np
+
+from starpos.errors import FrameError, one_line
+from starpos.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
+from starpos.frame_header import KEYS, focal_px, times
+
+FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
+
+
+def read_fits(path) -> Frame:
+    """A frame from a FITS file (also .fz and .gz) by the rules of reading.read_frame; FrameError if it is none."""
+    return _read(path, str(path))
+
+
+def decode_fits(data: bytes, source: str) -> Frame:
+    """The same from a FITS file's bytes; `source` says where they came from. FrameError where they are no whole frame."""
+    return _read(io.BytesIO(data), source)
+
+
+def _read(file, place):
+    from astropy.io import fits
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with fits.open(file, memmap=False, lazy_load_hdus=True) as hdus:
+                header, values = _first_image(hdus, place)
+    except (*FITS_TROUBLE, fits.VerifyError) as e:
+        raise FrameError(
+            f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
+        ) from e
+    mid, exposure = times(header, place)
+    pattern = str(header.get("BAYERPAT", "")).strip().lower()
+    if pattern not in PATTERNS:
+        raise FrameError(f"{place}: BAYERPAT is {pattern!r}; it must be RGGB, BGGR, GRBG or GBRG.")
+    return Frame(to_unsigned(values, place), pattern, mid, exposure, place, focal_px(header))
+
+
+def _first_image(hdus, place):
+    """Header (a dict of KEYS) and data (h, w) of the first HDU that holds an image."""
+    for hdu in hdus:
+        shape = [int(n) for n in hdu.shape] if hdu.is_image else []
+        if not shape:
+            continue
+        if len(shape) != 2 and not (len(shape) > 2 and max(shape[:-2]) == 1):
+            size = " x ".join(map(str, reversed(shape)))
+            raise FrameError(
+                f"{place}: the image has {len(shape)} axes ({size}); give one monochrome plane a file."
+            )
+        if min(shape) < 1 or shape[-1] * shape[-2] > MAX_PIXELS:
+            raise FrameError(
+                f"{place}: its header claims {shape[-1]} x {shape[-2]} pixels; a frame has 1 to {MAX_PIXELS}."
+            )
+        header = {key: hdu.header[key] for key in KEYS if key in hdu.header}
+        return header, np.asarray(hdu.data).reshape(shape[-2:])
+    raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame's header tells beside its pixels: when and how long it was exposed, and the focal length.
+
+A header is a mapping of FITS keywords (those of KEYS) to values of any kind, of which nothing is believed unchecked.
+"""
+
+import re
+import warnings
+from collections.abc import Mapping
+
+import numpy as np
+
+from starpos.errors import FrameError
+
+START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
+KEYS = (*START, "TIME-OBS", "TIMESYS", "EXPTIME", "EXPOSURE", "BAYERPAT", "FOCALLEN", "XPIXSZ")
+SCALES = ("utc", "tai", "tt", "tdb")  # of TIMESYS; UT1 would need tables
+MAX_EXPOSURE_S = 86400.0
+
+
+def times(header: Mapping, place: str) -> tuple[float | None, float | None]:
+    """Middle of the exposure (Unix, UTC) and its length in s, None where the header has none; FrameError of a bad one."""
+    exposure = next((header[k] for k in ("EXPTIME", "EXPOSURE") if header.get(k) not in (None, "")), None)
+    if exposure is not None:
+        try:
+            exposure = float(exposure)
+        except (TypeError, ValueError, OverflowError):
+            exposure = np.nan
+        if not 0 <= exposure <= MAX_EXPOSURE_S:
+            raise FrameError(
+                f"{place}: its exposure (EXPTIME) is not 0 to {MAX_EXPOSURE_S:.0f} s; correct the header."
+            )
+    key = next((k for k in START if header.get(k) not in (None, "")), None)
+    if key is None or exposure is None:
+        return None, exposure
+    start = header[key]
+    if key == "DATE-OBS" and "T" not in str(start) and header.get("TIME-OBS"):
+        start = f"{start}T{header['TIME-OBS']}"
+    if isinstance(start, str) and re.fullmatch(r"\d{4}-\d\d-\d\d", start.strip()):
+        return None, exposure  # a day without an hour is no time
+    scale = str(header.get("TIMESYS", "UTC")).strip().lower()
+    if scale not in SCALES:
+        raise FrameError(f"{place}: its TIMESYS is {scale!r}; it must be one of {', '.join(SCALES)}.")
+    return _middle(start, exposure, scale, f"{place}: its {key}"), exposure
+
+
+def _middle(start, exposure_s, scale, what):
+    """Unix time of start (ISO 8601 text or an MJD) + exposure / 2, counted in TAI: safe at a leap second."""
+    from astropy.utils import iers
+
+    iers.conf.auto_download = False  # before astropy.time is imported, which looks for leap seconds
+    from astropy.time import Time, TimeDelta
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if isinstance(start, str):
+                begin = Time(start.strip().removesuffix("Z"), format="isot", scale=scale)
+            else:
+                begin = Time(float(start), format="mjd", scale=scale)
+            unix = float((begin.utc + TimeDelta(exposure_s / 2, format="sec")).unix)
+    except (ValueError, TypeError, OverflowError):
+        unix = np.nan
+    if not np.isfinite(unix):
+        raise FrameError(f"{what} is {start!r}, which is no time; write it like 2026-11-02T18:00:00.000.")
+    return unix
+
+
+def focal_px(header: Mapping) -> float | None:
+    """FOCALLEN (mm) / XPIXSZ (um) in px; None where one is missing or senseless: it is but a hint."""
+    try:
+        focal = float(header["FOCALLEN"]) * 1000.0 / float(header["XPIXSZ"])
+    except (KeyError, TypeError, ValueError, ArithmeticError):
+        return None
+    return focal if np.isfinite(focal) and focal > 0 else None
