@@ -19,9 +19,11 @@ from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS, path_of
-from starpos_camera.sources import Settings, Source, SourceEnded
+from starpos_camera.sources import CaptureError, Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.worker import Worker
+from starpos_common import system_clock
+from starpos_common.clock_report import ClockReport
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera
 from starpos_common.parameters import declare
@@ -30,6 +32,7 @@ from starpos_interfaces.srv import SetCapture
 
 IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
+OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,8 @@ class CameraNode(Node):
         self.create_service(SetCapture, "~/set_capture", self._on_set_capture)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._take, self._wake.trigger, "capture")
-        self._diagnostics = Diagnostics(self, {"Capture": self._report}, self._source.hardware_id)
+        tasks = {"Capture": self._report, "Clock": ClockReport(self, self._stamped_by_system)}
+        self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
         self._timer = None
         self._start_timer()
         self._worker.start()
@@ -96,6 +100,9 @@ class CameraNode(Node):
 
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
+
+    def _stamped_by_system(self) -> bool:
+        return self._last is None or self._last.capture.stamp_source in OF_SYSTEM_CLOCK
 
     def _start_timer(self):
         if self._timer is not None:
@@ -127,13 +134,20 @@ class CameraNode(Node):
 
     def _take(self, settings: Settings) -> Taken:
         """In the worker's thread: a frame, ready to be published."""
-        begin = time.monotonic()
+        begin, clock = time.monotonic(), system_clock.StepWatch()
         exposure = self._source.capture(settings)
+        ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not self.get_clock().ros_time_is_active
+        if ours and (step := clock.step_s()):
+            raise CaptureError(
+                f"a frame is left out: the system's clock was set by {step:+.3g} s while it was taken."
+            )
+        state = system_clock.read() if ours else None
         image = frame_to_message(exposure.frame, self._values["frame_id"])
         capture = Capture(
             header=image.header,
             exposure=float(exposure.frame.exposure_s or 0.0),
             stamp_stddev=float(exposure.stamp_stddev_s),
+            clock_stddev=state.stddev_s if state else 0.0,
             stamp_source=exposure.stamp_source,
         )
         return Taken(image, capture, exposure.camera, time.monotonic() - begin)
@@ -263,6 +277,7 @@ class CameraNode(Node):
                 "size (px)": f"{last.image.width} x {last.image.height}",
                 "exposure (s)": last.capture.exposure,
                 "stamp from": STAMP_SOURCES[last.capture.stamp_source],
+                "stamp error (s)": last.capture.stamp_stddev,
                 "taking one frame (s)": last.seconds,
             }
         return Status(level, sentence, values)

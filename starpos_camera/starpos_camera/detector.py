@@ -31,11 +31,10 @@ MIN_SILENCE_S = 5.0  # without a frame, and three times as long as between the l
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A frame with its message's header and the sigma of its stamp."""
+    """A frame with its message's header."""
 
     frame: Frame
     header: Header
-    stamp_stddev: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +94,13 @@ class DetectorNode(Node):
         self._annotator.stop()
         super().destroy_node()
 
-    def submit(self, frame: Frame, header: Header, stamp_stddev: float = 0.0):
+    def submit(self, frame: Frame, header: Header):
         """Have a frame's stars published under `header`; it replaces one that still waits.
 
         What the subscription does; from any thread. A camera node in the same process calls it to hand over
         its pixels as they are.
         """
-        if self._worker.offer(Job(frame, header, stamp_stddev)):
+        if self._worker.offer(Job(frame, header)):
             self._dropped += 1
 
     def _detection_settings(self) -> DetectionSettings:
@@ -130,8 +129,7 @@ class DetectorNode(Node):
         self._last_frame_s = now
         try:
             _check_stamp(message.header)
-            exposure, stamp_stddev = self._taken(message.header)
-            frame = message_to_frame(message, exposure or None)
+            frame = replace(message_to_frame(message), **self._taken(message.header))
         except StarposError as error:
             self._complain(str(error))
             return
@@ -139,7 +137,7 @@ class DetectorNode(Node):
         if size != self._size:
             self._size = size
             self.get_logger().info(f"frames of {frame.width} x {frame.height} px, {message.encoding}.")
-        self.submit(frame, message.header, stamp_stddev)
+        self.submit(frame, message.header)
 
     def _count_overwritten(self, sequence: int | None):
         """Count the frames that newer ones replaced in the middleware; a lower number is another publisher's."""
@@ -147,19 +145,19 @@ class DetectorNode(Node):
             self._dropped += sequence - self._sequence - 1
         self._sequence = sequence
 
-    def _taken(self, header: Header) -> tuple[float, float]:
-        """Exposure and sigma of the stamp in s, 0 for unknown."""
-        capture = self._captures.pop(_key(header), None)
-        if capture is None:
-            return self._values["exposure"], 0.0
-        known = [v if math.isfinite(v) and v > 0 else 0.0 for v in (capture.exposure, capture.stamp_stddev)]
-        return known[0] or self._values["exposure"], known[1]
+    def _taken(self, header: Header) -> dict[str, float | None]:
+        """What its Capture says of a frame, by the names that Frame has for it."""
+        capture = self._captures.pop(_key(header), None) or Capture()
+        told = (capture.exposure, capture.stamp_stddev, capture.clock_stddev)
+        exposure, stamp, clock = (v if math.isfinite(v) and v > 0 else 0.0 for v in told)
+        exposure = exposure or self._values["exposure"] or None
+        return {"exposure_s": exposure, "stamp_stddev_s": stamp, "clock_stddev_s": clock}
 
     def _detect(self, job: Job) -> Outcome:
         """In the worker's thread."""
         begin, cpu = time.monotonic(), time.thread_time()  # other threads may be drawing, or rendering
         detection = detect(job.frame, self._settings)
-        message = stars_to_message(detection.stars, job.header.frame_id, job.stamp_stddev)
+        message = stars_to_message(detection.stars, job.header.frame_id)
         message.header = job.header  # to the nanosecond: it is what goes with a frame finds it by
         cpu_ms = (time.thread_time() - cpu) * 1e3
         return Outcome(job.frame, message, detection, cpu_ms, time.monotonic() - begin)

@@ -61,7 +61,9 @@ def feed(listener, start):
 def test_stars_are_those_of_starpos_under_the_header_of_the_image(feed, frame):
     def show():
         message = feed.message(frame)
-        feed.captures.publish(Capture(header=message.header, exposure=0.75, stamp_stddev=0.003))
+        feed.captures.publish(
+            Capture(header=message.header, exposure=0.75, stamp_stddev=0.003, clock_stddev=0.02)
+        )
         feed.images.publish(message)
         return feed.wait_for(message)
 
@@ -69,7 +71,8 @@ def test_stars_are_those_of_starpos_under_the_header_of_the_image(feed, frame):
         lambda: show().exposure
     )  # the first Captures go before the detector has found who sends them
     got = show()
-    assert (got.width, got.height, got.exposure, got.stamp_stddev) == (640, 480, 0.75, 0.003)
+    assert (got.width, got.height, got.exposure) == (640, 480, 0.75)
+    assert (got.stamp_stddev, got.clock_stddev) == (0.003, 0.02)
     want = detect(frame).stars
     stars = message_to_stars(got)
     assert len(want) >= 10
@@ -169,10 +172,12 @@ def test_exposure_is_the_parameter_where_no_capture_says_it(listener, start, fra
     feed = Feed(listener, start, "exposure:=0.4")
     assert feed.show(frame).exposure == 0.4
     message = feed.message(frame)
-    feed.captures.publish(Capture(header=message.header, exposure=math.nan, stamp_stddev=math.nan))
+    feed.captures.publish(
+        Capture(header=message.header, exposure=math.nan, stamp_stddev=math.nan, clock_stddev=math.inf)
+    )
     feed.images.publish(message)
     got = feed.wait_for(message)
-    assert (got.exposure, got.stamp_stddev) == (0.4, 0.0)
+    assert (got.exposure, got.stamp_stddev, got.clock_stddev) == (0.4, 0.0, 0.0)
 
 
 def test_parameters_apply_at_run_time(feed, frame):

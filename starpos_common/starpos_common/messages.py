@@ -50,8 +50,8 @@ def unix_to_stamp(unix_s: float | None) -> Time:
     return Time(sec=seconds, nanosec=microseconds * 1000)
 
 
-def stars_to_message(stars: Stars, frame_id: str, stamp_stddev: float = 0.0) -> StarArray:
-    """A StarArray; stamp_stddev in s, 0 unknown."""
+def stars_to_message(stars: Stars, frame_id: str) -> StarArray:
+    """A StarArray."""
     covariance = stars.covariance.reshape(-1, 4)
     columns = zip(
         stars.x.tolist(),
@@ -67,7 +67,8 @@ def stars_to_message(stars: Stars, frame_id: str, stamp_stddev: float = 0.0) -> 
         width=int(stars.width),
         height=int(stars.height),
         exposure=float(stars.exposure_s or 0.0),
-        stamp_stddev=float(stamp_stddev),
+        stamp_stddev=float(stars.stamp_stddev_s),
+        clock_stddev=float(stars.clock_stddev_s),
         stars=[Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns],
     )
 
@@ -87,6 +88,8 @@ def message_to_stars(message: StarArray, source: str = "stars") -> Stars:
         mid_unix_s=stamp_to_unix(message.header.stamp),
         exposure_s=message.exposure or None,
         source=source,
+        stamp_stddev_s=message.stamp_stddev,
+        clock_stddev_s=message.clock_stddev,
     )
 
 
@@ -186,7 +189,7 @@ def frame_to_message(frame: Frame, frame_id: str) -> Image:
     )
 
 
-def message_to_frame(message: Image, exposure_s: float | None = None, source: str = "image_raw") -> Frame:
+def message_to_frame(message: Image, source: str = "image_raw") -> Frame:
     """A Frame on the message's own memory where byte order and alignment allow, else on a copy.
 
     FrameError where encoding, size, step and data do not fit together.
@@ -216,4 +219,4 @@ def message_to_frame(message: Image, exposure_s: float | None = None, source: st
     pixels = np.ndarray(shape, dtype, message.data, strides=strides)
     if not pixels.dtype.isnative or not pixels.flags.aligned:
         pixels = pixels.astype(kind)
-    return Frame(pixels, pattern, stamp_to_unix(message.header.stamp), exposure_s, source)
+    return Frame(pixels, pattern, stamp_to_unix(message.header.stamp), source=source)

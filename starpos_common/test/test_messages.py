@@ -41,18 +41,32 @@ def stars(n=5):
     flux = np.sort(RNG.uniform(100, 1e5, n))[::-1]
     covariance = np.tile([[0.01, 0.002], [0.002, 0.02]], (n, 1, 1))
     x, y = RNG.uniform(0, 100, (2, n))
-    return Stars(x, y, flux, np.sqrt(flux), covariance, np.full(n, EDGE), 200, 100, MID, 0.5)
+    return Stars(
+        x,
+        y,
+        flux,
+        np.sqrt(flux),
+        covariance,
+        np.full(n, EDGE),
+        200,
+        100,
+        MID,
+        0.5,
+        stamp_stddev_s=1e-3,
+        clock_stddev_s=0.02,
+    )
 
 
 def test_stars_round_trip():
     sent = stars()
-    message = messages.stars_to_message(sent, "optical", 1e-3)
+    message = messages.stars_to_message(sent, "optical")
     assert (message.header.frame_id, message.stamp_stddev, message.exposure) == ("optical", 1e-3, 0.5)
     got = messages.message_to_stars(message)
     for name in ("x", "y", "covariance", "flags"):
         assert np.array_equal(getattr(got, name), getattr(sent, name))
     assert got.flux == pytest.approx(sent.flux, rel=1e-6)
     assert (got.width, got.height, got.exposure_s) == (200, 100, 0.5)
+    assert (got.stamp_stddev_s, got.clock_stddev_s) == (1e-3, 0.02)
     assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
 
 
@@ -165,9 +179,9 @@ def test_frames_round_trip_without_a_copy_on_arrival(encoding):
     frame = Frame(pixels(kind, channels), pattern, MID, 0.5)
     message = messages.frame_to_message(frame, "c")
     assert message.encoding == encoding and isinstance(message.data, array.array)
-    got = messages.message_to_frame(message, 0.5)
+    got = messages.message_to_frame(message)
     assert np.array_equal(got.pixels, frame.pixels) and got.pixels.dtype == kind
-    assert got.pattern == pattern and got.exposure_s == 0.5
+    assert got.pattern == pattern
     assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
     assert np.shares_memory(got.pixels, np.frombuffer(message.data, np.uint8))
 

@@ -26,7 +26,7 @@ from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 from starpos_interfaces.srv import Calibrate, SelfCalibrate
 from starpos_solver.averaging import Averaging, News
-from starpos_solver.memory import Poses, RecentFrames, Seen, of_worst_stamp, tilts_of
+from starpos_solver.memory import Poses, RecentFrames, Seen, tilts_of
 from starpos_solver.worker import Outcome, Worker
 
 # Fewer headings hold no check that they are of one place; a service's caller says that they are.
@@ -189,7 +189,7 @@ class Calibrating:
             raise FixError(
                 f"only {len(frames)}{asked} frames with stars and a tilt have arrived: wait for more, or ask for fewer"
             )
-        solver = of_worst_stamp(self._solver(), frames)
+        solver = self._solver()
         site = Site(latitude, longitude, solver.atmosphere)
         turn_deg = self._values["calibration_turn_stddev"]
         stars, tilts = [f.stars for f in frames], tilts_of(frames)
@@ -225,7 +225,7 @@ class Calibrating:
                 f"the instrument has stood at {_headings(len(poses))} here: turn it on the spot, to "
                 f"{FEWEST_HEADINGS} headings or more"
             )
-        solver = of_worst_stamp(self._solver(), poses)
+        solver = self._solver()
         turn_deg = self._values["calibration_turn_stddev"]
         return lambda: _turn(solver, poses, turn_deg)
 

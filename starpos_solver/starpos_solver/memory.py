@@ -11,7 +11,6 @@ from starpos.average import POSE_RAD, POSE_SIGMA
 from starpos.errors import TiltError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, TiltLog
-from starpos.solve import Solver
 from starpos.stars import Stars
 
 MOST_POSES = 36
@@ -20,11 +19,10 @@ MOST_TILTS = 64  # of a pose, the newest
 
 @dataclass(frozen=True)
 class Seen:
-    """The stars of a frame, which have a time, with the tilt and the error (s) of the stamp it came with; 0: unknown."""
+    """The stars of a frame, which have a time, with the tilt."""
 
     stars: Stars
     tilt: Tilt
-    stamp_stddev: float = 0.0
 
 
 class RecentFrames:
@@ -122,17 +120,6 @@ def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
     )
     mean = log.average((times.min() + times.max()) / 2, float(np.ptp(times)))
     return replace(mean, samples=sum(t.samples for t in tilts))
-
-
-def with_stamp(solver: Solver, stamp_stddev: float) -> Solver:
-    """The solver with a clock that errs as much as a frame's stamp says besides; 0: it does not say."""
-    clock = float(np.hypot(solver.instrument.clock_stddev_s, stamp_stddev))
-    return replace(solver, instrument=replace(solver.instrument, clock_stddev_s=clock))
-
-
-def of_worst_stamp(solver: Solver, seen: Sequence[Seen]) -> Solver:
-    """For all of these frames at once."""
-    return with_stamp(solver, max(s.stamp_stddev for s in seen))
 
 
 def tilts_of(seen: Sequence[Seen]) -> Callable[[float, float], Tilt]:

@@ -4,7 +4,7 @@
 import math
 import traceback
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 from starpos import catalogue
 from starpos.average import Average
 from starpos.camera import Camera
-from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.errors import InstrumentError, StarposError
 from starpos.geoid import Geoid
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
@@ -36,7 +36,7 @@ from starpos_interfaces.msg import Solution, StarArray, Tilt
 from starpos_interfaces.srv import SaveCalibration, Solve
 from starpos_solver import outputs, parameters, reports, saving
 from starpos_solver.calibrating import Calibrating
-from starpos_solver.memory import Seen, with_stamp
+from starpos_solver.memory import Seen
 from starpos_solver.tilts import TiltBuffer
 from starpos_solver.worker import Outcome, Worker
 
@@ -46,11 +46,13 @@ POLL_S = 0.02
 
 @dataclass(frozen=True)
 class Waiting:
-    """A frame's stars, as they came and as they are; `since` in ns of the steady clock."""
+    """A frame's stars, as they came and as they are; `since` in ns of the steady clock; by how much the middle of the
+    exposure lay ahead of this node's clock when it came."""
 
     message: StarArray
     stars: Stars
     since_ns: int
+    ahead_s: float
 
 
 class SolverNode(Node):
@@ -102,6 +104,7 @@ class SolverNode(Node):
         tasks = {
             "Solution": self._report_solution,
             "Inputs": self._report_inputs,
+            "Clock": self._report_clock,
             "Calibration": self._calibrating.report,
             "Average": self._calibrating.average.report,
         }
@@ -224,13 +227,15 @@ class SolverNode(Node):
         self._seen("stars")
         try:
             stars = message_to_stars(message)
-            if not 0 <= message.stamp_stddev < math.inf:
-                stddev = message.stamp_stddev
-                raise FrameError(f"stars: stamp_stddev is {stddev} s: it must be 0 (unknown) or more")
+            if not math.isnan(
+                self._values["clock_stddev"]
+            ):  # who sets it knows better than the camera's host
+                stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             self._publish(message.header, Answer(Status.BAD_INPUT, str(e), "stars", None, len(message.stars)))
             return
-        self._waiting.append(Waiting(message, stars, self._steady.now().nanoseconds))
+        ahead_s = (stars.mid_unix_s or 0.0) - self.get_clock().now().nanoseconds * 1e-9
+        self._waiting.append(Waiting(message, stars, self._steady.now().nanoseconds, ahead_s))
         while len(self._waiting) > WAITING:
             self._waiting.popleft()
             self._counts["dropped frames"] += 1
@@ -288,8 +293,9 @@ class SolverNode(Node):
     def _answer_to(self, frame: Waiting, standing: Standing | None) -> Answer:
         stars = frame.stars
         try:
-            solver = with_stamp(self._solver_now(), frame.message.stamp_stddev)
-            return solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing)
+            return self._solver_now().solve(
+                stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing
+            )
         except InstrumentError as e:
             return Answer.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:  # a defect costs this frame, not the night
@@ -306,7 +312,7 @@ class SolverNode(Node):
         except StarposError:
             return
         try:
-            self._calibrating.learn(Seen(stars, tilt, frame.message.stamp_stddev), answer.fix)
+            self._calibrating.learn(Seen(stars, tilt), answer.fix)
         except Exception:  # fix and heading go on without
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
         place = self._calibrating.average.place
@@ -400,6 +406,13 @@ class SolverNode(Node):
             waiting = "building the triangles of this field" if self._preparing.busy else "no frame yet"
             return Report(Level.WARN, self._trouble or waiting, self._counts)
         return reports.of_solution(self._answer, self._counts)
+
+    def _report_clock(self) -> Report:
+        if self._latest is None:
+            return Report(Level.WARN, "no frame yet")
+        stars = self._latest.stars
+        clock_s = self._solver.clock_stddev_s(stars) if self._solver else stars.clock_stddev_s
+        return reports.of_clock(clock_s, stars.stamp_stddev_s, self._latest.ahead_s)
 
     def _report_inputs(self) -> Report:
         now = self._steady.now().nanoseconds

@@ -103,8 +103,8 @@ PARAMETERS = (
     Parameter(
         "clock_stddev",
         NAN,
-        "Error of the frames' time stamps against UTC; unset takes the instrument file's, or 0.01. 1 s is 464 m at the "
-        "equator.",
+        "Error of the clock that stamps the frames against UTC; unset takes what the camera's host says of its clock, at "
+        "least the instrument file's, or 0.01. 1 s is 464 m at the equator. Too small makes fixes claim too much.",
         "s",
         0.0,
         3600.0,

@@ -3,11 +3,16 @@
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from starpos.solve import Solution as Answer
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 
 STALE_S = 5.0
+WIDE_CLOCK_S = 0.1
+EQUATOR_M_PER_S = 465.1
+AHEAD_S = 1.0
 
 
 def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
@@ -29,6 +34,26 @@ def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
         return Report(Level.WARN, old if answer.ok else answer.message, values)
     return Report(Level.OK if answer.ok else Level.WARN, answer.message, values)
+
+
+def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float) -> Report:
+    """How well the time of the newest frame is known; ahead_s: by how much it was ahead of this node's clock."""
+    values = {"clock sigma (s)": clock_stddev_s, "stamp sigma (s)": stamp_stddev_s, "frame age (s)": -ahead_s}
+    if ahead_s > AHEAD_S:
+        return Report(
+            Level.WARN,
+            f"frames come {ahead_s:.3g} s before their time: set the clocks of camera and solver by one source",
+            values,
+        )
+    wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))
+    if wide > WIDE_CLOCK_S:
+        return Report(
+            Level.WARN,
+            f"the time is known to {wide:.2g} s only, {wide * EQUATOR_M_PER_S:.0f} m at the equator: synchronise the "
+            "camera's clock, or set clock_stddev where you know better",
+            values,
+        )
+    return Report(Level.OK, f"the time is known to {wide:.2g} s", values)
 
 
 def of_inputs(ages_s: Mapping[str, float], tilts_kept: int) -> Report:

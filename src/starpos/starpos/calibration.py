@@ -22,7 +22,13 @@ from starpos.stars import Stars
 
 ROUNDS = 4
 SETTLED_RAD = np.radians(0.02 / 3600)
-OF_PLACE = ("refraction", "clock", "ut1", "pole")  # terms that move the zenith of all frames alike
+OF_PLACE = (
+    "refraction",
+    "clock",
+    "time stamp",
+    "ut1",
+    "pole",
+)  # terms that move the zenith, mostly of all frames alike
 VALID_DAYS = 365.0
 MOST_SCATTER = 4.0  # chi-square a degree of freedom of frames that have one zenith
 TURN_SIGMA = 3.0  # by which the fixes hold what the leans told of A3's turn: they are of the same tilts

@@ -87,6 +87,7 @@ def solve_fix(
     atmosphere: Atmosphere,
     earth: EarthState,
     clock_stddev_s: float,
+    stamp_stddev_s: float = 0.0,
 ) -> Fix:
     """The fix of one frame from identified stars.
 
@@ -126,7 +127,9 @@ def solve_fix(
     centroids = stars.covariance_px2[keep] + np.eye(2) * jitter2
     same_stars = ALWAYS if stars.index is None else tuple(stars.index[keep][:MARKS].tolist())
     errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep], same_stars)
-    terms = _terms(problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s)
+    terms = _terms(
+        problem, state, keep, errors, tilt, mounting, atmosphere, earth, (clock_stddev_s, stamp_stddev_s)
+    )
     residual = problem.residual(state)[keep]
     place = place_of(state.a4)
     link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
@@ -217,7 +220,7 @@ class _Problem:
 
 
 def _terms(
-    problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_stddev_s
+    problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_and_stamp_stddev_s
 ) -> tuple[ErrorTerm, ...]:
     """The budget: how the fit passes on the errors of its stars, and what else there is."""
     place = place_of(state.a4)
@@ -233,5 +236,5 @@ def _terms(
         bending,
         place.latitude,
         earth,
-        clock_stddev_s,
+        *clock_and_stamp_stddev_s,
     )

@@ -22,6 +22,8 @@ class Frame:
     exposure_s  None: unknown
     source      where it came from, for messages: a path or a topic
     focal_px    focal length the file's header claims (FOCALLEN / XPIXSZ), px; a hint only; None: unknown
+    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, new in each frame, s; 0: unknown
+    clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common, s; 0: unknown
 
     Raises FrameError on anything else.
     """
@@ -32,6 +34,8 @@ class Frame:
     exposure_s: float | None = None
     source: str = ""
     focal_px: float | None = None
+    stamp_stddev_s: float = 0.0
+    clock_stddev_s: float = 0.0
 
     def __post_init__(self):
         place = self.source or "the frame"
@@ -50,7 +54,7 @@ class Frame:
         if self.pattern not in PATTERNS or (colour and self.pattern):
             allowed = "''" if colour else ", ".join(map(repr, PATTERNS))
             raise FrameError(f"{place}: the colour pattern is {self.pattern!r}; it must be {allowed}.")
-        check_times(self.mid_unix_s, self.exposure_s, place)
+        check_times(self, place)
         check_focal(self.focal_px, place)
 
     @property

@@ -215,9 +215,14 @@ class Solver:
             self.instrument.mounting,
             self.atmosphere,
             state,
-            self.instrument.clock_stddev_s,
+            self.clock_stddev_s(stars),
+            stars.stamp_stddev_s,
         )
         return replace(fix, used=np.flatnonzero(use)[fix.used])
+
+    def clock_stddev_s(self, stars: Stars) -> float:
+        """Of the clock that stamped them: as its own host has it, never better than the instrument's."""
+        return max(self.instrument.clock_stddev_s, stars.clock_stddev_s)
 
     def _camera(self, width: int, height: int) -> Camera:
         camera = self.instrument.camera_for(width, height)

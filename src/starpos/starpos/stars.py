@@ -27,6 +27,8 @@ class Stars:
     exposure_s      None: unknown
     source          where it came from, for messages: a path or a topic
     focal_px        focal length a file's header claims, px; a hint only; None: unknown
+    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, new in each frame; 0: unknown
+    clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common; 0: unknown
 
     Sequences are converted; what does not fit together raises FrameError.
     """
@@ -43,11 +45,13 @@ class Stars:
     exposure_s: float | None = None
     source: str = ""
     focal_px: float | None = None
+    stamp_stddev_s: float = 0.0
+    clock_stddev_s: float = 0.0
 
     def __post_init__(self):
         place = self.source or "the star list"
         check_size(self.width, self.height, place)
-        check_times(self.mid_unix_s, self.exposure_s, place)
+        check_times(self, place)
         check_focal(self.focal_px, place)
         n = np.size(self.x)
         for name in ("x", "y", "flux", "snr"):
@@ -102,10 +106,21 @@ class Stars:
             self.exposure_s,
             self.source,
             self.focal_px,
+            self.stamp_stddev_s,
+            self.clock_stddev_s,
         )
 
 
-def no_stars(width, height, mid_unix_s=None, exposure_s=None, source="", focal_px=None) -> Stars:
+def no_stars(
+    width,
+    height,
+    mid_unix_s=None,
+    exposure_s=None,
+    source="",
+    focal_px=None,
+    stamp_stddev_s=0.0,
+    clock_stddev_s=0.0,
+) -> Stars:
     """The Stars of a frame on which there are none."""
     none = np.zeros(0)
     return Stars(
@@ -121,6 +136,8 @@ def no_stars(width, height, mid_unix_s=None, exposure_s=None, source="", focal_p
         exposure_s,
         source,
         focal_px,
+        stamp_stddev_s,
+        clock_stddev_s,
     )
 
 
@@ -133,8 +150,9 @@ def check_size(width, height, place):
             )
 
 
-def check_times(mid_unix_s, exposure_s, place):
-    """Raise FrameError unless each is None or a finite number, and the exposure is not negative."""
+def check_times(about, place):
+    """Raise FrameError unless a Frame's or Stars' times are finite numbers or None, exposure and errors not negative."""
+    mid_unix_s, exposure_s = about.mid_unix_s, about.exposure_s
     if mid_unix_s is not None and not np.isfinite(mid_unix_s):
         raise FrameError(
             f"{place}: the time of the exposure's middle is {mid_unix_s}; give a Unix time or None."
@@ -143,6 +161,10 @@ def check_times(mid_unix_s, exposure_s, place):
         raise FrameError(
             f"{place}: the exposure is {exposure_s} s; give 0 or more, or None where it is unknown."
         )
+    for name in ("stamp_stddev_s", "clock_stddev_s"):
+        value = getattr(about, name)
+        if not (np.isfinite(value) and value >= 0):
+            raise FrameError(f"{place}: {name} is {value}; it must be 0 (unknown) or more.")
 
 
 def check_focal(focal_px, place):

@@ -141,10 +141,21 @@ def test_stars_that_agree_on_nothing(rng):
             field.solve(xy, wrong, STATE)
 
 
-def drawn(field, rng, centroid=0.0, place=0.0, tilt=0.0, calibration=0.0, clock=0.0, ut1=0.0, refraction=0.0):
-    """A fix whose every error is drawn from the sigma it was told: px, arcsec, arcsec, arcsec, s, s, fraction."""
+def drawn(
+    field,
+    rng,
+    centroid=0.0,
+    place=0.0,
+    tilt=0.0,
+    calibration=0.0,
+    clock=0.0,
+    stamp=0.0,
+    ut1=0.0,
+    refraction=0.0,
+):
+    """A fix whose every error is drawn from the sigma it was told: px, arcsec, arcsec, arcsec, s, s, s, fraction."""
     state = replace(STATE, orientation=replace(STATE.orientation, ut1_sigma_s=ut1, pole_sigma=0.0))
-    true = replace(field, utc=field.utc + rng.normal(0, clock) + rng.normal(0, ut1))
+    true = replace(field, utc=field.utc + rng.normal(0, clock) + rng.normal(0, stamp) + rng.normal(0, ut1))
     air = Atmosphere(field.air.pressure_pa, field.air.temperature_c, 0.3, temperature_stddev_c=0.0,
                      pressure_stddev_pa=refraction * field.air.pressure_pa)  # fmt: skip
     true_air = replace(air, pressure_pa=air.pressure_pa * (1 + rng.normal(0, refraction)))
@@ -164,6 +175,7 @@ def drawn(field, rng, centroid=0.0, place=0.0, tilt=0.0, calibration=0.0, clock=
         mounting=field.mounting(calibration),
         atmosphere=air,
         clock_stddev_s=clock,
+        stamp_stddev_s=stamp,
     )
 
 
@@ -174,6 +186,7 @@ SOURCES = {
     "calibration": {"calibration": 20.0, "centroid": 0.01},
     "refraction": {"refraction": 0.1, "centroid": 0.001},
     "clock": {"clock": 0.5, "centroid": 0.01},
+    "time stamp": {"stamp": 0.5, "centroid": 0.01},
     "ut1": {"ut1": 0.1, "centroid": 0.01},
     "all": {
         "centroid": 0.1,
@@ -182,6 +195,7 @@ SOURCES = {
         "calibration": 5.0,
         "refraction": 0.1,
         "clock": 0.3,
+        "stamp": 0.2,
         "ut1": 0.1,
     },
 }
@@ -211,7 +225,7 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
     bound = 4 * np.sqrt(2 / tries)
     assert np.mean(together) / 3 == pytest.approx(1, abs=bound / np.sqrt(3))  # with what they have in common
     assert np.mean(position) / 2 == pytest.approx(1, abs=bound / np.sqrt(2))
-    if source not in ("clock", "ut1"):  # these turn the Earth: heading and attitude do not mind
+    if source not in ("clock", "time stamp", "ut1"):  # these turn the Earth: heading and attitude do not mind
         assert np.mean(heading) == pytest.approx(1, abs=bound)
         assert np.mean(attitude) == pytest.approx(1, abs=bound)
 
@@ -237,7 +251,7 @@ def test_the_budget_says_which_errors_are_common(rng):
     field = Field()
     xy, places = field.places(STATE, rng)
     common = {t.name: t.common for t in field.solve(xy, places, STATE).terms}
-    new = {"centroids", "tilt", "tilt quantisation"}
+    new = {"centroids", "tilt", "tilt quantisation", "time stamp"}
     assert {name for name, is_common in common.items() if not is_common} == new
     assert set(common) - new == {"catalogue", "calibration", "tilt drift", "tilt temperature", "tilt scale", "refraction",
                                  "clock", "ut1", "pole"}  # fmt: skip

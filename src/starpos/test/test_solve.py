@@ -21,6 +21,7 @@ from scenes import (
     with_false_stars,
 )
 
+from starpos.average import average
 from starpos.camera import Camera
 from starpos.cli.common import tell_extrapolation
 from starpos.earth import curvature_radii_m, earth_state, station_velocity
@@ -114,6 +115,44 @@ def test_over_many_nights_the_claims_hold(catalogue, rng):
         heading.append(h**2)
     assert np.mean(position) == pytest.approx(1, abs=4 / np.sqrt(25))
     assert np.mean(heading) < 1 + 4 * np.sqrt(2 / 25)
+
+
+def test_what_a_host_says_of_its_clock_widens_the_fix_and_never_narrows_it(catalogue, rng):
+    scene = wide_scene()
+    stars, tilt, solver = stars_of(scene, catalogue, rng), tilt_of(scene, rng), solver_of(scene, catalogue)
+    metres_per_s = 465.1 * np.cos(np.radians(scene.site.latitude_deg))
+
+    def claimed_s(name, **told):
+        terms = {t.name: t for t in solver.solve(replace(stars, **told), tilt).fix.terms}
+        return np.sqrt(terms[name].covariance[0, 0]) / metres_per_s
+
+    own = solver.instrument.clock_stddev_s
+    assert claimed_s("clock") == pytest.approx(own, rel=0.01)
+    assert claimed_s("clock", clock_stddev_s=16.0) == pytest.approx(16.0, rel=0.01)
+    assert claimed_s("clock", clock_stddev_s=own / 10) == pytest.approx(own, rel=0.01)
+    assert claimed_s("time stamp") == 0
+    assert claimed_s("time stamp", stamp_stddev_s=0.29) == pytest.approx(0.29, rel=0.01)
+
+
+def test_stamps_that_err_each_for_itself_average_and_their_clock_does_not(catalogue, rng):
+    scene = wide_scene(tilt_noise_deg=0.0)
+    stars, tilt = stars_of(scene, catalogue, rng), tilt_of(scene, rng)
+    exact = replace(
+        scene.instrument,
+        calibration=Calibration.of(scene.instrument.calibration.misalignment_deg, (0.0,) * 3),
+        inclinometer=replace(EXACT, noise_rad=1e-9),
+    )
+    solver = solver_of(replace(scene, instrument=exact), catalogue)
+
+    def sigma_east_m(**told):
+        fix = solver.solve(replace(stars, **told), tilt).fix
+        return np.sqrt(
+            average([replace(fix, utc_unix_s=fix.utc_unix_s + k) for k in range(25)]).covariance[0, 0]
+        )
+
+    alone = np.sqrt(solver.solve(replace(stars, stamp_stddev_s=1.0), tilt).fix.covariance[0, 0])
+    assert sigma_east_m(stamp_stddev_s=1.0) == pytest.approx(alone / 5, rel=0.1)
+    assert sigma_east_m(clock_stddev_s=1.0) == pytest.approx(alone, rel=0.1)
 
 
 def test_pixels_that_are_not_square_and_a_lens_that_distorts(catalogue, rng):

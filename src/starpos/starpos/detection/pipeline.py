@@ -14,7 +14,11 @@ from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.stars import Stars, no_stars
 
-ABOUT = ("width", "height", "mid_unix_s", "exposure_s", "source", "focal_px")
+# fmt: off
+ABOUT = (
+    "width", "height", "mid_unix_s", "exposure_s", "source", "focal_px", "stamp_stddev_s", "clock_stddev_s",
+)
+# fmt: on
 CHUNK_PIXELS = 200_000  # of stars fitted at once: a few tens of megabytes
 PEAKS = 10_000  # looked at; at least twice as many as stars are wanted, as hot pixels are peaks too
 

@@ -21,11 +21,10 @@ TRUTH_LIMIT = 1 << 26
 
 @dataclass(frozen=True)
 class Exposure:
-    """A frame's stars, or why there are none; clock_stddev_s: of its time stamp, where that is told."""
+    """A frame's stars, or why there are none."""
 
     name: str
     stars: Stars | FrameError
-    clock_stddev_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -59,12 +59,12 @@ def exposure_of(m) -> Exposure:
             mid_unix_s=at,
             exposure_s=m.exposure or None,
             source=name,
+            stamp_stddev_s=m.stamp_stddev,
+            clock_stddev_s=getattr(m, "clock_stddev", 0.0),  # bags from before it was told
         )
     except FrameError as error:
         return Exposure(name, error)
-    if not 0 <= m.stamp_stddev < np.inf:
-        return Exposure(name, FrameError(f"{name}: stamp_stddev is {m.stamp_stddev} s: it must be 0 or more"))
-    return Exposure(name, stars, m.stamp_stddev)
+    return Exposure(name, stars)
 
 
 def camera_of(m) -> Camera:

@@ -39,12 +39,8 @@ class Workshop:
     turn_stddev_deg: float | None = None
     progress: Progress = quiet
 
-    def solver(self, stars: Stars, clock_stddev_s: float) -> Solver:
-        instrument = self.instrument_for(stars)
-        if clock_stddev_s:
-            clock = float(np.hypot(instrument.clock_stddev_s, clock_stddev_s))
-            instrument = replace(instrument, clock_stddev_s=clock)
-        return Solver(instrument, self.catalogue, self.atmosphere, progress=self.progress)
+    def solver(self, stars: Stars) -> Solver:
+        return Solver(self.instrument_for(stars), self.catalogue, self.atmosphere, progress=self.progress)
 
 
 def worked(exposures: Exposures, shop: Workshop) -> Night:
@@ -87,7 +83,7 @@ def _one_by_one(exposures: Exposures, shop: Workshop) -> Iterator:
         if not isinstance(exposure.stars, Stars):
             yield exposure, _unreadable(exposure), None, ()
             continue
-        solver = shop.solver(exposure.stars, exposure.clock_stddev_s)
+        solver = shop.solver(exposure.stars)
         size = exposure.stars.width, exposure.stars.height
         if size not in prepared:  # else the time of the first frame would hold the building of the triangles
             prepared.add(size)
@@ -104,7 +100,7 @@ def _turned(exposures: Exposures, shop: Workshop) -> Iterator:
     good = [e for e in rows if isinstance(e.stars, Stars)]
     answers, instrument, said = iter(()), None, ()
     if good:
-        solver = shop.solver(good[0].stars, good[0].clock_stddev_s)
+        solver = shop.solver(good[0].stars)
         instrument = solver.instrument
         try:
             turned = turn(

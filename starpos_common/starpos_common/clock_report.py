@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The diagnostic `Clock` of a node that stamps with this machine's clock."""
+
+import time
+from collections.abc import Callable
+
+from rclpy.node import Node
+
+from starpos_common import system_clock
+from starpos_common.diagnostics import Level, Status
+
+TOLD_S = 30.0  # how long a step is told
+ARCSEC_PER_S = 15.041  # of longitude
+
+
+class ClockReport:
+    """Whether stamps can be believed; a step is logged once. `matters`: False while no stamp comes from this clock."""
+
+    def __init__(self, node: Node, matters: Callable[[], bool] = lambda: True):
+        self._node = node
+        self._matters = matters
+        self._watch = system_clock.StepWatch()
+        self._step_s = 0.0
+        self._stepped_at = -TOLD_S  # monotonic, s
+
+    def __call__(self) -> Status:
+        if self._node.get_clock().ros_time_is_active:
+            return Status(Level.OK, "time is simulated (use_sim_time).")
+        now = time.monotonic()
+        if step := self._watch.step_s():
+            self._step_s, self._stepped_at = step, now
+            self._node.get_logger().warning(f"{self._said(step)}.")
+        state = system_clock.read()
+        values = {"last step (s)": self._step_s}
+        if state is not None:
+            values |= {
+                "synchronised": state.synchronised,
+                "maximum error (s)": state.max_error_s,
+                "estimated error (s)": state.est_error_s,
+            }
+        if not self._matters():
+            return Status(Level.OK, "the frames carry times of their own.", values)
+        if now - self._stepped_at < TOLD_S:
+            return Status(Level.WARN, f"{self._said(self._step_s)}.", values)
+        if state is None:
+            cure = "the solver takes it for as good as its clock_stddev says"
+            return Status(Level.WARN, f"the system does not tell how good its clock is; {cure}.", values)
+        return Status(Level.OK if state.synchronised else Level.WARN, state.sentence, values)
+
+    def _said(self, step_s: float) -> str:
+        way = "ahead" if step_s > 0 else "back"
+        return (
+            f"the system's clock was set {way} by {abs(step_s):.3g} s: longitudes before and after differ by "
+            f"{abs(step_s) * ARCSEC_PER_S:.3g} arcsec"
+        )

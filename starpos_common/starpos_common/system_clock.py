@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the kernel says of this machine's clock: whether anything keeps it to UTC, and how far off it may be.
+
+Source: adjtimex(2); maxerror is in NTP's sense, the most the clock may be off (RFC 5905, root distance), and grows by
+500 ppm while nobody corrects it. chrony, systemd-timesyncd, ntpd and linuxptp all keep it.
+"""
+
+import ctypes
+import math
+import time
+from dataclasses import dataclass
+
+STA_UNSYNC = 0x0040
+TIME_ERROR = 5  # adjtimex's answer of a clock that is not synchronised
+UNIFORM = math.sqrt(3)  # bound over standard deviation of what is as likely anywhere within it
+STEP_S = 0.1
+SLEW = 0.1  # the quickest slewing in use (chrony's maxslewrate is 0.083): more than this is a step
+
+
+class _Timex(ctypes.Structure):
+    """struct timex of <sys/timex.h>."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        *((name, ctypes.c_long) for name in ("offset", "freq", "maxerror", "esterror")),
+        ("status", ctypes.c_int),
+        *(
+            (name, ctypes.c_long)
+            for name in ("constant", "precision", "tolerance", "seconds", "microseconds", "tick")
+        ),
+        *((name, ctypes.c_long) for name in ("ppsfreq", "jitter")),
+        ("shift", ctypes.c_int),
+        *((name, ctypes.c_long) for name in ("stabil", "jitcnt", "calcnt", "errcnt", "stbcnt")),
+        ("tai", ctypes.c_int),
+        ("reserved", ctypes.c_int * 11),
+    )
+
+
+@dataclass(frozen=True)
+class SystemClock:
+    """max_error_s, est_error_s: the kernel's bound and estimate of what the clock is off UTC."""
+
+    synchronised: bool
+    max_error_s: float
+    est_error_s: float
+
+    @property
+    def stddev_s(self) -> float:
+        """Standard deviation to claim: of anything within the bound; all of the bound where nothing holds it there."""
+        if not self.synchronised:
+            return max(self.max_error_s, self.est_error_s)
+        return max(self.max_error_s / UNIFORM, self.est_error_s)
+
+    @property
+    def sentence(self) -> str:
+        if self.synchronised:
+            return f"the system's clock is kept to UTC within {self.max_error_s:.2g} s."
+        return (
+            "the system's clock is not synchronised, fixes are as wide as it may be off: start chrony, systemd-timesyncd "
+            "or linuxptp, or set the solver's clock_stddev where you know better."
+        )
+
+
+def read() -> SystemClock | None:
+    """The state of now; None where the system does not tell (a container may forbid it)."""
+    state = _Timex()
+    try:
+        answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(state))
+    except (OSError, AttributeError):
+        return None
+    if answer < 0:
+        return None
+    synchronised = answer != TIME_ERROR and not state.status & STA_UNSYNC
+    return SystemClock(synchronised, state.maxerror * 1e-6, state.esterror * 1e-6)
+
+
+class StepWatch:
+    """Tells when the system's clock was set: moved against the clock that nobody sets, faster than any slewing.
+
+    clocks: gives (UTC, monotonic) in s at one moment.
+    """
+
+    def __init__(self, clocks=lambda: (time.time(), time.monotonic())):
+        self._clocks = clocks
+        self._utc, self._monotonic = clocks()
+
+    def step_s(self) -> float:
+        """How far it was set since the last call, ahead counts positive; 0 where it was not."""
+        utc, monotonic = self._clocks()
+        elapsed = monotonic - self._monotonic
+        moved = (utc - self._utc) - elapsed
+        self._utc, self._monotonic = utc, monotonic
+        return moved if abs(moved) > STEP_S + SLEW * elapsed else 0.0

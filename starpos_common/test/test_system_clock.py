@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The kernel's word on this machine's clock, and clocks that are set while one watches."""
+
+import math
+import shutil
+import subprocess
+
+import pytest
+
+from starpos_common import system_clock
+from starpos_common.system_clock import StepWatch, SystemClock
+
+
+def test_the_kernels_word_is_what_the_system_tool_reads():
+    state = system_clock.read()
+    if state is None:
+        pytest.skip("this system does not tell")
+    assert 0 <= state.est_error_s and 0 <= state.max_error_s < 100
+    if state.synchronised:
+        assert state.max_error_s <= 16.001  # NTP_PHASE_LIMIT: beyond it the kernel takes the clock for lost
+    tool = shutil.which("adjtimex") or shutil.which("ntptime")
+    if tool is None:
+        return
+    told = subprocess.run(
+        [tool, *(["-p"] if tool.endswith("adjtimex") else [])], capture_output=True, text=True
+    ).stdout
+    words = told.replace(",", " ").replace(":", " ").split()
+    key = "maxerror" if "maxerror" in words else "maximum"
+    value = float(next(w for w in words[words.index(key) + 1 :] if w.replace(".", "").isdigit()))
+    assert state.max_error_s == pytest.approx(value * 1e-6, abs=0.01)
+
+
+def test_what_is_claimed_of_a_clock():
+    assert SystemClock(True, 0.03, 0.002).stddev_s == pytest.approx(0.03 / math.sqrt(3))
+    assert SystemClock(True, 0.001, 0.02).stddev_s == 0.02  # the kernel's own estimate, where that is larger
+    assert SystemClock(False, 16.0, 16.0).stddev_s == 16.0
+    assert "not synchronised" in SystemClock(False, 16.0, 16.0).sentence
+    assert "0.03 s" in SystemClock(True, 0.03, 0.002).sentence
+
+
+class Clocks:
+    def __init__(self):
+        self.utc, self.monotonic = 1.8e9, 100.0
+
+    def go(self, seconds, slew=0.0, step=0.0):
+        self.monotonic += seconds
+        self.utc += seconds * (1 + slew) + step
+
+    def __call__(self):
+        return self.utc, self.monotonic
+
+
+@pytest.mark.parametrize("step", [2.0, -2.0, 0.2, -3600.0])
+def test_a_clock_that_is_set_is_noticed_once_and_by_how_much(step):
+    clocks = Clocks()
+    watch = StepWatch(clocks)
+    clocks.go(1.0)
+    assert watch.step_s() == 0
+    clocks.go(0.5, step=step)
+    assert watch.step_s() == pytest.approx(step, abs=1e-6)
+    clocks.go(0.5)
+    assert watch.step_s() == 0
+
+
+def test_a_clock_that_is_slewed_is_not_set():
+    clocks = Clocks()
+    watch = StepWatch(clocks)
+    for slew in (5e-4, -5e-4, 0.083, -0.083):
+        clocks.go(60.0, slew=slew)
+        assert watch.step_s() == 0
