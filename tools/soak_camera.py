@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Half an hour of one of the camera's sources, as fast as it gives frames: its memory, and whether it grows.
+
+    python tools/soak_camera.py SOURCE [NAME:=VALUE ...] [FRAMES]       360: 30 minutes of a frame every 5 s
+    python tools/soak_camera.py files files.path:=/nights/1 files.loop:=true
+    python tools/soak_camera.py simulated simulated.width:=1404 simulated.height:=936 focal_mm:=150.0
+
+The parameters are those of the node `camera`; a camera, or the server of one, has to be there. Prints the resident
+memory at each tenth. Exit status 0; 1 where the last half's memory has grown by more than 2 MB against the half
+before, or a frame did not come.
+"""
+
+import gc
+import os
+import sys
+import time
+from pathlib import Path
+
+import yaml
+
+from starpos.errors import StarposError
+from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.sources import Settings
+from starpos_camera.sources.registry import SOURCES
+
+HALF_HOUR, ALLOWED_MB = 360, 2.0
+
+
+def main() -> int:
+    name, *words = sys.argv[1:] or ["--help"]
+    if name not in SOURCES:
+        print(__doc__)
+        return 2
+    frames = HALF_HOUR if not words or ":=" in words[-1] else int(words.pop())
+    values = {p.name: p.default for p in PARAMETERS} | {"source": name}
+    table = {p.name: p for p in PARAMETERS}
+    for word in words:
+        key, value = word.split(":=", 1)
+        values[key] = table[key].convert(yaml.safe_load(value) if value else "")
+    settings = Settings(set_or_none(values["exposure"]), set_or_none(values["gain"]), values["cadence"])
+    if refusal := SOURCES[name].refusal(values, settings):
+        print(refusal)
+        return 2
+    source = SOURCES[name](values, time.time)
+    sizes, failed, begin = [], 0, time.monotonic()
+    try:
+        for k in range(1, frames + 1):
+            try:
+                frame = source.capture(settings).frame
+                size = f"{frame.width} x {frame.height} px {frame.pixels.dtype}"
+                del frame
+            except StarposError as error:
+                failed += 1
+                size = str(error)
+            if k > frames // 10:  # what is made once has been made
+                sizes.append(memory_mb())
+            if k % max(1, frames // 10) == 0:
+                gc.collect()
+                print(f"{k:6d} frames  {memory_mb():7.1f} MB  {size}", flush=True)
+    finally:
+        source.close()
+    half = len(sizes) // 2
+    grown = max(sizes[half:]) - max(sizes[:half] or sizes)
+    each_s = (time.monotonic() - begin) / frames
+    print(
+        f"{frames} frames of {name}, {failed} did not come: {each_s:.3f} s each; the last half's memory {grown:+.2f} MB "
+        "against the half's before"
+    )
+    return int(grown > ALLOWED_MB or failed > 0)
+
+
+def set_or_none(value: float) -> float | None:
+    return None if value != value else value
+
+
+def memory_mb() -> float:
+    """Resident memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+if __name__ == "__main__":
+    sys.exit(main())
