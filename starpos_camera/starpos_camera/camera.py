@@ -19,8 +19,9 @@ from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS, path_of
-from starpos_camera.sources import CaptureError, Settings, Source, SourceEnded
+from starpos_camera.sources import Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
+from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_camera.worker import Worker
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport
@@ -32,17 +33,17 @@ from starpos_interfaces.srv import SetCapture
 
 IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
-OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)
 
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """A frame as messages, the intrinsics its source vouches for, and how long it took."""
+    """A frame as messages, the intrinsics its source vouches for, how long it took, and what the source remarks."""
 
     image: Image
     capture: Capture
     camera: Camera | None
     seconds: float
+    remark: str = ""
 
 
 class CameraNode(Node):
@@ -134,23 +135,21 @@ class CameraNode(Node):
 
     def _take(self, settings: Settings) -> Taken:
         """In the worker's thread: a frame, ready to be published."""
-        begin, clock = time.monotonic(), system_clock.StepWatch()
-        exposure = self._source.capture(settings)
-        ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not self.get_clock().ros_time_is_active
-        if ours and (step := clock.step_s()):
-            raise CaptureError(
-                f"a frame is left out: the system's clock was set by {step:+.3g} s while it was taken."
-            )
-        state = system_clock.read() if ours else None
+        begin = time.monotonic()
+        if self.get_clock().ros_time_is_active:
+            exposure, clock = self._source.capture(settings), None
+        else:
+            exposure = in_one_time(lambda: self._source.capture(settings), system_clock.StepWatch())
+            clock = system_clock.read() if exposure.stamp_source in OF_SYSTEM_CLOCK else None
         image = frame_to_message(exposure.frame, self._values["frame_id"])
         capture = Capture(
             header=image.header,
             exposure=float(exposure.frame.exposure_s or 0.0),
             stamp_stddev=float(exposure.stamp_stddev_s),
-            clock_stddev=state.stddev_s if state else 0.0,
+            clock_stddev=clock.stddev_s if clock else 0.0,
             stamp_source=exposure.stamp_source,
         )
-        return Taken(image, capture, exposure.camera, time.monotonic() - begin)
+        return Taken(image, capture, exposure.camera, time.monotonic() - begin, exposure.remark)
 
     def _on_wake(self):
         for result in self._worker.fetch():
@@ -183,6 +182,8 @@ class CameraNode(Node):
                 f"the calibration is of {camera.width} x {camera.height} px but the frames have {image.width} x "
                 f"{image.height} px: calibrate the camera as it is used.",
             )
+        elif taken.remark:
+            self._say(Level.WARN, taken.remark)
         else:
             self._say(Level.OK, f"taking frames of {image.width} x {image.height} px.")
 
