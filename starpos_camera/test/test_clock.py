@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera when the system's clock is set while it works."""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import Image
+
+from starpos.frame import Frame
+from starpos_camera.sources import CaptureError, Exposure
+from starpos_camera.stamping import in_one_time
+from starpos_common.messages import stamp_to_unix
+from starpos_common.system_clock import StepWatch
+from starpos_common.testing import lacks
+from starpos_interfaces.msg import Capture
+
+WARN = 1
+PLAYED = ("files.loop:=true", "files.restamp:=true", "cadence:=0.1")
+
+
+@pytest.fixture
+def set_clock(tmp_path, monkeypatch):
+    """set_clock(seconds): the clock of processes that start from now on is so much ahead; again while they run."""
+    library = next(Path("/usr/lib").glob("**/libfaketimeMT.so.1"), None)
+    if library is None:
+        lacks("faketime")
+    ahead = tmp_path / "ahead"
+
+    def set_clock(seconds: float):
+        fresh = ahead.with_suffix(".new")
+        fresh.write_text(f"{seconds:+g}\n")
+        fresh.rename(ahead)
+
+    set_clock(0)
+    monkeypatch.setenv("LD_PRELOAD", str(library))
+    monkeypatch.setenv("FAKETIME_TIMESTAMP_FILE", str(ahead))
+    monkeypatch.setenv("FAKETIME_NO_CACHE", "1")
+    monkeypatch.setenv("FAKETIME_DONT_FAKE_MONOTONIC", "1")
+    return set_clock
+
+
+@pytest.mark.parametrize("step", [2.0, -2.0])
+def test_a_step_is_said_and_the_next_frames_are_in_the_new_time(
+    start, listener, folder, set_clock, step, record_property
+):
+    listener.hear(Image, "camera/image_raw", 1)
+    captures = listener.hear(Capture, "camera/capture")
+    node = start("camera", f"files.path:={folder}", *PLAYED)
+    listener.wait(lambda: len(captures) >= 3)
+
+    def ahead_s():
+        return stamp_to_unix(captures[-1].header.stamp) - listener.node.get_clock().now().nanoseconds * 1e-9
+
+    assert abs(ahead_s()) < 1.0
+    set_clock(step)
+    listener.wait(lambda: abs(ahead_s() - step) < 0.9)
+    state = listener.wait_for_state("camera: Clock", WARN, f"by {abs(step):.3g} s")
+    assert float(state["last step (s)"]) == pytest.approx(step, abs=0.05)
+    seen = len(captures)
+    listener.wait(lambda: len(captures) > seen + 3)  # the cadence does not hang on this clock
+    assert node.end(signal.SIGINT)[1].count("clock was set") == 1
+    record_property("fault", f"system clock stepped by {step:+g} s (camera)")
+    record_property(
+        "result", f"frames go on in the new time; WARN names {state['last step (s)']} s; one log line"
+    )
+
+
+@pytest.mark.parametrize("step", [2.0, -2.0, 0.0])
+def test_a_frame_during_which_the_clock_was_set_is_left_out_unless_its_time_is_its_own(step):
+    clocks = [1.8e9, 100.0]
+
+    def take(source):
+        def capture():
+            clocks[0] += 0.5 + step
+            clocks[1] += 0.5
+            return Exposure(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)
+
+        return in_one_time(capture, StepWatch(lambda: tuple(clocks)))
+
+    assert take(Capture.FILE).frame.width == 4
+    if step:
+        with pytest.raises(CaptureError, match="the system's clock was set by"):
+            take(Capture.COMMAND)
+    else:
+        assert take(Capture.COMMAND).frame.width == 4
