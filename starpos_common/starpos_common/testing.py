@@ -22,10 +22,10 @@ def take_domain() -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
-def lacks(package: str) -> None:
-    """Skip the test: the system lacks what the apt package has. Where STARPOS_COMPLETE is set, as in CI, it fails."""
+def lacks(package: str, install: str = "sudo apt-get install") -> None:
+    """Skip the test: this machine lacks what the package has. Where STARPOS_COMPLETE is set, as in CI, it fails."""
     refuse = pytest.fail if os.environ.get("STARPOS_COMPLETE") else pytest.skip
-    refuse(f"not on this machine: sudo apt-get install {package}")
+    refuse(f"not on this machine: {install} {package}")
 
 
 class Listener:
