@@ -15,11 +15,14 @@ FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, Ari
 
 def read_fits(path) -> Frame:
     """A frame from a FITS file (also .fz and .gz) by the rules of reading.read_frame; FrameError if it is none."""
-    return _read(path, str(path))
+    return _read(path, str(path))[0]
 
 
-def decode_fits(data: bytes, source: str) -> Frame:
-    """The same from a FITS file's bytes; `source` says where they came from. FrameError where they are no whole frame."""
+def decode_fits(data: bytes, source: str) -> tuple[Frame, dict]:
+    """The same from the bytes of a FITS file (also .fz), and what its header has of starpos.frame_header.KEYS.
+
+    source says where the bytes came from. FrameError where they are no whole frame.
+    """
     return _read(io.BytesIO(data), source)
 
 
@@ -39,7 +42,7 @@ def _read(file, place):
     pattern = str(header.get("BAYERPAT", "")).strip().lower()
     if pattern not in PATTERNS:
         raise FrameError(f"{place}: BAYERPAT is {pattern!r}; it must be RGGB, BGGR, GRBG or GBRG.")
-    return Frame(to_unsigned(values, place), pattern, mid, exposure, place, focal_px(header))
+    return Frame(to_unsigned(values, place), pattern, mid, exposure, place, focal_px(header)), header
 
 
 def _first_image(hdus, place):

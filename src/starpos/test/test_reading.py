@@ -262,7 +262,7 @@ def test_damaged_pictures_are_told_in_the_error_only(tmp_path, capfd):
         flipped[len(whole) // 2] ^= 255
         for damaged in (whole[: len(whole) // 2], whole[:-1], flipped):
             path.write_bytes(damaged)
-            with pytest.raises(FrameError, match="PNG or TIFF"):
+            with pytest.raises(FrameError, match="PNG, TIFF or JPEG"):
                 read_frame(path)
     # OpenCV before 4.7 cannot be kept from it for a TIFF
     told = [line for line in capfd.readouterr().err.splitlines() if line and "imdecode_" not in line]
@@ -310,7 +310,8 @@ def test_a_file_that_may_not_be_opened(tmp_path):
 
 def test_the_bytes_of_a_fits_file_are_read_like_the_file_and_short_ones_refused(tmp_path):
     data = write_fits(tmp_path / "a.fits", np.tile(PIXELS, (50, 50)), **NIGHT).read_bytes()
-    frame = decode_fits(data, "the camera's frame")
+    frame, header = decode_fits(data, "the camera's frame")
+    assert header == NIGHT
     assert np.array_equal(frame.pixels, read_frame(tmp_path / "a.fits").pixels)
     assert (frame.mid_unix_s, frame.source) == (unix(2026, 11, 2, 18) + 0.375, "the camera's frame")
     for length in (0, 100, 2880, 2881, len(data) - 2880):
