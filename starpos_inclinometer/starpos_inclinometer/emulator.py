@@ -24,9 +24,9 @@ from starpos_inclinometer import protocol, sensor
 FIRMWARE = 0x0100
 UNIT = 0x53494D00
 DEFAULT_RATE_HZ = 10
-DELAY_MS = 20  # what the two conversions and the reading take
 ADC_NOISE_CODES = 27.0  # 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV a code
 LINE_S = protocol.SAMPLE_LINE * 10 / protocol.BAUD
+WINDOW_MS = 20  # of a burst of conversions; a sample is the mean of those of its period, as the firmware's
 POLL_S = 0.2  # how soon a stop is noticed while nothing is due
 
 
@@ -56,6 +56,12 @@ class Faults:
         if rng.random() < self.garbage:
             line = rng.randbytes(rng.randrange(1, 64)) + line
         return line
+
+
+def delay_ms(rate_hz: int) -> int:
+    """From the middle of a sample to its line, as the firmware has it."""
+    bursts = 1000 // WINDOW_MS // rate_hz
+    return bursts * WINDOW_MS // 2 + 4
 
 
 class Mcu:
@@ -92,18 +98,23 @@ class Mcu:
         self._rate_hz = self._power_up_rate
         self._sequence = 0
         self._status = protocol.Status.FIRST
-        self._next = now + 1 / self._rate_hz
+        self._next = now + self._period
         return self._identify()
+
+    @property
+    def _period(self) -> float:
+        """From one sample to the next, which its own clock tells."""
+        return 1 / (self._rate_hz * self._tick)
 
     @property
     def due(self) -> float:
         """When the next line has been sent."""
-        return self._next + DELAY_MS * 1e-3 + LINE_S
+        return self._next + delay_ms(self._rate_hz) * 1e-3 + LINE_S
 
     def sample(self) -> bytes:
         """The next line."""
         at = self._next
-        self._next = at + 1 / self._rate_hz
+        self._next = at + self._period
         if not self.frozen:
             x, y = self.tilt(at)
             self._codes = (self._code(0, x), self._code(1, y))
@@ -117,9 +128,9 @@ class Mcu:
     def skip_to(self, now: float):
         """Forget what was due before `now`: the host was asleep, or nobody ran this."""
         if self.due < now - 1.0:
-            missed = int((now - self.due) * self._rate_hz)
+            missed = int((now - self.due) / self._period)
             self._sequence += missed
-            self._next += missed / self._rate_hz
+            self._next += missed * self._period
 
     def receive(self, data: bytes) -> bytes:
         """The answers to what the host sends."""
@@ -131,13 +142,14 @@ class Mcu:
             return protocol.refusal_line(command)
         name, rate = command
         if name == "R" and rate != self._rate_hz:
-            self._next += 1 / rate - 1 / self._rate_hz
+            self._next -= self._period
             self._rate_hz = rate
+            self._next += self._period
         return self._identify()
 
     def _identify(self) -> bytes:
         return protocol.identity_line(
-            protocol.Identity(protocol.VERSION, FIRMWARE, UNIT, self._rate_hz, DELAY_MS)
+            protocol.Identity(protocol.VERSION, FIRMWARE, UNIT, self._rate_hz, delay_ms(self._rate_hz))
         )
 
     def _code(self, axis: int, angle: float) -> int:

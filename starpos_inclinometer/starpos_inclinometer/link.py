@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial port: a thread that opens and reads it, sets the MCU's rate, comes back when the device does."""
+"""The serial port: a thread that opens and reads it, and comes back when the device does."""
 
 import contextlib
 import errno
@@ -10,26 +10,17 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
+from typing import Protocol
 
 import serial
 
-from starpos_inclinometer.protocol import (
-    BAUD,
-    Counts,
-    Identity,
-    Parser,
-    Reason,
-    Refusal,
-    Sample,
-    identify_command,
-    rate_command,
-)
+from starpos_inclinometer.host_clock import HostClock, Moment, Step
+from starpos_inclinometer.source import Arrival, Counts, Phase
 
 RETRY_S = 0.4  # so that a device that came back is read again within a second
 READ_TIMEOUT_S = 0.1  # how soon a stop, a command or silence is noticed
-COMMAND_RETRY_S = 1.0
-MIN_SILENCE_S = 1.0
+MIN_SILENCE_S, SILENT_PERIODS = 1.0, 1.5
+UNFIT_PATIENCES = 3.0  # so many times longer lines may come of which none is believed
 READ_BYTES = 4096
 QUEUE_SAMPLES = 512  # 10 s at the highest rate
 RATE_WINDOW_S = 5.0
@@ -38,13 +29,32 @@ RATE_WINDOW_S = 5.0
 PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueError)
 
 
-class Phase(Enum):
-    """How the link stands."""
+class Decoder(Protocol):
+    """What a device's bytes mean, and what it is to be told. Used by the link's thread; `counts` is read by any."""
 
-    ABSENT = "absent"  # the port cannot be opened, or it went
-    SILENT = "silent"  # open, but nothing comes
-    GARBLED = "garbled"  # bytes come, but no samples
-    RECEIVING = "receiving"
+    @property
+    def counts(self) -> Counts: ...
+
+    @property
+    def period_s(self) -> float:
+        """From one sample to the next."""
+
+    def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
+        """The samples that are complete and believed with these bytes, read at that moment; never raises."""
+
+    def resume(self):
+        """The connection was opened anew."""
+
+    def command(self) -> bytes:
+        """What to tell the device now so that it is as it should be; empty where it is."""
+
+    @property
+    def command_period_s(self) -> float:
+        """From one command to the next, unless it was answered."""
+
+    @property
+    def answered(self) -> bool:
+        """Whether a command was answered with the last bytes: the next need not wait."""
 
 
 @dataclass(frozen=True)
@@ -53,52 +63,39 @@ class LinkState:
 
     phase: Phase = Phase.ABSENT
     sentence: str = "the port has not been opened yet"
-    identity: Identity | None = None
-    refused: bool = False  # the MCU refused the rate that was asked for
     counts: Counts = field(default_factory=Counts)
     connections: int = 0  # how often the port was opened
     dropped: int = 0  # samples nobody fetched in time
     rate_hz: float = 0.0  # as they came in lately
-
-
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """A sample, and when its line was read: on the monotonic clock (s) and on the caller's (ns)."""
-
-    sample: Sample
-    monotonic_s: float
-    caller_ns: int
+    step: Step | None = None  # of the host's clock
 
 
 class SerialLink:
     """Reads samples from `port` until `stop`.
 
     port: use a stable path (/dev/serial/by-id/...); it is resolved at each opening, and opened exclusively.
-    now_ns: the caller's clock, read once for each chunk of bytes.  wake: called from the reader's thread when
-    there are samples to take or the phase changed; must be quick.
+    clock: read once for each chunk of bytes.  wake: called from the reader's thread when there are samples to
+    take or the phase changed; must be quick.
     """
 
     def __init__(
         self,
         port: str,
-        rate_hz: int,
-        now_ns: Callable[[], int] = time.time_ns,
+        baud: int,
+        decoder: Decoder,
+        clock: HostClock,
         wake: Callable[[], None] = lambda: None,
-        baud: int = BAUD,
     ):
         self._port = port
         self._baud = baud
-        self._now_ns = now_ns
+        self._decoder = decoder
+        self._clock = clock
         self._wake = wake
-        self._wanted_rate = rate_hz
-        self._refused_rate: int | None = None
-        self._parser = Parser()
         self._queue: deque[Arrival] = deque(maxlen=QUEUE_SAMPLES)
         self._recent: deque[float] = deque(maxlen=int(RATE_WINDOW_S * 64))
         self._lock = threading.Lock()
         self._phase = Phase.ABSENT
         self._sentence = LinkState.sentence
-        self._identity: Identity | None = None
         self._connections = self._dropped = 0
         self._next_command = 0.0
         self._stop = threading.Event()
@@ -112,10 +109,6 @@ class SerialLink:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
-
-    def set_rate(self, rate_hz: int):
-        """Ask the MCU for another rate; it is asked again after each reset and each opening."""
-        self._wanted_rate = rate_hz
 
     def take(self) -> list[Arrival]:
         """The samples that have come since the last call, in order."""
@@ -133,12 +126,11 @@ class SerialLink:
             return LinkState(
                 self._phase,
                 self._sentence,
-                self._identity,
-                self._refused_rate == self._wanted_rate,
-                self._parser.counts,
+                self._decoder.counts,
                 self._connections,
                 self._dropped,
                 (len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
+                self._clock.step,
             )
 
     # The rest runs in the thread.
@@ -154,6 +146,7 @@ class SerialLink:
             finally:
                 if device is not None:
                     _close(device)
+            self._clock.read()
             self._stop.wait(RETRY_S)
 
     def _open(self) -> serial.Serial:
@@ -165,71 +158,56 @@ class SerialLink:
         """Read until the link is stopped or the path leads elsewhere; raises when something goes wrong."""
         with self._lock:
             self._connections += 1
-            self._identity = None
-            self._refused_rate = None
-            self._parser.resume()
-        last_sample = last_byte = time.monotonic()
+            self._decoder.resume()
+        last_byte = last_line = last_sample = time.monotonic()
         self._next_command = 0.0
         while not self._stop.is_set():
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))
-            now = time.monotonic()
+            moment = self._clock.read()
+            now = moment.monotonic_s
             if data:
                 last_byte = now
-                if self._receive(data, now):
-                    last_sample = now
-            if now >= self._next_command and (command := self._command()):
+                lines, samples = self._receive(data, moment)
+                last_line = now if lines else last_line
+                last_sample = now if samples else last_sample
+            if now >= self._next_command and (command := self._decoder.command()):
                 device.write(command)
-                self._next_command = now + COMMAND_RETRY_S
-            if now - last_sample > self._patience():
-                if now - last_byte > self._patience():
-                    self._enter(
-                        Phase.SILENT, f"{self._port} is open but silent: check the device's power and cable."
-                    )
-                    if self._moved(device):
-                        return
-                else:
-                    self._enter(
-                        Phase.GARBLED,
-                        f"{self._port} sends bytes but no valid lines at {self._baud} baud: "
-                        "check the baud rate, and that this is the inclinometer.",
-                    )
+                self._next_command = now + self._decoder.command_period_s
+            patience = max(MIN_SILENCE_S, SILENT_PERIODS * self._decoder.period_s)
+            if now - last_byte > patience:
+                self._enter(
+                    Phase.SILENT, f"{self._port} is open but silent: check the device's power and cable."
+                )
+                if self._moved(device):
+                    return
+            elif now - last_line > patience:
+                self._enter(
+                    Phase.GARBLED,
+                    f"{self._port} sends bytes but no valid lines at {self._baud} baud: "
+                    "check the baud rate, and that this is the inclinometer.",
+                )
+            elif now - last_sample > UNFIT_PATIENCES * patience:
+                self._enter(
+                    Phase.GARBLED,
+                    f"{self._port} sends lines that do not fit one another: check cable and grounding.",
+                )
 
-    def _patience(self) -> float:
-        rate = self._identity.rate_hz if self._identity else self._wanted_rate
-        return max(MIN_SILENCE_S, 2.5 / max(rate, 1))
-
-    def _receive(self, data: bytes, now: float) -> bool:
-        """Whether there was a sample among the data."""
-        stamp = self._now_ns()
-        any_sample = False
+    def _receive(self, data: bytes, moment: Moment) -> tuple[bool, bool]:
+        """Whether there were valid lines among the data, and samples."""
         with self._lock:
-            for message in self._parser.feed(data):
-                if isinstance(message, Sample):
-                    any_sample = True
-                    self._dropped += len(self._queue) == QUEUE_SAMPLES
-                    self._queue.append(Arrival(message, now, stamp))
-                    self._recent.append(now)
-                    if message.restarted:
-                        # After a reset it is at the default rate, perhaps with another firmware.
-                        self._identity = None
-                    continue
-                self._next_command = 0.0  # it has answered
-                if isinstance(message, Identity):
-                    self._identity = message
-                elif isinstance(message, Refusal) and message.reason == Reason.OUT_OF_RANGE:
-                    self._refused_rate = self._wanted_rate
-        if any_sample:
+            before = self._decoder.counts.good
+            arrivals = self._decoder.feed(data, moment)
+            for arrival in arrivals:
+                self._dropped += len(self._queue) == QUEUE_SAMPLES
+                self._queue.append(arrival)
+                self._recent.append(moment.monotonic_s)
+            if self._decoder.answered:
+                self._next_command = 0.0
+            lines = self._decoder.counts.good > before
+        if arrivals:
             self._enter(Phase.RECEIVING, f"receiving from {self._port}")
             self._wake()
-        return any_sample
-
-    def _command(self) -> bytes | None:
-        """What to tell the MCU so that it is as it should be; None where it is."""
-        if self._identity is None:
-            return identify_command()
-        if self._identity.rate_hz != self._wanted_rate and self._refused_rate != self._wanted_rate:
-            return rate_command(self._wanted_rate)
-        return None
+        return lines, bool(arrivals)
 
     def _moved(self, device: serial.Serial) -> bool:
         """Whether the path now leads to another device than the open one; OSError where it leads nowhere."""
@@ -239,8 +217,6 @@ class SerialLink:
         with self._lock:
             changed = (phase, sentence) != (self._phase, self._sentence)
             self._phase, self._sentence = phase, sentence
-            if phase is Phase.ABSENT:
-                self._identity = None
         if changed:
             self._wake()
 

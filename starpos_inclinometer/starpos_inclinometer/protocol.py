@@ -11,6 +11,7 @@ BAUD = 38400
 MIN_RATE_HZ, MAX_RATE_HZ = 1, 50
 MAX_LINE = 48  # bytes with '$' and CR LF, in both directions
 SAMPLE_LINE = 43  # bytes of a `$T` line
+MAX_SENDING_MS = 50  # a line is sent within its sample's period and that
 
 _LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
 _SAMPLE = re.compile(
@@ -42,9 +43,9 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One `$T` line, and what the parser knows of the lines before it."""
+    """One `$T` line, and what `Continuity` knows of the lines before it."""
 
-    sequence: int  # counts on over 16-bit wraps and resets of the MCU: a jump of n + 1 is n samples lost
+    sequence: int  # 16 bits as sent; from `Continuity` it counts on over wraps and resets: a jump of n + 1 is n lost
     milliseconds: int  # the MCU's clock at the middle of the conversions, 32 bits
     x: int  # AD7730 codes, 24-bit offset binary: 0x800000 is no input
     y: int
@@ -69,19 +70,6 @@ class Identity:
 @dataclass(frozen=True, slots=True)
 class Refusal:
     reason: int  # of Reason
-
-
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """What has come in since the parser was made."""
-
-    good: int = 0  # lines with the right checksum and form
-    crc_errors: int = 0  # framed lines with the wrong checksum
-    malformed: int = 0  # right checksum, but no line this version knows
-    garbage_bytes: int = 0  # bytes outside of framed lines
-    lost: int = 0  # samples missing in the sequence
-    duplicates: int = 0  # samples that came twice; dropped
-    restarts: int = 0  # resets of the MCU
 
 
 def checksum(body: bytes) -> int:
@@ -152,76 +140,46 @@ class Parser:
     """What the MCU sends, out of arbitrary chunks of bytes, counted."""
 
     def __init__(self):
+        self.good = self.crc_errors = self.malformed = 0
         self._splitter = LineSplitter()
-        self._last: Sample | None = None
-        self._last_raw_sequence = 0
-        self._resumed = False
-        self._good = self._crc_errors = self._malformed = 0
-        self._lost = self._duplicates = self._restarts = 0
 
     @property
-    def counts(self) -> Counts:
-        return Counts(
-            self._good,
-            self._crc_errors,
-            self._malformed,
-            self._splitter.garbage_bytes,
-            self._lost,
-            self._duplicates,
-            self._restarts,
-        )
+    def garbage_bytes(self) -> int:
+        return self._splitter.garbage_bytes
 
     def feed(self, data: bytes) -> list[Sample | Identity | Refusal]:
-        """The messages completed by `data`, in order; corrupted and doubled ones never."""
+        """The messages completed by `data`, in order; never one with a wrong checksum or an impossible field."""
         messages = []
         for body, right in self._splitter.feed(data):
             if not right:
-                self._crc_errors += 1
-                continue
-            message = self._parse(body)
-            if message is None:
-                continue
-            self._good += 1
-            messages.append(message)
+                self.crc_errors += 1
+            elif (message := _parse(body)) is None:
+                self.malformed += 1
+            else:
+                self.good += 1
+                messages.append(message)
         return messages
 
-    def resume(self):
-        """Start on a connection that was opened anew: drop a half-received line, trust no continuity."""
+    def forget(self):
+        """Drop a half-received line: what follows comes from another connection."""
         self._splitter.forget()
-        self._resumed = self._last is not None
 
-    def _parse(self, body: bytes) -> Sample | Identity | Refusal | None:
-        if match := _SAMPLE.fullmatch(body):
-            return self._sample(*(int(group, 16) for group in match.groups()))
-        if match := _IDENTITY.fullmatch(body):
-            return Identity(*(int(group, 16) for group in match.groups()))
-        if match := _REFUSAL.fullmatch(body):
-            return Refusal(int(match[1], 16))
-        self._malformed += 1
-        return None
 
-    def _sample(self, raw_sequence, milliseconds, x, y, temperature, status) -> Sample | None:
-        last = self._last
-        lost, restarted, step = 0, False, 1
-        if last is not None:
-            elapsed = (milliseconds - last.milliseconds) & 0xFFFFFFFF
-            ahead = (raw_sequence - self._last_raw_sequence) & 0xFFFF
-            if ahead == 0 and elapsed == 0 and not self._resumed:
-                self._duplicates += 1
-                return None
-            # A serial line does not reorder: a clock that went back, or a first sample, is a reset.
-            restarted = bool(status & Status.FIRST) or elapsed >= 1 << 31
-            if restarted:
-                self._restarts += 1
-            else:
-                step = ahead or (1 if self._resumed else 1 << 16)
-                lost = step - 1
-                self._lost += lost
-        sequence = raw_sequence if last is None else (last.sequence + step) & 0xFFFFFFFF
-        self._last_raw_sequence = raw_sequence
-        self._last = Sample(sequence, milliseconds, x, y, temperature, status, lost, restarted, self._resumed)
-        self._resumed = False
-        return self._last
+def _parse(body: bytes) -> Sample | Identity | Refusal | None:
+    if match := _SAMPLE.fullmatch(body):
+        sample = Sample(*(int(group, 16) for group in match.groups()))
+        return None if sample.status & Status.FIRST and sample.sequence else sample
+    if match := _IDENTITY.fullmatch(body):
+        identity = Identity(*(int(group, 16) for group in match.groups()))
+        return identity if _possible(identity) else None
+    if match := _REFUSAL.fullmatch(body):
+        return Refusal(int(match[1], 16))
+    return None
+
+
+def _possible(identity: Identity) -> bool:
+    rate = identity.rate_hz
+    return MIN_RATE_HZ <= rate <= MAX_RATE_HZ and identity.delay_ms <= 1000 / rate + MAX_SENDING_MS
 
 
 def parse_command(body: bytes) -> tuple[str, int] | Reason:

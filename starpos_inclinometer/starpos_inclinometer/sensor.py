@@ -4,18 +4,14 @@
 Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (Analog Devices rev. A).
 """
 
+import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from starpos.inclinometer import (
-    LIMIT_RAD,
-    SCA100T_NOISE_RAD,
-    SCA100T_OFFSET_V,
-    SCA100T_SENSITIVITY_V_PER_G,
-    sca100t_angle,
-)
+from starpos.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD, SCA100T_OFFSET_V, SCA100T_SENSITIVITY_V_PER_G
+from starpos_inclinometer.noise import NoiseTracker
 from starpos_inclinometer.protocol import Sample, Status
+from starpos_inclinometer.source import GAP, OUT_OF_RANGE, SATURATED, STUCK
+from starpos_inclinometer.temperature import Temperature
 
 # Bipolar conversions of the AD7730 are offset binary: 0x000000 at minus full scale, 0x800000 at zero.
 CODE_ZERO = 1 << 23
@@ -29,14 +25,9 @@ DIVIDER = 31.0
 TEMPERATURE_ZERO_COUNTS = 197
 TEMPERATURE_COUNTS_PER_C = -1.083
 
-# starpos_interfaces/Tilt flags
-OUT_OF_RANGE = 1
-STUCK = 2
-SATURATED = 4
-GAP = 8
-
-# 24-bit codes of a living converter have noise of tens of counts: so many equal ones in a row are not chance.
-STUCK_SAMPLES = 10
+# 24-bit codes of a living converter have noise of tens of counts: so many equal ones in a row are not chance,
+# nor are so many where both axes repeat theirs.
+STUCK_SAMPLES, STUCK_PAIRS = 10, 3
 
 
 @dataclass(frozen=True)
@@ -51,7 +42,13 @@ class Calibration:
     sensitivity_volts_per_g: tuple[float, float] = (SCA100T_SENSITIVITY_V_PER_G, SCA100T_SENSITIVITY_V_PER_G)
     divider: float = DIVIDER
     reference_volts: float = ADC_NOMINAL_REFERENCE_V
-    noise_rad: float = SCA100T_NOISE_RAD  # white, of one sample
+    # (xx, xy, yx, yy): the axes' g into those of S
+    cross_axis: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
+    # of t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3), for x and for y
+    temperature_reference_c: float = 25.0
+    offset_per_c: tuple[tuple[float, float, float], ...] = ((0.0,) * 3,) * 2
+    sensitivity_per_c: tuple[tuple[float, float, float], ...] = ((0.0,) * 3,) * 2
+    noise_floor_rad: float = 0.0  # of one sample; what the samples show is never taken for less
 
     @property
     def volts_per_code(self) -> float:
@@ -59,24 +56,47 @@ class Calibration:
         full_scale = ADC_RANGE_V * self.reference_volts / ADC_NOMINAL_REFERENCE_V
         return self.divider * full_scale / CODE_ZERO
 
+    @property
+    def compensates(self) -> bool:
+        """Whether the temperature matters."""
+        return any(any(c) for c in (*self.offset_per_c, *self.sensitivity_per_c))
+
     def volts(self, code: int) -> float:
-        """The sensor's output voltage of an ADC code."""
+        """The sensor's output voltage."""
         return self.reference_volts / 2 + (code - CODE_ZERO) * self.volts_per_code
 
     def code(self, volts: float) -> int:
-        """The inverse of `volts`, limited to what the ADC can say."""
+        """The inverse, limited to what the converter can say."""
         code = CODE_ZERO + round((volts - self.reference_volts / 2) / self.volts_per_code)
         return min(max(code, 0), CODE_MAX)
 
+    def offset_and_sensitivity(self, axis: int, temperature_c: float) -> tuple[float, float]:
+        """V and V/g of an axis at a temperature."""
+        t = temperature_c - self.temperature_reference_c
+        share = 1.0 + _cubic(self.sensitivity_per_c[axis], t)
+        # A polynomial far outside of where it was fitted must not turn the axis round.
+        share = min(max(share, 0.5), 2.0)
+        offset = self.offset_volts[axis] + _cubic(self.offset_per_c[axis], t)
+        return offset, self.sensitivity_volts_per_g[axis] * share
 
-@dataclass(frozen=True)
-class Reading:
-    """A sample in units: x, y rad (always finite), variances rad2, deg C or NaN, flags of Tilt.msg."""
+    def axis_g(self, axis: int, code: int, temperature_c: float) -> float:
+        """What an axis feels, in g, limited to +-1: beyond there is no angle, and the sample is out of range anyway."""
+        offset, sensitivity = self.offset_and_sensitivity(axis, temperature_c)
+        return min(max((self.volts(code) - offset) / sensitivity, -1.0), 1.0)
+
+    def angles(self, gx: float, gy: float) -> tuple[float, float]:
+        """rad of S's axes above the horizon, from what the sensor's axes feel."""
+        xx, xy, yx, yy = self.cross_axis
+        return _asin(xx * gx + xy * gy), _asin(yx * gx + yy * gy)
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A sample in units: x, y rad (always finite), covariance rad2 (xx, xy, yx, yy), deg C or NaN, flags of Tilt.msg."""
 
     x: float
     y: float
-    variance_x: float
-    variance_y: float
+    covariance: tuple[float, float, float, float]
     temperature_c: float
     flags: int
 
@@ -92,35 +112,78 @@ def temperature_counts(celsius: float) -> int:
 
 
 class Sensor:
-    """Samples to readings; remembers the codes before, to tell a stuck converter."""
+    """Samples of one MCU to tilts; remembers the codes before, the temperature and the noise."""
 
     def __init__(self, calibration: Calibration = Calibration()):
         self.calibration = calibration
+        self.noise = NoiseTracker()
+        self.temperature = Temperature()
         self._last = (-1, -1)
         self._run = [0, 0]
 
-    def measure(self, sample: Sample) -> Reading:
+    def measure(self, sample: Sample, time_s: float) -> Measured:
+        """time_s: the sample's, of a clock that does not step."""
+        flags = self._flags(sample)
+        measured = math.nan
+        if not sample.status & Status.NO_TEMPERATURE:
+            measured = temperature_c(sample.temperature)
+        self.temperature.add(time_s, measured)
+        c, at = self.calibration, self.temperature.celsius(self.calibration.temperature_reference_c)
+        g = c.axis_g(0, sample.x, at), c.axis_g(1, sample.y, at)
+        x, y = c.angles(*g)
+        if max(abs(x), abs(y)) > LIMIT_RAD:
+            flags |= OUT_OF_RANGE
+        if flags & GAP:
+            self.noise.interrupt()
+        if not flags & (OUT_OF_RANGE | STUCK | SATURATED):
+            self.noise.add(time_s, math.asin(g[0]), math.asin(g[1]))
+        return Measured(x, y, self._covariance(sample, g, (x, y), at), measured, flags)
+
+    def _flags(self, sample: Sample) -> int:
         codes = (sample.x, sample.y)
         flags = GAP if sample.lost or sample.restarted or sample.resumed else 0
         for axis in range(2):
             self._run[axis] = self._run[axis] + 1 if codes[axis] == self._last[axis] else 1
         self._last = codes
-        if max(self._run) >= STUCK_SAMPLES or sample.status & (Status.ADC_TIMEOUT | Status.NO_REFERENCE):
+        stuck = max(self._run) >= STUCK_SAMPLES or min(self._run) >= STUCK_PAIRS
+        if stuck or sample.status & (Status.ADC_TIMEOUT | Status.NO_REFERENCE):
             flags |= STUCK
         if any(code in (0, CODE_MAX) for code in codes):
             flags |= SATURATED
-        (x, variance_x), (y, variance_y) = self._axis(0, sample.x), self._axis(1, sample.y)
-        if max(abs(x), abs(y)) > LIMIT_RAD:
-            flags |= OUT_OF_RANGE
-        unknown = sample.status & Status.NO_TEMPERATURE
-        temperature = float("nan") if unknown else temperature_c(sample.temperature)
-        return Reading(x, y, variance_x, variance_y, temperature, flags)
+        return flags
 
-    def _axis(self, axis: int, code: int) -> tuple[float, float]:
+    def _covariance(self, sample, g, angles, at) -> tuple[float, float, float, float]:
+        """Noise and quantisation of each axis, through the cross-axis matrix; and what the temperature leaves open."""
         c = self.calibration
-        offset, sensitivity = c.offset_volts[axis], c.sensitivity_volts_per_g[axis]
-        # Beyond +-1 g there is no angle; the sample is out of range anyway and stays a number.
-        volts = min(max(c.volts(code), offset - abs(sensitivity)), offset + abs(sensitivity))
-        angle = float(sca100t_angle(volts, offset, sensitivity))
-        step = c.volts_per_code / (sensitivity * max(np.cos(angle), 0.1))
-        return angle, c.noise_rad**2 + step**2 / 12
+        noise = self.noise.sigma or (SCA100T_NOISE_RAD, SCA100T_NOISE_RAD)
+        step = [c.volts_per_code / c.sensitivity_volts_per_g[axis] for axis in range(2)]
+        # of what each axis feels, g^2; an angle's noise is g's over the cosine
+        vx, vy = (
+            max(noise[i], c.noise_floor_rad) ** 2 * (1 - g[i] ** 2) + step[i] ** 2 / 12 for i in range(2)
+        )
+        kx, ky = (1 / max(math.cos(angle), 0.1) for angle in angles)
+        xx, xy, yx, yy = c.cross_axis
+        cxx = kx * kx * (xx * xx * vx + xy * xy * vy)
+        cxy = kx * ky * (xx * yx * vx + xy * yy * vy)
+        cyy = ky * ky * (yx * yx * vx + yy * yy * vy)
+        if c.compensates:
+            dx, dy = self._temperature_error(sample, at)
+            cxx, cxy, cyy = cxx + dx * dx, cxy + dx * dy, cyy + dy * dy
+        return cxx, cxy, cxy, cyy
+
+    def _temperature_error(self, sample, at) -> tuple[float, float]:
+        """rad, 1 sigma: what the tilt changes by at the worse end of where the temperature may be."""
+        c, sigma = self.calibration, self.temperature.stddev_c
+        here, low, high = (
+            c.angles(c.axis_g(0, sample.x, t), c.axis_g(1, sample.y, t)) for t in (at, at - sigma, at + sigma)
+        )
+        return max(((x - here[0], y - here[1]) for x, y in (low, high)), key=lambda d: math.hypot(*d))
+
+
+def _cubic(coefficients: tuple[float, float, float], t: float) -> float:
+    c1, c2, c3 = coefficients
+    return t * (c1 + t * (c2 + t * c3))
+
+
+def _asin(g: float) -> float:
+    return math.asin(min(max(g, -1.0), 1.0))

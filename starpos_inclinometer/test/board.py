@@ -10,7 +10,8 @@ import tty
 from pathlib import Path
 
 from starpos_common.testing import lacks
-from starpos_inclinometer.protocol import Parser
+from starpos_inclinometer.continuity import Continuity
+from starpos_inclinometer.protocol import Parser, Sample
 
 FIRMWARE = Path(__file__).parent.parent / "firmware"
 ELF, SIM = "inclinometer.elf", "inclinometer-sim"
@@ -49,7 +50,7 @@ class Board:
         )
         self.path = self.process.stdout.readline().strip()
         assert self.path, self.process.communicate()[1]
-        self.parser = Parser()
+        self.parser, self.continuity = Parser(), Continuity()
         self._host = None
         self._read = self._written = 0
 
@@ -85,7 +86,12 @@ class Board:
 
     def messages(self, milliseconds, send=b"") -> list:
         """The messages in what comes."""
-        return self.parser.feed(self.run(milliseconds, send))
+        return self.parse(self.run(milliseconds, send))
+
+    def parse(self, data) -> list:
+        """Every message in the bytes, samples with what was lost before them: no other judgement."""
+        messages = self.parser.feed(data)
+        return [self.continuity.follow(m) if isinstance(m, Sample) else m for m in messages]
 
     def close(self) -> str:
         """End it; what the firmware did that the parts' data sheets forbid."""

@@ -5,6 +5,7 @@ import threading
 
 import pytest
 from board import build
+from reader import Reader
 
 from starpos_inclinometer.emulator import Emulator, Mcu
 
@@ -36,6 +37,20 @@ def bench(tmp_path):
     bench = Bench(tmp_path / "port")
     yield bench
     bench.unplug()
+
+
+@pytest.fixture
+def read(bench):
+    """Makes readers of the bench's port, or of another."""
+    readers = []
+
+    def make(path=bench.path, **options):
+        readers.append(Reader(path, **options))
+        return readers[-1]
+
+    yield make
+    for reader in readers:
+        reader.close()
 
 
 @pytest.fixture(scope="session")

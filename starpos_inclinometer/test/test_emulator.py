@@ -24,7 +24,10 @@ COMMAND = [
 
 def readings(mcu, n):
     sensor, parser = Sensor(), Parser()
-    return [sensor.measure(s) for s in parser.feed(b"".join(mcu.sample() for _ in range(n)))]
+    return [
+        sensor.measure(s, s.milliseconds * 1e-3)
+        for s in parser.feed(b"".join(mcu.sample() for _ in range(n)))
+    ]
 
 
 def test_tilt_noise_and_temperature_come_back():
@@ -46,10 +49,12 @@ def test_beyond_its_range_it_says_so():
 def test_clock_and_sequence():
     mcu = Mcu(seed=1, rate_hz=20, drift_ppm=1000)
     (identity,) = Parser().feed(mcu.reset(5.0))
-    assert identity == Identity(1, 0x0100, 0x53494D00, 20, 20)
+    assert identity == Identity(1, 0x0100, 0x53494D00, 20, 24)
     samples = Parser().feed(b"".join(mcu.sample() for _ in range(101)))
     assert samples[0].status == Status.FIRST and samples[1].status == 0
-    assert samples[-1].milliseconds - samples[0].milliseconds == pytest.approx(5005, abs=1)
+    # Its samples are due by its own clock, which is fast.
+    assert samples[-1].milliseconds - samples[0].milliseconds == pytest.approx(5000, abs=1)
+    assert mcu.due - 5.0 == pytest.approx(102 * 0.05 / 1.001 + 0.0352, abs=1e-3)
 
 
 def test_commands_are_answered():

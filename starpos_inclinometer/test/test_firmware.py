@@ -52,7 +52,7 @@ def samples(messages):
 def angles(messages):
     """deg, (n, 2)."""
     sensor = Sensor()
-    return np.degrees([(r.x, r.y) for r in map(sensor.measure, samples(messages))])
+    return np.degrees([(r.x, r.y) for r in (sensor.measure(s, 0.0) for s in samples(messages))])
 
 
 def at_rate(board, rate_hz):
@@ -104,12 +104,12 @@ def test_takes_the_samples_of_its_rate(board, rate_hz):
     data = board.run(1000 * seconds)
     while not data.endswith(b"\r\n"):
         data += board.run(1)
-    got = samples(board.parser.feed(data))
+    got = samples(board.parse(data))
     assert len(got) == pytest.approx(rate_hz * seconds, abs=2)
     steps = np.diff([s.milliseconds for s in got])
     assert np.abs(steps - 1000 / rate_hz).max() < 1
     assert steps.sum() == pytest.approx(1000 / rate_hz * len(steps), abs=1)
-    assert [s.status for s in got[1:]] == [0] * (len(got) - 1) and board.parser.counts.lost == 0
+    assert [s.status for s in got[1:]] == [0] * (len(got) - 1) and board.continuity.lost == 0
     assert len(data) <= protocol.SAMPLE_LINE * (rate_hz * seconds + 1)
     sent_ms = board.tell("state")["line_ms"]
     assert sent_ms - got[-1].milliseconds == pytest.approx(identity.delay_ms, abs=0.3)
@@ -163,7 +163,7 @@ def test_temperature(board, celsius):
     board.tell(f"temperature {celsius}")
     sample = samples(board.messages(BOOT_MS))[-1]
     assert sample.status == 0
-    assert Sensor().measure(sample).temperature_c == pytest.approx(celsius, abs=0.47)
+    assert Sensor().measure(sample, 0.0).temperature_c == pytest.approx(celsius, abs=0.47)
 
 
 def test_without_the_sensors_answer_it_says_so_and_sends_on(board):
@@ -246,8 +246,8 @@ def test_a_reset_in_the_middle_tells_its_cause(board, cause, status):
     assert first.status == status and first.restarted
     assert {s.status for s in rest} == {0} and len(rest) >= 10
     assert first.milliseconds < 400
-    counts = board.parser.counts
-    assert (counts.restarts, counts.crc_errors, counts.malformed) == (1, 0, 0)
+    parser = board.parser
+    assert (board.continuity.restarts, parser.crc_errors, parser.malformed) == (1, 0, 0)
 
 
 def test_the_cause_of_a_reset_is_not_that_of_the_next(board):
@@ -302,7 +302,7 @@ def test_answers_as_the_protocol_says(board, command):
 
     assert plain(got) == plain(said)
     assert any(isinstance(m, Identity) for m in board.messages(100, protocol.identify_command()))
-    assert board.parser.counts.crc_errors == board.parser.counts.malformed == 0
+    assert board.parser.crc_errors == board.parser.malformed == 0
 
 
 def test_a_line_that_is_too_long_is_dropped_silently(board):
@@ -322,8 +322,8 @@ def test_noise_on_the_line_does_not_stop_it(board):
         noise = bytes(rng.choice(b"$$$QR,*0123456789ABCDEF\r\n\r\n\x00\xff") for _ in range(120))
         board.messages(100, noise)
     assert any(isinstance(m, Identity) for m in board.messages(200, b"\r\n" + protocol.identify_command()))
-    counts = board.parser.counts
-    assert (counts.crc_errors, counts.malformed, counts.lost, counts.restarts) == (0, 0, 0, 0)
+    parser, continuity = board.parser, board.continuity
+    assert (parser.crc_errors, parser.malformed, continuity.lost, continuity.restarts) == (0, 0, 0, 0)
 
 
 def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
@@ -333,9 +333,9 @@ def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
     for _ in range(10):
         got += board.messages(100, protocol.identify_command() * 25)
     got += board.messages(500)
-    counts = board.parser.counts
-    assert (counts.crc_errors, counts.malformed, counts.restarts) == (0, 0, 0)
-    assert counts.lost > 0
+    parser, continuity = board.parser, board.continuity
+    assert (parser.crc_errors, parser.malformed, continuity.restarts) == (0, 0, 0)
+    assert continuity.lost > 0
     for sample in samples(got):
         assert bool(sample.status & Status.OVERRUN) == (sample.lost > 0)
     assert [s.status for s in samples(got)[-10:]] == [0] * 10

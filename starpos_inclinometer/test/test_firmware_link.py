@@ -3,17 +3,15 @@
 
 import math
 import signal
-import threading
 
 import pytest
 from board import Board
 from diagnostic_msgs.msg import DiagnosticArray
 
 from starpos_common.testing import Listener, Process, take_domain
-from starpos_inclinometer.link import Phase, SerialLink
+from starpos_inclinometer.source import Phase
 from starpos_interfaces.msg import Tilt
 
-WAIT_S = 20.0
 TILT_DEG = (3.0, -11.0)
 
 
@@ -29,37 +27,18 @@ def board(built):
     assert board.close() == ""
 
 
-def test_the_link_sets_the_rate_again_after_a_reset_and_counts(board):
-    event, samples = threading.Condition(), []
-
-    def wake():
-        with event:
-            samples.extend(link.take())
-            event.notify_all()
-
-    def wait(condition):
-        with event:
-            assert event.wait_for(condition, WAIT_S), link.state()
-        return link.state()
-
-    link = SerialLink(board.path, 50, wake=wake)
-    link.start()
-    try:
-        state = wait(lambda: len(samples) >= 40 and link.state().identity is not None)
-        assert (state.phase, state.identity.unit, state.identity.rate_hz) == (Phase.RECEIVING, 0x2A, 50)
-        board.tell("hang")
-        state = wait(lambda: link.state().counts.restarts == 1)
-        state = wait(lambda: link.state().identity is not None and link.state().identity.rate_hz == 50)
-        link.set_rate(20)
-        state = wait(lambda: link.state().identity is not None and link.state().identity.rate_hz == 20)
-        board.tell("freeze 1")
-        wait(lambda: samples[-1].sample.status == 1)
-        board.tell("freeze 0")
-        state = wait(lambda: samples[-1].sample.status == 0)
-    finally:
-        link.stop()
+def test_the_link_sets_the_rate_and_sees_a_stuck_converter(board, read):
+    reader = read(board.path, rate_hz=50)
+    state = reader.wait(lambda state, samples: len(samples) >= 40 and reader.identity is not None)
+    assert (state.phase, reader.identity.unit, reader.identity.rate_hz) == (Phase.RECEIVING, 0x2A, 50)
+    reader.decoder.wanted_rate_hz = 20
+    reader.wait(lambda state, samples: reader.identity.rate_hz == 20)
+    board.tell("freeze 1")
+    reader.wait(lambda state, samples: samples[-1].sample.status == 1)
+    board.tell("freeze 0")
+    state = reader.wait(lambda state, samples: samples[-1].sample.status == 0)
     assert state.counts.crc_errors == state.counts.malformed == state.counts.lost == 0
-    assert (state.connections, state.counts.restarts, state.dropped) == (1, 1, 0)
+    assert (state.counts.restarts, state.counts.implausible, state.dropped) == (0, 0, 0)
 
 
 def test_the_node_publishes_the_tilt_of_the_device(board):

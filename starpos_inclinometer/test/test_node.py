@@ -64,21 +64,21 @@ def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listene
         return tilt
 
     bench.plug(Mcu(when, seed=1))
-    node = start(f"port:={bench.path}", "noise_stddev:=0.004", "rate:=20")
+    node = start(f"port:={bench.path}", "noise_stddev:=0.006", "rate:=20")
     listener.wait(lambda: len(listener.tilts) >= 40)
     first = listener.tilts[0]
     assert first.header.frame_id == "starpos_inclinometer_frame"
     mean = [sum(getattr(t, axis) for t in listener.tilts) / len(listener.tilts) for axis in "xy"]
     assert mean == pytest.approx(tilt, abs=4 * math.radians(0.0035) / math.sqrt(len(listener.tilts)))
     assert list(first.covariance) == pytest.approx(
-        [math.radians(0.004) ** 2, 0, 0, math.radians(0.004) ** 2], rel=1e-3
+        [math.radians(0.006) ** 2, 0, 0, math.radians(0.006) ** 2], rel=1e-3
     )
     assert first.temperature == pytest.approx(20, abs=0.5)
     assert all(t.flags == 0 for t in listener.tilts[1:])
     stamps = [t.header.stamp.sec + t.header.stamp.nanosec * 1e-9 for t in listener.tilts]
     assert stamps == sorted(stamps)
-    # The emulator asks for the tilt when the line is due: 20 ms of conversion and 11 ms of line later.
-    assert min(abs(stamps[20] - t + 0.031) for t in times) < 0.02
+    # The emulator asks for the tilt when the line is due: 24 ms of conversion and 11 ms of line later.
+    assert min(abs(stamps[20] - t + 0.035) for t in times) < 0.02
     assert [b.sequence - a.sequence for a, b in zip(listener.tilts, listener.tilts[1:], strict=False)] == [
         1
     ] * (len(listener.tilts) - 1)
@@ -93,10 +93,13 @@ def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listene
     refusal = listener.set("inclinometer", rate=51)
     assert not refusal.successful and "50" in refusal.reason
     assert not listener.set("inclinometer", baud=9600).successful
-    request = DescribeParameters.Request(names=["rate", "noise_stddev"])
-    rate, noise = listener.call(DescribeParameters, "/inclinometer/describe_parameters", request).descriptors
+    request = DescribeParameters.Request(names=["rate", "divider", "noise_stddev"])
+    rate, divider, noise = listener.call(
+        DescribeParameters, "/inclinometer/describe_parameters", request
+    ).descriptors
     assert (rate.integer_range[0].from_value, rate.integer_range[0].to_value) == (1, 50)
-    assert noise.description.endswith("[deg]") and noise.floating_point_range
+    assert noise.description.endswith("[deg]") and "nan" in noise.additional_constraints
+    assert divider.floating_point_range
     assert node.end(signal.SIGINT, signal.SIGINT)[0] == 0
 
 
@@ -134,7 +137,9 @@ def test_frozen_converter_and_steep_tilt_are_flagged_and_reported(bench, start, 
     ("parameter", "sentence"),
     [
         ("rate:=0", "rate must be a whole number from 1 to 50 Hz; 0 was given"),
-        ("noise_stddev:=.nan", "noise_stddev must be a number from 1e-06 to 10 deg"),
+        ("noise_stddev:=0.0", "noise_stddev must be a number from 1e-06 to 10 deg, or nan for unset"),
+        ("cross_axis:=[1.0, 1.0, 1.0, 1.0]", "cross_axis must be two different axes"),
+        ("source:=gnss", "source must be one of serial, imu, ascii"),
         ("offset_volts:=[2.5]", "offset_volts must be 2 values"),
         ("port:=7", "port must be a text"),
     ],

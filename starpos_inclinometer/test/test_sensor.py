@@ -11,6 +11,10 @@ from starpos_inclinometer.protocol import Sample, Status
 from starpos_inclinometer.sensor import Calibration, Sensor
 
 
+def measure(sample, *calibration):
+    return Sensor(*calibration).measure(sample, 0.0)
+
+
 def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):
     return Sample(0, 0, x, y, temperature, status, **more)
 
@@ -21,7 +25,7 @@ def test_codes_by_hand():
     assert c.volts(0x800000) == 2.5
     assert c.volts(0) == pytest.approx(0.02, abs=1e-12)
     assert c.code(4.5) == 0x800000 + round(2.0 / 2.48 * 2**23)
-    reading = Sensor().measure(sample(x=c.code(4.5) - 1, y=c.code(2.5 - 4 * math.sin(math.radians(5)))))
+    reading = measure(sample(x=c.code(4.5) - 1, y=c.code(2.5 - 4 * math.sin(math.radians(5)))))
     assert math.degrees(reading.x) == pytest.approx(30.0, abs=2e-5)
     assert math.degrees(reading.y) == pytest.approx(-5.0, abs=1e-5)
     assert reading.flags == 0
@@ -29,7 +33,7 @@ def test_codes_by_hand():
 
 def test_offset_sensitivity_divider_and_reference_of_each_axis():
     c = Calibration((2.4, 2.6), (3.9, 4.1), 40.0, 5.2)
-    reading = Sensor(c).measure(sample(c.code(2.4 + 3.9 * 0.1), c.code(2.6 - 4.1 * 0.2)))
+    reading = measure(sample(c.code(2.4 + 3.9 * 0.1), c.code(2.6 - 4.1 * 0.2)), c)
     assert math.sin(reading.x) == pytest.approx(0.1, abs=1e-6)
     assert math.sin(reading.y) == pytest.approx(-0.2, abs=1e-6)
 
@@ -40,14 +44,104 @@ def test_temperature_of_the_data_sheet():
     assert [sensor.temperature_c(sensor.temperature_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
         [-40, 20, 85], abs=0.47
     )
-    assert math.isnan(Sensor().measure(sample(status=Status.NO_TEMPERATURE)).temperature_c)
+    assert math.isnan(measure(sample(status=Status.NO_TEMPERATURE)).temperature_c)
 
 
-def test_variance_is_noise_and_quantisation():
-    quiet = Sensor(Calibration(noise_rad=0.0)).measure(sample())
-    step = 31 * 0.08 / 2**23 / 4.0
-    assert quiet.variance_x == pytest.approx(step**2 / 12)
-    assert Sensor().measure(sample()).variance_y == pytest.approx(math.radians(0.0035) ** 2, rel=1e-4)
+def test_until_the_noise_is_known_it_is_the_stated_one_and_the_quantisation():
+    stated, step = math.radians(0.0035), 31 * 0.08 / 2**23 / 4.0
+    variance = stated**2 + step**2 / 12
+    assert measure(sample()).covariance == pytest.approx((variance, 0, 0, variance), rel=1e-9)
+
+
+def test_the_noise_parameter_is_a_floor_that_the_samples_may_rise_above():
+    rng = np.random.default_rng(1)
+    for floor, noise, expected in ((0.004, 0.001, 0.004), (0.001, 0.004, 0.004)):
+        s = Sensor(Calibration(noise_floor_rad=math.radians(floor)))
+        for k in range(300):
+            volts = 2.5 + 4 * np.radians(noise) * rng.standard_normal(2)
+            last = s.measure(sample(*map(Calibration().code, volts)), 0.1 * k)
+        sigma = np.degrees(np.sqrt([last.covariance[0], last.covariance[3]]))
+        assert sigma == pytest.approx([expected] * 2, rel=0.2)
+
+
+def turned(gx, gy, c, at=20.0):
+    """The codes of what an instrument with the calibration's own errors feels."""
+    g = np.linalg.solve(np.array(c.cross_axis).reshape(2, 2), [gx, gy])
+    pairs = (c.offset_and_sensitivity(axis, at) for axis in range(2))
+    return [
+        c.code(offset + sensitivity * share) for (offset, sensitivity), share in zip(pairs, g, strict=True)
+    ]
+
+
+def test_cross_axis_matrix_and_its_covariance():
+    c = Calibration(cross_axis=(0.99, 0.05, -0.03, 1.01))
+    gx, gy = math.sin(math.radians(12)), math.sin(math.radians(-20))
+    reading = measure(sample(*turned(gx, gy, c)), c)
+    assert np.degrees([reading.x, reading.y]) == pytest.approx([12, -20], abs=1e-5)
+    # by differences: one code more on each axis
+    x, y = turned(gx, gy, c)
+    jump = 100_000
+    slopes = []
+    for k in range(2):
+        moved = measure(sample(x + jump * (k == 0), y + jump * (k == 1)), c)
+        slopes.append([(moved.x - reading.x), (moved.y - reading.y)])
+    raw = np.linalg.solve(np.array(c.cross_axis).reshape(2, 2), [gx, gy])
+    sigma_code = math.radians(0.0035) * np.sqrt(1 - raw**2) / (c.volts_per_code / 4.0)
+    jacobian = np.array(slopes).T / jump * sigma_code
+    expected = jacobian @ jacobian.T
+    assert np.array(reading.covariance).reshape(2, 2) == pytest.approx(expected, rel=0.01)
+    assert abs(expected[0, 1]) > 0.01 * expected[0, 0]
+
+
+WARM = Calibration(
+    temperature_reference_c=25.0,
+    offset_per_c=((5e-4, -2e-6, 1e-8), (-3e-4, 1e-6, 0.0)),
+    sensitivity_per_c=((1e-4, 1e-6, 0.0), (-2e-4, 0.0, 1e-8)),
+)
+
+
+@pytest.mark.parametrize("celsius", [-30.0, 25.0, 70.0])
+def test_temperature_polynomials(celsius):
+    t = celsius - 25.0
+    volts = (
+        2.5 + 5e-4 * t - 2e-6 * t**2 + 1e-8 * t**3 + 4.0 * (1 + 1e-4 * t + 1e-6 * t**2) * 0.1,
+        2.5 - 3e-4 * t + 1e-6 * t**2 + 4.0 * (1 - 2e-4 * t + 1e-8 * t**3) * -0.2,
+    )
+    counts = sensor.temperature_counts(celsius)
+    s = Sensor(WARM)
+    reading = s.measure(sample(*map(WARM.code, volts), temperature=counts), 0.0)
+    # one count is 0.92 deg C, of which the offset of x makes 0.007 deg
+    error = np.abs(np.sin([reading.x, reading.y]) - [0.1, -0.2])
+    assert error.max() < 0.46 * 8e-4 / 4
+    sigma = math.sqrt(reading.covariance[0] - math.radians(0.0035) ** 2)
+    assert 0.5 * 0.92 * 5e-4 / 4 / math.sqrt(12) < sigma < 2.5 * 0.92 * 5e-4 / 4 / math.sqrt(12)
+
+
+def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing_but_the_error():
+    s = Sensor(WARM)
+    x, y = turned(0.1, -0.2, WARM)
+    first = s.measure(sample(x, y, temperature=175), 0.0)
+    stepped = s.measure(sample(x, y, temperature=174), 0.1)
+    whole = 0.92 * 5e-4 / 4
+    assert abs(stepped.x - first.x) < 0.01 * whole
+    missing = s.measure(sample(x, y, status=Status.NO_TEMPERATURE, temperature=0), 0.2)
+    assert math.isnan(missing.temperature_c) and missing.x == stepped.x
+    for k in range(1, 61):
+        later = s.measure(sample(x, y, status=Status.NO_TEMPERATURE, temperature=0), 10.0 * k)
+    assert later.x == stepped.x
+    assert math.sqrt(later.covariance[0]) > 20 * whole / 0.92 / 2
+    back = s.measure(sample(x, y, temperature=174), 601.0)
+    assert back.covariance[0] < later.covariance[0] / 100
+
+
+def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
+    """Also where the compensation is as large on both sides of the reference."""
+    even = Calibration(offset_per_c=((0.0, 1e-5, 0.0), (0.0, 0.0, 0.0)))
+    for c, of_40 in ((WARM, 40 * 5e-4), (even, 40**2 * 1e-5)):
+        reading = measure(sample(status=Status.NO_TEMPERATURE), c)
+        assert math.sqrt(reading.covariance[0]) > 0.8 * of_40 / 4
+        assert measure(sample(temperature=170), c).covariance[0] < reading.covariance[0] / 100
+    assert measure(sample(status=Status.NO_TEMPERATURE)).covariance == measure(sample()).covariance
 
 
 @pytest.mark.parametrize(
@@ -66,19 +160,26 @@ def test_variance_is_noise_and_quantisation():
     ],
 )
 def test_flags(what, flags):
-    reading = Sensor().measure(what)
+    reading = measure(what)
     assert reading.flags == flags
-    assert np.isfinite([reading.x, reading.y, reading.variance_x, reading.variance_y]).all()
+    assert np.isfinite([reading.x, reading.y, *reading.covariance]).all()
 
 
 def test_angles_stay_finite_where_there_is_none():
-    reading = Sensor(Calibration(sensitivity_volts_per_g=(1.0, 1.0))).measure(sample(x=0, y=0xFFFFFF))
+    reading = measure(sample(x=0, y=0xFFFFFF), Calibration(sensitivity_volts_per_g=(1.0, 1.0)))
     assert (reading.x, reading.y) == pytest.approx((-math.pi / 2, math.pi / 2))
     assert reading.flags & sensor.OUT_OF_RANGE
 
 
 def test_a_code_that_repeats_is_stuck_until_it_moves():
     s = Sensor()
-    flags = [s.measure(sample(x=0x800000 + i, y=0x812345)).flags for i in range(sensor.STUCK_SAMPLES + 1)]
+    flags = [
+        s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags for i in range(sensor.STUCK_SAMPLES + 1)
+    ]
     assert flags == [0] * (sensor.STUCK_SAMPLES - 1) + [sensor.STUCK] * 2
-    assert s.measure(sample(y=0x812346)).flags == 0
+    assert s.measure(sample(y=0x812346), 9.0).flags == 0
+
+
+def test_both_codes_repeating_are_stuck_sooner():
+    s = Sensor()
+    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, sensor.STUCK, sensor.STUCK]

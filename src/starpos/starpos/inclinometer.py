@@ -17,6 +17,7 @@ NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20  # readings close in time that tell th
 OUTLIER_SIGMA, REST = 6.0, 6.0  # readings further out are left out; more scatter than this is no rest
 SIGMA_PER_MAD = 1.4826
 KEPT, KEPT_VARIANCE = 0.8, 0.4377  # the smaller part of a Gaussian's deviations, and the variance of that
+SIGNIFICANT = 4.0  # over sqrt(steps): three times the share by which `white_noise` of so many errs
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
@@ -117,6 +118,16 @@ def sca100t_volts(angle, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_
     return offset_v + sensitivity_v_per_g * np.sin(angle)
 
 
+def white_noise(steps: np.ndarray) -> np.ndarray:
+    """1 sigma (K,) of the white noise that readings differ by from one to the next: steps (N, K), N > 0.
+
+    A fifth of the steps may be leaps and outliers of any size. Readings that all stand on one step of a quantiser give 0.
+    """
+    # without the largest, not by the median, which jumps from step to step of coarse readings
+    size = np.sort(np.abs(steps), axis=0)[: int(np.ceil(KEPT * len(steps)))]
+    return np.sqrt((size**2).mean(0) / KEPT_VARIANCE / 2)
+
+
 @dataclass(frozen=True)
 class TiltLog:
     """Readings: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,), covariance (N, 2, 2) rad2 of each."""
@@ -153,10 +164,8 @@ class TiltLog:
         if len(steps) < ENOUGH_NEIGHBOURS:
             return 1.0
         stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
-        # without the largest, not by the median, which jumps from step to step of coarse readings
-        size = np.sort(np.abs(steps), axis=0)[: int(np.ceil(KEPT * len(steps)))]
-        found = float(np.sqrt((size**2).mean(0).max() / KEPT_VARIANCE / 2) / stated)
-        return found if found > 1 + 4 / np.sqrt(len(steps)) else 1.0  # three times the estimate's own error
+        found = float(white_noise(steps).max() / stated)
+        return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
 
     def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:
         """The mean tilt over an exposure; where no reading falls into it, the nearest within one second.

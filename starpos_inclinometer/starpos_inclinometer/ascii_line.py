@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The source `ascii`: digital tiltmeters that send lines of text, told apart by a regular expression."""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from typing import Any
+
+from starpos.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
+from starpos_inclinometer.clock import ArrivalFilter
+from starpos_inclinometer.continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
+from starpos_inclinometer.host_clock import HostClock, Moment
+from starpos_inclinometer.link import SerialLink
+from starpos_inclinometer.noise import NoiseTracker, noise_text
+from starpos_inclinometer.source import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
+
+MAX_LINE = 256  # bytes
+NEAR_RAD = math.radians(0.05)
+NEEDED = {"x", "y"}
+OPTIONAL = {"temperature", "sequence", "milliseconds", "seconds"}
+ANGLES_RAD = {
+    "deg": math.radians(1),
+    "arcmin": math.radians(1 / 60),
+    "arcsec": math.radians(1 / 3600),
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "urad": 1e-6,
+}
+SINES = {"g": 1.0, "mg": 1e-3, "percent_g": 1e-2}  # what an accelerometer feels: the sine of the tilt
+UNITS = (*ANGLES_RAD, *SINES)
+_END = re.compile(rb"[\r\n]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What one line says: rad, the step of its last digit in rad, deg C or NaN; None for what it does not tell."""
+
+    x: float
+    y: float
+    step: float
+    temperature_c: float
+    sequence: int | None
+    milliseconds: int | None  # 32 bits, of the device's clock
+    number: int = 0  # tells equal lines apart that are no doubled ones
+    lost: int = 0  # samples lost just before this one
+    broken: bool = False  # claims no continuity with the ones before
+
+
+def pattern_error(pattern: str) -> str | None:
+    """Why a pattern cannot be used, in one sentence; None if it can."""
+    try:
+        groups = set(re.compile(pattern).groupindex)
+    except (re.error, OverflowError, RecursionError) as error:
+        return f"ascii.pattern is no regular expression ({error}): write it as Python's re wants it."
+    if not groups >= NEEDED:
+        return "ascii.pattern needs the named groups x and y, such as (?P<x>[-+.0-9]+),(?P<y>[-+.0-9]+)."
+    if unknown := groups - NEEDED - OPTIONAL:
+        return (
+            f"ascii.pattern has a group {sorted(unknown)[0]}: there are x, y, {', '.join(sorted(OPTIONAL))}."
+        )
+    if groups >= {"milliseconds", "seconds"}:
+        return "ascii.pattern has both milliseconds and seconds: keep one."
+    return None
+
+
+class LineDecoder:
+    """A device's text to believed samples.
+
+    pattern: must match a whole line without the blanks around it; see `pattern_error`.  unit: of UNITS.
+    resolution: step of the values, in the unit; NaN: of the last digit each line shows.  period_s: from line to line.
+    request: what to send to be answered, once a period; empty: nothing.
+    """
+
+    answered = False
+
+    def __init__(
+        self, pattern: str, unit: str, resolution: float = math.nan, period_s: float = 1.0, request: str = ""
+    ):
+        self.period_s = self.command_period_s = period_s
+        self._pattern = re.compile(pattern)
+        self._unit = unit
+        self._resolution = resolution
+        self._request = request.encode()
+        self._lines = TextLines()
+        self._gate = Gate(_follows, NEAR_RAD)
+        self._last: Line | None = None
+        self._broken = False
+        self._good = self._malformed = self._lost = 0
+
+    @property
+    def counts(self) -> Counts:
+        return Counts(
+            self._good,
+            malformed=self._malformed,
+            garbage_bytes=self._lines.garbage_bytes,
+            lost=self._lost,
+            duplicates=self._gate.duplicates,
+            implausible=self._gate.rejected,
+        )
+
+    def resume(self):
+        self._lines.forget()
+        self._gate.reset()
+        self._broken = self._last is not None
+
+    def command(self) -> bytes:
+        return self._request
+
+    def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
+        believed = []
+        for text in self._lines.feed(data):
+            line = self._parse(text)
+            if line is None:
+                self._malformed += 1
+                continue
+            self._good += 1
+            believed += [
+                Arrival(self._continued(a.sample), a.moment) for a in self._gate.admit(Arrival(line, moment))
+            ]
+        return believed
+
+    def _parse(self, text: str) -> Line | None:
+        match = self._pattern.fullmatch(text)
+        if match is None:
+            return None
+        said = {name: value for name, value in match.groupdict().items() if value is not None}
+        try:
+            (x, step_x), (y, step_y) = self._angle(said["x"]), self._angle(said["y"])
+            temperature = float(said.get("temperature", "nan"))
+            sequence = int(said["sequence"]) if "sequence" in said else None
+            milliseconds = float(said["milliseconds"]) if "milliseconds" in said else None
+            if "seconds" in said:
+                milliseconds = 1e3 * float(said["seconds"])
+            if milliseconds is not None:
+                milliseconds = round(milliseconds) & 0xFFFFFFFF
+        except (ValueError, OverflowError, ArithmeticError, KeyError):
+            return None
+        if not (abs(x) <= math.pi and abs(y) <= math.pi) or math.isinf(temperature):
+            return None
+        number = self._good if sequence is None and milliseconds is None else 0
+        return Line(x, y, max(step_x, step_y), temperature, sequence, milliseconds, number)
+
+    def _angle(self, text: str) -> tuple[float, float]:
+        """rad of a value and of its last digit."""
+        value, step = float(text), self._resolution
+        if math.isnan(step):
+            step = 10.0 ** int(Decimal(text).as_tuple().exponent)
+        if self._unit in ANGLES_RAD:
+            return value * ANGLES_RAD[self._unit], step * ANGLES_RAD[self._unit]
+        sine = min(max(value * SINES[self._unit], -1.0), 1.0) if math.isfinite(value) else math.nan
+        angle = math.asin(sine)
+        return angle, step * SINES[self._unit] / max(math.cos(angle), 0.1)
+
+    def _continued(self, line: Line) -> Line:
+        last, self._last = self._last, line
+        broken, self._broken = self._broken, False
+        if last is None or last.sequence is None or line.sequence is None:
+            return replace(line, broken=broken)
+        ahead = line.sequence - last.sequence
+        if ahead < 1:  # it was reset, or the number wrapped
+            return replace(line, broken=True)
+        self._lost += ahead - 1
+        return replace(line, lost=ahead - 1, broken=broken)
+
+
+class TextLines:
+    """Lines of at most MAX_LINE bytes, ended by CR or LF or both, out of arbitrary chunks of bytes."""
+
+    def __init__(self):
+        self.garbage_bytes = 0
+        self._rest = b""
+        self._overlong = False
+
+    def feed(self, data: bytes) -> list[str]:
+        """The lines that end in `data`, without the blanks around them; empty and overlong ones are left out."""
+        *ended, rest = _END.split(self._rest + data)
+        lines = []
+        for line in ended:
+            if self._overlong or len(line) > MAX_LINE:
+                self.garbage_bytes += len(line)
+                self._overlong = False
+            elif text := line.decode("latin-1").strip():
+                lines.append(text)
+        if self._overlong or len(rest) > MAX_LINE:
+            self.garbage_bytes += len(rest)
+            self._overlong = True
+            rest = b""
+        self._rest = rest
+        return lines
+
+    def forget(self):
+        """Drop a half-received line: what follows comes from another connection."""
+        self.garbage_bytes += len(self._rest)
+        self._rest = b""
+        # What comes first may be the rest of a line.
+        self._overlong = True
+
+
+def _follows(a: Arrival, b: Arrival) -> bool:
+    """Whether a Line may come after another, by what it says of number and time."""
+    first, second = a.sample, b.sample
+    if None not in (first.sequence, second.sequence) and second.sequence <= first.sequence:
+        return False
+    if None in (first.milliseconds, second.milliseconds):
+        return True
+    elapsed = (second.milliseconds - first.milliseconds) & 0xFFFFFFFF
+    apart_s = b.moment.monotonic_s - a.moment.monotonic_s
+    return elapsed > 0 and abs(elapsed * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
+
+
+class AsciiSource:
+    """Lines of a digital tiltmeter as readings."""
+
+    def __init__(self, values: Mapping[str, Any], clock: HostClock, wake: Callable[[], None]):
+        self._baud = values["baud"]
+        self._decoder = LineDecoder(
+            values["ascii.pattern"],
+            values["ascii.unit"],
+            values["ascii.resolution"],
+            values["ascii.period"],
+            values["ascii.request"],
+        )
+        self._link = SerialLink(values["port"], self._baud, self._decoder, clock, wake)
+        self._arrivals = ArrivalFilter()
+        self._noise = NoiseTracker()
+        self._equal = 0
+        self._last = (math.nan, math.nan)
+        self._sequence = -1
+        self.configure(values)
+
+    def start(self):
+        self._link.start()
+
+    def stop(self):
+        self._link.stop()
+
+    def configure(self, values: Mapping[str, Any]):
+        self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
+        self._latency = 0.0 if math.isnan(values["latency"]) else values["latency"]
+        self._stuck_samples = values["ascii.stuck_samples"]
+
+    def take(self) -> list[Reading]:
+        return [self._read(arrival) for arrival in self._link.take()]
+
+    def _read(self, arrival: Arrival) -> Reading:
+        line, moment = arrival.sample, arrival.moment
+        late = 0.0
+        if line.milliseconds is not None:
+            if line.broken:
+                self._arrivals.restart()
+            late = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
+        flags = self._flags(line)
+        if flags & GAP:
+            self._noise.interrupt()
+        if not flags & (OUT_OF_RANGE | STUCK):
+            self._noise.add(moment.monotonic_s - late, line.x, line.y)
+        stated = max(SCA100T_NOISE_RAD, line.step)
+        variances = [
+            max(s, self._floor) ** 2 + line.step**2 / 12 for s in self._noise.sigma or (stated, stated)
+        ]
+        self._sequence = (self._sequence + 1 + line.lost) & 0xFFFFFFFF
+        stamp_ns = moment.host_ns - round((late + self._latency) * 1e9)
+        covariance = (variances[0], 0.0, 0.0, variances[1])
+        return Reading(
+            max(stamp_ns, 0), line.x, line.y, covariance, line.temperature_c, self._sequence, flags
+        )
+
+    def _flags(self, line: Line) -> int:
+        self._equal = self._equal + 1 if (line.x, line.y) == self._last else 1
+        self._last = line.x, line.y
+        flags = GAP if line.lost or line.broken else 0
+        if 0 < self._stuck_samples <= self._equal:
+            flags |= STUCK
+        if max(abs(line.x), abs(line.y)) > LIMIT_RAD:
+            flags |= OUT_OF_RANGE
+        return flags
+
+    def health(self) -> Health:
+        state = self._link.state()
+        values = {
+            "openings": state.connections,
+            "unfetched samples": state.dropped,
+            "clock rate error (ppm)": self._arrivals.rate_ppm,
+            "noise x, y (arcsec)": noise_text(self._noise.sigma),
+        }
+        return Health(state.phase, state.sentence, state.rate_hz, state.counts, "", state.step, values)

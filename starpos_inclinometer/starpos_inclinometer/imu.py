@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The source `imu`: sensor_msgs/Imu at rest to tilts. An accelerometer at rest feels g upward (REP 145)."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Imu
+
+from starpos.inclinometer import LIMIT_RAD
+from starpos_inclinometer.host_clock import HostClock
+from starpos_inclinometer.noise import NoiseTracker, noise_text
+from starpos_inclinometer.source import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
+
+TOPIC = "imu/data"
+STANDARD_GRAVITY = 9.80665  # m/s2; 0.3 % off anywhere on the ground
+LEAST = 3  # messages of an average: fewer tell no scatter
+COVERED = 0.5  # of the time of an average, at least
+FUTURE_S = 0.1  # two hosts' clocks differ by less
+NEW_TIME_S = 1.0  # stamps that go back further are of a clock that was set
+LEAST_STDDEV_RAD = 1e-6  # an accelerometer without noise is a simulated one
+MAX_MESSAGES = 10_000  # of an average
+QUEUE = 512
+RATE_WINDOW_S = 5.0
+PATIENCE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Felt:
+    """One message at rest or not."""
+
+    stamp_ns: int
+    force: tuple[float, float, float]  # specific force, m/s2
+    rotation: float  # rad/s; 0 where it is not measured
+    variance: tuple[float, float, float]  # m2/s4 of each axis; 0: not stated
+
+
+class BadMessage(ValueError):
+    """What is wrong with a message."""
+
+
+def felt(message: Imu) -> Felt:
+    """A message's content; BadMessage where it has no time or is no number."""
+    stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+    if stamp_ns <= 0:
+        raise BadMessage("has no stamp")
+    a, w = message.linear_acceleration, message.angular_velocity
+    force = (a.x, a.y, a.z)
+    # -1 as the first element of a covariance: what it belongs to is not measured. The forces are held against g anyway.
+    rotation = (0.0,) if message.angular_velocity_covariance[0] == -1 else (w.x, w.y, w.z)
+    stated = message.linear_acceleration_covariance
+    variance = (0.0,) * 3 if stated[0] == -1 else tuple(float(stated[i]) for i in (0, 4, 8))
+    if not all(map(math.isfinite, (*force, *rotation, *variance))) or min(variance) < 0:
+        raise BadMessage("holds NaN, infinity or a negative variance")
+    return Felt(stamp_ns, force, math.hypot(*rotation), variance)
+
+
+@dataclass(frozen=True)
+class Average:
+    """Messages of one span of time: (N, 3) forces; see `Felt`."""
+
+    forces: np.ndarray
+    mid_ns: int
+    rotation: float  # rms, rad/s
+    variance: np.ndarray  # (3,) m2/s4, stated for one message
+
+    @classmethod
+    def of(cls, messages: list[Felt]) -> "Average":
+        return cls(
+            np.array([m.force for m in messages]),
+            (messages[0].stamp_ns + messages[-1].stamp_ns) // 2,
+            math.sqrt(sum(m.rotation**2 for m in messages) / len(messages)),
+            np.mean([m.variance for m in messages], axis=0),
+        )
+
+    @property
+    def force(self) -> np.ndarray:
+        return self.forces.mean(0)
+
+    def unrest(self, max_force_error: float, max_rotation: float) -> str:
+        """Why it tells no tilt: a share of g, rad/s; empty where it does."""
+        strength = float(np.linalg.norm(self.force))
+        if abs(strength / STANDARD_GRAVITY - 1) > max_force_error:
+            return f"it feels {strength:.3g} m/s2 where gravity is 9.81"
+        if self.rotation > max_rotation:
+            return f"it turns at {math.degrees(self.rotation):.2g} deg/s"
+        return ""
+
+    def tilt(self) -> tuple[float, float]:
+        """rad."""
+        x, y, _ = (self.force / np.linalg.norm(self.force)).tolist()
+        return math.asin(x), math.asin(y)
+
+    def covariance(self) -> np.ndarray:
+        """(2, 2) rad2 of the tilt: from what the forces scatter by, or what is stated where that is more."""
+        scatter = np.cov(self.forces, rowvar=False)
+        more = np.sqrt(np.maximum(self.variance, np.diag(scatter)))
+        stddev = np.sqrt(np.diag(scatter))
+        grown = np.divide(more, stddev, out=np.ones(3), where=stddev > 0)
+        forces = scatter * np.outer(grown, grown) + np.diag(np.where(stddev > 0, 0.0, self.variance))
+        strength = np.linalg.norm(self.force)
+        up = self.force / strength
+        # d asin(u) = du / cos, du = (1 - u u^T) df / |f|
+        slope = (np.eye(3) - np.outer(up, up))[:2] / strength
+        slope /= np.sqrt(np.maximum(1 - up[:2] ** 2, 0.01))[:, None]
+        return slope @ forces @ slope.T / len(self.forces) + LEAST_STDDEV_RAD**2 * np.eye(2)
+
+
+class Averager:
+    """Messages to averages of a given length, in order of their stamps; counts what it drops."""
+
+    def __init__(self, seconds: float):
+        self.seconds = seconds
+        self.duplicates = self.disordered = 0
+        self.breaks = 0  # of the sequence of averages
+        self._messages: list[Felt] = []
+        self._last_ns = 0
+
+    def add(self, message: Felt) -> Average | None:
+        """The average that has ended with this message's coming, if one has and is well covered."""
+        last_ns, messages = self._last_ns, self._messages
+        if message.stamp_ns == last_ns:
+            self.duplicates += 1
+            return None
+        if message.stamp_ns < last_ns:
+            if last_ns - message.stamp_ns < NEW_TIME_S * 1e9:
+                self.disordered += 1
+                return None
+            messages = []
+        length_ns = self.seconds * 1e9
+        self.breaks += bool(last_ns) and not 0 < message.stamp_ns - last_ns <= length_ns
+        self._last_ns = message.stamp_ns
+        if messages and message.stamp_ns - messages[0].stamp_ns < length_ns and len(messages) < MAX_MESSAGES:
+            messages.append(message)
+            return None
+        self._messages = [message]
+        if len(messages) < LEAST or messages[-1].stamp_ns - messages[0].stamp_ns < COVERED * length_ns:
+            self.breaks += bool(messages)
+            return None
+        return Average.of(messages)
+
+
+class ImuSource:
+    """Averages of what a node's subscription to TOPIC brings, as readings."""
+
+    def __init__(self, node: Node, values: Mapping[str, Any], clock: HostClock, wake: Callable[[], None]):
+        self._clock = clock
+        self._now_ns = lambda: node.get_clock().now().nanoseconds
+        self._wake = wake
+        self._averager = Averager(values["imu.average"])
+        self._noise = NoiseTracker()
+        self._readings: deque[Reading] = deque(maxlen=QUEUE)
+        self._recent: deque[float] = deque(maxlen=QUEUE)
+        self._heard_s = self._told_s = -math.inf
+        self._good = self._malformed = self._future = self._sequence = 0
+        self._unrest = self._frame = ""
+        self._gap = self._has_noise = False
+        self.configure(values)
+        self._subscription = node.create_subscription(
+            Imu,
+            TOPIC,
+            self._hear,
+            QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self._topic = self._subscription.topic_name
+
+    def start(self):
+        pass
+
+    def stop(self):
+        pass
+
+    def configure(self, values: Mapping[str, Any]):
+        self._averager.seconds = values["imu.average"]
+        self._max_force_error = values["imu.max_force_error"]
+        self._max_rotation = math.radians(values["imu.max_rotation"])
+        self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
+        self._latency_ns = 0 if math.isnan(values["latency"]) else round(values["latency"] * 1e9)
+
+    def take(self) -> list[Reading]:
+        taken = list(self._readings)
+        self._readings.clear()
+        return taken
+
+    def _hear(self, message: Imu):
+        self._heard_s = self._clock.read().monotonic_s
+        self._frame = message.header.frame_id
+        try:
+            said = felt(message)
+        except BadMessage:
+            self._malformed += 1
+            return
+        if said.stamp_ns > self._now_ns() + FUTURE_S * 1e9:
+            self._future += 1
+            return
+        self._good += 1
+        breaks = self._averager.breaks
+        average = self._averager.add(said)
+        if average is not None:
+            self._tell(average)
+        self._gap |= self._averager.breaks != breaks
+
+    def _tell(self, average: Average):
+        before, self._unrest = self._unrest, average.unrest(self._max_force_error, self._max_rotation)
+        if self._unrest:
+            self._sequence += 1
+            self._gap = True
+            if not before:
+                self._wake()
+            return
+        self._readings.append(self._reading(average))
+        self._told_s = self._heard_s
+        self._recent.append(self._heard_s)
+        self._wake()
+
+    def _reading(self, average: Average) -> Reading:
+        x, y = average.tilt()
+        flags = self._flags(average, x, y)
+        if flags & GAP:
+            self._noise.interrupt()
+        if not flags & (OUT_OF_RANGE | STUCK):
+            self._noise.add(average.mid_ns * 1e-9, x, y)
+        self._sequence += 1
+        return Reading(
+            max(average.mid_ns - self._latency_ns, 0),
+            x,
+            y,
+            tuple(self._covariance(average).ravel().tolist()),
+            math.nan,
+            (self._sequence - 1) & 0xFFFFFFFF,
+            flags,
+        )
+
+    def _flags(self, average: Average, x: float, y: float) -> int:
+        flags = GAP if self._gap else 0
+        self._gap = False
+        still = not np.ptp(average.forces, axis=0).any()
+        if still and (self._has_noise or average.variance.any()):
+            flags |= STUCK
+        self._has_noise |= not still
+        if max(abs(x), abs(y)) > LIMIT_RAD or average.force[2] <= 0:  # upside down it would look level
+            flags |= OUT_OF_RANGE
+        return flags
+
+    def _covariance(self, average: Average) -> np.ndarray:
+        """Of the messages within, or of what averages differ by where that is more: an IMU's noise is not white."""
+        covariance = average.covariance()
+        found = np.sqrt(np.diag(covariance))
+        least = np.maximum(self._noise.sigma or (0.0, 0.0), self._floor)
+        grown = np.maximum(least / found, 1.0)
+        return covariance * np.outer(grown, grown)
+
+    def health(self) -> Health:
+        now_s = self._clock.read().monotonic_s
+        recent = [t for t in self._recent if now_s - t < RATE_WINDOW_S]
+        rate_hz = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
+        averager = self._averager
+        counts = Counts(self._good, malformed=self._malformed, duplicates=averager.duplicates)
+        values = {
+            "messages from the future": self._future,
+            "messages out of order": averager.disordered,
+            "IMU's frame": self._frame or "unknown",
+            "noise x, y (arcsec)": noise_text(self._noise.sigma),
+        }
+        phase, sentence = self._phase(now_s)
+        return Health(phase, sentence, rate_hz, counts, "", self._clock.step, values)
+
+    def _phase(self, now_s: float) -> tuple[Phase, str]:
+        if now_s - self._heard_s > PATIENCE_S:
+            return Phase.ABSENT, f"nothing comes on {self._topic}: start the IMU's driver, or remap {TOPIC}."
+        if self._unrest:
+            return Phase.MOVING, f"the IMU is not at rest: {self._unrest}; tilts come when it is."
+        if now_s - self._told_s > PATIENCE_S + 2 * self._averager.seconds:
+            return (
+                Phase.GARBLED,
+                f"{self._topic} brings no usable messages: check its stamps against this host's clock, and that "
+                f"at least {LEAST} come in {self._averager.seconds:g} s.",
+            )
+        return Phase.RECEIVING, f"receiving from {self._topic}"

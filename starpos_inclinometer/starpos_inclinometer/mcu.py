@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The source `serial`: the microcontroller's lines to tilts, and what it is told."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from starpos_inclinometer import protocol
+from starpos_inclinometer.clock import ArrivalFilter
+from starpos_inclinometer.continuity import Continuity, Gate, mcu_follows
+from starpos_inclinometer.host_clock import HostClock, Moment
+from starpos_inclinometer.link import SerialLink
+from starpos_inclinometer.noise import noise_text
+from starpos_inclinometer.protocol import Identity, Reason, Refusal
+from starpos_inclinometer.sensor import Calibration, Sensor
+from starpos_inclinometer.source import Arrival, Counts, Health, Reading
+
+BITS_PER_BYTE = 10  # 8N1
+NEAR_CODES = 11_000  # 0.05 deg, ten times the noise
+DEFAULT_DELAY_MS = 54  # of the firmware at its default rate, until it has said its own
+
+
+class McuDecoder:
+    """The MCU's bytes to believed samples, and the commands that keep it at the rate that is wanted."""
+
+    command_period_s = 1.0  # PROTOCOL.md
+
+    def __init__(self, rate_hz: int):
+        self.wanted_rate_hz = rate_hz
+        self.identity: Identity | None = None
+        self.answered = False
+        self._refused_rate: int | None = None
+        self._parser = protocol.Parser()
+        self._gate = Gate(self._follows, NEAR_CODES)
+        self._continuity = Continuity()
+
+    @property
+    def counts(self) -> Counts:
+        parser, gate, continuity = self._parser, self._gate, self._continuity
+        return Counts(
+            parser.good,
+            parser.crc_errors,
+            parser.malformed,
+            parser.garbage_bytes,
+            continuity.lost,
+            gate.duplicates,
+            continuity.restarts,
+            gate.rejected,
+        )
+
+    @property
+    def period_s(self) -> float:
+        return 1 / (self.identity.rate_hz if self.identity else self.wanted_rate_hz)
+
+    @property
+    def refused(self) -> bool:
+        """Whether the MCU refused the rate that is wanted."""
+        return self._refused_rate == self.wanted_rate_hz
+
+    def resume(self):
+        self.identity = None
+        self._refused_rate = None
+        self._parser.forget()
+        self._gate.reset()
+        self._continuity.resume()
+
+    def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
+        believed = []
+        self.answered = False
+        for message in self._parser.feed(data):
+            if isinstance(message, protocol.Sample):
+                believed += self._admit(Arrival(message, moment))
+                continue
+            self.answered = True
+            if isinstance(message, Identity):
+                self.identity = message
+            elif isinstance(message, Refusal) and message.reason == Reason.OUT_OF_RANGE:
+                self._refused_rate = self.wanted_rate_hz
+        return believed
+
+    def command(self) -> bytes:
+        if self.identity is None:
+            return protocol.identify_command()
+        if self.identity.rate_hz != self.wanted_rate_hz and not self.refused:
+            return protocol.rate_command(self.wanted_rate_hz)
+        return b""
+
+    def _admit(self, arrival: Arrival) -> list[Arrival]:
+        rejected = self._gate.rejected
+        believed = [Arrival(self._continuity.follow(a.sample), a.moment) for a in self._gate.admit(arrival)]
+        if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
+            # After a reset it is at the default rate, perhaps with another firmware; so it may be where nobody saw one.
+            self.identity = None
+        return believed
+
+    def _follows(self, a: Arrival, b: Arrival) -> bool:
+        return mcu_follows(a, b, 1000 / self.identity.rate_hz if self.identity else None)
+
+
+class McuSource:
+    """Samples of the starpos microcontroller as readings; `calibration` makes one of the parameters' values."""
+
+    def __init__(
+        self,
+        values: Mapping[str, Any],
+        clock: HostClock,
+        wake: Callable[[], None],
+        calibration: Callable[[Mapping[str, Any]], Calibration],
+    ):
+        self._calibration = calibration
+        self._baud = values["baud"]
+        self._decoder = McuDecoder(values["rate"])
+        self._link = SerialLink(values["port"], self._baud, self._decoder, clock, wake)
+        self._sensor = Sensor()
+        self._arrivals = ArrivalFilter()
+        self._delay_ms = DEFAULT_DELAY_MS
+        self._rate_hz = 0
+        self.configure(values)
+
+    def start(self):
+        self._link.start()
+
+    def stop(self):
+        self._link.stop()
+
+    def configure(self, values: Mapping[str, Any]):
+        self._sensor.calibration = self._calibration(values)
+        self._decoder.wanted_rate_hz = values["rate"]
+        self._latency = values["latency"]
+
+    def take(self) -> list[Reading]:
+        if identity := self._decoder.identity:
+            self._delay_ms = identity.delay_ms
+            if identity.rate_hz != self._rate_hz:  # a slower sample is a mean of more conversions
+                self._rate_hz = identity.rate_hz
+                self._sensor.noise.restart()
+        latency = self._delay_ms * 1e-3 if math.isnan(self._latency) else self._latency
+        latency += protocol.SAMPLE_LINE * BITS_PER_BYTE / self._baud
+        return [self._read(arrival, latency) for arrival in self._link.take()]
+
+    def _read(self, arrival: Arrival, latency: float) -> Reading:
+        sample, moment = arrival.sample, arrival.moment
+        if sample.restarted or sample.resumed:
+            self._arrivals.restart()
+        late = self._arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        measured = self._sensor.measure(sample, moment.monotonic_s - late)
+        return Reading(
+            max(moment.host_ns - round((late + latency) * 1e9), 0),
+            measured.x,
+            measured.y,
+            measured.covariance,
+            measured.temperature_c,
+            sample.sequence,
+            measured.flags,
+        )
+
+    def health(self) -> Health:
+        state = self._link.state()
+        identity = self._decoder.identity
+        complaint = ""
+        if self._decoder.refused:
+            wanted = self._decoder.wanted_rate_hz
+            complaint = f"the microcontroller refused {wanted} Hz: set another `rate`."
+        sigma = self._sensor.noise.sigma
+        values = {
+            "openings": state.connections,
+            "unfetched samples": state.dropped,
+            "clock rate error (ppm)": self._arrivals.rate_ppm,
+            "noise x, y (arcsec)": noise_text(sigma),
+            "sensor temperature (deg C)": self._sensor.temperature.celsius(math.nan),
+            "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
+            "unit": f"{identity.unit:08X}" if identity else "unknown",
+        }
+        return Health(state.phase, state.sentence, state.rate_hz, state.counts, complaint, state.step, values)

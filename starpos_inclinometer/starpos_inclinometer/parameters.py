@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of the node `inclinometer`, and what they mean for the sensor."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from starpos_common.parameters import Parameter
+from starpos_inclinometer import protocol, sensor
+from starpos_inclinometer.ascii_line import UNITS, pattern_error
+
+SOURCES = ("serial", "imu", "ascii")
+NUMBER = r"[-+]?\d+\.?\d*"
+SMALLEST_DETERMINANT = 0.5  # of the cross-axis matrix: less, and the axes are no two axes
+MAX_REQUEST = 256
+
+PARAMETERS = (
+    Parameter(
+        "source",
+        "serial",
+        "Where tilts come from: serial is the starpos microcontroller, imu a sensor_msgs/Imu on imu/data, ascii lines "
+        "of text from a digital tiltmeter.",
+        choices=SOURCES,
+        read_only=True,
+    ),
+    Parameter(
+        "port",
+        "/dev/ttyUSB0",
+        "Serial port; a stable path such as /dev/serial/by-id/... survives replugging, /dev/ttyUSB0 may "
+        "become another device.",
+        read_only=True,
+    ),
+    Parameter(
+        "baud",
+        protocol.BAUD,
+        "Speed of the serial line; with a wrong one nothing but garbage comes.",
+        "baud",
+        1200,
+        1_000_000,
+        read_only=True,
+    ),
+    Parameter(
+        "frame_id",
+        "starpos_inclinometer_frame",
+        "Frame of the tilts: S, the sensor's X', Y', Z'; of source imu, the IMU's own axes.",
+        read_only=True,
+    ),
+    Parameter(
+        "rate",
+        10,
+        "Samples a second from the microcontroller; above 18 Hz, the sensor's bandwidth, they add little.",
+        "Hz",
+        protocol.MIN_RATE_HZ,
+        protocol.MAX_RATE_HZ,
+    ),
+    Parameter(
+        "noise_stddev",
+        math.nan,
+        "White noise of one sample and axis, at least; unset takes what the samples show, 0.0035 deg until there are "
+        "enough. Too large widens fixes for nothing.",
+        "deg",
+        1e-6,
+        10.0,
+    ),
+    Parameter(
+        "offset_volts",
+        (2.5, 2.5),
+        "Sensor output of x and y at zero tilt; an error of 1 mV is 52 arcsec of tilt, 1.6 km of position.",
+        "V",
+        0.0,
+        5.5,
+    ),
+    Parameter(
+        "sensitivity",
+        (4.0, 4.0),
+        "Sensor sensitivity of x and y, 4 for the SCA100T-D01; 0.1 % off is 36 arcsec at 10 deg of tilt.",
+        "V/g",
+        0.1,
+        100.0,
+    ),
+    Parameter(
+        "divider",
+        sensor.DIVIDER,
+        "Divider between sensor and ADC, (R1 + R2) / R2; 0.1 % off is 36 arcsec at 10 deg of tilt.",
+        "",
+        1.0,
+        1000.0,
+    ),
+    Parameter(
+        "reference_volts",
+        sensor.ADC_NOMINAL_REFERENCE_V,
+        "Reference of the ADC and supply of the sensor that offset_volts and sensitivity were measured at; "
+        "the circuit is ratiometric, so what it is at work does not matter.",
+        "V",
+        4.5,
+        5.5,
+    ),
+    Parameter(
+        "cross_axis",
+        (1.0, 0.0, 0.0, 1.0),
+        "Matrix (xx, xy, yx, yy) that takes what the sensor's two axes feel, in g, into X' and Y' of S; 0.01 off in xy "
+        "is 0.6 deg of x at 90 deg of y, 360 arcsec at 10 deg.",
+        "",
+        -2.0,
+        2.0,
+    ),
+    Parameter(
+        "temperature.reference",
+        25.0,
+        "Temperature that offset_volts and sensitivity hold at; the four polynomials below are in T less this.",
+        "deg C",
+        -40.0,
+        125.0,
+    ),
+    *(
+        Parameter(
+            f"temperature.offset_{axis}",
+            (0.0, 0.0, 0.0),
+            f"What is added to the offset of {axis}: linear, square and cubic term; 0.5 mV/deg C left out is 26 arcsec "
+            "a degree. All zeros: no compensation.",
+            "V/deg C^n",
+            -0.1,
+            0.1,
+        )
+        for axis in "xy"
+    ),
+    *(
+        Parameter(
+            f"temperature.sensitivity_{axis}",
+            (0.0, 0.0, 0.0),
+            f"Share by which the sensitivity of {axis} grows: linear, square and cubic term; 0.0001/deg C left out is "
+            "3.6 arcsec a degree at 10 deg of tilt.",
+            "1/deg C^n",
+            -0.01,
+            0.01,
+        )
+        for axis in "xy"
+    ),
+    Parameter(
+        "latency",
+        math.nan,
+        "From the middle of a sample to the first byte of its line, of source imu to its stamp; unset takes what the "
+        "microcontroller reports, 0 of other sources. Matters only while the tilt moves.",
+        "s",
+        0.0,
+        10.0,
+    ),
+    Parameter(
+        "imu.average",
+        0.5,
+        "Time over which an IMU's accelerations are averaged to one tilt; short ones are noisy, long ones late.",
+        "s",
+        0.02,
+        60.0,
+    ),
+    Parameter(
+        "imu.max_force_error",
+        0.05,
+        "Share by which the IMU's acceleration may differ from 9.81 m/s2; beyond it is not at rest and tells no tilt. "
+        "Too small refuses an uncalibrated accelerometer, too large takes driving for leaning.",
+        "",
+        0.0001,
+        0.5,
+    ),
+    Parameter(
+        "imu.max_rotation",
+        2.0,
+        "Rate of rotation beyond which the IMU is not at rest, its gyroscope's own offset included.",
+        "deg/s",
+        0.001,
+        360.0,
+    ),
+    Parameter(
+        "ascii.pattern",
+        rf"(?P<x>{NUMBER})[,;\s]+(?P<y>{NUMBER})",
+        "Regular expression (Python's) that a whole line must match, with the named groups x, y, and where the device "
+        "tells them temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.unit",
+        "deg",
+        "Unit of x and y; g, mg and percent_g are the sine of the tilt. A wrong one is wrong by its factor.",
+        choices=UNITS,
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.resolution",
+        math.nan,
+        "Step of x and y in ascii.unit; unset takes the last digit a line shows.",
+        "",
+        0.0,
+        1e6,
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.period",
+        0.1,
+        "From line to line, or from request to request; the device counts as silent after 1.5 of them, at least 1 s.",
+        "s",
+        0.02,
+        60.0,
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.request",
+        "",
+        "What to send once a period, for a device that speaks when it is asked, with its line end; empty: nothing.",
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.stuck_samples",
+        100,
+        "So many equal lines in a row are a stuck device; 0: never, for one whose steps are coarser than its noise.",
+        "",
+        0,
+        1_000_000,
+    ),
+)
+
+
+def complaint(values: Mapping[str, Any]) -> str | None:
+    """Why these values do not fit together, in one sentence; None where they do."""
+    xx, xy, yx, yy = values["cross_axis"]
+    if abs(xx * yy - xy * yx) < SMALLEST_DETERMINANT:
+        return (
+            "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
+            f"{list(values['cross_axis'])} was given."
+        )
+    if values["source"] != "ascii":
+        return None
+    if not values["ascii.request"].isascii() or len(values["ascii.request"]) > MAX_REQUEST:
+        return f"ascii.request must be at most {MAX_REQUEST} ASCII characters."
+    return pattern_error(values["ascii.pattern"])
+
+
+def calibration(values: Mapping[str, Any]) -> sensor.Calibration:
+    """The sensor's calibration that the parameters say."""
+    floor = values["noise_stddev"]
+    return sensor.Calibration(
+        values["offset_volts"],
+        values["sensitivity"],
+        values["divider"],
+        values["reference_volts"],
+        values["cross_axis"],
+        values["temperature.reference"],
+        (values["temperature.offset_x"], values["temperature.offset_y"]),
+        (values["temperature.sensitivity_x"], values["temperature.sensitivity_y"]),
+        0.0 if math.isnan(floor) else math.radians(floor),
+    )

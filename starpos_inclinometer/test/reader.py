@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Someone who reads a link; waits for events instead of sleeping."""
+
+import threading
+import time
+
+from starpos_inclinometer.host_clock import HostClock
+from starpos_inclinometer.link import LinkState, SerialLink
+from starpos_inclinometer.mcu import McuDecoder
+from starpos_inclinometer.protocol import BAUD
+
+WAIT_S = 20.0
+
+
+class Reader:
+    """A link to the microcontroller, and what came out of it."""
+
+    def __init__(self, path, rate_hz=50, now_ns=time.time_ns):
+        self.samples = []
+        self.decoder = McuDecoder(rate_hz)
+        self.link = SerialLink(path, BAUD, self.decoder, HostClock(now_ns), self._wake)
+        self._event = threading.Condition()
+        self.link.start()
+
+    @property
+    def identity(self):
+        return self.decoder.identity
+
+    def _wake(self):
+        with self._event:
+            self.samples += self.link.take()
+            self._event.notify_all()
+
+    def wait(self, condition) -> LinkState:
+        """The state, once condition(state, samples) is true."""
+        with self._event:
+            met = self._event.wait_for(lambda: condition(self.link.state(), self.samples), WAIT_S)
+        state = self.link.state()
+        assert met, state
+        return state
+
+    def close(self):
+        self.link.stop()
+        assert not any(t is self.link._thread for t in threading.enumerate())
