@@ -25,6 +25,11 @@ setup(
         "opencv-python-headless>=4.6",
         "PyYAML",
     ],
-    extras_require={"picture": ["matplotlib"], "report": ["matplotlib", "rosbags>=0.10"], "test": ["pytest"]},
+    extras_require={
+        "picture": ["matplotlib"],
+        "raw": ["rawpy", "exifread>=3"],
+        "report": ["matplotlib", "rosbags>=0.10"],
+        "test": ["pytest"],
+    },
     entry_points={"console_scripts": ["starpos = starpos.cli:main"]},
 )

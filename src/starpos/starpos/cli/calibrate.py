@@ -35,6 +35,7 @@ def define(parser) -> None:
     parser.add_argument(
         "--map", metavar="PNG", help="draw where the stars lie off the given and the fitted camera (--camera)"
     )
+    common.add_exif(parser)
     common.add_instrument(parser)
     parser.add_argument(
         "--tilt",
@@ -80,7 +81,7 @@ def run(args) -> int:
 def _stars_of_all(args) -> tuple[list[Stars], bool]:
     """The stars of the frames that can be read, and whether some cannot."""
     progress, frames, unreadable = common.ProgressBar(), [], False
-    for k, (_, item) in enumerate(common.frames_of(args.frames)):
+    for k, (_, item) in enumerate(common.frames_of(args.frames, common.clock_of(args))):
         if isinstance(item, FrameError):
             common.complain("calibrate", item)
             unreadable = True

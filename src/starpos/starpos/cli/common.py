@@ -13,6 +13,7 @@ from starpos import geoid, instrument, instrument_file
 from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frame import Frame
 from starpos.reading import read_frame
 from starpos.stars import Stars
@@ -28,6 +29,45 @@ def add_frames(
         "frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids"
     )
     parser.add_argument("--json", action="store_true", help=json_help)
+
+
+def add_exif(parser: argparse.ArgumentParser) -> None:
+    """What `clock_of` reads."""
+    parser.add_argument(
+        "--exif-utc-offset",
+        type=_utc_offset,
+        metavar="HOURS|file",
+        help="take the time of raw files, TIFF and JPEG from EXIF: by how much the camera's clock was ahead of UTC "
+        "(file: as each file says)",
+    )
+    parser.add_argument(
+        "--exif-clock-stddev",
+        type=number(0, 86400),
+        metavar="S",
+        help=f"how far that clock may be off ({UNTENDED_STDDEV_S:g}; 1 s is 464 m at the equator)",
+    )
+
+
+FILES_OWN = "file"
+
+
+def _utc_offset(text: str) -> float | str:
+    return FILES_OWN if text == FILES_OWN else number(-ZONES_H, ZONES_H)(text)
+
+
+_utc_offset.__name__ = "float"  # what argparse calls it
+
+
+def clock_of(args: argparse.Namespace) -> CameraClock | None:
+    """The clock that wrote the files' EXIF; None where nobody vouches for it."""
+    offset_h, stddev_s = args.exif_utc_offset, args.exif_clock_stddev
+    if offset_h is None:
+        if stddev_s is not None:
+            raise InstrumentError("--exif-clock-stddev is for --exif-utc-offset: give both")
+        return None
+    return CameraClock(
+        None if offset_h == FILES_OWN else offset_h, UNTENDED_STDDEV_S if stddev_s is None else stddev_s
+    )
 
 
 def add_optics(parser: argparse.ArgumentParser) -> None:
@@ -172,11 +212,11 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
     )
 
 
-def frames_of(paths: list[str]):
+def frames_of(paths: list[str], clock: CameraClock | None = None):
     """(path, Frame or Stars or FrameError) of each, read one at a time."""
     for path in paths:
         try:
-            yield path, read_frame(path)
+            yield path, read_frame(path, clock)
         except FrameError as e:
             yield path, e
 

@@ -14,13 +14,14 @@ from starpos.solve import Solution, Solver, Status
 
 def define(parser) -> None:
     common.add_frames(parser)
+    common.add_exif(parser)
     common.add_optics(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
     solver, any_found, unreadable = None, False, False
-    for path, item in common.frames_of(args.frames):
+    for path, item in common.frames_of(args.frames, common.clock_of(args)):
         if isinstance(item, FrameError):
             common.complain("identify", item)
             unreadable = True

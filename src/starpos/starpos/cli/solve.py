@@ -28,6 +28,7 @@ def define(parser) -> None:
     parser.add_argument(
         "--tilt", required=True, metavar="CSV", help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]"
     )
+    common.add_exif(parser)
     common.add_instrument(parser)
     common.add_air(parser)
     common.add_vertical(parser)
@@ -68,7 +69,7 @@ def run(args) -> int:
 def _one_by_one(args):
     """(path, Solution or FrameError) of each frame as it is solved."""
     solver = tilts = None
-    for path, item in common.frames_of(args.frames):
+    for path, item in common.frames_of(args.frames, common.clock_of(args)):
         if not isinstance(item, FrameError):
             if solver is None:
                 solver, tilts = _solver(args, item)
@@ -79,7 +80,7 @@ def _one_by_one(args):
 def _turned(args):
     """The same of all frames together, solved with the A3 that they tell."""
     solver, rows = None, []
-    for path, item in common.frames_of(args.frames):
+    for path, item in common.frames_of(args.frames, common.clock_of(args)):
         if not isinstance(item, FrameError):
             if solver is None:
                 solver, tilts = _solver(args, item)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a camera writes into its own files of when it took them (EXIF 2.31), and how well that is known.
+
+A camera's clock is set by hand to some zone's time, and counts whole seconds where it tells no fraction. So a time comes
+of it only where somebody vouches for the clock.
+"""
+
+import io
+import logging
+import math
+import re
+from dataclasses import dataclass
+from datetime import datetime, timezone
+
+from starpos.errors import FrameError, TimeError
+from starpos.frame_header import MAX_EXPOSURE_S
+
+UNTENDED_STDDEV_S = 60.0  # Canon and Nikon allow their clocks a minute a month
+ZONES_H = 14.0  # UTC-12 to UTC+14 are in use
+FIRST_YEAR = 1996  # of EXIF; a clock before it was never set
+
+
+@dataclass(frozen=True)
+class CameraClock:
+    """How far a camera's own clock is to be believed.
+
+    utc_offset_h  what it shows less UTC, hours, east positive; None: as each file says (OffsetTimeOriginal)
+    stddev_s      of it against that, which all frames have in common
+    """
+
+    utc_offset_h: float | None = None
+    stddev_s: float = UNTENDED_STDDEV_S
+
+    def __post_init__(self):
+        if self.utc_offset_h is not None and not abs(self.utc_offset_h) <= ZONES_H:
+            raise TimeError(
+                f"a camera's clock {self.utc_offset_h:g} h from UTC is of no zone: give -{ZONES_H:g} to {ZONES_H:g} h"
+            )
+        if not 0 <= self.stddev_s <= 86400:
+            raise TimeError(f"a camera's clock is known to {self.stddev_s:g} s: give 0 to 86400 s")
+
+
+def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, float]:
+    """What the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) says of its Frame, by Frame's names.
+
+    exposure_s from ExposureTime. With a clock also mid_unix_s, stamp_stddev_s and clock_stddev_s: DateTimeOriginal and
+    SubSecTimeOriginal are the start of the exposure, rounded down. FrameError where these are there but say no time.
+    """
+    try:
+        import exifread
+    except ImportError:
+        if clock is None:
+            return {}
+        raise FrameError(f"{place}: reading EXIF needs exifread; run `pip install exifread`.") from None
+    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it warns of every file without EXIF
+    try:
+        tags = exifread.process_file(io.BytesIO(data), details=False)
+    except Exception:  # it raises whatever the bytes make it stumble over
+        tags = {}
+    exposure_s = _exposure_s(tags)
+    known = {} if exposure_s is None else {"exposure_s": exposure_s}
+    if clock is None or exposure_s is None or "EXIF DateTimeOriginal" not in tags:
+        return known
+    start_unix_s, step_s = _start(tags, place, clock)
+    return known | {
+        "mid_unix_s": start_unix_s + exposure_s / 2,
+        "stamp_stddev_s": step_s / math.sqrt(12),
+        "clock_stddev_s": clock.stddev_s,
+    }
+
+
+def _exposure_s(tags):
+    """ExposureTime; None where there is none that could be."""
+    try:
+        ratio = tags["EXIF ExposureTime"].values[0]
+        seconds = ratio.num / ratio.den
+    except (LookupError, TypeError, AttributeError, ArithmeticError):
+        return None
+    return seconds if 0 < seconds <= MAX_EXPOSURE_S else None
+
+
+def _start(tags, place, clock):
+    """Unix time of the middle of the clock's last step before the exposure, and that step (s)."""
+    text = _text(tags, "DateTimeOriginal")
+    try:
+        shown = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        shown = datetime.min
+    if shown.year < FIRST_YEAR:
+        raise FrameError(
+            f"{place}: its EXIF was taken at {text!r}, which is no time: set the camera's clock."
+        )
+    offset_h = clock.utc_offset_h
+    if offset_h is None:
+        zone = _text(tags, "OffsetTimeOriginal")
+        parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", zone)
+        if not parts:
+            raise FrameError(
+                f"{place}: its EXIF has no zone (OffsetTimeOriginal is {zone!r}): say by how many hours the camera's "
+                "clock is before UTC."
+            )
+        offset_h = float(parts[1] + "1") * (int(parts[2]) + int(parts[3]) / 60)
+    digits = _text(tags, "SubSecTimeOriginal")
+    if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):  # many write zeros where they count none
+        digits = ""
+    step_s = 10.0 ** -len(digits)
+    whole = shown.replace(tzinfo=timezone.utc).timestamp() - 3600 * offset_h
+    return whole + (int(digits or 0) + 0.5) * step_s, step_s
+
+
+def _text(tags, name):
+    """The tag's text without padding; empty where there is none."""
+    value = getattr(tags.get(f"EXIF {name}"), "values", "")
+    return value.replace("\0", " ").strip() if isinstance(value, str) else ""

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PNG, TIFF and JPEG to frames, from their bytes."""
+
+import struct
+import zlib
+
+import numpy as np
+
+from starpos import exif
+from starpos.errors import FrameError
+from starpos.frame import MAX_PIXELS, Frame, to_unsigned
+
+PNG = b"\x89PNG\r\n\x1a\n"
+JPEG = b"\xff\xd8\xff"
+SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG: the segments that tell the size
+SCAN = 0xDA
+
+
+def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
+    """A frame from the bytes of a PNG, TIFF or JPEG by the rules of reading.read_frame; FrameError of anything else.
+
+    place: where they came from.
+    """
+    size = _size(data)
+    if size is None:
+        raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; give one, or FITS.")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise FrameError(
+            f"{place}: its header claims {size[0]} x {size[1]} pixels; a frame has 1 to {MAX_PIXELS}."
+        )
+    pixels = decode_picture(_png_image(data) if data.startswith(PNG) else data)
+    if pixels is None:
+        raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; take or copy it again.")
+    if pixels.ndim == 3:
+        pixels = pixels[:, :, :3]  # without the alpha channel
+        if pixels.shape[2] < 3:
+            pixels = np.ascontiguousarray(pixels[:, :, 0])
+        elif pixels.dtype == np.uint16:
+            pixels = (pixels >> 8).astype(np.uint8)
+        pixels = np.ascontiguousarray(pixels)
+    if pixels.ndim == 2:
+        pixels = to_unsigned(pixels, place)
+    return Frame(pixels, source=place, **exif.told(data, place, clock))
+
+
+def decode_picture(data: bytes) -> np.ndarray | None:
+    """A PNG's, TIFF's or JPEG's pixels as they are, None where they cannot be decoded; nothing is printed."""
+    import cv2
+
+    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 4.6 has it at the top
+    level = log.setLogLevel(0)
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        log.setLogLevel(level)
+
+
+def _size(data):
+    """(width, height) that its header claims, before a decoder makes room for it; None: no picture."""
+    try:
+        if data.startswith(PNG):
+            return struct.unpack_from(">II", data, 16)
+        return _jpeg_size(data) if data.startswith(JPEG) else _tiff_size(data)
+    except struct.error:  # it ends before
+        return None
+
+
+def _tiff_size(data):
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        return None
+    (at,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, at)
+    size = {}
+    for k in range(count):
+        tag, kind, _ = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
+        if tag in (256, 257):  # ImageWidth, ImageLength: SHORT or LONG
+            (size[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 10 + 12 * k)
+    return (size[256], size[257]) if len(size) == 2 else None
+
+
+def _jpeg_size(data):
+    """The same of a JPEG, None also where it breaks off: a decoder would fill the rest with grey."""
+    at, size = 2, None
+    while data[at : at + 1] == b"\xff":
+        (kind,) = struct.unpack_from("B", data, at + 1)
+        if kind == 0xFF:  # padding
+            at += 1
+            continue
+        if kind == SCAN:
+            return size if data.find(b"\xff\xd9", at) >= 0 else None
+        if kind in SIZED:
+            size = struct.unpack_from(">HH", data, at + 5)[::-1]
+        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+    return None
+
+
+def _png_image(data):
+    """The chunks of a PNG that make its image, b"" where one is damaged or the last is missing.
+
+    libpng prints on standard error about damage, and about such things as colour profiles: it gets neither.
+    """
+    kept, at = [PNG], len(PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        chunk = data[at : at + 12 + length]
+        at += 12 + length
+        if at > len(data) or struct.pack(">I", zlib.crc32(chunk[4:-4])) != chunk[-4:]:
+            return b""
+        if chunk[4:5].isupper():  # critical
+            kept.append(chunk)
+        if chunk[4:8] == b"IEND":
+            return b"".join(kept)
+    return b""

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera's raw files to frames, from their bytes, through rawpy (LibRaw)."""
+
+import io
+import struct
+
+import numpy as np
+
+from starpos import exif
+from starpos.errors import FrameError, one_line
+from starpos.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
+
+# TIFF 6.0: where the data of an image lie and how long they are, in strips or tiles; and the IFDs below one
+STRIPS, TILES, BELOW = (273, 279), (324, 325), 330
+MOST_IFDS, MOST_VALUES = 64, 1 << 20
+
+
+def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
+    """The mosaic as the sensor gave it, with its pattern, from the bytes of a raw file; FrameError of anything else.
+
+    place: where they came from.
+    """
+    try:
+        import rawpy
+    except ImportError:
+        raise FrameError(
+            f"{place}: reading a camera's raw file needs rawpy; run `pip install rawpy`."
+        ) from None
+    try:
+        if _end(data) > len(data):  # LibRaw goes on with zeros in some formats
+            raise ValueError("it breaks off")
+        with rawpy.RawPy() as raw:
+            raw.open_buffer(io.BytesIO(data))
+            if raw.sizes.raw_width * raw.sizes.raw_height > MAX_PIXELS:
+                raise ValueError(f"it claims more than {MAX_PIXELS} pixels")
+            raw.unpack()
+            pixels = raw.raw_image_visible.copy()
+            colours = raw.color_desc.decode("ascii", "replace")
+            pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
+    except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError, AttributeError) as e:
+        raise FrameError(f"{place}: this is not a whole raw file ({one_line(e)}); copy it again.") from e
+    if pattern not in PATTERNS or not pattern:
+        raise FrameError(
+            f"{place}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
+        )
+    return Frame(to_unsigned(pixels, place), pattern, source=place, **exif.told(data, place, clock))
+
+
+def _end(data):
+    """Where the last strip or tile of a file built like TIFF (CR2, DNG, NEF ...) ends; 0 of others and of broken ones."""
+    order = {b"II": "<", b"MM": ">"}.get(data[:2])
+    if order is None or len(data) < 8:
+        return 0
+    waiting, seen, end = [struct.unpack_from(order + "I", data, 4)[0]], set(), 0
+    while waiting and len(seen) < MOST_IFDS:
+        at = waiting.pop()
+        if at in seen or not at:
+            continue
+        seen.add(at)
+        try:
+            tags, following = _ifd(data, at, order)
+        except struct.error:
+            continue
+        waiting += [following, *tags.get(BELOW, ())]
+        for offsets, lengths in (STRIPS, TILES):
+            parts = zip(tags.get(offsets, ()), tags.get(lengths, ()), strict=False)
+            end = max([end, *(sum(part) for part in parts)])
+    return end
+
+
+def _ifd(data, at, order):
+    """The values of an IFD's tags named above, and where the next IFD is; struct.error where it is none."""
+    (count,) = struct.unpack_from(order + "H", data, at)
+    tags = {}
+    for k in range(count):
+        entry = at + 2 + 12 * k
+        tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
+        letter = {3: "H", 4: "I", 13: "I"}.get(kind)
+        if tag in (*STRIPS, *TILES, BELOW) and letter and n <= MOST_VALUES:
+            form = f"{order}{n}{letter}"
+            place = entry + 8
+            if struct.calcsize(form) > 4:
+                (place,) = struct.unpack_from(order + "I", data, place)
+            tags[tag] = struct.unpack_from(form, data, place)
+    (following,) = struct.unpack_from(order + "I", data, at + 2 + 12 * count)
+    return tags, following

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera files for the tests: DNG (TIFF 6.0's structure with a colour mosaic, Adobe DNG 1.4), and EXIF 2.31 in JPEG.
+
+rawpy reads such files and writes none, so this writes the least of one that LibRaw takes for a camera's.
+"""
+
+import os
+import struct
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
+SIZES = {BYTE: 1, ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, SRATIONAL: 8}
+COLOURS = {"r": 0, "g": 1, "b": 2}
+START = "2026:11:02 18:00:00"
+
+
+def needs(module):
+    """A mark of tests that skip without an optional library; where STARPOS_COMPLETE is set, as in CI, they fail."""
+    absent = not find_spec(module) and not os.environ.get("STARPOS_COMPLETE")
+    return pytest.mark.skipif(absent, reason=f"not on this machine: pip install {module}")
+
+
+def exif_tags(start=START, subsec=None, offset=None, exposure=(1, 2)):
+    """The tags of an Exif IFD; None leaves one out."""
+    tags = {
+        0x829A: None if exposure is None else (RATIONAL, exposure),
+        0x9003: None if start is None else (ASCII, start),
+        0x9291: None if subsec is None else (ASCII, subsec),
+        0x9011: None if offset is None else (ASCII, offset),
+    }
+    return {tag: value for tag, value in tags.items() if value is not None}
+
+
+def tiff(tags, exif, order="<", pixels=b""):
+    """The bytes of a TIFF: one IFD of `tags` (with StripOffsets for `pixels`), one Exif IFD, the pixels last."""
+    first = 8
+    at_exif = first + _length(tags | {0x8769: (LONG, [0])} | ({0x111: (LONG, [0])} if pixels else {}))
+    at_pixels = at_exif + _length(exif)
+    tags = tags | {0x8769: (LONG, [at_exif])} | ({0x111: (LONG, [at_pixels])} if pixels else {})
+    magic = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", first)
+    return magic + _ifd(tags, first, order) + _ifd(exif, at_exif, order) + pixels
+
+
+def dng(mosaic, pattern="rggb", order="<", **exif):
+    """The bytes of a DNG of a (h, w) uint16 mosaic; the keywords are those of `exif_tags`."""
+    height, width = mosaic.shape
+    pixels = mosaic.astype(order + "u2").tobytes()
+    tags = {
+        0xFE: (LONG, [0]),
+        0x100: (LONG, [width]),
+        0x101: (LONG, [height]),
+        0x102: (SHORT, [16]),
+        0x103: (SHORT, [1]),  # not compressed
+        0x106: (SHORT, [32803]),  # a colour mosaic
+        0x10F: (ASCII, "starpos"),
+        0x110: (ASCII, "test"),
+        0x112: (SHORT, [1]),
+        0x115: (SHORT, [1]),
+        0x116: (LONG, [height]),
+        0x117: (LONG, [len(pixels)]),
+        0x828D: (SHORT, [2, 2]),
+        0x828E: (BYTE, [COLOURS[c] for c in pattern]),
+        0xC612: (BYTE, [1, 4, 0, 0]),
+        0xC614: (ASCII, "starpos test"),
+        0xC621: (SRATIONAL, [1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1]),  # colours are XYZ
+    }
+    return tiff(tags, exif_tags(**exif), order, pixels)
+
+
+def with_exif(jpeg, orientation=1, **exif):
+    """A JPEG's bytes with an APP1 segment of EXIF after its SOI."""
+    segment = b"Exif\0\0" + tiff({0x112: (SHORT, [orientation])}, exif_tags(**exif))
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+
+
+def mosaic(height=96, width=128, seed=1):
+    """(h, w) uint16 of noise, brighter towards the bottom right."""
+    rng = np.random.default_rng(seed)
+    ramp = np.add.outer(np.arange(height) * 20, np.arange(width) * 3)
+    return (ramp + rng.integers(500, 600, (height, width))).astype(np.uint16)
+
+
+def _length(tags):
+    values = sum(len(_bytes(*v, "<")) + 1 & ~1 for v in tags.values() if len(_bytes(*v, "<")) > 4)
+    return 2 + 12 * len(tags) + 4 + values
+
+
+def _ifd(tags, at, order):
+    """An IFD that begins at a place of the file, its long values behind it."""
+    entries, values = b"", b""
+    behind = at + 2 + 12 * len(tags) + 4
+    for tag, (kind, items) in sorted(tags.items()):
+        data = _bytes(kind, items, order)
+        entries += struct.pack(order + "HHI", tag, kind, len(data) // SIZES[kind])
+        if len(data) > 4:
+            entries += struct.pack(order + "I", behind + len(values))
+            values += data + b"\0" * (len(data) % 2)
+        else:
+            entries += data.ljust(4, b"\0")
+    return struct.pack(order + "H", len(tags)) + entries + b"\0\0\0\0" + values
+
+
+def _bytes(kind, items, order):
+    if kind == ASCII:
+        return items.encode() + b"\0"
+    letter = {BYTE: "B", SHORT: "H", LONG: "I", RATIONAL: "I", SRATIONAL: "i"}[kind]
+    return struct.pack(f"{order}{len(items)}{letter}", *items)

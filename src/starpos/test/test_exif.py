@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Raw files and pictures of a camera, and when they were taken by its own clock."""
+
+import contextlib
+import sys
+from datetime import datetime, timezone
+
+import cv2
+import numpy as np
+import pytest
+import raws
+
+from starpos.errors import FrameError, TimeError
+from starpos.exif import CameraClock
+from starpos.frame import Frame
+from starpos.reading import decode_frame, read_frame
+
+MOSAIC = raws.mosaic()
+SHOWN_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()  # raws.START, were it UTC
+TEHRAN = CameraClock(3.5, 2.0)
+
+needs_rawpy, needs_exifread = raws.needs("rawpy"), raws.needs("exifread")
+
+
+def jpeg(**exif):
+    data = cv2.imencode(".jpg", (MOSAIC >> 8).astype(np.uint8))[1].tobytes()
+    return raws.with_exif(data, **exif)
+
+
+def picture_tiff(**exif):
+    tags = {
+        0x100: (raws.LONG, [8]),
+        0x101: (raws.LONG, [4]),
+        0x102: (raws.SHORT, [8]),
+        0x103: (raws.SHORT, [1]),
+        0x106: (raws.SHORT, [1]),
+        0x115: (raws.SHORT, [1]),
+        0x116: (raws.LONG, [4]),
+        0x117: (raws.LONG, [32]),
+    }
+    return raws.tiff(tags, raws.exif_tags(**exif), pixels=bytes(range(32)))
+
+
+def write(path, data):
+    path.write_bytes(data)
+    return path
+
+
+@needs_rawpy
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "grbg", "gbrg"])
+@pytest.mark.parametrize("order", "<>")
+def test_a_raw_file_is_the_mosaic_the_sensor_gave(tmp_path, pattern, order):
+    data = raws.dng(MOSAIC, pattern, order)
+    frame = read_frame(write(tmp_path / "a.dng", data))
+    assert np.array_equal(frame.pixels, MOSAIC) and frame.pixels.dtype == np.uint16
+    assert frame.pattern == pattern
+    assert frame.mid_unix_s is None
+    assert np.array_equal(decode_frame(data, "IMG_0001.DNG").pixels, MOSAIC)
+
+
+@needs_rawpy
+@pytest.mark.parametrize("kept", [0.02, 0.5, 0.99])
+def test_a_raw_file_that_breaks_off_is_no_frame(tmp_path, kept):
+    whole = raws.dng(MOSAIC)
+    for cut in (whole[: int(kept * len(whole))], whole[:-1]):
+        with pytest.raises(FrameError, match="not a whole raw file"):
+            read_frame(write(tmp_path / "a.dng", cut))
+
+
+@pytest.mark.parametrize("quality", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]])
+def test_a_jpeg_that_breaks_off_is_no_frame_and_what_follows_one_does_not_matter(tmp_path, quality):
+    whole = cv2.imencode(".jpg", (MOSAIC >> 8).astype(np.uint8), quality)[1].tobytes()
+    assert read_frame(write(tmp_path / "a.jpg", whole + b"\0" * 100)).pixels.shape == MOSAIC.shape
+    for cut in (whole[:-2], whole[:-1], whole[: len(whole) // 2], whole[: len(whole) // 2] + b"\0" * 5000):
+        with pytest.raises(FrameError, match="not a whole"):
+            read_frame(write(tmp_path / "a.jpg", cut))
+
+
+def test_a_picture_stays_as_the_sensor_has_it_however_the_camera_was_held():
+    grey = (MOSAIC >> 8).astype(np.uint8)
+    data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    pixels = decode_frame(raws.with_exif(data, orientation=6), "a.jpg").pixels
+    assert pixels.shape == grey.shape and abs(pixels.astype(int) - grey).max() < 5
+
+
+@needs_exifread
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        pytest.param("a.dng", lambda **e: raws.dng(MOSAIC, **e), marks=needs_rawpy),
+        pytest.param("a.nef", lambda **e: raws.dng(MOSAIC, order=">", **e), marks=needs_rawpy),
+        ("a.jpg", jpeg),
+        ("a.tif", picture_tiff),
+    ],
+)
+def test_the_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path, name, make):
+    path = write(tmp_path / name, make(subsec="25"))
+    unasked = read_frame(path)
+    assert (unasked.mid_unix_s, unasked.exposure_s, unasked.clock_stddev_s) == (None, 0.5, 0.0)
+    frame = read_frame(path, TEHRAN)
+    assert frame.mid_unix_s == pytest.approx(SHOWN_S - 3.5 * 3600 + 0.255 + 0.25, abs=1e-6)
+    assert frame.stamp_stddev_s == pytest.approx(0.01 / np.sqrt(12))
+    assert (frame.exposure_s, frame.clock_stddev_s) == (0.5, 2.0)
+
+
+@needs_exifread
+@pytest.mark.parametrize("subsec", [None, "", "00", "  ", "x"])
+def test_whole_seconds_are_known_to_a_third_of_a_second(tmp_path, subsec):
+    frame = read_frame(write(tmp_path / "a.jpg", jpeg(subsec=subsec)), CameraClock(0.0))
+    assert frame.stamp_stddev_s == pytest.approx(0.2887, abs=1e-4)
+    assert frame.mid_unix_s == pytest.approx(SHOWN_S + 0.5 + 0.25)
+    assert frame.clock_stddev_s == 60.0
+
+
+@needs_exifread
+@pytest.mark.parametrize("step", [1.0, 0.1, 0.01])
+def test_the_error_of_a_clock_that_counts_in_steps_is_as_large_as_it_is_said_to_be(tmp_path, rng, step):
+    away, claimed = [], 0.0
+    for true in rng.uniform(0.2, 59.0, 200):
+        whole, rest = divmod(true, 1.0)
+        subsec = f"{int(rest / step):0{round(-np.log10(step))}d}" if step < 1 else None
+        start = f"2026:11:02 18:00:{int(whole):02d}"
+        frame = read_frame(write(tmp_path / "a.jpg", jpeg(start=start, subsec=subsec)), CameraClock(0.0))
+        if subsec and not int(subsec):
+            continue  # such are taken for no fraction
+        away.append(frame.mid_unix_s - frame.exposure_s / 2 - SHOWN_S - true)
+        claimed = frame.stamp_stddev_s
+    assert abs(np.mean(away)) < 4 * claimed / np.sqrt(len(away))
+    assert np.std(away) == pytest.approx(claimed, rel=0.15)
+
+
+@needs_exifread
+def test_the_zone_is_the_files_own_or_the_users(tmp_path):
+    path = write(tmp_path / "a.jpg", jpeg(offset="-02:30"))
+    for clock, offset_h in ((CameraClock(), -2.5), (CameraClock(1.0), 1.0)):
+        assert read_frame(path, clock).mid_unix_s == pytest.approx(SHOWN_S - 3600 * offset_h + 0.75)
+    for offset in (None, "", "Z", "+3", "   :  "):
+        path = write(tmp_path / "b.jpg", jpeg(offset=offset))
+        with pytest.raises(FrameError, match="no zone"):
+            read_frame(path, CameraClock())
+        assert read_frame(path, CameraClock(0.0)).mid_unix_s == pytest.approx(SHOWN_S + 0.75)
+
+
+@needs_exifread
+@pytest.mark.parametrize(
+    "start", ["0000:00:00 00:00:00", "    :  :     :  :  ", "1970:01:01 00:00:00", "now", ""]
+)
+def test_a_clock_that_was_never_set_is_said(tmp_path, start):
+    path = write(tmp_path / "a.jpg", jpeg(start=start))
+    with pytest.raises(FrameError, match="set the camera's clock"):
+        read_frame(path, TEHRAN)
+    assert read_frame(path).mid_unix_s is None
+
+
+@needs_exifread
+@pytest.mark.parametrize(
+    "exif", [{"start": None}, {"exposure": None}, {"exposure": (1, 0)}, {"exposure": (0, 1)}]
+)
+def test_without_a_start_or_an_exposure_there_is_no_time(tmp_path, exif):
+    assert read_frame(write(tmp_path / "a.jpg", jpeg(**exif)), TEHRAN).mid_unix_s is None
+
+
+@pytest.mark.parametrize("given", [(15.0, 1.0), (float("nan"), 1.0), (0.0, -1.0), (0.0, float("inf"))])
+def test_a_clock_that_cannot_be_is_refused(given):
+    with pytest.raises(TimeError, match="give"):
+        CameraClock(*given)
+
+
+def test_a_missing_exifread_matters_only_to_those_who_want_a_time(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "exifread", None)
+    path = write(tmp_path / "a.jpg", jpeg())
+    assert read_frame(path).exposure_s is None
+    with pytest.raises(FrameError, match="pip install exifread"):
+        read_frame(path, TEHRAN)
+
+
+@needs_exifread
+@needs_rawpy
+@pytest.mark.parametrize("name", ["a.dng", "a.jpg", "a.tif"])
+def test_nothing_but_a_frame_error_comes_of_damaged_camera_files(tmp_path, rng, name):
+    exif = {"subsec": "25", "offset": "+03:30"}
+    whole = {"a.dng": raws.dng(MOSAIC, **exif), "a.jpg": jpeg(**exif), "a.tif": picture_tiff(**exif)}[name]
+    for _ in range(300):
+        bad = bytearray(whole)
+        for place in rng.integers(0, min(len(whole), 700), rng.integers(1, 12)):
+            bad[place] = rng.integers(256)
+        with contextlib.suppress(FrameError):
+            assert isinstance(read_frame(write(tmp_path / name, bad), TEHRAN), Frame)
