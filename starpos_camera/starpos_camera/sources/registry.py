@@ -2,10 +2,12 @@
 """The sources by the name that the parameter `source` gives them."""
 
 from starpos_camera.sources import Source
+from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.files import Files
 from starpos_camera.sources.simulated import Simulated
 
 SOURCES: dict[str, type[Source]] = {
     "files": Files,
     "simulated": Simulated,
+    "alpaca": Alpaca,
 }

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras behind an ASCOM Alpaca server, through PyPI's alpyca."""
+
+import math
+import re
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from starpos.frame import MAX_PIXELS, Frame
+from starpos_camera.sources import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.timing import middle_of_commanded, middle_of_started, read_utc
+from starpos_common.parameters import Parameter
+from starpos_interfaces.msg import Capture
+
+DEFAULT_EXPOSURE_S = 0.5
+READOUT_S = 20.0  # from the end of an exposure to its picture: slow CCDs take 15
+POLL_S = 0.02
+WATCH_S = 0.5  # while an exposure runs: a dead server is noticed within it
+MONOCHROME, RGGB = 0, 2  # ASCOM's sensor types
+PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}  # by BayerOffsetX, BayerOffsetY
+IDLE, ERROR = 0, 5  # ASCOM's camera states
+LOCAL = ("127.0.0.1", "localhost")
+CLOCK_TOLERANCE_S = 0.05
+PARAMETERS = (
+    Parameter(
+        "alpaca.address",
+        "127.0.0.1:11111",
+        "HOST:PORT of the Alpaca server, which must be in a trusted network: it knows no passwords.",
+        read_only=True,
+    ),
+    Parameter(
+        "alpaca.device",
+        0,
+        "Number of the camera on this server; no other program may use it meanwhile.",
+        "",
+        0,
+        2**32 - 1,
+        read_only=True,
+    ),
+    Parameter(
+        "alpaca.clock_stddev",
+        math.nan,
+        "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
+        "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
+        "s",
+        0.0,
+        60.0,
+    ),
+)
+
+
+class Alpaca:
+    """Takes whole, unbinned frames; each exposure is commanded, waited for and fetched by `capture`."""
+
+    parameters = PARAMETERS
+    waits_for_listener = False
+
+    @staticmethod
+    def refusal(values: Mapping, settings: Settings) -> str | None:
+        if lack := missing("alpaca", "alpyca"):
+            return lack
+        host, _, port = values["alpaca.address"].rpartition(":")
+        if not (re.fullmatch(r"[A-Za-z0-9.-]+", host) and port.isdecimal() and 0 < int(port) < 65536):
+            return f"alpaca.address must be HOST:PORT, not {values['alpaca.address']!r}."
+        if settings.gain is not None and settings.gain != int(settings.gain):
+            return f"the `gain` of an Alpaca camera is a whole number, not {settings.gain:g}."
+        return None
+
+    def __init__(self, values: Mapping, now: Callable[[], float]):
+        self._address = values["alpaca.address"]
+        self._number = values["alpaca.device"]
+        self.hardware_id = f"Alpaca camera {self._number} at {self._address}"
+        self._values = values
+        self._now = now
+        self._closing = threading.Event()
+        self._camera = None
+        self._size = (0, 0)
+        self._pattern = ""
+        self._gain: float | None = None  # as it was set last
+
+    def lacking(self) -> None:
+        """Only a call to the server tells."""
+
+    def capture(self, settings: Settings) -> Exposure:
+        try:
+            if self._camera is None or not self._camera.Connected:  # another program may have disconnected it
+                self._open()
+            return self._expose(settings)
+        except Exception as error:  # of alpyca, requests, urllib3, or what an absurd reply makes of them
+            self._camera = None
+            raise CaptureError(f"{self.hardware_id}: {_sentence(error)}") from error
+
+    def update(self, values: Mapping):
+        self._values = values
+
+    def close(self):
+        self._closing.set()
+        self._camera = None
+
+    def _open(self):
+        from alpaca.camera import Camera
+
+        from starpos_camera.sources.alpaca_http import Session
+
+        camera = Camera(self._address, self._number)
+        camera.rqs = Session()
+        if not camera.Connected:
+            camera.Connected = True
+        if camera.CameraState != IDLE:  # of a session before, or after a fault
+            camera.AbortExposure()
+        width, height = int(camera.CameraXSize), int(camera.CameraYSize)
+        if min(width, height) < 1 or width * height > MAX_PIXELS:
+            raise CaptureError(f"its sensor of {width} x {height} px is none.")
+        camera.BinX = camera.BinY = 1
+        camera.StartX = camera.StartY = 0
+        camera.NumX, camera.NumY = width, height
+        self._size, self._pattern, self._gain = (width, height), _pattern(camera), None
+        self._camera = camera
+
+    def _expose(self, settings) -> Exposure:
+        camera, wanted_s = self._camera, settings.exposure_s or DEFAULT_EXPOSURE_S
+        remark = self._set_gain(settings.gain)
+        commanded_s = self._now()
+        camera.StartExposure(wanted_s, True)
+        self._wait(wanted_s)
+        ready_s = self._now()
+        exposure_s = _optional(camera, "LastExposureDuration", wanted_s)
+        if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
+            raise CaptureError(
+                f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
+            )
+        pixels = camera.rqs.picture(f"{camera.base_url}/imagearray", *self._size)
+        mid_s, stddev_s, stamp, remark_on_clock = self._stamp(commanded_s, ready_s, exposure_s)
+        frame = Frame(_unsigned(pixels), self._pattern, mid_s, exposure_s, self.hardware_id)
+        return Exposure(frame, stamp, stddev_s, remark=remark_on_clock or remark)
+
+    def _set_gain(self, gain):
+        """Set it where it is another than was asked last; a remark where the camera has another."""
+        if gain is None:
+            return ""
+        if gain != self._gain:
+            self._camera.Gain = int(gain)
+            self._gain = gain
+        has = self._camera.Gain
+        return "" if has == gain else f"{self.hardware_id}: its gain is {has}, though {gain:g} was set."
+
+    def _wait(self, exposure_s):
+        """Until the picture is there."""
+        begin = time.monotonic()
+        while not self._camera.ImageReady:
+            left_s = begin + exposure_s - time.monotonic()
+            state = self._camera.CameraState
+            if state == ERROR:
+                raise CaptureError("it reports an error; see the server's log.")
+            if state == IDLE and not self._camera.ImageReady:
+                raise CaptureError(
+                    "its exposure was ended by another program, or the server has started anew."
+                )
+            if left_s < -READOUT_S:
+                raise CaptureError(f"no picture has come {READOUT_S:g} s after the end of the exposure.")
+            if self._closing.wait(min(WATCH_S, max(POLL_S, left_s))):
+                raise CaptureError("the node ends.")
+
+    def _stamp(self, commanded_s, ready_s, exposure_s):
+        """Middle of the exposure and its standard deviation (s), where they come from, and what is to be said of it."""
+        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
+        commanded = (mid_s, stddev_s, Capture.COMMAND)
+        local = self._address.rpartition(":")[0] in LOCAL
+        clock_s = 0.0 if local else self._values["alpaca.clock_stddev"]
+        start = read_utc(_optional(self._camera, "LastExposureStartTime", ""))
+        if start is None or math.isnan(clock_s):
+            return *commanded, ""
+        start_s, resolution_s = start
+        tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_s
+        if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
+            remark = (
+                f"{self.hardware_id}: its times of exposures are off by more than {tolerance_s:.2g} s and not used; set "
+                "the server's clock, to UTC."
+            )
+            return *commanded, remark
+        mid_s, driver_stddev_s = middle_of_started(start_s, resolution_s, exposure_s)
+        driver_stddev_s = math.hypot(driver_stddev_s, clock_s)
+        if driver_stddev_s > stddev_s:
+            return *commanded, ""
+        return mid_s, driver_stddev_s, Capture.DRIVER, ""
+
+
+def _optional(camera, member, otherwise):
+    """What a driver need not have."""
+    from alpaca.exceptions import InvalidOperationException, NotImplementedException
+
+    try:
+        return type(otherwise)(getattr(camera, member))
+    except (NotImplementedException, InvalidOperationException):
+        return otherwise
+
+
+def _pattern(camera):
+    kind = int(_optional(camera, "SensorType", MONOCHROME))
+    if kind == MONOCHROME:
+        return ""
+    if kind != RGGB:
+        raise CaptureError(f"its sensor is of ASCOM's type {kind}; monochrome and RGGB ones are known here.")
+    offsets = int(camera.BayerOffsetX), int(camera.BayerOffsetY)
+    if offsets not in PATTERNS:
+        raise CaptureError(f"its Bayer offsets are {offsets}; they must be 0 or 1.")
+    return PATTERNS[offsets]
+
+
+def _unsigned(pixels):
+    """uint8 or uint16 of whole numbers of any width."""
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels)
+    if pixels.dtype != np.dtype("<u2"):
+        low, high = int(pixels.min()), int(pixels.max())
+        if low < 0 or high > 65535:
+            raise CaptureError(f"its pixels are {low} to {high}; they must be 0 to 65535.")
+    return np.ascontiguousarray(pixels, np.uint16)
+
+
+def _sentence(error):
+    """What a library's exception means."""
+    import requests
+    import urllib3
+
+    if isinstance(error, CaptureError):
+        return str(error)
+    if isinstance(error, (requests.Timeout, urllib3.exceptions.TimeoutError)):
+        return "it does not answer in time; look after the server and the network."
+    if isinstance(error, (requests.ConnectionError, urllib3.exceptions.ProtocolError, ConnectionError)):
+        return "there is no Alpaca server, or it has gone; start it, or correct alpaca.address."
+    words = " ".join(str(getattr(error, "message", error)).split())[:160].rstrip(".")
+    return f"{words or 'no reason given'} ({type(error).__name__})."
