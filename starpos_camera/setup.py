@@ -21,6 +21,7 @@ setup(
     entry_points={
         "console_scripts": [
             "camera = starpos_camera.main:camera",
+            "camera_detector = starpos_camera.main:camera_detector",
             "detector = starpos_camera.main:detector",
         ],
     },

@@ -3,7 +3,8 @@
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -13,10 +14,12 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
+from std_msgs.msg import Header
 
 from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
+from starpos.frame import Frame
 from starpos.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS, path_of
 from starpos_camera.sources import Settings, Source, SourceEnded
@@ -26,7 +29,7 @@ from starpos_camera.worker import Worker
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport
 from starpos_common.diagnostics import Diagnostics, Level, Status
-from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera
+from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
@@ -37,13 +40,26 @@ STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated"
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """A frame as messages, the intrinsics its source vouches for, how long it took, and what the source remarks."""
+    """A frame with its Capture, the intrinsics and the remark of its source, how long it took; the message of it where
+    somebody subscribes."""
 
-    image: Image
+    frame: Frame
     capture: Capture
+    image: Image | None
     camera: Camera | None
+    remark: str
     seconds: float
-    remark: str = ""
+
+
+class Taker(Protocol):
+    """Who takes frames in this process."""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody listens to what it makes of them."""
+
+    def submit(self, frame: Frame, header: Header):
+        """Take one; returns at once."""
 
 
 class CameraNode(Node):
@@ -68,7 +84,9 @@ class CameraNode(Node):
 
         self._frames = self._failed = self._skipped = 0
         self._skipped_before = 0  # at the last report
-        self._last: Taken | None = None  # without its image
+        self._last: Taken | None = None  # without its pixels
+        self._size: tuple[int, int] | None = None  # of the frames
+        self._takers: list[Taker] = []
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")
         self._logged = ""
@@ -99,6 +117,10 @@ class CameraNode(Node):
         self._source.close()
         super().destroy_node()
 
+    def hand_to(self, taker: Taker):
+        """Give it each frame as it is, in the executor's thread: a detector in this process."""
+        self._takers.append(taker)
+
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
@@ -124,14 +146,15 @@ class CameraNode(Node):
             return
         if not self._worker.idle:
             self._skipped += 1
-        elif (
-            self._source.waits_for_listener and not self._frames and not self._images.get_subscription_count()
-        ):
+        elif self._source.waits_for_listener and not self._frames and not self._heard():
             lack = self._source.lacking()  # comes first, for a subscriber would not help
-            waiting = f"waiting for a subscriber of {self._images.topic_name}."
+            waiting = f"waiting for a subscriber of {self._images.topic_name}{' or of the stars' * bool(self._takers)}."
             self._say(Level.WARN if lack else Level.OK, lack or waiting)
         else:
             self._worker.offer(_settings(self._values))
+
+    def _heard(self) -> bool:
+        return self._images.get_subscription_count() > 0 or any(t.wanted for t in self._takers)
 
     def _take(self, settings: Settings) -> Taken:
         """In the worker's thread: a frame, ready to be published."""
@@ -141,15 +164,22 @@ class CameraNode(Node):
         else:
             exposure = in_one_time(lambda: self._source.capture(settings), system_clock.StepWatch())
             clock = system_clock.read() if exposure.stamp_source in OF_SYSTEM_CLOCK else None
-        image = frame_to_message(exposure.frame, self._values["frame_id"])
+        frame = replace(
+            exposure.frame,
+            stamp_stddev_s=float(exposure.stamp_stddev_s),
+            clock_stddev_s=clock.stddev_s if clock else 0.0,
+        )
+        header = Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=self._values["frame_id"])
         capture = Capture(
-            header=image.header,
-            exposure=float(exposure.frame.exposure_s or 0.0),
-            stamp_stddev=float(exposure.stamp_stddev_s),
-            clock_stddev=clock.stddev_s if clock else 0.0,
+            header=header,
+            exposure=float(frame.exposure_s or 0.0),
+            stamp_stddev=frame.stamp_stddev_s,
+            clock_stddev=frame.clock_stddev_s,
             stamp_source=exposure.stamp_source,
         )
-        return Taken(image, capture, exposure.camera, time.monotonic() - begin, exposure.remark)
+        heard = self._images.get_subscription_count()  # a message is a copy of the frame
+        image = frame_to_message(frame, header.frame_id) if heard else None
+        return Taken(frame, capture, image, exposure.camera, exposure.remark, time.monotonic() - begin)
 
     def _on_wake(self):
         for result in self._worker.fetch():
@@ -168,30 +198,33 @@ class CameraNode(Node):
                 self._publish(result)
 
     def _publish(self, taken: Taken):
-        image, camera = taken.image, self._camera(taken)
-        info = camera_to_message(camera, image.header.frame_id)
-        info.header = image.header
+        frame, camera = taken.frame, self._camera(taken)
+        info = camera_to_message(camera, taken.capture.header.frame_id)
+        info.header = taken.capture.header
         self._captures.publish(taken.capture)
         self._infos.publish(info)
-        self._images.publish(image)
+        if taken.image is not None:
+            self._images.publish(taken.image)
+        for taker in self._takers:
+            taker.submit(frame, taken.capture.header)
         self._frames += 1
-        self._last = Taken(Image(width=image.width, height=image.height), taken.capture, None, taken.seconds)
-        if (camera.width, camera.height) != (image.width, image.height):
+        self._last, self._size = replace(taken, frame=None, image=None), (frame.width, frame.height)
+        if (camera.width, camera.height) != self._size:
             self._say(
                 Level.ERROR,
-                f"the calibration is of {camera.width} x {camera.height} px but the frames have {image.width} x "
-                f"{image.height} px: calibrate the camera as it is used.",
+                f"the calibration is of {camera.width} x {camera.height} px but the frames have {frame.width} x "
+                f"{frame.height} px: calibrate the camera as it is used.",
             )
         elif taken.remark:
             self._say(Level.WARN, taken.remark)
         else:
-            self._say(Level.OK, f"taking frames of {image.width} x {image.height} px.")
+            self._say(Level.OK, f"taking frames of {frame.width} x {frame.height} px.")
 
     def _camera(self, taken: Taken) -> Camera:
         if self._calibration or taken.camera:
             return self._calibration or taken.camera
         focal_px = focal_px_of(self._values["focal_mm"], self._values["pixel_um"])
-        return Camera.from_focal(taken.image.width, taken.image.height, focal_px)
+        return Camera.from_focal(taken.frame.width, taken.frame.height, focal_px)
 
     def _say(self, level: Level, sentence: str):
         """The state from now on; logged where it is another than before."""
@@ -208,13 +241,10 @@ class CameraNode(Node):
     def _on_set_camera_info(self, request, response):
         try:
             camera = message_to_camera(request.camera_info, "set_camera_info")
-            if self._last and (camera.width, camera.height) != (
-                self._last.image.width,
-                self._last.image.height,
-            ):
+            if self._size not in (None, (camera.width, camera.height)):
                 raise InstrumentError(
                     f"set_camera_info: the calibration is of {camera.width} x {camera.height} px but the frames "
-                    f"have {self._last.image.width} x {self._last.image.height} px: calibrate with whole frames."
+                    f"have {self._size[0]} x {self._size[1]} px: calibrate with whole frames."
                 )
             # What cannot be kept is still right: it holds for this session, and the answer says so.
             self._calibration = camera
@@ -275,7 +305,7 @@ class CameraNode(Node):
         }
         if last:
             values |= {
-                "size (px)": f"{last.image.width} x {last.image.height}",
+                "size (px)": "{} x {}".format(*self._size),
                 "exposure (s)": last.capture.exposure,
                 "stamp from": STAMP_SOURCES[last.capture.stamp_source],
                 "stamp error (s)": last.capture.stamp_stddev,

@@ -19,7 +19,7 @@ from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
 from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
-from starpos_common.messages import message_to_frame, stars_to_message
+from starpos_common.messages import encoding_of, message_to_frame, stars_to_message
 from starpos_common.parameters import declare
 from starpos_interfaces.msg import Capture, StarArray
 
@@ -61,12 +61,23 @@ class DetectorNode(Node):
         self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
         self._complaint = ""  # about a frame since the last report
         self._last: Outcome | None = None
-        self._size = None
+        self._size = ""  # of the last frame, in words
         self._last_frame_s = self._interval_s = None  # monotonic
         overriding = QoSOverridingOptions.with_default_policies()
         self._publisher = self.create_publisher(
             StarArray, "stars", QoSProfile(depth=10), qos_overriding_options=overriding
         )
+        self._where = ""  # frames come from, for messages
+        self._annotator = Annotator(self)
+        self._wake = self.create_guard_condition(self._on_wake)
+        self._worker = Worker(self._detect, self._wake.trigger, "detection")
+        self._diagnostics = Diagnostics(self, {"Stars": self._report})
+        _warm_up()
+        self._worker.start()
+
+    def listen(self):
+        """Take the frames of `camera/image_raw`; beside a camera in this process `submit` is called instead."""
+        overriding = QoSOverridingOptions.with_default_policies()
         # This one first: the executor takes what is ready in this order, and an image needs its Capture.
         self.create_subscription(
             Capture,
@@ -75,33 +86,43 @@ class DetectorNode(Node):
             QoSProfile(depth=CAPTURES_KEPT),
             qos_overriding_options=overriding,
         )
-        self._images = self.create_subscription(
+        images = self.create_subscription(
             Image,
             "camera/image_raw",
             self._on_image,
             QoSProfile(depth=IMAGE_DEPTH),
             qos_overriding_options=overriding,
         )
-        self._annotator = Annotator(self)
-        self._wake = self.create_guard_condition(self._on_wake)
-        self._worker = Worker(self._detect, self._wake.trigger, "detection")
-        self._diagnostics = Diagnostics(self, {"Stars": self._report})
-        _warm_up()
-        self._worker.start()
+        self._where = f" on {images.topic_name}"
 
     def destroy_node(self):
         self._worker.stop()
         self._annotator.stop()
         super().destroy_node()
 
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody subscribes to the stars."""
+        return self._publisher.get_subscription_count() > 0
+
     def submit(self, frame: Frame, header: Header):
         """Have a frame's stars published under `header`; it replaces one that still waits.
 
-        What the subscription does; from any thread. A camera node in the same process calls it to hand over
-        its pixels as they are.
+        What the subscription does; a camera node in the same process hands its pixels over as they are.
         """
+        self._arrived()
+        size = f"{frame.width} x {frame.height} px, {encoding_of(frame)}"
+        if size != self._size:
+            self._size = size
+            self.get_logger().info(f"frames of {size}.")
         if self._worker.offer(Job(frame, header)):
             self._dropped += 1
+
+    def _arrived(self):
+        now = time.monotonic()
+        if self._last_frame_s is not None:
+            self._interval_s = now - self._last_frame_s
+        self._last_frame_s = now
 
     def _detection_settings(self) -> DetectionSettings:
         v = self._values
@@ -123,20 +144,13 @@ class DetectorNode(Node):
 
     def _on_image(self, message: Image, info: dict):
         self._count_overwritten(info["publication_sequence_number"])
-        now = time.monotonic()
-        if self._last_frame_s is not None:
-            self._interval_s = now - self._last_frame_s
-        self._last_frame_s = now
         try:
             _check_stamp(message.header)
             frame = replace(message_to_frame(message), **self._taken(message.header))
         except StarposError as error:
+            self._arrived()
             self._complain(str(error))
             return
-        size = (frame.width, frame.height, message.encoding)
-        if size != self._size:
-            self._size = size
-            self.get_logger().info(f"frames of {frame.width} x {frame.height} px, {message.encoding}.")
         self.submit(frame, message.header)
 
     def _count_overwritten(self, sequence: int | None):
@@ -189,12 +203,12 @@ class DetectorNode(Node):
             sentence = f"{len(last.message.stars)} stars in {last.seconds:.2f} s."
         silence_s = time.monotonic() - self._last_frame_s if self._last_frame_s is not None else math.inf
         if self._last_frame_s is None:
-            level, sentence = Level.WARN, f"no frame has come yet on {self._images.topic_name}."
+            level, sentence = Level.WARN, f"no frame has come yet{self._where}."
         elif complaint:
             level, sentence = Level.WARN, complaint
         elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
             level = Level.WARN
-            sentence = f"no frame for {silence_s:.0f} s on {self._images.topic_name}: is the camera running?"
+            sentence = f"no frame for {silence_s:.0f} s{self._where}: is the camera running?"
         values = {"frames": self._frames, "bad frames": self._bad, "dropped": self._dropped}
         if last:
             values |= {

@@ -6,21 +6,40 @@ def camera() -> int:
     """The node `camera`."""
     from starpos_common.node_main import run
 
-    def make_node():
+    def make_nodes():
         from starpos_camera.camera import CameraNode
 
-        return CameraNode()
+        yield CameraNode()
 
-    return run(make_node)
+    return run(make_nodes)
 
 
 def detector() -> int:
     """The node `detector`."""
     from starpos_common.node_main import run
 
-    def make_node():
+    def make_nodes():
         from starpos_camera.detector import DetectorNode
 
-        return DetectorNode()
+        node = DetectorNode()
+        node.listen()
+        yield node
 
-    return run(make_node)
+    return run(make_nodes)
+
+
+def camera_detector() -> int:
+    """Both in one process: frames go from one to the other as they are, not through the middleware."""
+    from starpos_common.node_main import run
+
+    def make_nodes():
+        from starpos_camera.camera import CameraNode
+        from starpos_camera.detector import DetectorNode
+
+        detector = DetectorNode()
+        yield detector
+        camera = CameraNode()
+        camera.hand_to(detector)
+        yield camera
+
+    return run(make_nodes)

@@ -172,17 +172,22 @@ def message_to_camera(message: CameraInfo, source: str = "camera_info") -> Camer
     return Camera(message.width, message.height, *k[[0, 4, 2, 5]].tolist(), distortion)
 
 
+def encoding_of(frame: Frame) -> str:
+    """What sensor_msgs/Image calls such pixels."""
+    layout = "bgr" if frame.pixels.ndim == 3 else f"bayer_{frame.pattern}" if frame.pattern else "mono"
+    return f"{layout}{8 * frame.pixels.itemsize}"
+
+
 def frame_to_message(frame: Frame, frame_id: str) -> Image:
     """An Image; the pixels are copied once."""
     pixels = np.ascontiguousarray(frame.pixels)
-    layout = "bgr" if pixels.ndim == 3 else f"bayer_{frame.pattern}" if frame.pattern else "mono"
     data = array.array("B")  # rclpy takes this as it is and copies, or checks byte by byte, anything else
     data.frombytes(memoryview(pixels).cast("B"))
     return Image(
         header=Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=frame_id),
         width=frame.width,
         height=frame.height,
-        encoding=f"{layout}{8 * pixels.itemsize}",
+        encoding=encoding_of(frame),
         is_bigendian=int(HOST_IS_BIG_ENDIAN),
         step=pixels.strides[0],
         data=data,

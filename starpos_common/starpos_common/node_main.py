@@ -2,7 +2,7 @@
 """The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.
 
 Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up is a clean
-exit too; an executable's module therefore imports its node inside `make_node`.
+exit too; an executable's module therefore imports its node inside `make_nodes`.
 """
 
 import os
@@ -16,11 +16,11 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 NOTICE_S = 0.5
 
 
-def run(make_node, args=None) -> int:
-    """Run the node that `make_node()` returns until it is told to stop; the process's exit status.
+def run(make_nodes, args=None) -> int:
+    """Run the nodes that `make_nodes()` yields until they are told to stop; the process's exit status.
 
-    make_node: called without arguments after rclpy.init; may raise StarposError or one of rclpy's parameter
-    errors to refuse to start.  args: the command line, by default sys.argv.
+    make_nodes: a generator, begun after rclpy.init; may raise StarposError or one of rclpy's parameter errors to refuse
+    to start.  args: the command line, by default sys.argv.
 
     0 after SIGINT (once or twice) or SIGTERM; 1 with one line on standard error when the start is refused.
     Anything else a callback raises is a defect and leaves with its traceback.
@@ -29,7 +29,7 @@ def run(make_node, args=None) -> int:
     for number in SIGNALS:
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     try:
-        return _run(make_node, args, stopped)
+        return _run(make_nodes, args, stopped)
     finally:
         # launch sends a second SIGINT: it must not meet the default handler while the interpreter ends.
         for number in SIGNALS:
@@ -48,7 +48,7 @@ def leave(status: int) -> int:
     return status
 
 
-def _run(make_node, args, stopped) -> int:
+def _run(make_nodes, args, stopped) -> int:
     import rclpy
     from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -63,19 +63,22 @@ def _run(make_node, args, stopped) -> int:
     except Exception as error:
         # A bad command line or parameter file; rcl has an error class for each.
         return 0 if stopped else _refuse(error)
-    node = None
+    nodes, made = [], False
     try:
-        node = make_node()
+        for node in make_nodes():
+            nodes.append(node)
+        made = True
         # rclpy's handlers shut the context down, which would trip over a node half made; ours run as well.
         install_signal_handlers(SignalHandlerOptions.ALL)
         executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        for node in nodes:
+            executor.add_node(node)
         while not stopped and rclpy.ok():
             executor.spin_once(timeout_sec=NOTICE_S)
     except ExternalShutdownException:
         pass
     except (StarposError, ParameterException) as error:
-        if node is None and not stopped:
+        if not made and not stopped:
             return _refuse(error)
         if not stopped and rclpy.ok():
             raise
@@ -84,7 +87,7 @@ def _run(make_node, args, stopped) -> int:
         if not stopped and rclpy.ok():
             raise
     finally:
-        if node is not None:
+        for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -14,7 +14,7 @@ PROGRAM = """
 import sys
 from starpos_common.node_main import run
 
-def make_node():
+def make_nodes():
     print("making", flush=True)
     %s
     from rclpy.node import Node
@@ -26,9 +26,9 @@ def make_node():
             print("spinning", flush=True)
             self.timers.__next__().cancel()
             %s
-    return Ready()
+    yield Ready()
 
-sys.exit(run(make_node))
+sys.exit(run(make_nodes))
 """
 
 

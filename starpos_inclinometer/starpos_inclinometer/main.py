@@ -9,12 +9,12 @@ def inclinometer() -> int:
     """The node."""
     from starpos_common.node_main import run
 
-    def make_node():
+    def make_nodes():
         from starpos_inclinometer.node import InclinometerNode
 
-        return InclinometerNode()
+        yield InclinometerNode()
 
-    return run(make_node)
+    return run(make_nodes)
 
 
 def emulator() -> int:

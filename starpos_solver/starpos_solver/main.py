@@ -6,9 +6,9 @@ def solver() -> int:
     """The node."""
     from starpos_common.node_main import leave, run
 
-    def make_node():
+    def make_nodes():
         from starpos_solver.node import SolverNode
 
-        return SolverNode()
+        yield SolverNode()
 
-    return leave(run(make_node))  # the triangles may be in the making
+    return leave(run(make_nodes))  # the triangles may be in the making
