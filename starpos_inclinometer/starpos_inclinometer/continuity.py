@@ -17,13 +17,15 @@ WITNESSES = 3  # samples in a row that are believed though no two are near each 
 
 PERIOD_TOLERANCE_MS = 2  # both ends are floored to ms
 SHORTEST_MS, LONGEST_MS = 20, 1000  # periods of the rates there are
+TEMPERATURE_TOLERANCE = 3  # counts: 2.8 deg C from one sample to the next
+FAULTS = Status.ADC_TIMEOUT | Status.NO_REFERENCE
 HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE = 3.0, 0.05  # a stalled host, an MCU's RC oscillator
 
 
 class Gate:
     """Lets samples pass that fit the last one; others wait until the ones after them bear them out, or are dropped.
 
-    follows: whether the second arrival may come after the first, by number and time.  tolerance: change of `x` and `y`
+    follows: whether the second arrival may come after the first, by all but `x` and `y`.  tolerance: change of `x` and `y`
     of a sample that is never suspicious; what the instrument does lately is not either.
     """
 
@@ -77,16 +79,26 @@ def _change(a: Arrival, b: Arrival) -> float:
 
 
 def mcu_follows(a: Arrival, b: Arrival, period_ms: float | None) -> bool:
-    """Whether a Sample may come after another of the same run of the MCU, at its rate (None: not known)."""
+    """Whether a Sample may come after another of the same run of the MCU, at its rate (None: not known).
+
+    By number, MCU's time, host's time, temperature and status.
+    """
     ahead = (b.sample.sequence - a.sample.sequence) & 0xFFFF
     elapsed = (b.sample.milliseconds - a.sample.milliseconds) & 0xFFFFFFFF
     if not ahead or b.sample.status & Status.FIRST:
         return False
+    if _temperature_leaps(a.sample, b.sample) or a.sample.status & FAULTS & ~b.sample.status:
+        return False  # that a fault is over has to be said twice
     low, high = (SHORTEST_MS, LONGEST_MS) if period_ms is None else (period_ms, period_ms)
     if not low * ahead - PERIOD_TOLERANCE_MS <= elapsed <= high * ahead + PERIOD_TOLERANCE_MS:
         return False
     apart_s = b.moment.monotonic_s - a.moment.monotonic_s
     return abs(elapsed * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
+
+
+def _temperature_leaps(a: Sample, b: Sample) -> bool:
+    known = not (a.status | b.status) & Status.NO_TEMPERATURE
+    return known and abs(b.temperature - a.temperature) > TEMPERATURE_TOLERANCE
 
 
 class Continuity:

@@ -29,6 +29,7 @@ class McuDecoder:
         self.wanted_rate_hz = rate_hz
         self.identity: Identity | None = None
         self.answered = False
+        self._ask = True  # who it is and at which rate
         self._refused_rate: int | None = None
         self._parser = protocol.Parser()
         self._gate = Gate(self._follows, NEAR_CODES)
@@ -59,6 +60,7 @@ class McuDecoder:
 
     def resume(self):
         self.identity = None
+        self._ask = True
         self._refused_rate = None
         self._parser.forget()
         self._gate.reset()
@@ -74,12 +76,13 @@ class McuDecoder:
             self.answered = True
             if isinstance(message, Identity):
                 self.identity = message
+                self._ask = False
             elif isinstance(message, Refusal) and message.reason == Reason.OUT_OF_RANGE:
                 self._refused_rate = self.wanted_rate_hz
         return believed
 
     def command(self) -> bytes:
-        if self.identity is None:
+        if self._ask or self.identity is None:
             return protocol.identify_command()
         if self.identity.rate_hz != self.wanted_rate_hz and not self.refused:
             return protocol.rate_command(self.wanted_rate_hz)
@@ -90,7 +93,7 @@ class McuDecoder:
         believed = [Arrival(self._continuity.follow(a.sample), a.moment) for a in self._gate.admit(arrival)]
         if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
             # After a reset it is at the default rate, perhaps with another firmware; so it may be where nobody saw one.
-            self.identity = None
+            self._ask = True
         return believed
 
     def _follows(self, a: Arrival, b: Arrival) -> bool:

@@ -55,9 +55,23 @@ def test_the_first_sample_waits_for_a_second_one(cable):
     assert numbers(cable.send(line(2))) == [2]
 
 
+def test_a_fault_is_told_at_once_its_end_when_it_is_said_twice(cable):
+    cable.send(line(0), line(1))
+    got = cable.send(line(2, status=Status.ADC_TIMEOUT), line(3, status=Status.ADC_TIMEOUT))
+    assert numbers(got) == [2, 3]
+    assert cable.send(line(4)) == [] and numbers(cable.send(line(5))) == [4, 5]
+
+
+def test_without_temperature_its_number_means_nothing(cable):
+    cable.send(line(0), line(1))
+    odd = protocol.sample_line(2, 200, CODE, CODE, 0xFF, Status.NO_TEMPERATURE)
+    assert numbers(cable.send(odd, line(3))) == [2, 3]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
+        protocol.sample_line(3, 300, CODE, CODE, 0xAF ^ 0x40, 0),
         line(3, x=CODE + 4 * NEAR_CODES),
         line(3, y=0xFFFFFF),
         line(3, ms=350),
@@ -109,9 +123,9 @@ def test_after_a_rejection_the_rate_is_asked_for_again(cable):
     cable.decoder.feed(identity(50), Moment(100.0, 0))
     cable.send(*(line(k, ms=20 * k) for k in range(5)), apart_s=0.02)
     assert cable.decoder.command() == b""
-    restarted = cable.send(*(line(k) for k in range(7, 12)))
+    assert cable.send(*(line(k) for k in range(7, 12))) == []
     assert cable.decoder.command() == protocol.identify_command()
-    assert len(restarted) >= 3 and cable.counts.restarts <= 1
+    assert numbers(cable.send(identity(), line(12), line(13))) and cable.counts.restarts <= 1
 
 
 def test_a_host_that_stalled_loses_nothing(cable):
