@@ -35,6 +35,8 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
                 raise ValueError(f"it claims more than {MAX_PIXELS} pixels")
             raw.unpack()
             pixels = raw.raw_image_visible.copy()
+            if not pixels[-1].any():  # no sensor gives that
+                raise ValueError("its last row is empty")
             colours = raw.color_desc.decode("ascii", "replace")
             pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
     except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError, AttributeError) as e:

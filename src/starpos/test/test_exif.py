@@ -67,6 +67,13 @@ def test_a_raw_file_that_breaks_off_is_no_frame(tmp_path, kept):
             read_frame(write(tmp_path / "a.dng", cut))
 
 
+@needs_rawpy
+def test_a_raw_file_whose_rest_was_never_written_is_no_frame(tmp_path):
+    whole = raws.dng(MOSAIC)
+    with pytest.raises(FrameError, match="last row is empty"):
+        read_frame(write(tmp_path / "a.dng", whole[: len(whole) // 2].ljust(len(whole), b"\0")))
+
+
 @pytest.mark.parametrize("quality", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]])
 def test_a_jpeg_that_breaks_off_is_no_frame_and_what_follows_one_does_not_matter(tmp_path, quality):
     whole = cv2.imencode(".jpg", (MOSAIC >> 8).astype(np.uint8), quality)[1].tobytes()

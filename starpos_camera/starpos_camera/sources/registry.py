@@ -4,10 +4,12 @@
 from starpos_camera.sources import Source
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.files import Files
+from starpos_camera.sources.gphoto2 import Gphoto2
 from starpos_camera.sources.simulated import Simulated
 
 SOURCES: dict[str, type[Source]] = {
     "files": Files,
     "simulated": Simulated,
     "alpaca": Alpaca,
+    "gphoto2": Gphoto2,
 }

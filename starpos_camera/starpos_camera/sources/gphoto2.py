@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Canon, Nikon and other cameras that libgphoto2 knows, by USB or PTP/IP, through PyPI's gphoto2."""
+
+import math
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+from starpos.errors import FrameError
+from starpos.reading import RAW, decode_frame
+from starpos_camera.sources import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.gphoto2_camera import TOLERANCE, Gphoto2Camera, sentence
+from starpos_camera.sources.timing import middle_of_commanded
+from starpos_common.parameters import Parameter
+from starpos_interfaces.msg import Capture
+
+TARGETS = {"memory": "ram", "card": "card"}  # and what is in libgphoto2's names of them
+FORMATS = ("imageformat", "imagequality")  # Canon's and Nikon's
+RAW_ALONE = r"^(?!.*(jpe?g|\+|fine|large)).*\b(raw|nef)\b"
+PARAMETERS = (
+    Parameter(
+        "gphoto2.model",
+        "",
+        "The camera's name or a part of it, as the program `gphoto2 --auto-detect` prints it; empty: the only one there.",
+        read_only=True,
+    ),
+    Parameter(
+        "gphoto2.port",
+        "",
+        "Its port, like ptpip:192.168.1.1 (then with gphoto2.model in full), or usb:001,004, which changes each time the "
+        "camera is plugged in; empty: any.",
+        read_only=True,
+    ),
+    Parameter(
+        "gphoto2.shutter_setting",
+        "shutterspeed",
+        "The camera's name of its setting of the exposure time (gphoto2 --list-config); shutterspeed2 for some Nikon.",
+        read_only=True,
+    ),
+    Parameter(
+        "gphoto2.iso_setting",
+        "iso",
+        "The camera's name of the setting of ISO, which is what `gain` sets.",
+        read_only=True,
+    ),
+    Parameter(
+        "gphoto2.raw",
+        True,
+        "Set the camera to its raw format, where it has one; false leaves the format as it is. A JPEG has 8 bits, and "
+        "its noise and faint stars are smoothed away.",
+        read_only=True,
+    ),
+    Parameter(
+        "gphoto2.target",
+        "memory",
+        "Where the camera puts a frame before it is fetched; some can do only one of them.",
+        choices=tuple(TARGETS),
+        read_only=True,
+    ),
+    Parameter(
+        "gphoto2.keep",
+        False,
+        "Leave the frames in the camera too; its card fills up, and then there are no more.",
+        read_only=True,
+    ),
+)
+
+
+class Gphoto2:
+    """Commands each exposure, waits for its file, fetches and deletes it. The camera's dial stands at M."""
+
+    parameters = PARAMETERS
+    waits_for_listener = False
+
+    @staticmethod
+    def refusal(values: Mapping, settings: Settings) -> str | None:
+        for package in ("gphoto2", "exifread", *(("rawpy",) if values["gphoto2.raw"] else ())):
+            if lack := missing(package, package):
+                return lack
+        exposure_s, cadence_s = settings.exposure_s, settings.cadence_s
+        if exposure_s is not None and exposure_s > cadence_s:
+            return f"`exposure` ({exposure_s:g} s) must not be longer than `cadence` ({cadence_s:g} s)."
+        return None
+
+    def __init__(self, values: Mapping, now: Callable[[], float]):
+        self._values = values
+        self._now = now
+        which = filter(None, (values["gphoto2.model"], values["gphoto2.port"]))
+        self.hardware_id = " ".join(("gphoto2", *which))
+        self._closing = threading.Event()
+        self._in_use = threading.Lock()
+        self._camera: Gphoto2Camera | None = None
+
+    def lacking(self) -> None:
+        """Only a look at the bus tells."""
+
+    def capture(self, settings: Settings) -> Exposure:
+        import gphoto2
+
+        with self._in_use:
+            try:
+                if self._camera is None:
+                    self._camera = self._opened()
+                return self._expose(self._camera, settings)
+            except (CaptureError, FrameError) as error:
+                self._release()
+                raise CaptureError(f"{self.hardware_id}: {error}") from error
+            except gphoto2.GPhoto2Error as error:
+                self._release()
+                raise CaptureError(f"{self.hardware_id}: {sentence(error.code)}") from error
+
+    def update(self, values: Mapping):
+        self._values = values
+
+    def close(self):
+        self._closing.set()
+        with self._in_use:
+            self._release()
+
+    def _release(self):
+        if self._camera is not None:
+            self._camera.release()
+            self._camera = None
+
+    def _opened(self) -> Gphoto2Camera:
+        """The camera, set to what holds as long as it is open."""
+        values = self._values
+        camera = Gphoto2Camera(values["gphoto2.model"], values["gphoto2.port"], self._closing)
+        camera.prefer("autofocus", "off")  # stars are no target for it, and without one there is no exposure
+        camera.prefer("capturetarget", TARGETS[values["gphoto2.target"]])
+        if values["gphoto2.raw"]:
+            for name in FORMATS:
+                camera.prefer(name, RAW_ALONE)
+        return camera
+
+    def _expose(self, camera: Gphoto2Camera, settings: Settings) -> Exposure:
+        camera.drain()
+        set_s, bulb = camera.set_exposure(self._values["gphoto2.shutter_setting"], settings.exposure_s)
+        if settings.gain is not None:
+            camera.set_gain(self._values["gphoto2.iso_setting"], settings.gain)
+        commanded_s = self._now()
+        if bulb:
+            set_s = camera.hold_open(set_s)
+        else:
+            camera.trigger()
+        files = camera.files(set_s)
+        file = next((f for f in files if PurePosixPath(f).suffix.lower() in RAW), files[0])
+        data = camera.fetch(file)
+        remark = "" if self._values["gphoto2.keep"] else self._delete(camera, files)
+        frame = decode_frame(data, file)
+        told_s = frame.exposure_s
+        exposure_s = set_s if bulb or told_s is None else told_s
+        if abs(math.log(exposure_s / set_s)) > TOLERANCE:
+            told = f"it says that it exposed for {exposure_s:g} s, though its shutter stood at {set_s:g} s"
+            remark = f"{self.hardware_id}: {told}."
+        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
+        if not bulb:
+            stddev_s = math.hypot(stddev_s, named_off_s(exposure_s) / 2)
+        frame = replace(frame, exposure_s=exposure_s, mid_unix_s=mid_s)
+        return Exposure(frame, Capture.COMMAND, stddev_s, remark=remark)
+
+    def _delete(self, camera, files) -> str:
+        """Remove from the camera what this exposure put there; a sentence where that failed."""
+        import gphoto2
+
+        try:
+            camera.delete(files)
+        except gphoto2.GPhoto2Error as error:
+            return f"{self.hardware_id}: frames stay in the camera, which fills up ({error.string})."
+        return ""
+
+
+def named_off_s(exposure_s: float) -> float:
+    """How far an exposure may be from what it is called: shutters go by thirds of powers of 2, and 30 s may be 32 s."""
+    return abs(2 ** (round(3 * math.log2(exposure_s)) / 3) - exposure_s)
