@@ -74,6 +74,7 @@ class LineDecoder:
     """
 
     answered = False
+    hint = "check `baud` and `ascii.pattern`, and that this is the inclinometer."
 
     def __init__(
         self, pattern: str, unit: str, resolution: float = math.nan, period_s: float = 1.0, request: str = ""
@@ -125,7 +126,9 @@ class LineDecoder:
         match = self._pattern.fullmatch(text)
         if match is None:
             return None
-        said = {name: value for name, value in match.groupdict().items() if value is not None}
+        said = {name: value for name, value in match.groupdict().items() if value}
+        if any("_" in value for value in said.values()):
+            return None  # which float takes
         try:
             (x, step_x), (y, step_y) = self._angle(said["x"]), self._angle(said["y"])
             temperature = float(said.get("temperature", "nan"))

@@ -25,8 +25,8 @@ HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE = 3.0, 0.05  # a stalled host, an MCU's R
 class Gate:
     """Lets samples pass that fit the last one; others wait until the ones after them bear them out, or are dropped.
 
-    follows: whether the second arrival may come after the first, by all but `x` and `y`.  tolerance: change of `x` and `y`
-    of a sample that is never suspicious; what the instrument does lately is not either.
+    follows: whether the second arrival may come after the first, by all but `x` and `y`.  tolerance: how far these may
+    go from one sample to the next without suspicion; what the instrument does lately is none either.
     """
 
     def __init__(self, follows: Callable[[Arrival, Arrival], bool], tolerance: float):

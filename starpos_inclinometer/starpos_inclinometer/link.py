@@ -32,6 +32,8 @@ PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueE
 class Decoder(Protocol):
     """What a device's bytes mean, and what it is to be told. Used by the link's thread; `counts` is read by any."""
 
+    hint: str  # what to do where bytes come but no lines
+
     @property
     def counts(self) -> Counts: ...
 
@@ -184,7 +186,7 @@ class SerialLink:
                 self._enter(
                     Phase.GARBLED,
                     f"{self._port} sends bytes but no valid lines at {self._baud} baud: "
-                    "check the baud rate, and that this is the inclinometer.",
+                    + self._decoder.hint,
                 )
             elif now - last_sample > UNFIT_PATIENCES * patience:
                 self._enter(

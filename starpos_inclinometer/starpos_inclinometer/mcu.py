@@ -24,6 +24,7 @@ class McuDecoder:
     """The MCU's bytes to believed samples, and the commands that keep it at the rate that is wanted."""
 
     command_period_s = 1.0  # PROTOCOL.md
+    hint = "check the baud rate, and that this is the inclinometer."
 
     def __init__(self, rate_hz: int):
         self.wanted_rate_hz = rate_hz
