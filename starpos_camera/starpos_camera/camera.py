@@ -22,7 +22,7 @@ from starpos.errors import InstrumentError, StarposError
 from starpos.frame import Frame
 from starpos.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS, path_of
-from starpos_camera.sources import Settings, Source, SourceEnded
+from starpos_camera.sources import NothingYet, Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_camera.worker import Worker
@@ -167,7 +167,7 @@ class CameraNode(Node):
         frame = replace(
             exposure.frame,
             stamp_stddev_s=float(exposure.stamp_stddev_s),
-            clock_stddev_s=clock.stddev_s if clock else 0.0,
+            clock_stddev_s=clock.stddev_s if clock else exposure.frame.clock_stddev_s,
         )
         header = Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=self._values["frame_id"])
         capture = Capture(
@@ -186,6 +186,9 @@ class CameraNode(Node):
             if isinstance(result, SourceEnded):
                 self._ended = True
                 self._say(Level.OK, str(result))
+            elif isinstance(result, NothingYet):
+                if self._state[0] is not Level.OK:  # between two frames it is no news
+                    self._say(Level.OK, str(result))
             elif isinstance(result, StarposError):
                 self._failed += 1
                 self._say(Level.ERROR, str(result))

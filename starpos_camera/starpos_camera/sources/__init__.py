@@ -16,6 +16,10 @@ class CaptureError(StarposError):
     """The camera is not there, or gave no frame."""
 
 
+class NothingYet(StarposError):
+    """No frame has come since the last one, and that is as it should be."""
+
+
 class SourceEnded(StarposError):
     """There are no more frames, and there will be none: not a fault."""
 
@@ -75,7 +79,7 @@ class Source(Protocol):
         """Take the next frame, in a thread of the node's; blocks until it is there.
 
         StarposError in one sentence where there is none: the node reports it and calls again one cadence
-        later. SourceEnded where there will be none.
+        later. NothingYet where it waits for one, SourceEnded where there will be none.
         """
 
     def update(self, values: Mapping):
