@@ -246,12 +246,31 @@ def test_what_is_no_bag_is_refused_in_a_sentence(domain, run, tmp_path, make):
     )
 
 
+def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_made_of_them(
+    graph, run, tmp_path
+):
+    names = ("/rover/stars", "/rover/tilt", "/rover/fix", "/rover/camera/image_raw", "/stars_of_another_kind")
+    messages = [(k * S, name, STRING, text(name)) for k, name in enumerate(names, 1)]
+    bag, heard = write_bag(tmp_path / "bag", messages), {n: graph.hear(String, n, LATCHED) for n in names}
+    for inputs, played in (("stars", names[:2]), ("images", (names[1], names[3]))):
+        for said in heard.values():
+            said.clear()
+        replay = run(
+            "starpos_solver", "replay", arguments=(str(bag), "--rate", "0", "--inputs", inputs, "--wait", "3")
+        )
+        assert replay.wait() == 0, replay.output
+        graph.wait(lambda names=played: all(heard[name] for name in names))
+        assert {name for name, said in heard.items() if said} == set(played)
+
+
 def test_bad_calls(run):
     for words, said in (
         ((str(NIGHT), "--rate", "-1"), "--rate"),
         ((str(NIGHT), "--rate", "nan"), "--rate"),
         ((str(NIGHT), "--topics", "/nothing"), "no topic /nothing"),
         ((), "BAG"),
+        ((str(NIGHT), "--inputs", "moon"), "--inputs"),
+        ((str(NIGHT), "--inputs", "stars", "--topics", "/stars"), "not allowed with"),
         ((str(NIGHT), "--ros-args", "-p"), "replay: "),
     ):
         replay = run("starpos_solver", "replay", arguments=words)

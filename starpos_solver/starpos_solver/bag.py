@@ -59,6 +59,15 @@ class Bag:
     def _broken(self, error: Exception) -> ReplayError:
         return ReplayError(f"{self.path}: not a readable bag ({type(error).__name__}: {str(error)[:200]})")
 
+    def inputs(self, needed: str, others: tuple[str, ...]) -> list[str]:
+        """The topics of these relative names, in whatever namespace; ReplayError where the needed one is not there."""
+        names = sorted({c.topic for c in self._reader.connections})
+        if not any(name.endswith("/" + needed) for name in names):
+            raise ReplayError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
+        return [
+            name for name in names if name.endswith(tuple("/" + relative for relative in (needed, *others)))
+        ]
+
     def topics(self, wanted: list[str] | None, left_out: Callable[[str], None]) -> dict[int, Topic]:
         """What can be played, by connection; `left_out` is called with a sentence for each topic that cannot.
 

@@ -18,6 +18,11 @@ PLAYED, CUT_SHORT, REFUSED = 0, 1, 2  # exit statuses
 FRAMES = ("sensor_msgs/msg/Image", "starpos_interfaces/msg/StarArray")
 HELD = (*FRAMES, "sensor_msgs/msg/CameraInfo")  # what must not overtake the solution of the frame before
 SOLUTION = "solver/solution"
+INPUTS = {  # the one there must be, and others
+    "stars": ("stars", ("camera/camera_info", "tilt")),
+    "images": ("camera/image_raw", ("camera/camera_info", "camera/capture", "tilt")),
+}
+WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 CLOCK_PERIOD_S = 0.025
 ANSWER_S = 3.0  # the solver's own patience with a frame is far shorter
 UNANSWERED = 3  # frames of a topic in a row, until nothing is expected of it
@@ -44,7 +49,8 @@ def main(arguments: list[str], stopped: list) -> int:
     options = _parser().parse_args(ours)
     try:
         with Bag(options.bag) as bag:
-            topics = bag.topics(options.topics, left_out=_say)
+            wanted = bag.inputs(*INPUTS[options.inputs]) if options.inputs else options.topics
+            topics = bag.topics(wanted, left_out=_say)
             return 0 if stopped else _play(bag, topics, options, ros, stopped)
     except ReplayError as error:
         _say(str(error))
@@ -72,10 +78,20 @@ def _parser() -> argparse.ArgumentParser:
         metavar="R",
         help="times real time (1); 0: as fast as it is taken, each frame after the solution of the one before",
     )
-    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these (all)")
+    some = parser.add_mutually_exclusive_group()
+    some.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these (all)")
+    some.add_argument(
+        "--inputs",
+        choices=tuple(INPUTS),
+        help="only what a solver takes (stars), or detector and solver (images), in whatever namespace; not what they "
+        "gave then",
+    )
     parser.add_argument("--loop", action="store_true", help="again and again; the time begins anew as well")
     parser.add_argument(
-        "--wait", type=_rate, default=3.0, metavar="S", help="at most so long for each topic's subscriber (3)"
+        "--wait",
+        type=_rate,
+        metavar="S",
+        help="at most so long for each topic's subscriber (3; with --inputs 30)",
     )
     return parser
 
@@ -115,7 +131,8 @@ def _play(bag: Bag, topics: dict[int, Topic], options, ros: list[str], stopped: 
 
 
 def _rounds(player: "Player", bag: Bag, topics: dict[int, Topic], options, stopped: list) -> int:
-    player.wait_for_subscribers(options.wait)
+    patience_s = WAIT_FOR_INPUTS_S if options.inputs else WAIT_S
+    player.wait_for_subscribers(patience_s if options.wait is None else options.wait)
     begin, status = time.monotonic(), PLAYED
     while not stopped:
         before = player.count

@@ -1,48 +1,135 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launch file, where launch is installed: it is no part of the ROS that PyPI carries."""
+"""The launch files, where launch is installed: it is no part of the ROS that PyPI carries."""
 
 import importlib.util
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import yaml
+from sensor_msgs.msg import NavSatFix
 
-LAUNCH_FILE = Path(__file__).parent.parent / "launch" / "starpos.launch.py"
+from starpos_common.testing import Listener, take_domain
+
+pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
+
+import launch
+import launch_ros
+
+FOLDER = Path(__file__).parent.parent / "launch"
+NIGHT = Path(__file__).parents[2] / "test" / "data" / "night"
+LAUNCH = """
+import sys
+from launch import LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+service = LaunchService()
+source = PythonLaunchDescriptionSource(sys.argv[1])
+arguments = [a.split(":=", 1) for a in sys.argv[2:]]
+service.include_launch_description(
+    __import__("launch").LaunchDescription([IncludeLaunchDescription(source, launch_arguments=arguments)])
+)
+sys.exit(service.run())
+"""
 
 
-@pytest.fixture
-def launch_file():
-    pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
-    spec = importlib.util.spec_from_file_location("starpos_launch", LAUNCH_FILE)
+def module_of(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.launch.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def started(module, **given) -> dict[str, list]:
-    """Parameters of each executable as launch would pass them."""
-    import launch
-
-    context = launch.LaunchContext()
-    description = module.generate_launch_description()
-    for entity in description.entities:
+def started(name, **given):
+    """The executables it starts, each with the parameters that go over the file's, and its arguments."""
+    module, context = module_of(name), launch.LaunchContext()
+    for entity in module.generate_launch_description().entities:
         if isinstance(entity, launch.actions.DeclareLaunchArgument):
-            context.launch_configurations[entity.name] = given.get(entity.name, "")
-    return {n.node_executable: n._Node__parameters for n in module.nodes(context)}
+            default = launch.utilities.perform_substitutions(context, entity.default_value or [])
+            context.launch_configurations[entity.name] = given.get(entity.name, default)
+    processes = {}
+    for action in module.nodes(context):
+        if not isinstance(action, launch_ros.actions.Node):
+            continue
+        files = [
+            launch.utilities.perform_substitutions(context, f.param_file)
+            for f in action._Node__parameters  # launch_ros has no public way to them
+        ]
+        over = yaml.safe_load(Path(files[-1]).read_text()) if len(files) > 1 else {}
+        words = [w for w in action._Node__arguments if isinstance(w, str)]
+        processes[action.node_executable] = ({k: v["ros__parameters"] for k, v in over.items()}, words)
+    return processes
 
 
-def test_it_starts_the_four_nodes_and_takes_its_arguments(launch_file):
-    names = {name for name, _, _ in launch_file.ARGUMENTS}
-    assert names == {"namespace", "params_file", "use_sim_time", "camera", "port", "log_level"}
-    assert list(started(launch_file, params_file="mine.yaml")) == [
-        "camera",
-        "detector",
-        "inclinometer",
-        "solver",
+def test_the_instrument_takes_the_arguments_it_names():
+    assert {name for name, _, _ in module_of("starpos").ARGUMENTS} >= {
+        "namespace", "params_file", "use_sim_time", "camera", "port", "log_level",
+    }  # fmt: skip
+    silent = started("starpos", params_file="mine.yaml")
+    assert list(silent) == ["camera_detector", "inclinometer", "solver"]
+    assert all(over == {} for over, _ in silent.values())  # what is not given, the file says
+    told = started(
+        "starpos", port="/dev/x", use_sim_time="true", camera="indi", log_level="warn", dashboard="true"
+    )
+    assert told["camera_detector"][0] == {"/**": {"use_sim_time": True}, "/**/camera": {"source": "indi"}}
+    assert told["inclinometer"][0]["/**/inclinometer"] == {"port": "/dev/x"}
+    assert told["solver"][1][-2:] == ["--log-level", "warn"] and "dashboard" in told
+
+
+def test_a_replay_takes_the_stars_or_finds_them_again():
+    stars = started("replay", bag="night", rate="0")
+    assert list(stars) == ["solver", "replay"] and stars["replay"][1] == [
+        "--rate",
+        "0",
+        "--inputs",
+        "stars",
+        "--",
+        "night",
     ]
+    assert stars["solver"][0] == {"/**": {"use_sim_time": True}}
+    images = started("replay", bag="night", detector="true")
+    assert "detector" in images and "images" in images["replay"][1]
 
 
-def test_only_arguments_that_are_given_override_the_parameter_file(launch_file):
-    silent = started(launch_file, params_file="mine.yaml")
-    assert all(len(parameters) == 1 or not parameters[1] for parameters in silent.values())
-    told = started(launch_file, params_file="mine.yaml", port="/dev/x", use_sim_time="true")
-    assert len(told["inclinometer"][1]) == 2 and len(told["camera"][1]) == 1
+@pytest.fixture
+def run():
+    take_domain()
+    processes = []
+
+    def run(name, *arguments):
+        command = [sys.executable, "-c", LAUNCH, str(FOLDER / f"{name}.launch.py"), *arguments]
+        processes.append(
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        )
+        return processes[-1]
+
+    yield run
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def test_the_demo_gives_its_place_in_a_namespace_and_ends_cleanly(run):
+    listener = Listener()
+    try:
+        fixes = listener.hear(NavSatFix, "/rover/fix")
+        process = run("demo", "namespace:=rover", "dashboard:=false", "latitude:=-30", "longitude:=100")
+        listener.wait(lambda: fixes and fixes[-1].status.status >= 0)
+    finally:
+        listener.close()
+    fix = fixes[-1]
+    sigma_deg = (fix.position_covariance[0] + fix.position_covariance[4]) ** 0.5 / 111e3
+    assert abs(fix.latitude + 30) < 5 * sigma_deg and abs(fix.longitude - 100) < 6 * sigma_deg
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=30)
+    assert "Traceback" not in out and "has died" not in out
+
+
+@pytest.mark.skipif(not NIGHT.is_dir(), reason="no bag beside the package")
+def test_a_replay_ends_with_its_bag(run):
+    out, _ = run("replay", f"bag:={NIGHT}", "rate:=0").communicate(timeout=60)
+    assert "fixes are coming" in out and "messages in" in out, out
+    assert "Traceback" not in out and "has died" not in out
