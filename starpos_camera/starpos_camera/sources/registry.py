@@ -5,6 +5,7 @@ from starpos_camera.sources import Source
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.files import Files
 from starpos_camera.sources.gphoto2 import Gphoto2
+from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.simulated import Simulated
 
 SOURCES: dict[str, type[Source]] = {
@@ -12,4 +13,5 @@ SOURCES: dict[str, type[Source]] = {
     "simulated": Simulated,
     "alpaca": Alpaca,
     "gphoto2": Gphoto2,
+    "indi": Indi,
 }

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras behind an INDI server (indilib.org), through PyPI's indipyclient."""
+
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from starpos.errors import StarposError, one_line
+from starpos.fits_frame import decode_fits
+from starpos.frame import MAX_PIXELS
+from starpos_camera.sources import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
+from starpos_camera.sources.indi_server import Blob, Server
+from starpos_camera.sources.timing import middle_of_commanded, middle_of_started, read_utc
+from starpos_common.parameters import Parameter
+from starpos_interfaces.msg import Capture
+
+DEFAULT_EXPOSURE_S = 0.5
+BLOB_MAX = 4 * MAX_PIXELS  # bytes
+LOCAL = ("127.0.0.1", "localhost", "::1")
+CLOCK_TOLERANCE_S = 0.05
+PARAMETERS = (
+    Parameter(
+        "indi.host",
+        "127.0.0.1",
+        "Where indiserver runs, in a trusted network: it knows no passwords.",
+        read_only=True,
+    ),
+    Parameter("indi.port", 7624, "Its port.", "", 1, 65535, read_only=True),
+    Parameter(
+        "indi.device",
+        "",
+        "The camera's name, such as `CCD Simulator`, on the left of what `indi_getprop` prints.",
+        read_only=True,
+    ),
+    Parameter(
+        "indi.binning",
+        1,
+        "Pixels that become one, each way. A calibration and pixel_um hold for one binning only.",
+        "px",
+        1,
+        16,
+    ),
+    Parameter(
+        "indi.readout",
+        15.0,
+        "The frame has to be here so long after its exposure; too short for the camera or the network, none ever comes, "
+        "too long, and a camera that hangs is noticed late.",
+        "s",
+        0.5,
+        600.0,
+    ),
+    Parameter(
+        "indi.clock_stddev",
+        math.nan,
+        "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
+        "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
+        "s",
+        0.0,
+        60.0,
+    ),
+)
+
+
+class Indi:
+    """Takes whole light frames as FITS. Connects a device that is not connected; an exposure given up is aborted."""
+
+    parameters = PARAMETERS
+    waits_for_listener = False
+
+    @staticmethod
+    def refusal(values: Mapping, settings: Settings) -> str | None:
+        if lack := missing("indipyclient", "indipyclient"):
+            return lack
+        for name, what in (
+            ("indi.host", "the machine that indiserver runs on"),
+            ("indi.device", "the camera"),
+        ):
+            if not values[name]:
+                return f"{name} must name {what}; it is empty."
+        return None
+
+    def __init__(self, values: Mapping, now: Callable[[], float]):
+        self._host, self._port = values["indi.host"], values["indi.port"]
+        self._device = values["indi.device"]
+        self.hardware_id = f"{self._device} of indiserver at {self._host}:{self._port}"
+        self._values = values
+        self._now = now
+        self._server: Server | None = None
+        self._closing = False
+
+    def lacking(self) -> None:
+        """Only the server knows."""
+
+    def update(self, values: Mapping):
+        self._values = values
+
+    def close(self):
+        """Also while `capture` runs, which then ends: the exposure is aborted."""
+        self._closing = True
+        if server := self._server:
+            server.close()
+
+    def capture(self, settings: Settings) -> Exposure:
+        try:
+            return self._exposure(*self._take(settings))
+        except StarposError as error:
+            self._leave()
+            raise CaptureError(f"{self.hardware_id}: {error}") from error
+        except Exception:
+            self._leave()
+            raise
+
+    def _take(self, settings):
+        """The BLOB of one exposure, and when it was asked for and there (Unix time)."""
+        if self._closing:
+            raise CaptureError("the node ends.")
+        if self._server is None:
+            self._server = Server(self._host, self._port)
+        server = self._server
+
+        async def take():
+            wish = Wish(
+                settings.exposure_s or DEFAULT_EXPOSURE_S,
+                settings.gain,
+                self._values["indi.binning"],
+                self._values["indi.readout"],
+            )
+            device = await find(server, self._device)
+            await connect(device)
+            await set_up(device, wish)
+            commanded_s = self._now()
+            await expose(device, wish)
+            return server.blob, wish.exposure_s, commanded_s, self._now()
+
+        return server.run(take())
+
+    def _leave(self):
+        if self._server:
+            self._server.close()
+        self._server = None
+
+    def _exposure(self, blob, wanted_s, commanded_s, ready_s) -> Exposure:
+        frame, header = decode_fits(_unpacked(blob), "its frame")
+        exposure_s = frame.exposure_s or wanted_s
+        if exposure_s > ready_s - commanded_s + CLOCK_TOLERANCE_S:
+            raise CaptureError(
+                f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
+            )
+        mid_s, stddev_s, stamp, remark = self._stamp(header, commanded_s, ready_s, exposure_s)
+        frame = replace(frame, mid_unix_s=mid_s, exposure_s=exposure_s, source=self.hardware_id)
+        return Exposure(frame, stamp, stddev_s, remark=remark)
+
+    def _stamp(self, header, commanded_s, ready_s, exposure_s):
+        """Middle of the exposure and its standard deviation (s), where they come from, and what is to be said of it."""
+        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
+        commanded = (mid_s, stddev_s, Capture.COMMAND)
+        clock_s = 0.0 if self._host in LOCAL else self._values["indi.clock_stddev"]
+        start = read_utc(str(header.get("DATE-OBS", "")))
+        if start is None or math.isnan(clock_s):
+            return *commanded, ""
+        start_s, resolution_s = start
+        tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_s
+        early_s, late_s = commanded_s - start_s, start_s + exposure_s - ready_s
+        if max(early_s, late_s) > tolerance_s:
+            off_s = late_s if late_s > early_s else -early_s
+            return (
+                *commanded,
+                f"its driver's times are off by {off_s:+.3g} s and not used: set the clock there.",
+            )
+        mid_s, driver_s = middle_of_started(start_s, resolution_s, exposure_s)
+        driver_s = math.hypot(driver_s, clock_s)
+        if driver_s > stddev_s:
+            return *commanded, ""
+        return mid_s, driver_s, Capture.DRIVER, ""
+
+
+def _unpacked(blob: Blob) -> bytes:
+    """The FITS file in a BLOB; CaptureError where it is another thing, or not all of it."""
+    if not 0 < blob.size <= BLOB_MAX:
+        raise CaptureError(f"its frame claims {blob.size} bytes; a frame has at most {BLOB_MAX}.")
+    data = blob.data
+    if blob.format == ".fits.fz":  # astropy unpacks it; the size is that of the image before
+        return data
+    if blob.format == ".fits.z":
+        try:
+            data = zlib.decompressobj().decompress(data, blob.size + 1)
+        except zlib.error as error:
+            raise CaptureError(f"its frame cannot be unpacked ({one_line(error)}).") from error
+    elif blob.format != ".fits":
+        raise CaptureError(f"it sends {one_line(blob.format)!r}, not FITS: set its driver's transfer format.")
+    if len(data) != blob.size:
+        raise CaptureError(f"its frame has {len(data)} of {blob.size} bytes; it is left out.")
+    return data
