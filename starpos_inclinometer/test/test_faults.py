@@ -6,6 +6,7 @@ Every test tells its `fault` and `result`, which the package's README has as a t
 
 import math
 import signal
+import threading
 import time
 
 import numpy as np
@@ -261,8 +262,10 @@ class Taken:
     """A source of the microcontroller, and its readings."""
 
     def __init__(self, path, now_ns=time.time_ns, **parameters):
-        self.readings, self.times = [], []
-        self.source = McuSource(values(port=path, **parameters), HostClock(now_ns), lambda: None, calibration)
+        self.readings = []
+        self._come = threading.Event()
+        clock = HostClock(now_ns)
+        self.source = McuSource(values(port=path, **parameters), clock, self._come.set, calibration)
         self.source.start()
 
     def until(self, condition):
