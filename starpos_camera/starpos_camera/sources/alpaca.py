@@ -174,6 +174,8 @@ class Alpaca:
         if start is None or math.isnan(clock_s):
             return *commanded, ""
         start_s, resolution_s = start
+        if start_s % 1 == 0:  # some drivers count whole seconds, and write .000
+            resolution_s = 1.0
         tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_s
         if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
             remark = (

@@ -7,6 +7,7 @@ from starpos_camera.sources.files import Files
 from starpos_camera.sources.gphoto2 import Gphoto2
 from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.simulated import Simulated
+from starpos_camera.sources.video import Video
 
 SOURCES: dict[str, type[Source]] = {
     "files": Files,
@@ -14,4 +15,5 @@ SOURCES: dict[str, type[Source]] = {
     "alpaca": Alpaca,
     "gphoto2": Gphoto2,
     "indi": Indi,
+    "video": Video,
 }

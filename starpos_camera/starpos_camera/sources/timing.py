@@ -21,10 +21,7 @@ def middle_of_started(start_s: float, resolution_s: float, exposure_s: float) ->
 
 
 def read_utc(text: str) -> tuple[float, float] | None:
-    """Unix time of a time in ISO 8601 and UTC, and its resolution: the last digit's, 1 s where all decimals are 0.
-
-    None where it is no such time.
-    """
+    """Unix time of a time in ISO 8601 and UTC, and its last digit's resolution (s); None: it is no such time."""
     match = re.fullmatch(
         r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d+))?(?:Z|\+00:00)?", text.strip(), re.ASCII
     )
@@ -35,4 +32,4 @@ def read_utc(text: str) -> tuple[float, float] | None:
         whole = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc).timestamp()
     except ValueError:
         return None
-    return whole + float(f"0.{decimals or 0}"), 10.0 ** -len(decimals) if decimals.strip("0") else 1.0
+    return whole + float(f"0.{decimals or 0}"), 10.0 ** -len(decimals)

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""V4L2 cameras and video files, through OpenCV."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from starpos_camera.sources import Exposure, Settings
+from starpos_camera.sources.timing import read_utc
+from starpos_camera.sources.v4l2 import FORMATS, Device
+from starpos_camera.sources.video_file import SUFFIXES, Film
+from starpos_common.parameters import Parameter
+
+PARAMETERS = (
+    Parameter(
+        "video.device",
+        "",
+        "A V4L2 camera: its number, /dev/videoN, or better a stable path under /dev/v4l/by-id; or a video file "
+        f"({', '.join(SUFFIXES)}). Numbers change when cameras are plugged in another order.",
+        read_only=True,
+    ),
+    Parameter(
+        "video.format",
+        "",
+        f"Four letters of the pixels that a V4L2 camera sends: {', '.join(f.strip() for f in FORMATS)}; unset: what "
+        "OpenCV takes first. Compressed or 8-bit ones lose faint stars.",
+        read_only=True,
+    ),
+    Parameter(
+        "video.width",
+        0,
+        "Width of a V4L2 camera's frames; it must be one that the camera has. 0: 640.",
+        "px",
+        0,
+        20000,
+        read_only=True,
+    ),
+    Parameter(
+        "video.height",
+        0,
+        "Height of a V4L2 camera's frames; it must be one that the camera has. 0: 480.",
+        "px",
+        0,
+        20000,
+        read_only=True,
+    ),
+    Parameter(
+        "video.lag",
+        math.nan,
+        "From the middle of an exposure to the time that the kernel gives the frame; command_lag_stddev says how well it "
+        "is known. Unset: nothing is assumed, and a stamp is as wide as the exposure and the frame's period. Longitudes "
+        "come out 15 arcsec off for each second it is wrong.",
+        "s",
+        -10.0,
+        60.0,
+    ),
+    Parameter(
+        "video.start",
+        "",
+        "UTC of the start of a video file's first frame, as 2026-11-02T18:00:00.00 with as many decimals as are right. "
+        "Longitudes come out 15 arcsec off for each second it is wrong.",
+        read_only=True,
+    ),
+)
+
+
+class Video:
+    """A V4L2 camera, live, or the frames of a video file, one after the other."""
+
+    parameters = PARAMETERS
+
+    @staticmethod
+    def refusal(values: Mapping, settings: Settings) -> str | None:
+        device = values["video.device"]
+        if not device or "://" in device:
+            return (
+                f"video.device must be a V4L2 camera or a video file of this machine, not {device!r}: streams of a "
+                "network do not tell when a frame was taken."
+            )
+        if is_camera(device):
+            if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
+                known = ", ".join(f.strip() for f in FORMATS)
+                return f"video.format must be one of {known}, not {values['video.format']!r}."
+            if bool(values["video.width"]) != bool(values["video.height"]):
+                return "video.width and video.height must be given together."
+            return None
+        if Path(device).suffix.lower() not in SUFFIXES:
+            return (
+                f"video.device must be below /dev, or a video file ({', '.join(SUFFIXES)}), not {device!r}."
+            )
+        if read_utc(values["video.start"]) is None:
+            return (
+                "a video file does not tell when it was taken: set video.start to the UTC of its first frame, as "
+                "2026-11-02T18:00:00.00."
+            )
+        if settings.exposure_s is not None or settings.gain:
+            return "a video file has its own exposure and gain: leave `exposure` and `gain` unset."
+        return None
+
+    def __init__(self, values: Mapping, now: Callable[[], float]):
+        device = values["video.device"]
+        self.waits_for_listener = not is_camera(
+            device
+        )  # else the first frames are gone before the detector is up
+        self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
+        self._from = (
+            Device(self.hardware_id, values, now)
+            if is_camera(device)
+            else Film(self.hardware_id, values["video.start"])
+        )
+
+    def lacking(self) -> str | None:
+        if not Path(self.hardware_id).exists():
+            return f"{self.hardware_id}: it is not there; plug it in, or correct video.device."
+        return None
+
+    def capture(self, settings: Settings) -> Exposure:
+        return self._from.capture(settings)
+
+    def update(self, values: Mapping):
+        """What may change is looked up at each frame."""
+
+    def close(self):
+        self._from.close()
+
+
+def is_camera(device: str) -> bool:
+    """Otherwise it is a file."""
+    return device.isdecimal() or device.startswith("/dev/")
