@@ -30,22 +30,31 @@ class HostClock:
     """Reads both clocks as one and notices steps; to be read several times a second, by one thread.
 
     now_ns: the host's clock.  simulated: whether that is a simulation's, which goes as it likes and is not judged.
+    monotonic_ns: the one that is never set.
     """
 
     def __init__(
-        self, now_ns: Callable[[], int] = time.time_ns, simulated: Callable[[], bool] = lambda: False
+        self,
+        now_ns: Callable[[], int] = time.time_ns,
+        simulated: Callable[[], bool] = lambda: False,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ):
         self.step: Step | None = None  # the last one
-        self._now_ns = now_ns
+        self.now_ns = now_ns
+        self._monotonic_ns = monotonic_ns
         self._simulated = simulated
         self._offset_ns: int | None = None  # host's clock less the monotonic one
+
+    def monotonic_s(self) -> float:
+        """The monotonic clock alone; any thread may ask."""
+        return self._monotonic_ns() * 1e-9
 
     def read(self) -> Moment:
         """Now."""
         for _ in range(TRIES):
-            before = time.monotonic_ns()
-            host_ns = self._now_ns()
-            took_ns = time.monotonic_ns() - before
+            before = self._monotonic_ns()
+            host_ns = self.now_ns()
+            took_ns = self._monotonic_ns() - before
             if took_ns < QUICK_S * 1e9:
                 break
         offset_ns = None if self._simulated() else host_ns - before

@@ -6,7 +6,6 @@ import errno
 import os
 import termios
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -122,7 +121,7 @@ class SerialLink:
 
     def state(self) -> LinkState:
         with self._lock:
-            horizon = time.monotonic() - RATE_WINDOW_S
+            horizon = self._clock.monotonic_s() - RATE_WINDOW_S
             recent = [t for t in self._recent if t >= horizon]
             span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
             return LinkState(
@@ -161,7 +160,7 @@ class SerialLink:
         with self._lock:
             self._connections += 1
             self._decoder.resume()
-        last_byte = last_line = last_sample = time.monotonic()
+        last_byte = last_line = last_sample = self._clock.monotonic_s()
         self._next_command = 0.0
         while not self._stop.is_set():
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))

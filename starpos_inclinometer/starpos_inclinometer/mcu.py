@@ -101,55 +101,40 @@ class McuDecoder:
         return mcu_follows(a, b, 1000 / self.identity.rate_hz if self.identity else None)
 
 
-class McuSource:
-    """Samples of the starpos microcontroller as readings; `calibration` makes one of the parameters' values."""
+class McuTilts:
+    """Believed samples to readings; `calibration` makes the sensor's of the parameters' values."""
 
-    def __init__(
-        self,
-        values: Mapping[str, Any],
-        clock: HostClock,
-        wake: Callable[[], None],
-        calibration: Callable[[Mapping[str, Any]], Calibration],
-    ):
+    def __init__(self, values: Mapping[str, Any], calibration: Callable[[Mapping[str, Any]], Calibration]):
+        self.sensor = Sensor()
+        self.arrivals = ArrivalFilter()
         self._calibration = calibration
-        self._baud = values["baud"]
-        self._decoder = McuDecoder(values["rate"])
-        self._link = SerialLink(values["port"], self._baud, self._decoder, clock, wake)
-        self._sensor = Sensor()
-        self._arrivals = ArrivalFilter()
+        self._line_s = protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
         self._delay_ms = DEFAULT_DELAY_MS
         self._rate_hz = 0
         self.configure(values)
 
-    def start(self):
-        self._link.start()
-
-    def stop(self):
-        self._link.stop()
-
     def configure(self, values: Mapping[str, Any]):
-        self._sensor.calibration = self._calibration(values)
-        self._decoder.wanted_rate_hz = values["rate"]
-        self._latency = values["latency"]
+        self.sensor.calibration = self._calibration(values)
+        self._latency_s = values["latency"]
 
-    def take(self) -> list[Reading]:
-        if identity := self._decoder.identity:
+    def read(self, arrivals: list[Arrival], identity: Identity | None) -> list[Reading]:
+        """identity: what the MCU says of itself, if it has."""
+        if identity:
             self._delay_ms = identity.delay_ms
             if identity.rate_hz != self._rate_hz:  # a slower sample is a mean of more conversions
                 self._rate_hz = identity.rate_hz
-                self._sensor.noise.restart()
-        latency = self._delay_ms * 1e-3 if math.isnan(self._latency) else self._latency
-        latency += protocol.SAMPLE_LINE * BITS_PER_BYTE / self._baud
-        return [self._read(arrival, latency) for arrival in self._link.take()]
+                self.sensor.noise.restart()
+        delay_s = self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s
+        return [self._reading(arrival, delay_s + self._line_s) for arrival in arrivals]
 
-    def _read(self, arrival: Arrival, latency: float) -> Reading:
+    def _reading(self, arrival: Arrival, latency_s: float) -> Reading:
         sample, moment = arrival.sample, arrival.moment
         if sample.restarted or sample.resumed:
-            self._arrivals.restart()
-        late = self._arrivals.delay(sample.milliseconds, moment.monotonic_s)
-        measured = self._sensor.measure(sample, moment.monotonic_s - late)
+            self.arrivals.restart()
+        late_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        measured = self.sensor.measure(sample, moment.monotonic_s - late_s)
         return Reading(
-            max(moment.host_ns - round((late + latency) * 1e9), 0),
+            max(moment.host_ns - round((late_s + latency_s) * 1e9), 0),
             measured.x,
             measured.y,
             measured.covariance,
@@ -158,6 +143,34 @@ class McuSource:
             measured.flags,
         )
 
+
+class McuSource:
+    """The starpos microcontroller on a serial port; see `McuTilts`."""
+
+    def __init__(
+        self,
+        values: Mapping[str, Any],
+        clock: HostClock,
+        wake: Callable[[], None],
+        calibration: Callable[[Mapping[str, Any]], Calibration],
+    ):
+        self._decoder = McuDecoder(values["rate"])
+        self._link = SerialLink(values["port"], values["baud"], self._decoder, clock, wake)
+        self._tilts = McuTilts(values, calibration)
+
+    def start(self):
+        self._link.start()
+
+    def stop(self):
+        self._link.stop()
+
+    def configure(self, values: Mapping[str, Any]):
+        self._tilts.configure(values)
+        self._decoder.wanted_rate_hz = values["rate"]
+
+    def take(self) -> list[Reading]:
+        return self._tilts.read(self._link.take(), self._decoder.identity)
+
     def health(self) -> Health:
         state = self._link.state()
         identity = self._decoder.identity
@@ -165,13 +178,13 @@ class McuSource:
         if self._decoder.refused:
             wanted = self._decoder.wanted_rate_hz
             complaint = f"the microcontroller refused {wanted} Hz: set another `rate`."
-        sigma = self._sensor.noise.sigma
+        sensor = self._tilts.sensor
         values = {
             "openings": state.connections,
             "unfetched samples": state.dropped,
-            "clock rate error (ppm)": self._arrivals.rate_ppm,
-            "noise x, y (arcsec)": noise_text(sigma),
-            "sensor temperature (deg C)": self._sensor.temperature.celsius(math.nan),
+            "clock rate error (ppm)": self._tilts.arrivals.rate_ppm,
+            "noise x, y (arcsec)": noise_text(sensor.noise.sigma),
+            "sensor temperature (deg C)": sensor.temperature.celsius(math.nan),
             "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
             "unit": f"{identity.unit:08X}" if identity else "unknown",
         }

@@ -36,6 +36,9 @@ class InclinometerNode(Node):
         self._logged_step = None
         self._reporter = Reporter()
         self._wake = self.create_guard_condition(self._on_wake)
+        self.host_clock = HostClock(
+            lambda: self.get_clock().now().nanoseconds, lambda: self.get_clock().ros_time_is_active
+        )
         self._source = self._make_source()
         name = TOPIC if self._values["source"] == "imu" else self._values["port"]
         self._diagnostics = Diagnostics(self, {"Link": self._report}, name)
@@ -46,10 +49,7 @@ class InclinometerNode(Node):
         super().destroy_node()
 
     def _make_source(self) -> Source:
-        clock = HostClock(
-            lambda: self.get_clock().now().nanoseconds, lambda: self.get_clock().ros_time_is_active
-        )
-        wake = self._wake.trigger
+        clock, wake = self.host_clock, self._wake.trigger
         if self._values["source"] == "imu":
             return ImuSource(self, self._values, clock, wake)
         if self._values["source"] == "ascii":
