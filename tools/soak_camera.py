@@ -36,7 +36,8 @@ def main() -> int:
     table = {p.name: p for p in PARAMETERS}
     for word in words:
         key, value = word.split(":=", 1)
-        values[key] = table[key].convert(yaml.safe_load(value) if value else "")
+        text = isinstance(table[key].default, str)
+        values[key] = table[key].convert(value if text else yaml.safe_load(value))
     settings = Settings(set_or_none(values["exposure"]), set_or_none(values["gain"]), values["cadence"])
     if refusal := SOURCES[name].refusal(values, settings):
         print(refusal)
