@@ -28,7 +28,9 @@ PICTURES = (
 
 def write(path, letters, pictures, depth=cv2.CV_8U):
     colour = pictures.ndim == 4
-    options = [cv2.VIDEOWRITER_PROP_IS_COLOR, int(colour), cv2.VIDEOWRITER_PROP_DEPTH, depth]
+    options = [cv2.VIDEOWRITER_PROP_IS_COLOR, int(colour)]
+    if depth != cv2.CV_8U:
+        options += [cv2.VIDEOWRITER_PROP_DEPTH, depth]
     code = cv2.VideoWriter_fourcc(*letters)
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, RATE, (WIDTH, HEIGHT), options)
     assert writer.isOpened()
@@ -79,6 +81,7 @@ def test_every_frame_as_it_was_written_at_the_time_of_its_place(film):
     assert isinstance(end, SourceEnded) and isinstance(still_ended, SourceEnded)
 
 
+@pytest.mark.skipif(cv2.__version__ < "4.7", reason="OpenCV before 4.7 neither writes nor reads 16-bit video")
 def test_sixteen_bits_stay_sixteen(tmp_path):
     path = write(tmp_path / "deep.mkv", "FFV1", PICTURES, cv2.CV_16U)
     for k, exposure in enumerate(play(make(path), FRAMES)):
@@ -126,7 +129,7 @@ def test_the_disk_goes_and_comes_back(film, record_property):
 
 
 @pytest.mark.parametrize(
-    "text", [b"", b"no video", b"\x1aE\xdf\xa3" + bytes(100), b"RIFF\xff\xff\xff\xffAVI LIST"]
+    "text", [b"", b"no video", b"\x1aE\xdf\xa3" + bytes(100), b"RIFF\xff\xff\xff\xffAVI LIST", b"RIFF"]
 )
 def test_what_is_no_video_is_one_sentence(tmp_path, text):
     path = tmp_path / "night.avi"

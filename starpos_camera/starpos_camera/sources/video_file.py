@@ -14,10 +14,17 @@ from starpos_camera.sources.opencv_video import quiet
 from starpos_camera.sources.timing import read_utc
 from starpos_interfaces.msg import Capture
 
-SUFFIXES = (".avi", ".mkv", ".mov", ".mp4")
+BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")  # that a QuickTime or MP4 file may begin with
+BEGINNINGS = {
+    ".avi": (0, (b"RIFF",)),
+    ".mkv": (0, (b"\x1aE\xdf\xa3",)),
+    ".mov": (4, BOXES),
+    ".mp4": (4, BOXES),
+}
+SUFFIXES = tuple(BEGINNINGS)
 MAX_RATE = 1000.0  # frames a second
 MAX_GAP_S = 3600.0  # between frames
-# A frame whose data are cut off or damaged is none; and a file must not lead to others, or to the network.
+# A frame whose data are cut off or damaged is none; and a file must not lead to the network.
 OPTIONS = "fflags;discardcorrupt|err_detect;explode|protocol_whitelist;file"
 OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 GREY_8, GREY_16 = 0x30303859, 0x10003159  # FFmpeg's tags of pixel formats: Y800, and Y1 of 16 bits
@@ -76,6 +83,13 @@ class Film:
         self._capture = None
 
     def _open(self, cv2):
+        at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
+        with open(self._path, "rb") as file:
+            head = file.read(16)
+        if head[at : at + 4] not in beginnings:  # FFmpeg takes a playlist of other files by any name
+            raise FrameError(
+                f"{self._path}: this is no {Path(self._path).suffix[1:].upper()} file; convert it to one."
+            )
         before = os.environ.get(OPTIONS_IN)
         os.environ[OPTIONS_IN] = OPTIONS
         try:
