@@ -34,6 +34,7 @@ from starpos_common.parameters import declare
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 
+SHOWN_S = 5.0  # diagnostics are seen once a second
 IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
 
@@ -89,6 +90,7 @@ class CameraNode(Node):
         self._takers: list[Taker] = []
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")
+        self._said_s = -math.inf
         self._logged = ""
         overriding = QoSOverridingOptions.with_default_policies()
         self._images = self.create_publisher(
@@ -187,7 +189,8 @@ class CameraNode(Node):
                 self._ended = True
                 self._say(Level.OK, str(result))
             elif isinstance(result, NothingYet):
-                if self._state[0] is not Level.OK:  # between two frames it is no news
+                # between two frames it is no news, and what is wrong is shown for a while
+                if self._state[0] is not Level.OK and time.monotonic() > self._said_s + SHOWN_S:
                     self._say(Level.OK, str(result))
             elif isinstance(result, StarposError):
                 self._failed += 1
@@ -231,7 +234,7 @@ class CameraNode(Node):
 
     def _say(self, level: Level, sentence: str):
         """The state from now on; logged where it is another than before."""
-        self._state = (level, sentence)
+        self._state, self._said_s = (level, sentence), time.monotonic()
         if sentence == self._logged:
             return
         self._logged = sentence

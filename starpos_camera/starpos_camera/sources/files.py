@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames from files: a folder, or all that a pattern matches, in the order of their names."""
+"""Frames from files: of a folder, or all that a pattern matches, in the order of their names; or as they come into it."""
 
+import fnmatch
 import glob
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from starpos.errors import FrameError
+from starpos.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frame import Frame
-from starpos.reading import FITS, PICTURE, RAW, read_frame
-from starpos_camera.sources import Exposure, Settings, SourceEnded
+from starpos.reading import FITS, JPEG, PICTURE, RAW, read_frame
+from starpos_camera.sources import CaptureError, Exposure, NothingYet, Settings, SourceEnded, missing
+from starpos_camera.sources.watched_folder import WatchedFolder
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
@@ -23,28 +27,71 @@ PARAMETERS = (
     ),
     Parameter("files.loop", False, "Begin again after the last frame.", read_only=True),
     Parameter(
+        "files.watch",
+        False,
+        "Take the frames that come into the folder from now on, for ever; a name counts once. With a `cadence` longer "
+        "than theirs they are taken later and later.",
+        read_only=True,
+    ),
+    Parameter(
+        "files.rest",
+        2.0,
+        "A file that comes is whole once it has not changed for so long; one that cannot be read then is given up after "
+        "ten times that. Too short and frames are lost that are written with pauses.",
+        "s",
+        0.01,
+        600.0,
+        read_only=True,
+    ),
+    Parameter(
         "files.restamp",
         False,
         "Stamp the frames with the node's clock instead of their own time. For frames without a time; old ones "
         "restamped give a wrong longitude, 15 arcsec for each second.",
         read_only=True,
     ),
+    Parameter(
+        "files.exif",
+        False,
+        "Take the time of raw files and TIFF from EXIF, that is from the camera's own clock. It was set by hand: 1 s is "
+        "464 m at the equator.",
+        read_only=True,
+    ),
+    Parameter(
+        "files.exif_utc_offset",
+        math.nan,
+        "By how much the camera's clock is ahead of UTC, summer time included; nan: as each file says, which those of "
+        "older cameras do not. An hour wrong is 15 deg of longitude.",
+        "h",
+        -ZONES_H,
+        ZONES_H,
+        read_only=True,
+    ),
+    Parameter(
+        "files.exif_clock_stddev",
+        UNTENDED_STDDEV_S,
+        "How far the camera's clock may be off; its whole seconds come on top.",
+        "s",
+        0.0,
+        86400.0,
+        read_only=True,
+    ),
 )
 
 
 class Files:
-    """Plays files.path once, or round and round with files.loop; each round lists the files anew.
+    """Plays files.path once, round and round with files.loop (each round lists the files anew), or what comes into it.
 
     A file that cannot be read raises FrameError, is passed over in later rounds, and the next call takes the
     next one.
     """
 
     parameters = PARAMETERS
-    waits_for_listener = True  # else the first frames of a night are gone before the detector is up
 
     @staticmethod
     def refusal(values: Mapping, settings: Settings) -> str | None:
-        if not values["files.path"]:
+        path, watch = values["files.path"], values["files.watch"]
+        if not path:
             return (
                 "parameter files.path must name a folder or a pattern of frames; it is empty "
                 "(for a simulated sky instead set source to simulated)."
@@ -53,6 +100,18 @@ class Files:
             return "frames from files have their own exposure: leave `exposure` unset."
         if settings.gain:
             return "frames from files have their own gain: leave `gain` unset."
+        if watch and values["files.loop"]:
+            return "files.watch takes frames once as they come: leave files.loop unset."
+        if watch and glob.has_magic(str(Path(path).parent)):
+            return (
+                "files.watch looks into one folder: the pattern of files.path must be in its last part only."
+            )
+        if watch and (lack := _no_home(path)):
+            return lack
+        if values["files.exif"]:
+            return missing("exifread", "exifread")
+        if not math.isnan(values["files.exif_utc_offset"]):
+            return "files.exif_utc_offset says how to take EXIF's times: set files.exif too."
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]):
@@ -60,11 +119,23 @@ class Files:
         self._loop = values["files.loop"]
         self._restamp = values["files.restamp"]
         self._now = now
+        self._clock = camera_clock(values)
         self._queue: list[Path] | None = None  # what this round has left, last first
         self._bad: set[Path] = set()
+        self._watched = None
+        if values["files.watch"]:
+            folder, pattern = split(self._path)
+            self._watched = WatchedFolder(folder, lambda name: fits(name, pattern), values["files.rest"])
+        # else the first frames of a night are gone before the detector is up
+        self.waits_for_listener = self._watched is None
 
     def lacking(self) -> str | None:
         try:
+            if self._watched is not None:
+                folder, _ = split(self._path)
+                return (
+                    None if folder.is_dir() else f"{folder}: there is no such folder yet; check files.path."
+                )
             if next(find_files(self._path), None) is None:
                 return f"{self._path}: there are no frames here; check files.path."
         except (OSError, RuntimeError) as error:  # no permission, no such user's home
@@ -72,32 +143,65 @@ class Files:
         return None
 
     def capture(self, settings: Settings) -> Exposure:
+        if self._watched is not None:
+            return self._next_arrived(self._watched)
         if not self._queue:
             self._queue = self._next_round()
         path = self._queue.pop()
         try:
-            frame = read_frame(path)
-            if not isinstance(frame, Frame):
-                raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
-            if self._restamp:
-                # as if the exposure had just ended: the tilts that belong to it are there
-                frame = replace(frame, mid_unix_s=self._now() - (frame.exposure_s or 0.0) / 2)
-                return Exposure(frame, Capture.DRIVER)
-            if frame.mid_unix_s is None:
-                raise FrameError(
-                    f"{path}: it does not say when it was taken; add DATE-OBS and EXPTIME to it, or set "
-                    "files.restamp."
-                )
+            return self._read(path)
         except Exception:
             self._bad.add(path)
             raise
-        return Exposure(frame, Capture.FILE)
 
     def update(self, values: Mapping):
         """Nothing of it changes at run time."""
 
     def close(self):
         """Nothing is held open."""
+
+    def _read(self, path: Path) -> Exposure:
+        frame = read_frame(path, self._clock)
+        if not isinstance(frame, Frame):
+            raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
+        if self._restamp:
+            # as if the exposure had just ended: the tilts that belong to it are there
+            frame = replace(frame, mid_unix_s=self._now() - (frame.exposure_s or 0.0) / 2)
+            return Exposure(frame, Capture.DRIVER)
+        by_camera = path.suffix.lower() in PICTURE + JPEG + RAW
+        if frame.mid_unix_s is None:
+            lack = (
+                "vouch for its camera's clock (files.exif)" if by_camera else "add DATE-OBS and EXPTIME to it"
+            )
+            raise FrameError(f"{path}: it does not say when it was taken; {lack}, or set files.restamp.")
+        return Exposure(frame, Capture.EXIF if by_camera else Capture.FILE, frame.stamp_stddev_s)
+
+    def _next_arrived(self, watched: WatchedFolder) -> Exposure:
+        try:
+            found = watched.next()
+        except OSError as error:
+            reason = error.strerror or error
+            raise CaptureError(
+                f"{self._path}: it cannot be looked into ({reason}); check files.path."
+            ) from None
+        if found is None:
+            raise NothingYet(f"waiting for frames that come into {self._path}.")
+        path, last_chance = found
+        try:
+            exposure = self._read(path)
+        except FrameError:
+            if last_chance:
+                watched.done(path)
+                raise
+            watched.try_again(path)
+            raise NothingYet(f"waiting for the rest of {path}.") from None
+        except Exception:
+            watched.done(path)
+            raise
+        if not watched.at_rest(path):  # it was being written again
+            raise NothingYet(f"waiting for the rest of {path}.")
+        watched.done(path)
+        return exposure
 
     def _next_round(self) -> list[Path]:
         if self._queue is not None and not self._loop:
@@ -111,11 +215,40 @@ class Files:
         return good[::-1]
 
 
+def camera_clock(values: Mapping) -> CameraClock | None:
+    """The clock of the camera that wrote the files' EXIF; None where nobody vouches for it."""
+    if not values["files.exif"]:
+        return None
+    offset_h = values["files.exif_utc_offset"]
+    return CameraClock(None if math.isnan(offset_h) else offset_h, values["files.exif_clock_stddev"])
+
+
+def _no_home(path):
+    try:
+        split(path)
+    except RuntimeError as error:
+        return f"files.path {path}: {error}; check it."
+    return None
+
+
+def split(path: str) -> tuple[Path, str]:
+    """The folder that is watched and the pattern of its names, '' for every frame's."""
+    place = Path(path).expanduser()
+    return (place.parent, place.name) if glob.has_magic(place.name) else (place, "")
+
+
+def fits(name: str, pattern: str) -> bool:
+    """Whether a name is a frame's; those of other encodings cannot be told, and hidden ones are not finished."""
+    if not name.isprintable() or name.startswith("."):
+        return False
+    return fnmatch.fnmatchcase(name, pattern) if pattern else name.lower().endswith(SUFFIXES)
+
+
 def find_files(path: str) -> Iterator[Path]:
     """The frames in a folder, or whatever files a pattern matches, in no order; none where there is no such place."""
     place = Path(path).expanduser()
     if place.is_dir():
-        found = (file for file in place.iterdir() if file.suffix.lower() in SUFFIXES)
+        found = (file for file in place.iterdir() if fits(file.name, ""))
     else:
         found = (Path(name) for name in glob.iglob(str(place), recursive=True))
     return (file for file in found if file.is_file())
