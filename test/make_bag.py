@@ -12,11 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from rclpy.serialization import serialize_message
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from std_msgs.msg import Header
 
 from starpos.atmosphere import Atmosphere
@@ -25,6 +21,7 @@ from starpos.inclinometer import Tilt
 from starpos.simulate import Optics, detected, expose, read_tilt, render, scene_of
 from starpos_common.messages import camera_to_message, frame_to_message, stars_to_message, tilt_to_message
 from starpos_interfaces.msg import Capture
+from starpos_solver.bag_writer import BagWriter
 
 SEED = 20261102
 START_S = 1793642400.0  # 2026-11-02T18:00:00Z
@@ -45,50 +42,27 @@ END_S = SMALL_START_S + SMALL_FRAMES * CADENCE_S
 TURN_DEG = 36.0
 CAMERA_FRAME, TILT_FRAME = "starpos_camera_optical_frame", "starpos_inclinometer_frame"
 SLOW_S = 0.3  # from the end of an exposure to its stars
-ENDLESS = QosTime(9223372036, 854775807)
 
 
 class Bag:
-    """A rosbag2 that is written with the ROS messages of this workspace."""
+    """A rosbag2 that is written in the order of time with the ROS messages of this workspace."""
 
     def __init__(self, folder: Path):
-        self.store = get_typestore(Stores.ROS2_JAZZY)
-        share = Path(get_package_share_directory("starpos_interfaces"))
-        for path in sorted((share / "msg").glob("*.msg")):
-            self.store.register(get_types_from_msg(path.read_text(), f"starpos_interfaces/msg/{path.stem}"))
-        self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer = BagWriter(folder)
         self._messages = []
-        self._connections = {}
 
     def add(self, log_s: float, topic: str, message) -> None:
         kind = "/".join((type(message).__module__.split(".")[0], "msg", type(message).__name__))
+        self._writer.add_topic(topic, kind)
+        store = self._writer.store
         # rmw leaves whatever was in memory between the fields; rosbags writes zeros
-        data = self.store.serialize_cdr(self.store.deserialize_cdr(serialize_message(message), kind), kind)
-        self._messages.append((round(log_s * 1e6) * 1000, topic, kind, bytes(data)))
+        data = store.serialize_cdr(store.deserialize_cdr(serialize_message(message), kind), kind)
+        self._messages.append((round(log_s * 1e6) * 1000, topic, bytes(data)))
 
     def write(self) -> None:
-        with self._writer as writer:
-            for log_ns, topic, kind, data in sorted(self._messages, key=lambda m: m[0]):
-                if topic not in self._connections:
-                    self._connections[topic] = writer.add_connection(
-                        topic, kind, typestore=self.store, offered_qos_profiles=[reliable()]
-                    )
-                writer.write(self._connections[topic], log_ns, data)
-
-
-def reliable() -> Qos:
-    return Qos(
-        QosHistory.KEEP_LAST,
-        10,
-        QosReliability.RELIABLE,
-        QosDurability.VOLATILE,
-        ENDLESS,
-        ENDLESS,
-        QosLiveliness.AUTOMATIC,
-        ENDLESS,
-        False,
-    )
+        for log_ns, topic, data in sorted(self._messages, key=lambda m: m[0]):
+            self._writer.write(topic, log_ns, data)
+        self._writer.close()
 
 
 def scenes():

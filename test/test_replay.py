@@ -13,7 +13,6 @@ import pytest
 import yaml
 from graph import stamp_of
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
@@ -22,6 +21,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution
+from starpos_solver.bag_writer import offered_qos
 
 NIGHT = Path(__file__).parent / "data" / "night"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -104,7 +104,7 @@ def test_the_kept_script_makes_this_bag(tmp_path, truth):
 def write_bag(folder, messages, plugin=StoragePlugin.MCAP):
     """A bag of (log ns, topic, type, bytes); every topic latched. Types that nobody knows get a definition."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    latched = make_bag.reliable()._replace(durability=QosDurability.TRANSIENT_LOCAL)
+    latched = offered_qos(latched=True)
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         connections = {}
         for log_ns, topic, kind, data in messages:

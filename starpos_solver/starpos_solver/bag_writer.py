@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A rosbag2 (mcap, zstd) of serialized messages, written by `rosbags` with the message types that are installed here."""
+
+import re
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+
+
+class BagError(Exception):
+    """One sentence: what, where, what to do."""
+
+
+class BagWriter:
+    """Messages as they are, compressed; the folder is a bag once it is closed.
+
+    Raises BagError where rosbags is not installed, the folder is there already, or cannot be made.
+    """
+
+    def __init__(self, folder: Path):
+        try:
+            from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError:
+            raise BagError("rosbags, which writes bags, is not installed: pip install rosbags") from None
+        self.folder, self.count = folder, 0
+        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self._known: set[str] = set()
+        self._connections = {}
+        try:
+            self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            self._writer.open()
+        except WriterError:
+            raise BagError(f"{folder}: there is something of that name: give another one") from None
+        except OSError as error:
+            raise BagError(f"{folder}: no bag can be made there ({error.strerror})") from None
+
+    def add_topic(self, topic: str, type_name: str, latched: bool = False):
+        """Declare a topic before its first message; type_name as 'sensor_msgs/msg/Imu'."""
+        if topic not in self._connections:
+            self._learn(type_name)
+            self._connections[topic] = self._writer.add_connection(
+                topic, type_name, typestore=self.store, offered_qos_profiles=[offered_qos(latched)]
+            )
+
+    def write(self, topic: str, log_ns: int, data: bytes):
+        """A serialized message; BagError where the disk does not take it."""
+        try:
+            self._writer.write(self._connections[topic], log_ns, data)
+        except OSError as error:
+            raise BagError(
+                f"{self.folder}: it cannot be written ({error.strerror}): the recording ends"
+            ) from None
+        self.count += 1
+
+    def close(self):
+        """Make it a bag. Where even that fails, BagError."""
+        try:
+            self._writer.close()
+        except OSError as error:
+            raise BagError(
+                f"{self.folder}: its end cannot be written ({error.strerror}): `mcap recover` gets back what is in it"
+            ) from None
+
+    def _learn(self, type_name: str):
+        """Have the definition of a type, and of those in it, as it is installed."""
+        from rosbags.typesys import get_types_from_msg
+
+        if type_name in self.store.fielddefs or type_name in self._known:
+            return
+        self._known.add(type_name)
+        package, message = type_name.split("/msg/")
+        text = (Path(get_package_share_directory(package)) / "msg" / f"{message}.msg").read_text()
+        for part in re.findall(r"^([A-Za-z]\w*(?:/\w+)?)(?:\[[^]]*\])?\s+\w+", text, re.MULTILINE):
+            if part[0].isupper() or "/" in part:
+                self._learn(f"{package}/msg/{part}" if "/" not in part else part.replace("/", "/msg/"))
+        self.store.register(get_types_from_msg(text, type_name))
+
+
+def offered_qos(latched: bool = False):
+    """A reliable publisher's, as a bag describes it."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    endless = QosTime(9223372036, 854775807)
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    return Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, endless, endless,
+               QosLiveliness.AUTOMATIC, endless, False)  # fmt: skip

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A night recorded as it comes, and what is left of it when the disk is full."""
+
+import resource
+import signal
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.rosbag2 import Reader
+from shots import photograph, shoot
+
+from starpos_interfaces.msg import Solution
+
+
+@pytest.fixture
+def recorded(graph, run, tmp_path):
+    """recorded(*options): start to record; stop(): the bag's messages by topic."""
+
+    def recorded(*options):
+        process = run("starpos_solver", "record", arguments=(str(tmp_path / "bag"), *options))
+        graph.wait(lambda: "recording" in process.output)
+        graph.wait(
+            lambda: graph.stars.get_subscription_count() == 2 and graph.tilt.get_subscription_count() == 2
+        )
+        return process
+
+    return recorded
+
+
+def messages_of(folder) -> dict[str, list[bytes]]:
+    by_topic = {}
+    with Reader(folder) as reader:
+        for connection, _, data in reader.messages():
+            by_topic.setdefault(connection.topic, []).append(bytes(data))
+    return by_topic
+
+
+def counts_of(graph) -> dict[str, str]:
+    """Messages by topic that the recorder says it has."""
+    return {v.key: v.value for v in graph.diagnostics["record: Bag"][-1][1].values}
+
+
+def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
+    graph, solver, recorded, run, tmp_path
+):
+    process = recorded("--images")
+    graph.wait(graph.image.get_subscription_count)
+    shots = [shoot() for _ in range(3)]
+    answers = [graph.answer(shot)[0] for shot in shots]
+    _, image, capture = photograph()
+    graph.capture.publish(capture)
+    graph.image.publish(image)
+    graph.state("record: Bag", "recording")
+    sent = {
+        "stars": 3,
+        "tilt": 3 * len(shots[0].tilts),
+        "solver/solution": 3,
+        "camera/capture": 1,
+        "camera/image_raw": 1,
+    }
+    graph.wait(lambda: counts_of(graph).items() >= {k: str(n) for k, n in sent.items()}.items())
+    process.signal(signal.SIGINT)
+    assert process.wait() == 0, process.output
+    kept = messages_of(tmp_path / "bag")
+    for topic, sent in {
+        "/stars": [s.stars for s in shots],
+        "/tilt": [t for s in shots for t in s.tilts],
+        "/camera/image_raw": [image],
+        "/camera/capture": [capture],
+    }.items():
+        # not the bytes themselves: rmw leaves whatever was in memory between the fields
+        kind, wanted = type(sent[0]), [serialize_message(m) for m in sent]
+        got, wanted = ([deserialize_message(data, kind) for data in side] for side in (kept[topic], wanted))
+        assert got == wanted, topic
+    assert len(kept["/solver/solution"]) == len(kept["/fix"]) == 3 and kept["/diagnostics"]
+    size = sum(f.stat().st_size for f in (tmp_path / "bag").iterdir())
+    assert size < 0.7 * sum(len(m) for sent in kept.values() for m in sent)  # noise is what does not compress
+
+    graph.solutions.clear()
+    again = run(
+        "starpos_solver", "replay", arguments=(str(tmp_path / "bag"), "--rate", "0", "--inputs", "stars")
+    )
+    assert again.wait() == 0, again.output
+    for shot, before in zip(shots, answers, strict=True):
+        after, _, _ = graph.result(shot.stamp)
+        assert after.status == Solution.OK
+        np.testing.assert_array_equal(
+            [after.latitude, after.longitude, after.heading, *after.covariance],
+            [before.latitude, before.longitude, before.heading, *before.covariance],
+        )
+
+
+def test_a_full_disk_ends_the_recording_with_a_sentence(graph, solver, recorded):
+    process = recorded()
+    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (4096, 4096))  # as a disk with no more room
+    while process.process.poll() is None:
+        shot = shoot()
+        graph.send(shot)
+        graph.comes(lambda: process.process.poll() is not None, 0.1)
+    assert process.wait() == 1
+    assert "cannot be written" in process.output and "Traceback" not in process.output
+
+
+def test_nothing_is_overwritten_and_nothing_made_in_a_place_that_is_none(run, tmp_path):
+    (tmp_path / "bag").mkdir()
+    for place, words in (
+        (tmp_path / "bag", "something of that name"),
+        (tmp_path / "file" / "x", "no bag can be made"),
+    ):
+        (tmp_path / "file").touch()
+        process = run("starpos_solver", "record", arguments=(str(place),))
+        assert process.wait() == 2 and words in process.output and "Traceback" not in process.output, (
+            process.output
+        )
