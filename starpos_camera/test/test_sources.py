@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame sources by themselves."""
 
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
+import raws
 
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
@@ -12,6 +19,7 @@ from starpos.simulate import expose
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings, SourceEnded
 from starpos_camera.sources.registry import SOURCES
+from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
 
 NOW_S = 1793642400.0
@@ -140,3 +148,34 @@ def test_simulated_sky_follows_its_parameters(scene):
 def test_simulated_sky_refuses_what_it_cannot_do(settings, changes, sentence):
     given = values(**(SMALL | changes))
     assert sentence in SOURCES["simulated"].refusal(given, settings)
+
+
+def raw_files(folder, **exif):
+    (folder / "a.dng").write_bytes(raws.dng(raws.mosaic(), **exif))
+    return str(folder)
+
+
+def test_a_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path):
+    for package in ("rawpy", "exifread"):
+        if not find_spec(package):
+            lacks(package, "pip install")
+    path = raw_files(tmp_path, subsec="25", offset="+01:00")  # of 18:00:00
+    (refused,) = play(make(files__path=path), 1)
+    assert "a.dng" in str(refused) and "files.exif" in str(refused)
+    (taken,) = play(make(files__path=path, files__exif=True), 1)
+    assert taken.stamp_source == Capture.EXIF
+    assert taken.frame.mid_unix_s == pytest.approx(NOW_S - 3600 + 0.255 + 0.25)
+    assert taken.stamp_stddev_s == pytest.approx(0.01 / np.sqrt(12))
+    assert taken.frame.clock_stddev_s == 60.0
+    own = {"files__exif_utc_offset": -2.5, "files__exif_clock_stddev": 2.0}
+    (taken,) = play(make(files__path=path, files__exif=True, **own), 1)
+    assert taken.frame.mid_unix_s == pytest.approx(NOW_S + 2.5 * 3600 + 0.255 + 0.25)
+    assert taken.frame.clock_stddev_s == 2.0
+    raw_files(tmp_path)
+    (refused,) = play(make(files__path=path, files__exif=True), 1)
+    assert "no zone" in str(refused)
+
+
+def test_an_offset_without_leave_is_refused():
+    given = values(files__path="/x", files__exif_utc_offset=1.0)
+    assert "set files.exif too" in SOURCES["files"].refusal(given, SETTINGS)
