@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo    the whole instrument on a simulated night      make test    linters, unit tests, whole-graph tests
+# make emulated   firmware on an emulated MCU, INDI camera under a sky, nodes: tools/emulated_instrument.py
 # make build   set-up (once) and build                        make lint    linters only
 # make clean   removes what was built                         make distclean   and the set-up
-# PYTHON=python3.12 chooses the interpreter of the set-up; ARGS goes to the demo or to pytest.
+# PYTHON=python3.12 chooses the interpreter of the set-up; ARGS goes to the demo, to emulated or to pytest.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
@@ -13,7 +14,7 @@ PACKAGES := $(patsubst %/package.xml,%,$(wildcard */package.xml src/*/package.xm
 INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/package.xml $(p)/setup.* $(p)/CMakeLists.txt \
   $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* $(p)/resource/*))
 
-.PHONY: build demo test lint clean distclean FORCE
+.PHONY: build demo emulated test lint clean distclean FORCE
 build: install/.built
 
 install/.built: .underlay/stamp $(INPUTS)
@@ -24,6 +25,9 @@ install/.built: .underlay/stamp $(INPUTS)
 
 demo: build
 	@. tools/env.sh && python tools/demo.py $(ARGS)
+
+emulated: build
+	@. tools/env.sh && python tools/emulated_instrument.py $(ARGS)
 
 test: build
 	@. tools/env.sh && python tools/test.py $(ARGS)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The instrument as it is built, devices emulated: tools/emulated_instrument.py, shortened."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from starpos_common.testing import lacks
+
+TOOL = Path(__file__).parent.parent / "tools" / "emulated_instrument.py"
+FRAMES = 3
+
+
+def test_firmware_indi_camera_detector_and_solver_find_a_place_nobody_told_them(tmp_path):
+    command = [sys.executable, str(TOOL), "--seed", "11", "--frames", str(FRAMES), "--out", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tool:
+        try:
+            out, error = tool.communicate(timeout=80)
+        except subprocess.TimeoutExpired:
+            tool.send_signal(signal.SIGINT)  # it ends what it has started
+            out, error = tool.communicate()
+    if tool.returncode == 2 and (lack := re.search("(sudo apt-get install|pip install) (.+)", error)):
+        lacks(lack[2], lack[1])
+    assert tool.returncode == 0, out + error
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"] == FRAMES
+    assert summary["sigmas_off"] < 4
+    assert max(summary["sigma_east_m"], summary["sigma_north_m"]) < 300  # it claims something

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sky in front of the CCD simulator of a running indiserver: each exposure shows what a place sees in its middle.
+
+    indi_sky.py PORT FOLDER EXPOSURE_S SEED PLACE       PLACE: instrument_run.Place as JSON
+
+The simulator can read its frames from a folder, and does so as an exposure begins.  There is one file in the folder,
+and this process holds a lease on it (fcntl(2), F_SETLEASE): the kernel tells it that the simulator opens the file, and
+has the simulator wait until the sky of that moment is drawn and the lease given back.  Only this process knows the place.
+Prints `ready`, then the Unix time of each exposure's begin.
+"""
+
+import fcntl
+import json
+import mmap
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from instrument_run import Place
+
+DEVICE = "CCD Simulator"
+PIXEL_UM = 6.4
+PATIENCE_S = 5.0
+ENDS = {signal.SIGINT, signal.SIGTERM}
+
+
+class Picture:
+    """A 16-bit FITS file that is opened once and drawn into; `lease` of it must be had before anybody may read it."""
+
+    def __init__(self, path: Path, width: int, height: int):
+        from astropy.io import fits
+
+        blank = fits.PrimaryHDU(np.zeros((height, width), np.uint16), fits.Header({"PIXSIZE1": PIXEL_UM}))
+        blank.writeto(path)
+        with fits.open(path, memmap=False) as hdus:
+            begin = hdus.fileinfo(0)["datLoc"]
+        self._file = os.open(path, os.O_RDWR)
+        content = mmap.mmap(self._file, 0)
+        self._pixels = np.frombuffer(content, ">u2", width * height, begin).reshape(height, width)
+
+    def draw(self, pixels: np.ndarray):
+        np.bitwise_xor(pixels, 0x8000, out=self._pixels, casting="unsafe")  # FITS has them signed, less 32768
+
+    def lease(self):
+        """Wait until nobody reads the file; from now on a reader waits, and SIGIO tells of it."""
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                fcntl.fcntl(self._file, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+                return
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.002)
+
+    def release(self):
+        fcntl.fcntl(self._file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+
+
+def set_up(port: str, folder: Path):
+    """Have the simulator take its frames from the folder."""
+    for setting in (
+        "CONNECTION.CONNECT=On",
+        f"CCD_DIRECTORY_LOCATION.LOCATION={folder}",
+        "CCD_DIRECTORY_TOGGLE.INDI_ENABLED;INDI_DISABLED=On;Off",
+    ):
+        subprocess.run(["indi_setprop", "-p", port, "-t", "10", f"{DEVICE}.{setting}"], check=True)
+    enabled = f'"{DEVICE}.CCD_DIRECTORY_TOGGLE.INDI_ENABLED"==1'
+    subprocess.run(["indi_eval", "-p", port, "-t", "10", "-w", enabled], check=True)
+
+
+def main() -> int:
+    port, folder, exposure_s, seed, place = sys.argv[1:]
+    folder, exposure_s, rng = Path(folder), float(exposure_s), np.random.default_rng(int(seed))
+    scene = Place(**json.loads(place)).scene()
+    from starpos.catalogue import load
+    from starpos.simulate import expose, render
+
+    catalogue = load()
+    expose(scene, catalogue, time.time(), exposure_s, rng)  # what takes long the first time
+    picture = Picture(folder / "sky.fits", scene.camera.width, scene.camera.height)
+    set_up(port, folder)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGIO, *ENDS})
+    picture.lease()
+    print("ready", flush=True)
+    begun = 0.0
+    while signal.sigwaitinfo({signal.SIGIO, *ENDS}).si_signo == signal.SIGIO:
+        now = time.time()
+        if now > begun + exposure_s:  # else the same exposure looks once more
+            begun = now
+            stars = expose(scene, catalogue, begun, exposure_s, rng)
+            picture.draw(render(scene, stars, begun, exposure_s, rng).pixels)
+            print(f"{begun:.6f}", flush=True)
+        picture.release()
+        picture.lease()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
