@@ -115,8 +115,9 @@ class CameraNode(Node):
             self._say(Level.WARN, lack)
 
     def destroy_node(self):
+        self._worker.retire()
+        self._source.close()  # an exposure may have an hour to go
         self._worker.stop()
-        self._source.close()
         super().destroy_node()
 
     def hand_to(self, taker: Taker):

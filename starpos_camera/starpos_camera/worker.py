@@ -26,12 +26,16 @@ class Worker:
     def start(self):
         self._thread.start()
 
-    def stop(self):
-        """Finish the running job, forget the waiting one, end the thread. May be called twice, or unstarted."""
+    def retire(self):
+        """Begin no further job."""
         with self._changed:
             self._stopping = True
             self._waiting = None
             self._changed.notify()
+
+    def stop(self):
+        """Finish the running job, forget the waiting one, end the thread. May be called twice, or unstarted."""
+        self.retire()
         if self._thread.is_alive():
             self._thread.join()
 

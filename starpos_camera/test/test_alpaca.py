@@ -2,6 +2,7 @@
 """The source `alpaca`, against PyPI's alpaca-simulators, and against a server that lies."""
 
 import math
+import signal
 import threading
 import time
 from datetime import datetime, timezone
@@ -163,6 +164,19 @@ def test_a_gain_is_set_once_and_kept(liar):
     assert "its gain is 100, though 300 was set" in source.capture(Settings(0.1, 300.0, 5.0)).remark
     liar.values["gain"] = 3
     assert "its gain is 3" in source.capture(Settings(0.1, 300.0, 5.0)).remark
+
+
+def test_the_node_ends_within_a_long_exposure(simulator, start):
+    process = start(
+        "camera", "source:=alpaca", f"alpaca.address:={simulator.address}", "exposure:=60.0", "cadence:=0.5"
+    )
+    camera = simulator.client()
+    while camera.CameraState != 2:
+        pass
+    begin = time.monotonic()
+    status, out = process.end(signal.SIGINT)
+    assert status == 0 and time.monotonic() - begin < 10, out
+    camera.AbortExposure()
 
 
 ROWS = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)

@@ -90,6 +90,14 @@ def test_without_stamps_the_time_of_the_read_counts(session):
         assert abs(shot["mid_s"] - shot["began_s"] - 0.015) < math.sqrt(3) * shot["stddev_s"]
 
 
+@pytest.mark.parametrize("stamps", [(), ("unstamped",)])
+def test_a_camera_that_is_slower_in_the_dark_than_it_says(session, stamps):
+    for shot in session("frames", "dark", "automatic", *stamps, options={"settings": [[None, None]] * 2}):
+        assert shot["began_s"] >= 0 and shot["exposure_s"] is None
+        assert shot["stddev_s"] == pytest.approx(2 * 0.12 / math.sqrt(12), rel=0.1)
+        assert abs(shot["mid_s"] - shot["began_s"] - 0.06) < math.sqrt(3) * shot["stddev_s"]
+
+
 def test_what_the_camera_makes_of_settings_is_told(session):
     long, strong, too_strong = session(
         "frames", options={"settings": [[0.5, None], [None, 20.0], [None, 5000.0]]}

@@ -2,7 +2,7 @@
 // A camera of V4L2 for programs that this library is preloaded into: OpenCV's own backend talks to it as to the kernel's.
 // It is /dev/starpos-emulated while the file `plugged` is in the folder STARPOS_V4L2; other files there change what it
 // does: `short` (frames lack 16 bytes), `unstamped`, `realtime` (stamps of the other clock), `frozen`, `automatic` (no
-// control of the exposure). A frame is exposed up to its stamp, and there 10 ms later. Its pixels are row * 5 + column * 3,
+// control of the exposure), `dark` (exposed for longer than the period that it tells). A frame is exposed up to its stamp, and there 10 ms later. Its pixels are row * 5 + column * 3,
 // but for the first 8: the start of the exposure, steady time in us.
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -45,7 +45,7 @@ static int64_t clock_us(clockid_t id) {
 
 static int each(void) { return format.pixelformat == V4L2_PIX_FMT_YUYV || format.pixelformat == V4L2_PIX_FMT_Y16 ? 2 : 1; }
 static int size(void) { return format.width * format.height * each(); }
-static int64_t exposed_us(void) { return exposure * 100LL; }
+static int64_t exposed_us(void) { return is("dark") ? 120000 : exposure * 100LL; }
 static int64_t there_us(void) { return next_us + exposed_us() + TRANSFER_US; }
 
 static void expose(int index) {

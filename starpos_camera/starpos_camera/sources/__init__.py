@@ -86,7 +86,7 @@ class Source(Protocol):
         """The node's parameters have changed; may be called while `capture` runs."""
 
     def close(self):
-        """Release the device. Called once, after the last `capture` has returned."""
+        """Release the device. Called once, also while the last `capture` runs, which then ends soon."""
 
 
 def missing(module: str, package: str) -> str | None:

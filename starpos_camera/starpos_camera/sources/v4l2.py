@@ -20,6 +20,8 @@ from starpos_interfaces.msg import Capture
 
 EXPOSURE_UNIT_S = 1e-4
 MANUAL = 1  # V4L2_EXPOSURE_MANUAL
+AUTOMATIC = (0, 3)  # V4L2_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY
+MAX_EXPOSURE_S = 60.0
 SETTLE_FRAMES = 4  # that a camera still takes with the settings before
 MAX_WAIT_S = 10.0  # besides what the frames themselves take
 DEFAULT_RATE = 5.0  # frames a second where the driver tells none: slow is careful
@@ -46,6 +48,7 @@ class Device:
     """Keeps the camera streaming; `capture` gives the first frame that was exposed after it was asked for."""
 
     def __init__(self, path: str, values: Mapping, now: Callable[[], float]):
+        self.closing = False
         self._path = path
         self._values = values
         self._now = now
@@ -119,7 +122,8 @@ class Device:
             self._set = settings.exposure_s, settings.gain
             self._not_before_s = time.monotonic() + SETTLE_FRAMES * self._period_s(cv2)
         units = capture.get(cv2.CAP_PROP_EXPOSURE)
-        told = units > 0 and capture.get(cv2.CAP_PROP_AUTO_EXPOSURE) == MANUAL
+        told = 0 < units <= MAX_EXPOSURE_S / EXPOSURE_UNIT_S
+        told = told and capture.get(cv2.CAP_PROP_AUTO_EXPOSURE) not in AUTOMATIC
         exposure_s = units * EXPOSURE_UNIT_S if told else None
         if settings.exposure_s is not None:
             if exposure_s is None:
@@ -127,6 +131,8 @@ class Device:
             if abs(exposure_s - settings.exposure_s) > max(EXPOSURE_UNIT_S, 0.01 * settings.exposure_s):
                 remark = f"it exposes for {exposure_s:g} s, not for {settings.exposure_s:g} s."
         if settings.gain is not None and (gain := capture.get(cv2.CAP_PROP_GAIN)) != settings.gain:
+            if gain < 0:
+                raise CaptureError("its driver does not let its gain be set; leave `gain` unset.")
             remark = f"its gain is {gain:g}, though {settings.gain:g} was set."
         return exposure_s, remark
 
@@ -136,38 +142,41 @@ class Device:
 
     def _grab(self, cv2, exposure_s):
         """Middle, its standard deviation (s) and where it comes from, of the frame that `retrieve` then gives."""
-        # An unknown exposure is no longer than the period; a long one slows the camera.
-        period_s = max(self._period_s(cv2), exposure_s or 0.0)
-        exposed_s = exposure_s or period_s
-        lag_s, lag_stddev_s = self._values["video.lag"], self._values["command_lag_stddev"]
-        if math.isnan(lag_s):
-            # Drivers stamp the start of the exposure, its end, or the end of the transfer one period later at most.
-            lag_s, lag_stddev_s = period_s / 2, (period_s + exposed_s) / math.sqrt(12)
-            latest_s = period_s + exposed_s  # from the start of an exposure to its stamp
-        else:
-            latest_s = lag_s + exposed_s / 2
         asked_s = max(time.monotonic(), self._not_before_s)
         buffers = int(self._capture.get(cv2.CAP_PROP_BUFFERSIZE))
         stale = buffers if 1 <= buffers <= 32 else 4
+        period_s = max(self._period_s(cv2), exposure_s or 0.0)
         end_s = asked_s + MAX_WAIT_S + (stale + SETTLE_FRAMES) * period_s
-        unstamped = 0
-        while time.monotonic() < end_s:
+        before_s, apart_s, unstamped = None, math.inf, 0
+        while time.monotonic() < end_s and not self.closing:
             if not self._capture.grab():
                 raise CaptureError("it gives no frame; look after its plug.")
             steady_s, now_s = time.monotonic(), self._now()
             stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             age_s = min(steady_s - stamp_s, time.time() - stamp_s, key=abs)  # drivers stamp with either clock
-            if -0.1 < age_s < MAX_AGE_S:
-                if steady_s - age_s - latest_s >= asked_s:
-                    return now_s - age_s - lag_s, lag_stddev_s, Capture.HARDWARE
-            else:
-                unstamped += 1
-                # after the buffers that had been filled before, and one that was being so
-                if unstamped > stale + 1 and steady_s - latest_s >= asked_s:
-                    return now_s - lag_s, lag_stddev_s, Capture.DRIVER
+            stamped = stamp_s > 0 and -0.1 < age_s < MAX_AGE_S
+            if not stamped:
+                age_s, unstamped = 0.0, unstamped + 1
+            at_s = steady_s - age_s
+            if before_s is not None:  # in the dark a camera may be slower than it says
+                apart_s = min(apart_s, at_s - before_s) if stamped else at_s - before_s
+                lag_s, stddev_s, latest_s = self._lag(exposure_s, max(period_s, apart_s))
+                # Without stamps: after the buffers that had been filled before, and one that was being so.
+                if at_s - latest_s >= asked_s and (stamped or unstamped > stale + 1):
+                    return now_s - age_s - lag_s, stddev_s, Capture.HARDWARE if stamped else Capture.DRIVER
+            before_s = at_s
         raise CaptureError(
             "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
         )
+
+    def _lag(self, exposure_s, period_s):
+        """From an exposure's middle to its stamp, the standard deviation of that, and the most from its start (s)."""
+        exposed_s = exposure_s or period_s  # an unknown one is no longer
+        lag_s = self._values["video.lag"]
+        if not math.isnan(lag_s):
+            return lag_s, self._values["command_lag_stddev"], lag_s + exposed_s / 2
+        # Drivers stamp the start of the exposure, its end, or the end of the transfer, one period later at most.
+        return period_s / 2, (period_s + exposed_s) / math.sqrt(12), period_s + exposed_s
 
     def _pixels(self, cv2, raw):
         """Pixels and the pattern of their mosaic; CaptureError of a frame that is not whole."""

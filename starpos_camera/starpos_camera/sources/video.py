@@ -2,6 +2,7 @@
 """V4L2 cameras and video files, through OpenCV."""
 
 import math
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -103,6 +104,7 @@ class Video:
             device
         )  # else the first frames are gone before the detector is up
         self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
+        self._in_use = threading.Lock()
         self._from = (
             Device(self.hardware_id, values, now)
             if is_camera(device)
@@ -115,13 +117,16 @@ class Video:
         return None
 
     def capture(self, settings: Settings) -> Exposure:
-        return self._from.capture(settings)
+        with self._in_use:
+            return self._from.capture(settings)
 
     def update(self, values: Mapping):
         """What may change is looked up at each frame."""
 
     def close(self):
-        self._from.close()
+        self._from.closing = True
+        with self._in_use:
+            self._from.close()
 
 
 def is_camera(device: str) -> bool:

@@ -33,6 +33,8 @@ GREY_8, GREY_16 = 0x30303859, 0x10003159  # FFmpeg's tags of pixel formats: Y800
 class Film:
     """Plays a file once. A disk that has gone and come back is gone on with, at the next frame."""
 
+    closing = False  # a frame takes no time
+
     def __init__(self, path: str, start: str):
         self._path = path
         self._start_s, self._start_resolution_s = read_utc(start)
@@ -84,8 +86,13 @@ class Film:
 
     def _open(self, cv2):
         at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
-        with open(self._path, "rb") as file:
-            head = file.read(16)
+        try:
+            with open(self._path, "rb") as file:
+                head = file.read(16)
+        except OSError as error:
+            raise CaptureError(
+                f"{self._path}: it cannot be read ({error.strerror}); look after its disk."
+            ) from None
         if head[at : at + 4] not in beginnings:  # FFmpeg takes a playlist of other files by any name
             raise FrameError(
                 f"{self._path}: this is no {Path(self._path).suffix[1:].upper()} file; convert it to one."
