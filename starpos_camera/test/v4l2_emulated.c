@@ -2,8 +2,9 @@
 // A camera of V4L2 for programs that this library is preloaded into: OpenCV's own backend talks to it as to the kernel's.
 // It is /dev/starpos-emulated while the file `plugged` is in the folder STARPOS_V4L2; other files there change what it
 // does: `short` (frames lack 16 bytes), `unstamped`, `realtime` (stamps of the other clock), `frozen`, `automatic` (no
-// control of the exposure), `dark` (exposed for longer than the period that it tells). A frame is exposed up to its stamp, and there 10 ms later. Its pixels are row * 5 + column * 3,
-// but for the first 8: the start of the exposure, steady time in us.
+// control of the exposure), `dark` (exposed for longer than the period that it tells). A frame is exposed up to its
+// stamp, and there 10 ms later. Its pixels are row * 5 + column * 3, but for the first 8: the start of the exposure,
+// steady time in us.
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
