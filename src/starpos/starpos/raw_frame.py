@@ -40,13 +40,18 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
             colours = raw.color_desc.decode("ascii", "replace")
             pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
     except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError, AttributeError) as e:
-        reason = e.args[0].decode("ascii", "replace") if e.args and isinstance(e.args[0], bytes) else e
-        raise FrameError(f"{place}: this is not a whole raw file ({one_line(reason)}); copy it again.") from e
+        raise FrameError(f"{place}: this is not a whole raw file ({_words(e)}); copy it again.") from e
     if pattern not in PATTERNS or not pattern:
         raise FrameError(
             f"{place}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
         )
     return Frame(to_unsigned(pixels, place), pattern, source=place, **exif.told(data, place, clock))
+
+
+def _words(error):
+    """An exception's, of which LibRaw's are bytes."""
+    told = error.args[0] if error.args else ""
+    return one_line(told.decode("ascii", "replace") if isinstance(told, bytes) else error)
 
 
 def _end(data):

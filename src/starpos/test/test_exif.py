@@ -2,6 +2,7 @@
 """Raw files and pictures of a camera, and when they were taken by its own clock."""
 
 import contextlib
+import gc
 import sys
 from datetime import datetime, timezone
 
@@ -193,3 +194,20 @@ def test_nothing_but_a_frame_error_comes_of_damaged_camera_files(tmp_path, rng, 
             bad[place] = rng.integers(256)
         with contextlib.suppress(FrameError):
             assert isinstance(read_frame(write(tmp_path / name, bad), TEHRAN), Frame)
+
+
+@needs_rawpy
+@pytest.mark.parametrize("name", ["a.dng", "a.jpg", "a.tif"])
+def test_of_a_broken_file_nothing_is_kept(name):
+    """Its bytes are many, and the collector of cycles counts objects, not bytes."""
+    data = {"a.dng": raws.dng(MOSAIC), "a.jpg": jpeg(), "a.tif": picture_tiff()}[name][:-30]
+    held = sys.getrefcount(data)
+    gc.disable()
+    try:
+        for _ in range(3):
+            with contextlib.suppress(FrameError):
+                decode_frame(data, name)
+                pytest.fail("it was taken for whole")
+        assert sys.getrefcount(data) == held
+    finally:
+        gc.enable()
