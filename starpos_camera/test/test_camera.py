@@ -3,9 +3,16 @@
 
 import math
 import signal
+import sys
+from importlib.util import find_spec
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
+import raws
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
@@ -19,6 +26,7 @@ from starpos.reading import read_frame
 from starpos.simulate import expose
 from starpos_camera.camera_parameters import path_of
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
+from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 
@@ -30,6 +38,20 @@ def hear_all(listener):
     """Lists of the images, the intrinsics and the captures to come."""
     topics = ((Image, "image_raw"), (CameraInfo, "camera_info"), (Capture, "capture"))
     return [listener.hear(kind, f"camera/{name}") for kind, name in topics]
+
+
+def test_what_a_cameras_own_clock_is_off_goes_with_its_frames(start, listener, tmp_path):
+    if not find_spec("exifread"):
+        lacks("exifread", "pip install")
+    jpeg = cv2.imencode(".jpg", np.full((64, 96), 30, np.uint8))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(raws.with_exif(jpeg))
+    _, _, captures = hear_all(listener)
+    start("camera", f"files.path:={tmp_path}/*.jpg", "files.exif:=true", "files.exif_utc_offset:=1.0")
+    listener.wait(lambda: captures)
+    told = captures[0]
+    assert (told.stamp_source, told.clock_stddev, told.exposure) == (Capture.EXIF, 60.0, 0.5)
+    assert told.stamp_stddev == pytest.approx(0.2887, abs=1e-4)
+    assert stamp_to_unix(told.header.stamp) == pytest.approx(1793642400.0 - 3600 + 0.75)
 
 
 def set_capture(listener, exposure=math.nan, gain=math.nan, cadence=math.nan):
