@@ -165,6 +165,8 @@ class Device:
                 if at_s - latest_s >= asked_s and (stamped or unstamped > stale + 1):
                     return now_s - age_s - lag_s, stddev_s, Capture.HARDWARE if stamped else Capture.DRIVER
             before_s = at_s
+        if self.closing:
+            raise CaptureError("the node ends.")
         raise CaptureError(
             "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
         )
