@@ -4,7 +4,7 @@
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from typing import Any
 
@@ -40,7 +40,7 @@ class Line:
     x: float
     y: float
     step: float
-    temperature_c: float
+    temperature_c: float = field(compare=False)  # NaN is not equal to itself
     sequence: int | None
     milliseconds: int | None  # 32 bits, of the device's clock
     number: int = 0  # tells equal lines apart that are no doubled ones

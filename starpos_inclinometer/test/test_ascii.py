@@ -131,6 +131,14 @@ def test_numbers_lost_doubled_wrapped():
     assert [(s.sequence, s.broken) for s in got] == [(0, True), (1, False)]
 
 
+def test_equal_lines_are_doubled_ones_only_where_they_are_numbered():
+    feeder = Feeder()
+    assert len(feeder.send(*["1.0,2.0"] * 10)) == 10 and feeder.decoder.counts.duplicates == 0
+    numbered = Feeder(FULL)
+    numbered.send("$TILT,1,100,1,2,", "$TILT,2,200,1,2,")
+    assert numbered.send("$TILT,2,200,1,2,") == [] and numbered.decoder.counts.duplicates == 1
+
+
 def test_a_wrong_digit_that_nothing_bears_out_is_dropped():
     feeder = Feeder()
     feeder.send("1.000,2.000", "1.001,2.000")
@@ -284,21 +292,19 @@ def test_a_meter_that_is_asked(meter):
 def test_a_device_clock_takes_the_jitter_out(meter):
     """Lines that are late by up to 15 ms; their clock says when they were taken."""
     rng = random.Random(1)
-    begin = time.monotonic()
+    begin = time.time()
+    taken = []
 
     def line(k):
-        taken = time.monotonic()
+        taken.append(time.time())
         threading.Event().wait(rng.random() * 0.015)
-        ms = int(1000 * (taken - begin))
-        return b"$TILT,%d,%d,1.0%d,2.00,20\r\n" % (k, ms, k % 10)
+        return b"$TILT,%d,%d,1.0,%.4f,20\r\n" % (k, 1000 * (taken[-1] - begin), k * 1e-4)
 
     got, health = readings(meter(line, period_s=0.01).path, 200, **{"ascii.pattern": FULL})
     assert health.counts.lost == 0 and abs(got[-1].temperature_c - 20) < 1e-9
-    ms = np.array([r.stamp_ns for r in got]) * 1e-6
-    assert (
-        np.ptp(np.diff(ms)) < 40
-    )  # steps of 10 to 30 ms as taken; with the lateness they would go down to 0
-    assert np.diff(ms).min() > 5
+    numbers = np.rint(np.degrees([r.y for r in got]) * 1e4).astype(int)
+    late = (np.array([r.stamp_ns * 1e-9 for r in got]) - np.array(taken)[numbers])[50:]
+    assert np.median(np.abs(late - np.median(late))) < 0.002  # of the lines' lateness it is 3.7 ms
 
 
 def test_stuck_and_steep_and_reopened(meter):
@@ -308,8 +314,15 @@ def test_stuck_and_steep_and_reopened(meter):
     assert flags[:19] == [0] * 19 and set(flags[19:50]) == {STUCK}
     assert flags[90] == STUCK | OUT_OF_RANGE
     assert not any(f & GAP for f in flags)
-    never, _ = readings(device.path, 50, **{"ascii.stuck_samples": 0})
+    never, _ = readings(device.path, 150, **{"ascii.stuck_samples": 0, "ascii.resolution": 0.01})
     assert not any(r.flags & STUCK for r in never)
+
+
+def test_readings_that_all_stand_on_one_step_may_be_half_a_step_off(meter):
+    device = meter(lambda k: b"1.00,2.00\n")
+    got, _ = readings(device.path, 150, **{"ascii.stuck_samples": 0})
+    sigma = np.degrees(np.sqrt([r.covariance[0] for r in (got[0], got[-1])]))
+    assert sigma == pytest.approx([math.hypot(0.01, 0.01 / math.sqrt(12)), 0.01 / math.sqrt(12)], rel=1e-6)
 
 
 def test_a_device_that_says_something_else(tmp_path):

@@ -117,6 +117,13 @@ def test_one_wrong_code_does_not_open_the_gate_for_the_next(cable):
     assert cable.counts.implausible == 50
 
 
+def test_a_leap_does_not_open_the_gate_for_what_comes_after(cable):
+    cable.send(*(line(k) for k in range(30)))
+    far = CODE + 4_000_000
+    assert numbers(cable.send(line(30, x=far), line(31, x=far))) == [30, 31]
+    assert cable.send(line(32, x=far - 500_000)) == [] and numbers(cable.send(line(33, x=far))) == [33]
+
+
 def test_after_a_rejection_the_rate_is_asked_for_again(cable):
     """The MCU was reset to 10 Hz, and of what it said then nothing came through but samples."""
     cable.decoder.wanted_rate_hz = 50
@@ -160,7 +167,8 @@ def test_the_first_sample_of_a_new_connection_claims_no_continuity(cable):
     """The MCU may have been reset while nobody listened, and by chance go on where it was."""
     got = cable.send(line(0), line(1), line(2)[:9])
     cable.decoder.resume()
-    got += cable.send(line(2), line(3))
+    assert cable.send(line(2)) == []
+    got += cable.send(line(3))
     assert [s.resumed for s in got] == [False, False, True, False]
     assert numbers(got) == [0, 1, 2, 3]
     assert (cable.counts.lost, cable.counts.garbage_bytes) == (0, 9)

@@ -144,6 +144,10 @@ class Imitation:
         self._stamp_ns = time.time_ns() - 200_000_000_000
         listener.wait(lambda: self._publisher.get_subscription_count() == 1)
 
+    def skip(self, seconds):
+        """Say nothing for a while."""
+        self._stamp_ns += seconds * 10**9
+
     def send(self, n, tilt=(3.0, -11.0), noise=0.01, scale=1.0, ahead_ns=0, **options):
         for _ in range(n):
             self._stamp_ns += PERIOD_NS
@@ -189,6 +193,12 @@ def test_the_node_reads_an_imu(listener):
         assert tilts[n].flags == Tilt.GAP and tilts[n + 1].flags == 0
         assert tilts[n].sequence > tilts[n - 1].sequence + 1
 
+        imu.skip(5)
+        n = len(tilts)
+        send_until(lambda: len(tilts) >= n + 4)
+        assert sorted(t.flags for t in tilts[n : n + 4]) == [0, 0, 0, Tilt.GAP]
+        assert listener.set("inclinometer", noise_stddev=0.1).successful
+        send_until(lambda: math.degrees(math.sqrt(tilts[-1].covariance[3])) == pytest.approx(0.1))
         n = len(tilts)
         send_until(lambda: len(tilts) >= n + 5, tilt=(3.0, 40.0))
         assert tilts[-1].flags == Tilt.OUT_OF_RANGE

@@ -2,6 +2,7 @@
 """The node itself, in this process, while the host's clock is stepped: what it publishes, logs and reports."""
 
 import time
+from itertools import pairwise
 
 import pytest
 import rclpy
@@ -48,8 +49,8 @@ def test_a_step_is_in_the_stamps_one_line_of_the_log_and_the_diagnostics(spin, c
     levels.clear()
     spin(lambda: sum(level == b"\x01" and "-2.0" in text for level, text in levels) >= 2)
     stamps = [t.header.stamp.sec + t.header.stamp.nanosec * 1e-9 for t in tilts]
-    back = [b - a for a, b in zip(stamps, stamps[1:], strict=False) if b < a]
+    back = [b - a for a, b in pairwise(stamps) if b < a]
     assert len(back) == 1 and back[0] == pytest.approx(-1.98, abs=0.05)
-    assert [b.sequence - a.sequence for a, b in zip(tilts, tilts[1:], strict=False)] == [1] * (len(tilts) - 1)
+    assert [b.sequence - a.sequence for a, b in pairwise(tilts)] == [1] * (len(tilts) - 1)
     out, err = capfd.readouterr()
     assert (out + err).count("was stepped by") == 1

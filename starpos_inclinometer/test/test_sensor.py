@@ -134,12 +134,38 @@ def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing
     assert back.covariance[0] < later.covariance[0] / 100
 
 
+def offset_x(linear, square):
+    return Calibration(offset_per_c=((linear, square, 0.0), (0.0, 0.0, 0.0)))
+
+
+def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
+    c = Calibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
+    counts = sensor.temperature_counts(125.0)
+    reading = measure(sample(x=0x880000, y=0x780000, temperature=counts), c)
+    assert reading.x > 0 > reading.y and np.isfinite(reading.covariance).all()
+
+
+@pytest.mark.parametrize(
+    "odd", [{"lost": 1}, {"status": Status.ADC_TIMEOUT}, {"x": 0}, {"x": Calibration().code(4.9)}]
+)
+def test_what_is_flagged_tells_no_noise(odd):
+    s = Sensor()
+    for k in range(100):
+        s.measure(sample(**({"x": 0x800000 + 37 * k % 101, "y": 0x800000 + k} | odd)), 0.1 * k)
+    assert s.noise.sigma is None
+
+
 def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
     """Also where the compensation is as large on both sides of the reference."""
-    even = Calibration(offset_per_c=((0.0, 1e-5, 0.0), (0.0, 0.0, 0.0)))
-    for c, of_40 in ((WARM, 40 * 5e-4), (even, 40**2 * 1e-5)):
+    x_alone = (
+        (WARM, 0.020),
+        (offset_x(0.0, 1e-5), 0.016),
+        (offset_x(5e-4, 1e-5), 0.036),
+        (offset_x(-5e-4, 1e-5), 0.036),
+    )
+    for c, volts in x_alone:
         reading = measure(sample(status=Status.NO_TEMPERATURE), c)
-        assert math.sqrt(reading.covariance[0]) > 0.8 * of_40 / 4
+        assert math.sqrt(reading.covariance[0]) > 0.8 * volts / 4
         assert measure(sample(temperature=170), c).covariance[0] < reading.covariance[0] / 100
     assert measure(sample(status=Status.NO_TEMPERATURE)).covariance == measure(sample()).covariance
 
