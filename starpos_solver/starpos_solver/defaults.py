@@ -5,9 +5,16 @@ from starpos_camera.camera_parameters import PARAMETERS as CAMERA
 from starpos_camera.detector_parameters import PARAMETERS as DETECTOR
 from starpos_common.parameters import to_yaml
 from starpos_inclinometer.node import PARAMETERS as INCLINOMETER
+from starpos_solver.dashboard.parameters import PARAMETERS as DASHBOARD
 from starpos_solver.parameters import PARAMETERS as SOLVER
 
-NODES = {"camera": CAMERA, "detector": DETECTOR, "inclinometer": INCLINOMETER, "solver": SOLVER}
+NODES = {
+    "camera": CAMERA,
+    "detector": DETECTOR,
+    "inclinometer": INCLINOMETER,
+    "solver": SOLVER,
+    "dashboard": DASHBOARD,
+}
 
 
 def parameter_file() -> str:

@@ -1,0 +1,43 @@
+// SPDX-License-Identifier: Apache-2.0
+// The line to the node: states and track as they come, and whether it lives.
+
+const SILENT_MS = 5000; // the node speaks every second
+const AGAIN_MS = 3000;
+
+export class Link {
+  // hear(state), hearTrack({begin, points}), hearFull(places)
+  constructor(handlers) {
+    this.handlers = handlers;
+    this.heardAt = -Infinity;
+    this.frames = null;
+  }
+
+  get alive() {
+    return performance.now() - this.heardAt < SILENT_MS;
+  }
+
+  // Whether frames are wanted: without a page that shows them the detector draws none.
+  open(frames) {
+    if (frames === this.frames) return;
+    this.frames = frames;
+    this._connect();
+  }
+
+  _connect() {
+    clearTimeout(this.timer);
+    this.source?.close();
+    const source = new EventSource(this.frames ? "/events?frame" : "/events");
+    this.source = source;
+    source.addEventListener("state", (event) => {
+      this.heardAt = performance.now();
+      this.handlers.hear(JSON.parse(event.data));
+    });
+    source.addEventListener("track", (event) => this.handlers.hearTrack(JSON.parse(event.data)));
+    source.addEventListener("full", (event) => this.handlers.hearFull(Number(event.data)));
+    source.addEventListener("error", () => {
+      if (source.readyState !== EventSource.CLOSED) return; // the browser comes again by itself
+      clearTimeout(this.timer);
+      this.timer = setTimeout(() => this._connect(), AGAIN_MS);
+    });
+  }
+}

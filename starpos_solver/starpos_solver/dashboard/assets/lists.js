@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: Apache-2.0
+// The lights of the links, and the bars of the error budget.
+
+import { add, element, rows } from "/page.js";
+import * as text from "/text.js";
+
+const LEVELS = ["ok", "warn", "error", "stale"];
+const WORDS = ["OK", "WARN", "ERROR", "STALE"];
+
+// lights: [{name, level, sentence, age}]; one that was not heard for longer than `limit` s is grey.
+export function showLights(list, lights, limit) {
+  rows(list, lights, makeLight, (item, light) => {
+    const silent = !(light.age < limit);
+    item.className = silent ? "silent" : LEVELS[light.level];
+    const [, name, sentence, level] = item.children;
+    set(name, light.name);
+    set(level, silent ? "SILENT" : WORDS[light.level]);
+    set(sentence, silent ? `nothing heard for ${text.age(light.age)}` : light.sentence);
+  });
+}
+
+function makeLight(parent) {
+  const item = add(parent, "li");
+  add(item, "i", { class: "lamp", "aria-hidden": "true" });
+  for (const part of ["name", "sentence", "level"]) add(item, "span", { class: part });
+}
+
+// terms: [{name, position, heading, common}]
+export function showBudget(terms) {
+  const known = terms.filter((t) => t.position !== null).sort((a, b) => b.position - a.position);
+  const most = Math.max(...known.map((t) => t.position), 1e-9);
+  rows(element("budget"), known, makeBar, (item, term) => {
+    const [name, bar, metres, heading] = item.children;
+    item.className = term.common ? "common" : "random";
+    set(name, term.name);
+    bar.firstElementChild.style.width = `${(100 * term.position) / most}%`;
+    set(metres, text.metres(term.position));
+    set(heading, text.angle(term.heading));
+  });
+}
+
+function makeBar(parent) {
+  const item = add(parent, "li");
+  add(item, "span", { class: "name" });
+  add(add(item, "span", { class: "bar", "aria-hidden": "true" }), "i");
+  add(item, "span", { class: "metres numbers" });
+  add(item, "span", { class: "turn numbers" });
+}
+
+function set(e, said) {
+  if (e.textContent !== said) e.textContent = said;
+}

@@ -1,0 +1,235 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the page shows of the newest state, again twice a second: what nobody renews grows old by itself.
+
+import { Bubble } from "/bubble.js";
+import { Compass } from "/compass.js";
+import { Link } from "/link.js";
+import { showBudget, showLights } from "/lists.js";
+import { EarthMap } from "/map.js";
+import { dress, element, say } from "/page.js";
+import * as text from "/text.js";
+
+const TICK_MS = 500;
+const AHEAD_S = 1; // a stamp further in the future is told
+const MOST_TRACK = 10000;
+
+let state = { lights: [], old_after: { slow: 15, fast: 5 } };
+let received = performance.now();
+let track = [];
+let full = 0;
+let map = null;
+const compass = new Compass(element("compass"));
+const bubble = new Bubble(element("bubble"));
+
+const link = new Link({
+  hear(told) {
+    [state, received, full] = [told, performance.now(), 0];
+    showFrame();
+    render();
+  },
+  hearTrack({ begin, points }) {
+    track = (begin ? points : track.concat(points)).slice(-MOST_TRACK);
+  },
+  hearFull(places) {
+    full = places;
+    render();
+  },
+});
+
+// ages --------------------------------------------------------------------------------------------------------------
+
+const elapsed = () => (performance.now() - received) / 1000;
+const heardAgo = (told) => told.age + elapsed();
+const stampAge = (told) => (told.stamp === null ? heardAgo(told) : state.now + elapsed() - told.stamp);
+
+// Of what comes with a frame: neither the message nor what it tells of may be old.
+const isOld = (told) => Math.max(heardAgo(told), stampAge(told)) > state.old_after.slow;
+const badge = (told, old) => (old ? `${text.age(Math.max(heardAgo(told), stampAge(told)))} old` : "");
+
+// the cards -----------------------------------------------------------------------------------------------------------
+
+function render() {
+  const { fix } = state;
+  const old = Boolean(fix) && (isOld(fix) || !link.alive);
+  showStatus(fix, old);
+  showPosition(fix, old);
+  showTime();
+  showHeading();
+  showTilt();
+  showErrors();
+  const lights = state.lights.map((light) => ({ ...light, age: heardAgo(light) }));
+  showLights(element("lights"), lights, state.old_after.fast);
+  showLights(element("clocks"), lights.filter((l) => l.name.endsWith(": Clock")), state.old_after.fast);
+  say("lights-note", lights.length ? "" : "no diagnostics yet");
+  dressFrame();
+}
+
+function verdict(fix, old) {
+  const said = state.solution && !state.solution.good && !isOld(state.solution) ? state.solution.sentence : "";
+  const solver = state.lights.find((l) => l.name.endsWith(": Solution") && heardAgo(l) < state.old_after.fast);
+  const why = said || (solver && solver.level > 0 ? solver.sentence : "");
+  if (full) return ["lost", "No place", `${full} pages are open already, as many as the parameter clients allows`];
+  if (!link.alive) return ["lost", "No connection", "the dashboard node is silent: what is shown is of the past"];
+  if (!fix) return ["none", "No fix yet", why || "nothing has come on the topic fix"];
+  if (old && heardAgo(fix) <= state.old_after.slow) {
+    return ["old", "Old fix", `it was taken ${text.age(stampAge(fix))} ago: a replay, or a clock that is wrong`];
+  }
+  if (old) return ["old", "No fix now", why || `nothing has come on the topic fix for ${text.age(heardAgo(fix))}`];
+  if (!fix.good) return ["none", "No fix", why || fix.trouble];
+  if (stampAge(fix) < -AHEAD_S) {
+    return ["old", "Fix", `its time lies ${text.age(-stampAge(fix))} ahead of this machine's clock`];
+  }
+  return ["good", "Fix", fix.trouble || (state.solution?.good ? state.solution.sentence : "")];
+}
+
+function showStatus(fix, old) {
+  const [kind, word, sentence] = verdict(fix, old);
+  element("status").className = kind;
+  say("status-word", word);
+  say("status-sentence", sentence);
+  say("clock", link.alive ? `${text.utcTime(state.now).slice(0, 8)} UTC` : "");
+}
+
+function sigmas(fix) {
+  const [east, north] = fix?.covariance ? [Math.sqrt(fix.covariance[0]), Math.sqrt(fix.covariance[2])] : [null, null];
+  const degree = 111195; // m
+  const across = degree * Math.max(Math.cos((fix?.latitude * Math.PI) / 180), 1e-6);
+  return { east, north, latitude: north && north / degree, longitude: east && east / across };
+}
+
+function showPosition(fix, old) {
+  const good = fix?.good ? fix : null;
+  const s = sigmas(good);
+  const last = good || state.last_fix || null;
+  dress("position-card", "position-age", good ? (old ? "old" : "") : "missing", good ? badge(good, old) : "no fix");
+  say("latitude", text.sexagesimal(good?.latitude, "NS", s.latitude));
+  say("longitude", text.sexagesimal(good?.longitude, "EW", s.longitude));
+  say("sigma-east", good ? `± ${text.metres(s.east)}` : text.UNKNOWN);
+  say("sigma-north", good ? `± ${text.metres(s.north)}` : text.UNKNOWN);
+  say("altitude", text.metres(good?.altitude));
+  say("decimal", good ? plain(good, s) : last ? `last fix ${plain(last, sigmas(last))}, ${text.age(stampAge(last))} ago` : "");
+  const average = state.averaged?.good && !isOld(state.averaged) && !old && good ? state.averaged : null;
+  const a = sigmas(average);
+  const both = ["latitude", "longitude"].map((n, i) => text.sexagesimal(average?.[n], ["NS", "EW"][i], a[n]));
+  say("average", average ? both.join("  ") : text.UNKNOWN);
+  say("average-sigma", average ? `± ${text.metres(a.east)} east, ± ${text.metres(a.north)} north` : "");
+  const heading = state.heading && !isOld(state.heading) && link.alive ? state.heading.azimuth : null;
+  map?.show({ newest: last, average, old: old || !good, azimuth: heading, track });
+}
+
+const plain = (fix, s) => `${text.decimal(fix.latitude, s.latitude)} ${text.decimal(fix.longitude, s.longitude)}`;
+
+function showTime() {
+  const last = state.last_fix ?? null;
+  const solution = state.solution && !isOld(state.solution) && link.alive ? state.solution : null;
+  element("time-card").classList.toggle("old", !last || isOld(last) || !link.alive);
+  say("fix-time", text.utcTime(last?.stamp));
+  say("fix-date", text.utcDate(last?.stamp));
+  const age = last && stampAge(last);
+  say("fix-age", !last ? text.UNKNOWN : age < -AHEAD_S ? `${text.age(-age)} ahead` : text.age(age));
+  say("stars", solution ? `${solution.stars_matched} of ${solution.stars_detected}` : text.UNKNOWN);
+  say("residual", solution?.residual != null ? `${solution.residual.toFixed(2)}″` : text.UNKNOWN);
+}
+
+function showHeading() {
+  const { heading } = state;
+  const old = Boolean(heading) && (isOld(heading) || !link.alive);
+  dress("heading-card", "heading-age", !heading ? "missing" : old ? "old" : "", heading ? badge(heading, old) : "none");
+  compass.show(heading);
+  say("heading", text.azimuth(heading?.azimuth, heading?.sigma));
+  say("heading-sigma", heading ? ` ± ${text.angle(heading.sigma)}` : "");
+  say("heading-frame", heading ? `of ${heading.frame}` : "");
+}
+
+function showTilt() {
+  const { tilt } = state;
+  const old = Boolean(tilt) && (heardAgo(tilt) > state.old_after.fast || !link.alive);
+  const missing = !tilt || tilt.x === null || tilt.y === null;
+  dress("tilt-card", "tilt-age", old ? "old" : missing ? "missing" : "", old ? `${text.age(heardAgo(tilt))} old` : "");
+  bubble.show(tilt);
+  for (const axis of ["x", "y"]) {
+    const sigma = tilt?.[`sigma_${axis}`];
+    const error = sigma ? ` ± ${text.angle(sigma)}` : "";
+    say(`theta-${axis}`, tilt?.[axis] == null ? text.UNKNOWN : text.decimal(tilt[axis], sigma ?? 0.005, 4) + error);
+  }
+  say("tilt-warmth", tilt?.temperature != null ? `${tilt.temperature.toFixed(1)} °C` : text.UNKNOWN);
+  say("tilt-flags", tilt?.flags.join(", ") ?? "");
+}
+
+function showErrors() {
+  const solution = state.solution?.good ? state.solution : null;
+  const old = Boolean(solution) && (isOld(solution) || !link.alive);
+  dress("budget-card", "budget-age", !solution ? "missing" : old ? "old" : "", solution ? badge(solution, old) : "none");
+  showBudget(solution?.budget ?? []);
+  say("budget-note", solution ? "plain: new in every frame; striped: stays, however long the average" : "");
+}
+
+// the frame -----------------------------------------------------------------------------------------------------------
+
+const picture = element("frame");
+let frameNumber = 0;
+let wanted = localStorage.getItem("frame") !== "hidden";
+
+function showFrame() {
+  const number = state.frame && !state.frame.trouble && wanted ? state.frame.number : 0;
+  if (!number) {
+    frameNumber = 0;
+    picture.hidden = true;
+  } else if (number !== frameNumber) {
+    frameNumber = number;
+    picture.src = `/frame.jpg?${number}`;
+    picture.alt = `annotated frame of ${text.utcTime(state.frame.stamp)} UTC`;
+  }
+}
+
+picture.addEventListener("load", () => (picture.hidden = !frameNumber));
+picture.addEventListener("error", () => (picture.hidden = true));
+
+function dressFrame() {
+  const { frame } = state;
+  const old = Boolean(frame) && (isOld(frame) || !link.alive);
+  dress("frame-card", "frame-age", !wanted ? "" : !frame ? "missing" : old ? "old" : "", frame && wanted ? badge(frame, old) : "");
+  const waiting = "no frame yet: the detector draws the next one";
+  say("frame-note", !wanted ? "hidden: the detector draws none for this page" : frame ? frame.trouble : waiting);
+}
+
+function look() {
+  link.open(wanted && !document.hidden);
+}
+
+element("frame-switch").addEventListener("click", () => {
+  wanted = !wanted;
+  localStorage.setItem("frame", wanted ? "shown" : "hidden");
+  dressSwitches();
+  showFrame();
+  render();
+  look();
+});
+
+// night ---------------------------------------------------------------------------------------------------------------
+
+let night = localStorage.getItem("night") === "on";
+
+element("night").addEventListener("click", () => {
+  night = !night;
+  localStorage.setItem("night", night ? "on" : "off");
+  dressSwitches();
+});
+
+function dressSwitches() {
+  document.documentElement.classList.toggle("night", night);
+  element("night").setAttribute("aria-pressed", night);
+  element("frame-switch").setAttribute("aria-pressed", wanted);
+  say("frame-switch", wanted ? "Shown" : "Hidden");
+}
+
+// the beginning -------------------------------------------------------------------------------------------------------
+
+dressSwitches();
+render();
+document.addEventListener("visibilitychange", look);
+look();
+setInterval(render, TICK_MS);
+const answer = await fetch("/vendor/land-110m.json");
+map = new EarthMap(await answer.json());
+render();

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dashboard's parameters."""
+
+from starpos_common.parameters import Parameter
+
+PARAMETERS = (
+    Parameter(
+        "address",
+        "127.0.0.1",
+        "Address the page is served on; 0.0.0.0 or :: is every network of this machine, and whoever reaches it reads "
+        "where the instrument is, without a password.",
+        read_only=True,
+    ),
+    Parameter(
+        "port",
+        8042,
+        "Port the page is served on; 0 takes any free one, which the log names.",
+        "",
+        0,
+        65535,
+        read_only=True,
+    ),
+    Parameter(
+        "hosts",
+        "",
+        "Names under which browsers may ask for the page, separated by commas, besides localhost, this machine's own "
+        "name and plain addresses. Any other name is refused: it would let a foreign page read this one (DNS rebinding).",
+        read_only=True,
+    ),
+    Parameter("clients", 8, "Pages that may be open at once; each costs a connection.", "", 1, 64),
+    Parameter(
+        "rate",
+        5.0,
+        "How often an open page gets new values; often costs CPU here and on the phone.",
+        "Hz",
+        1.0,
+        20.0,
+    ),
+    Parameter(
+        "stale_after",
+        15.0,
+        "Age at which fix, heading and frame are shown as old; longer than the cadence of the camera, else they are old "
+        "between any two frames. Tilt and diagnostics are old after 5 s, or this where it is shorter.",
+        "s",
+        1.0,
+        86400.0,
+    ),
+    Parameter("track", 1000, "Newest fixes drawn on the map; many cost the browser time.", "", 1, 10000),
+    Parameter(
+        "image_side",
+        1280,
+        "Longest side of the annotated frame as it is shown; large ones cost the network.",
+        "px",
+        64,
+        4096,
+    ),
+    Parameter("image_rate", 1.0, "Most frames a second that are shown.", "Hz", 0.01, 10.0),
+    Parameter(
+        "lights",
+        "camera, detector, inclinometer, solver",
+        "Nodes whose diagnostics are shown, separated by commas; '' shows those of every node there is.",
+    ),
+)
+
+
+def names(text: str) -> frozenset[str]:
+    """The words of a list separated by commas."""
+    return frozenset(word.strip() for word in text.split(",") if word.strip())
