@@ -80,7 +80,7 @@ def test_a_known_lag_makes_the_stamp_sharp(session, clock):
     taken = session("frames", *clock.split(), video__lag=0.015, command_lag_stddev=0.001, options=settings)
     for shot in taken:
         assert (shot["stamp"], shot["stddev_s"]) == (Capture.HARDWARE, 0.001)
-        assert shot["mid_s"] == pytest.approx(shot["began_s"] + 0.015, abs=0.002)
+        assert shot["mid_s"] == pytest.approx(shot["began_s"] + 0.015, abs=0.004)
         assert shot["began_s"] >= 0
 
 

@@ -151,7 +151,7 @@ class Device:
         while time.monotonic() < end_s and not self.closing:
             if not self._capture.grab():
                 raise CaptureError("it gives no frame; look after its plug.")
-            steady_s, now_s = time.monotonic(), self._now()
+            steady_s, now_s = self._clocks()
             stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             age_s = min(steady_s - stamp_s, time.time() - stamp_s, key=abs)  # drivers stamp with either clock
             stamped = stamp_s > 0 and -0.1 < age_s < MAX_AGE_S
@@ -170,6 +170,14 @@ class Device:
         raise CaptureError(
             "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
         )
+
+    def _clocks(self):
+        """Steady time and the node's (s) of one moment, to half a millisecond: other threads may come between."""
+        for _ in range(5):
+            before_s, now_s, after_s = time.monotonic(), self._now(), time.monotonic()
+            if after_s - before_s < 1e-3:
+                break
+        return (before_s + after_s) / 2, now_s
 
     def _lag(self, exposure_s, period_s):
         """From an exposure's middle to its stamp, the standard deviation of that, and the most from its start (s)."""
