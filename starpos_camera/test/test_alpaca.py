@@ -15,6 +15,7 @@ from sensor_msgs.msg import Image
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import CaptureError, Settings
 from starpos_camera.sources.alpaca import Alpaca
+from starpos_common.testing import WAIT_S
 from starpos_interfaces.msg import Capture
 
 SHORT = Settings(0.1, None, 5.0)
@@ -110,10 +111,15 @@ def test_another_program_disconnects_bins_or_aborts(simulator, record_property):
     )
 
 
+def until(condition):
+    end = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end
+
+
 def simulator_settles(camera):
     """Its exposure goes on after an abort, and makes it busy once more at the end."""
-    while not camera.ImageReady:
-        pass
+    until(lambda: camera.ImageReady)
 
 
 def test_a_server_killed_in_mid_exposure_and_back(tmp_path, record_property):
@@ -171,8 +177,7 @@ def test_the_node_ends_within_a_long_exposure(simulator, start):
         "camera", "source:=alpaca", f"alpaca.address:={simulator.address}", "exposure:=60.0", "cadence:=0.5"
     )
     camera = simulator.client()
-    while camera.CameraState != 2:
-        pass
+    until(lambda: camera.CameraState == 2)
     begin = time.monotonic()
     status, out = process.end(signal.SIGINT)
     assert status == 0 and time.monotonic() - begin < 10, out
