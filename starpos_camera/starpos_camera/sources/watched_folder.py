@@ -56,16 +56,13 @@ class WatchedFolder:
         self._changed_s = -np.inf
         self._listed_s = -np.inf
         self._listing_s = 0.0  # how long it took
-        self._newest_ns: int | None = (
-            None  # time of the newest file that is not new any more; None before the first look
-        )
+        # time of the newest file that is new no more; None before the first look
+        self._newest_ns: int | None = None
 
     def next(self) -> tuple[Path, bool] | None:
         """The oldest file at rest, and whether it is its last chance; None: there is none.
 
-        It is to be followed by `try_again` or `done`.
-
-        OSError where there is no such folder.
+        It is to be followed by `try_again` or `done`. OSError where there is no such folder.
         """
         self._look()
         now = self._clock()
