@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a health and the samples' flags become in /diagnostics; samples to readings over resets and other rates."""
+
+import math
+
+import numpy as np
+import pytest
+
+from starpos_inclinometer.host_clock import Moment, Step
+from starpos_inclinometer.mcu import McuTilts
+from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.protocol import Identity, Sample
+from starpos_inclinometer.report import Reporter
+from starpos_inclinometer.source import GAP, OUT_OF_RANGE, SATURATED, STUCK, Arrival, Counts, Health, Phase
+
+VALUES = {p.name: p.default for p in PARAMETERS}
+
+
+def health(phase=Phase.RECEIVING, **more):
+    return Health(phase, "as it is", **more)
+
+
+@pytest.mark.parametrize(
+    ("state", "flags", "level", "text"),
+    [
+        (health(), [0, GAP], 0, "as it is"),
+        (health(Phase.ABSENT), [], 2, "as it is"),
+        (health(Phase.SILENT), [STUCK], 2, "as it is"),
+        (health(Phase.GARBLED), [], 2, "as it is"),
+        (health(Phase.MOVING), [], 1, "as it is"),
+        (health(), [0, STUCK, 0], 2, "stuck"),
+        (health(), [SATURATED | OUT_OF_RANGE], 1, "30 deg"),
+        (health(), [OUT_OF_RANGE], 1, "30 deg"),
+        (health(complaint="refused"), [0], 1, "refused"),
+        (health(step=Step(2.0, 80.0)), [0], 1, "+2.000 s"),
+        (health(step=Step(2.0, 60.0)), [0], 0, "as it is"),
+        (health(counts=Counts(good=90, crc_errors=5, lost=5)), [0], 1, "10 of 100"),
+        (health(counts=Counts(good=97, crc_errors=3)), [0], 0, "as it is"),
+    ],
+)
+def test_the_worst_is_told(state, flags, level, text):
+    reporter = Reporter()
+    for f in flags:
+        reporter.count(f)
+    status = reporter.report(state, 100.0)
+    assert (status.level, text in status.message) == (level, True), status.message
+    assert status.values["samples since the last report"] == len(flags)
+
+
+def test_each_report_counts_what_came_since_the_one_before():
+    reporter = Reporter()
+    for f in (STUCK, STUCK | SATURATED, 0):
+        reporter.count(f)
+    counts = Counts(good=50, crc_errors=50)
+    first = reporter.report(health(counts=counts), 0.0).values
+    assert [first[f"of these {n}"] for n in ("stuck", "saturated", "out of range")] == [2, 1, 0]
+    second = reporter.report(health(counts=counts), 1.0)
+    assert second.level == 0 and second.values["of these stuck"] == 0
+
+
+def test_a_flag_is_urgent_until_it_was_told():
+    reporter = Reporter()
+    assert [reporter.count(f) for f in (0, STUCK, STUCK, STUCK | SATURATED, GAP)] == [
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]
+    reporter.report(health(), 0.0)
+    assert not reporter.count(STUCK)
+    reporter.report(health(), 1.0)
+    reporter.report(health(), 2.0)
+    assert reporter.count(STUCK)
+
+
+def arrival(k, at_s, **more):
+    sample = Sample(k, 20 * k, 0x800000 + 37 * k % 1009, 0x800000 + k, 175, 0, **more)
+    return Arrival(sample, Moment(at_s, round(at_s * 1e9)))
+
+
+def identity(rate_hz, delay_ms=14):
+    return Identity(1, 0x0100, 7, rate_hz, delay_ms)
+
+
+def test_another_rate_is_another_noise():
+    tilts = McuTilts(VALUES, calibration)
+    tilts.read([arrival(k, 0.02 * k) for k in range(500)], identity(50))
+    assert tilts.sensor.noise.sigma is not None
+    tilts.read([], identity(50))
+    assert tilts.sensor.noise.sigma is not None
+    tilts.read([], identity(10))
+    assert tilts.sensor.noise.sigma is None
+
+
+@pytest.mark.parametrize("cause", ["restarted", "resumed"])
+def test_after_a_reset_or_a_new_connection_the_clocks_are_related_anew(cause):
+    """The MCU's milliseconds go on by chance where they were, 1 s off: that is no lateness."""
+    tilts = McuTilts(VALUES, calibration)
+    tilts.read([arrival(k, 0.02 * k) for k in range(500)], identity(50))
+    (reading,) = tilts.read([arrival(500, 11.0, **{cause: True})], identity(50))
+    assert 11.0 - reading.stamp_ns * 1e-9 == pytest.approx(0.014 + 43 * 10 / 38400, abs=1e-6)
+
+
+def test_the_latency_is_the_devices_or_the_parameters():
+    for latency, delay_ms, expected in ((math.nan, 14, 0.014), (math.nan, 9, 0.009), (0.1, 14, 0.1)):
+        tilts = McuTilts(VALUES | {"latency": latency}, calibration)
+        (reading,) = tilts.read([arrival(0, 5.0)], identity(50, delay_ms))
+        assert 5.0 - reading.stamp_ns * 1e-9 == pytest.approx(expected + 430 / 38400, abs=1e-6)
+    (unknown,) = McuTilts(VALUES, calibration).read([arrival(0, 5.0)], None)
+    assert np.isfinite(unknown.x) and unknown.stamp_ns < 5_000_000_000
