@@ -166,7 +166,9 @@ class CameraNode(Node):
             exposure, clock = self._source.capture(settings), None
         else:
             exposure = in_one_time(lambda: self._source.capture(settings), system_clock.StepWatch())
-            clock = system_clock.read() if exposure.stamp_source in OF_SYSTEM_CLOCK else None
+            # a source that knows the error has the clock of another machine
+            ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
+            clock = system_clock.read() if ours else None
         frame = replace(
             exposure.frame,
             stamp_stddev_s=float(exposure.stamp_stddev_s),

@@ -91,9 +91,10 @@ class OtherClient:
         text = f'<new{kind}Vector device="{device}" name="{vector}">{inner}</new{kind}Vector>'
         self._socket.sendall(text.encode())
 
-    def hear(self, vector: str, state: str):
-        """Wait until the device sets the vector with this state; what was said before is forgotten."""
-        pattern = re.compile(rf'<set\w+Vector[^>]*name="{vector}"[^>]*state="{state}"'.encode())
+    def hear(self, vector: str, state: str, first: str = ""):
+        """Wait until the device sets the vector with this state, and its first member so; what was said is forgotten."""
+        pattern = rf'<set\w+Vector[^>]*name="{vector}"[^>]*state="{state}"[^>]*>\s*<\w+[^>]*>\s*{first}'
+        pattern = re.compile(pattern.encode())
         while not (found := pattern.search(self._heard)):
             data = self._socket.recv(65536)
             assert data, "the server has gone"

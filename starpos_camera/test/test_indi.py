@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The source `indi`, against the real indiserver with the real CCD simulator, and with a driver that lies."""
 
+import math
 import os
 import signal
 import threading
@@ -12,9 +13,10 @@ from astropy.io import fits
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings
+from starpos_camera.sources import CaptureError, Settings, indi
 from starpos_camera.sources.indi import Indi
 from starpos_interfaces.msg import Capture
+from starpos_interfaces.srv import SetCapture
 
 SHORT = Settings(0.1, None, 5.0)
 LONG = Settings(60.0, None, 60.0)
@@ -291,11 +293,40 @@ def test_a_drivers_clock_that_is_wrong_is_not_used_and_said(liar, year):
     exposure = source.capture(QUICK)
     assert begin < exposure.frame.mid_unix_s < time.time()
     assert (exposure.stamp_source, exposure.stamp_stddev_s) == (Capture.COMMAND, 0.1)
-    assert "set the clock there" in exposure.remark
+    assert "set its machine's clock, to UTC" in exposure.remark
 
 
-def test_a_driver_that_tells_no_time_or_whole_seconds_only(liar):
-    assert liar(header={"DATE-OBS": ""}).capture(QUICK).stamp_source == Capture.COMMAND
+@pytest.mark.parametrize("told", ["", "2026-11-21"])
+def test_a_driver_that_tells_no_time_leaves_the_commands(liar, told):
+    assert liar(header={"DATE-OBS": told}).capture(QUICK).stamp_source == Capture.COMMAND
+
+
+def test_the_clock_of_another_machine_is_used_where_its_error_is_given(server, monkeypatch):
+    monkeypatch.setattr(indi, "LOCAL", ())
+    source = make(server)
+    assert source.capture(SHORT).stamp_source == Capture.COMMAND
+    source.close()
+    source = make(server, indi__clock_stddev=0.02)
+    exposure = source.capture(SHORT)
+    source.close()
+    assert exposure.stamp_source == Capture.DRIVER
+    assert (exposure.stamp_stddev_s, exposure.frame.clock_stddev_s) == (0.005, 0.02)
+
+
+def test_the_node_publishes_frames_and_ends_at_once_in_a_long_exposure(server, other, start, listener):
+    captures = listener.hear(Capture, "camera/capture")
+    options = (f"indi.port:={server.port}", f"indi.device:={DEVICE}", "cadence:=0.5")
+    camera = start("camera", "source:=indi", "exposure:=0.1", *options)
+    listener.wait(lambda: captures)
+    assert captures[0].exposure == 0.1 and captures[0].stamp_source == Capture.DRIVER
+    request = SetCapture.Request(exposure=60.0, gain=math.nan, cadence=math.nan)
+    assert listener.call(SetCapture, "/camera/set_capture", request).success
+    other.catch_up()
+    other.hear("CCD_EXPOSURE", "Busy", "60")
+    begin = time.monotonic()
+    status, out = camera.end(signal.SIGINT)
+    assert status == 0 and time.monotonic() - begin < 5, out
+    other.hear("CCD_ABORT_EXPOSURE", "Ok")
 
 
 def test_packed_frames_are_unpacked(liar):

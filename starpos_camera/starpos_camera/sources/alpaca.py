@@ -11,9 +11,8 @@ import numpy as np
 
 from starpos.frame import MAX_PIXELS, Frame
 from starpos_camera.sources import CaptureError, Exposure, Settings, missing
-from starpos_camera.sources.timing import middle_of_commanded, middle_of_started, read_utc
+from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, LOCAL, stamp_of
 from starpos_common.parameters import Parameter
-from starpos_interfaces.msg import Capture
 
 DEFAULT_EXPOSURE_S = 0.5
 READOUT_S = 20.0  # from the end of an exposure to its picture: slow CCDs take 15
@@ -22,8 +21,6 @@ WATCH_S = 0.5  # while an exposure runs: a dead server is noticed within it
 MONOCHROME, RGGB = 0, 2  # ASCOM's sensor types
 PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}  # by BayerOffsetX, BayerOffsetY
 IDLE, ERROR = 0, 5  # ASCOM's camera states
-LOCAL = ("127.0.0.1", "localhost")
-CLOCK_TOLERANCE_S = 0.05
 PARAMETERS = (
     Parameter(
         "alpaca.address",
@@ -133,9 +130,19 @@ class Alpaca:
                 f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
             )
         pixels = camera.rqs.picture(f"{camera.base_url}/imagearray", *self._size)
-        mid_s, stddev_s, stamp, remark_on_clock = self._stamp(commanded_s, ready_s, exposure_s)
-        frame = Frame(_unsigned(pixels), self._pattern, mid_s, exposure_s, self.hardware_id)
-        return Exposure(frame, stamp, stddev_s, remark=remark_on_clock or remark)
+        told = _optional(camera, "LastExposureStartTime", "")
+        clock_s = 0.0 if self._address.rpartition(":")[0] in LOCAL else self._values["alpaca.clock_stddev"]
+        stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
+        frame = Frame(
+            _unsigned(pixels),
+            self._pattern,
+            stamp.mid_s,
+            exposure_s,
+            self.hardware_id,
+            clock_stddev_s=stamp.clock_stddev_s,
+        )
+        remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else remark
+        return Exposure(frame, stamp.source, stamp.stddev_s, remark=remark)
 
     def _set_gain(self, gain):
         """Set it where it is another than was asked last; a remark where the camera has another."""
@@ -163,31 +170,6 @@ class Alpaca:
                 raise CaptureError(f"no picture has come {READOUT_S:g} s after the end of the exposure.")
             if self._closing.wait(min(WATCH_S, max(POLL_S, left_s))):
                 raise CaptureError("the node ends.")
-
-    def _stamp(self, commanded_s, ready_s, exposure_s):
-        """Middle of the exposure and its standard deviation (s), where they come from, and what is to be said of it."""
-        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
-        commanded = (mid_s, stddev_s, Capture.COMMAND)
-        local = self._address.rpartition(":")[0] in LOCAL
-        clock_s = 0.0 if local else self._values["alpaca.clock_stddev"]
-        start = read_utc(_optional(self._camera, "LastExposureStartTime", ""))
-        if start is None or math.isnan(clock_s):
-            return *commanded, ""
-        start_s, resolution_s = start
-        if start_s % 1 == 0:  # some drivers count whole seconds, and write .000
-            resolution_s = 1.0
-        tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_s
-        if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
-            remark = (
-                f"{self.hardware_id}: its times of exposures are off by more than {tolerance_s:.2g} s and not used; set "
-                "the server's clock, to UTC."
-            )
-            return *commanded, remark
-        mid_s, driver_stddev_s = middle_of_started(start_s, resolution_s, exposure_s)
-        driver_stddev_s = math.hypot(driver_stddev_s, clock_s)
-        if driver_stddev_s > stddev_s:
-            return *commanded, ""
-        return mid_s, driver_stddev_s, Capture.DRIVER, ""
 
 
 def _optional(camera, member, otherwise):

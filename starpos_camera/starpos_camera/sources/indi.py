@@ -12,14 +12,11 @@ from starpos.frame import MAX_PIXELS
 from starpos_camera.sources import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
 from starpos_camera.sources.indi_server import Blob, Server
-from starpos_camera.sources.timing import middle_of_commanded, middle_of_started, read_utc
+from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, LOCAL, stamp_of
 from starpos_common.parameters import Parameter
-from starpos_interfaces.msg import Capture
 
 DEFAULT_EXPOSURE_S = 0.5
 BLOB_MAX = 4 * MAX_PIXELS  # bytes
-LOCAL = ("127.0.0.1", "localhost", "::1")
-CLOCK_TOLERANCE_S = 0.05
 PARAMETERS = (
     Parameter(
         "indi.host",
@@ -118,6 +115,8 @@ class Indi:
             raise CaptureError("the node ends.")
         if self._server is None:
             self._server = Server(self._host, self._port)
+            if self._closing:  # meanwhile
+                raise CaptureError("the node ends.")
         server = self._server
 
         async def take():
@@ -148,32 +147,18 @@ class Indi:
             raise CaptureError(
                 f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
             )
-        mid_s, stddev_s, stamp, remark = self._stamp(header, commanded_s, ready_s, exposure_s)
-        frame = replace(frame, mid_unix_s=mid_s, exposure_s=exposure_s, source=self.hardware_id)
-        return Exposure(frame, stamp, stddev_s, remark=remark)
-
-    def _stamp(self, header, commanded_s, ready_s, exposure_s):
-        """Middle of the exposure and its standard deviation (s), where they come from, and what is to be said of it."""
-        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
-        commanded = (mid_s, stddev_s, Capture.COMMAND)
+        told = str(header.get("DATE-OBS", ""))
         clock_s = 0.0 if self._host in LOCAL else self._values["indi.clock_stddev"]
-        start = read_utc(str(header.get("DATE-OBS", "")))
-        if start is None or math.isnan(clock_s):
-            return *commanded, ""
-        start_s, resolution_s = start
-        tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_s
-        early_s, late_s = commanded_s - start_s, start_s + exposure_s - ready_s
-        if max(early_s, late_s) > tolerance_s:
-            off_s = late_s if late_s > early_s else -early_s
-            return (
-                *commanded,
-                f"its driver's times are off by {off_s:+.3g} s and not used: set the clock there.",
-            )
-        mid_s, driver_s = middle_of_started(start_s, resolution_s, exposure_s)
-        driver_s = math.hypot(driver_s, clock_s)
-        if driver_s > stddev_s:
-            return *commanded, ""
-        return mid_s, driver_s, Capture.DRIVER, ""
+        stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
+        frame = replace(
+            frame,
+            mid_unix_s=stamp.mid_s,
+            exposure_s=exposure_s,
+            source=self.hardware_id,
+            clock_stddev_s=stamp.clock_stddev_s,
+        )
+        remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else ""
+        return Exposure(frame, stamp.source, stamp.stddev_s, remark=remark)
 
 
 def _unpacked(blob: Blob) -> bytes:

@@ -2,10 +2,10 @@
 """An INDI server as a blocking caller sees it: indipyclient's event loop in a thread of its own."""
 
 import asyncio
+import concurrent.futures
 import logging
 import threading
 from collections.abc import Callable, Coroutine
-from concurrent.futures import CancelledError
 from dataclasses import dataclass
 
 from starpos.errors import one_line
@@ -41,6 +41,7 @@ class Server:
         self.blob: Blob | None = None  # the newest
         self.definitions: dict[str, int] = {}  # of a device's CONNECTION, since it came or was disconnected
         self._loop = self._talking = self._working = None
+        self._leaving = False
         self._changed = asyncio.Event()
         started = threading.Event()
         self._thread = threading.Thread(target=self._run_loop, args=(started,), name="indi", daemon=True)
@@ -50,8 +51,15 @@ class Server:
     def run(self, work: Coroutine):
         """What the coroutine returns or raises; CaptureError if `close` ends it."""
         try:
-            return asyncio.run_coroutine_threadsafe(self._work(work), self._loop).result()
-        except (CancelledError, RuntimeError):  # RuntimeError: the loop has ended
+            future = asyncio.run_coroutine_threadsafe(self._work(work), self._loop)
+            while not future.done() and self._thread.is_alive():
+                concurrent.futures.wait([future], BEAT_S)
+            return future.result(0)
+        except (
+            concurrent.futures.CancelledError,
+            concurrent.futures.TimeoutError,
+            RuntimeError,
+        ):  # or the loop has ended, before or now
             work.close()
             raise CaptureError(
                 "the connection to the INDI server was closed; the frame is given up."
@@ -81,6 +89,8 @@ class Server:
         """Wait until something holds that a server or a device says; False where the time or the server ends before."""
         end = self._loop.time() + seconds
         while not (found := condition()) and not self.lost and (left := end - self._loop.time()) > 0:
+            if self._leaving:  # wait_for of Python 3.11 may lose a cancellation
+                raise asyncio.CancelledError
             self._changed.clear()
             try:
                 await asyncio.wait_for(self._changed.wait(), min(left, BEAT_S))
@@ -120,6 +130,8 @@ class Server:
         return await work
 
     async def _leave(self):
+        self._leaving = True
+        self._changed.set()
         if self._working and not self._working.done():
             self._working.cancel()
             await asyncio.wait({self._working}, timeout=LEAVE_S)

@@ -4,9 +4,56 @@
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
+from starpos_interfaces.msg import Capture
+
+LOCAL = ("127.0.0.1", "localhost", "::1")  # hosts whose clock is this machine's
+CLOCK_TOLERANCE_S = 0.05  # between what a driver says of its exposure and when it was commanded and had
 DRIVER_STDDEV_S = 0.005  # a driver reads its clock, then tells the camera, or the other way round
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """When an exposure had its middle (Unix time), and how that is known.
+
+    stddev_s        standard deviation of mid_s, new in each frame
+    source          one of starpos_interfaces/Capture's constants
+    clock_stddev_s  standard deviation against UTC of a clock that is not this machine's; 0: it is
+    remark          what is wrong with the driver's clock, without a full stop; '' for nothing
+    """
+
+    mid_s: float
+    stddev_s: float
+    source: int
+    clock_stddev_s: float = 0.0
+    remark: str = ""
+
+
+def stamp_of(
+    told: str, clock_stddev_s: float, exposure_s: float, commanded_s: float, ready_s: float, values: Mapping
+) -> Stamp:
+    """The best of what a driver tells of an exposure's start, in ISO 8601, and of when it was commanded.
+
+    clock_stddev_s: of the driver's clock; 0: it is this machine's, NaN: unknown, so that it is not used. Nor is what
+    cannot be, as an exposure lies between commanded_s and ready_s (Unix time).
+    """
+    commanded = Stamp(*middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
+    start = read_utc(told)
+    if start is None or math.isnan(clock_stddev_s):
+        return commanded
+    start_s, resolution_s = start
+    if start_s % 1 == 0:  # some drivers count whole seconds, and write .000
+        resolution_s = 1.0
+    tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_stddev_s
+    if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
+        off = f"its times of exposures are off by more than {tolerance_s:.2g} s and not used"
+        return replace(commanded, remark=f"{off}; set its machine's clock, to UTC")
+    mid_s, stddev_s = middle_of_started(start_s, resolution_s, exposure_s)
+    if math.hypot(stddev_s, clock_stddev_s) > commanded.stddev_s:
+        return commanded
+    return Stamp(mid_s, stddev_s, Capture.DRIVER, clock_stddev_s)
 
 
 def middle_of_commanded(commanded_s: float, exposure_s: float, values: Mapping) -> tuple[float, float]:
