@@ -12,7 +12,8 @@ import tempfile
 import threading
 import time
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from itertools import combinations
 from math import comb
@@ -290,17 +291,37 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
     folder = cache_folder() / f"{PREFIX}{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
     if (stored := _map(folder, len(catalogue))) is not None:
         return stored
-    built = build(catalogue, half_diagonal, progress)
-    try:
-        _store(built, folder)
-    except OSError as e:
-        warnings.warn(
-            f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}), so that each start builds it "
-            "again: make the folder writable or set XDG_CACHE_HOME",
-            stacklevel=2,
-        )
-        return built
+    with _one_builder(folder.parent):
+        if (stored := _map(folder, len(catalogue))) is not None:  # another process was first
+            return stored
+        built = build(catalogue, half_diagonal, progress)
+        try:
+            _store(built, folder)
+        except OSError as e:
+            warnings.warn(
+                f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}), so that each start builds "
+                "it again: make the folder writable or set XDG_CACHE_HOME",
+                stacklevel=2,
+            )
+            return built
     return _map(folder, len(catalogue)) or built
+
+
+@contextmanager
+def _one_builder(cache: Path) -> Iterator[None]:
+    """Other processes that want to build there wait, where folders can be locked; a killed one holds none up."""
+    folder = None
+    with suppress(OSError, ImportError):
+        import fcntl
+
+        cache.mkdir(parents=True, exist_ok=True)
+        folder = os.open(cache, os.O_RDONLY)
+        fcntl.flock(folder, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if folder is not None:
+            os.close(folder)
 
 
 def _store(triangles: TriangleCatalogue, folder: Path) -> None:

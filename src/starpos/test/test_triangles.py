@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+import fcntl
 import os
 import subprocess
 import sys
+import threading
 from itertools import combinations
 
 import numpy as np
@@ -156,6 +158,33 @@ def test_it_is_built_once_then_mapped(own_cache, catalogue, monkeypatch):
     # a refined focal length does not build another
     assert triangles.cached(catalogue, WIDE * 1.0001) is not None
     assert [p.name for p in own_cache.iterdir()] == [folder.name]
+
+
+def test_who_waited_for_another_process_that_built_does_not_build_again(own_cache, catalogue, monkeypatch):
+    triangles.cached(catalogue, WIDE)
+    (folder,) = own_cache.iterdir()
+    away = folder.rename(own_cache.parent / "away")
+    triangles._in_use.clear()
+    absent, built, load = threading.Event(), [], triangles._map
+
+    def looked(*of):
+        found = load(*of)
+        absent.set()
+        return found
+
+    monkeypatch.setattr(triangles, "_map", looked)
+    other = os.open(own_cache, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    waiting = threading.Thread(
+        target=triangles.cached, args=(catalogue, WIDE, lambda what, done: built.append(done))
+    )
+    waiting.start()
+    assert absent.wait(30)
+    away.rename(folder)
+    os.close(other)
+    waiting.join(60)
+    assert not waiting.is_alive()
+    assert built == []
 
 
 def zeroed(path):

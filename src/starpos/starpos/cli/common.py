@@ -257,6 +257,8 @@ def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection)
 
 
 def complain(command: str, error: StarposError | str) -> None:
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr)  # a progress bar may stand there
     print(f"starpos {command}: {error}", file=sys.stderr)
 
 

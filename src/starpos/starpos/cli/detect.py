@@ -1,42 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos detect`: the stars of frames."""
 
-import time
-
-from starpos.cli import common
-from starpos.detection import detect
+from starpos.cli import common, jobs
+from starpos.cli.frame_work import Detecting, Reader
 from starpos.errors import FrameError
 from starpos.stars import Stars
 
 
 def define(parser) -> None:
     common.add_frames(parser)
+    jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
-    status = 0
-    for path, item in common.frames_of(args.frames):
-        if isinstance(item, FrameError):
-            common.complain("detect", item)
-            status = common.UNREADABLE
-            if args.json:
-                common.print_json({"file": path, "stars": [], "cpu_ms": 0.0, "status": "bad input"})
-            continue
-        begin = time.process_time()
-        found = None if isinstance(item, Stars) else detect(item)
-        stars = found.stars if found else item
-        cpu_ms = 1000 * (time.process_time() - begin)
-        if args.json:
-            common.print_json({"file": path, "stars": _rows(stars), "cpu_ms": cpu_ms})
-        elif found:
-            print(
-                f"{path}: {len(stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
-                f"FWHM {found.fwhm_px:.2f} px, {cpu_ms:.0f} ms"
-            )
-        else:
-            print(f"{path}: a list of {len(stars)} stars")
+    status, work, number = 0, Detecting(Reader()), len(args.frames)
+    with jobs.workers_of(args, number) as workers:
+        answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
+        for path, answer in zip(args.frames, answers, strict=True):
+            if isinstance(answer, FrameError):
+                status = common.UNREADABLE
+            _tell(path, answer, args.json)
     return status
+
+
+def _tell(path: str, answer, as_json: bool) -> None:
+    if isinstance(answer, FrameError):
+        common.complain("detect", answer)
+        if as_json:
+            common.print_json({"file": path, "stars": [], "cpu_ms": 0.0, "status": "bad input"})
+        return
+    found, cpu_ms = answer
+    stars = found if isinstance(found, Stars) else found.stars
+    if as_json:
+        common.print_json({"file": path, "stars": _rows(stars), "cpu_ms": cpu_ms})
+    elif found is stars:
+        print(f"{path}: a list of {len(stars)} stars", flush=True)
+    else:
+        print(
+            f"{path}: {len(stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
+            f"FWHM {found.fwhm_px:.2f} px, {cpu_ms:.0f} ms",
+            flush=True,
+        )
 
 
 def _rows(stars: Stars) -> list[list[float]]:

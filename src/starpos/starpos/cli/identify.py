@@ -1,49 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos identify`: where frames look, from their stars alone."""
 
-import time
-from contextlib import suppress
-
 import numpy as np
 
-from starpos import catalogue
-from starpos.cli import common
-from starpos.errors import FrameError, StarposError
-from starpos.solve import Solution, Solver, Status
+from starpos.cli import common, jobs
+from starpos.cli.frame_work import Identifying, Listing, Look, Reader
+from starpos.errors import FrameError
+from starpos.solve import Solution, Status
 
 
 def define(parser) -> None:
     common.add_frames(parser)
     common.add_exif(parser)
     common.add_optics(parser)
+    jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> int:
-    solver, any_found, unreadable = None, False, False
-    for path, item in common.frames_of(args.frames, common.clock_of(args)):
-        if isinstance(item, FrameError):
-            common.complain("identify", item)
-            unreadable = True
-            answer = Solution(Status.BAD_INPUT, str(item), path, None, 0)
-            cpu_ms = 0.0
-        else:
-            if solver is None:
-                solver = Solver(
-                    common.instrument_of(args, item), catalogue.load(), progress=common.ProgressBar()
-                )
-            with suppress(StarposError):  # identify says it
-                solver.prepare(item.width, item.height)
-            begin = time.process_time()
-            answer = solver.identify(common.stars_of(item))
-            cpu_ms = 1000 * (time.process_time() - begin)
-            if not answer.ok:
-                common.complain("identify", answer.message)
-        any_found |= answer.ok
-        if args.json:
-            common.print_json(as_json(path, answer) | {"cpu_ms": cpu_ms})
-        else:
-            print(_line(path, answer))
+    any_found, unreadable, number = False, False, len(args.frames)
+    read = Reader(common.clock_of(args))
+    with jobs.workers_of(args, number) as workers:
+        (about,) = workers.map([(Look(read), tuple(args.frames))])
+        work = Listing(read)  # each frame says why it cannot be read
+        if about is not None:
+            work = Identifying(read, common.instrument_of(args, about))
+            jobs.prepare(work.instrument, about)
+        answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
+        for path, answer in zip(args.frames, answers, strict=True):
+            if isinstance(answer, FrameError):
+                unreadable = True
+                answer = Solution(Status.BAD_INPUT, str(answer), path, None, 0), 0.0
+            found, cpu_ms = answer
+            any_found |= found.ok
+            if not found.ok:
+                common.complain("identify", found.message)
+            if args.json:
+                common.print_json(as_json(path, found) | {"cpu_ms": cpu_ms})
+            else:
+                print(_line(path, found), flush=True)
     return common.UNREADABLE if unreadable else 0 if any_found else 1
 
 

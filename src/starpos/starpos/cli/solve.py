@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos solve`: position and heading of frames with their tilts, each and all together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from starpos import catalogue, instrument_file
 from starpos.average import Average, average
-from starpos.cli import common
-from starpos.errors import FixError, FrameError, InstrumentError
+from starpos.cli import common, jobs
+from starpos.cli.archive import Night, nights_of
+from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
+from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix import Fix
-from starpos.inclinometer import TiltLog, read_tilt_csv
+from starpos.inclinometer import TiltLog
 from starpos.solve import Solution, Solver, Status
 from starpos.stars import Stars
 from starpos.turning import turn
@@ -26,7 +29,9 @@ COUNTS = ("frames", "poses", "left_out", "moved")  # of an average
 def define(parser) -> None:
     common.add_frames(parser)
     parser.add_argument(
-        "--tilt", required=True, metavar="CSV", help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]"
+        "--tilt",
+        metavar="CSV",
+        help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; not with nights: folders of frames with tilt.csv",
     )
     common.add_exif(parser)
     common.add_instrument(parser)
@@ -36,106 +41,157 @@ def define(parser) -> None:
     parser.add_argument(
         "--save", metavar="OUT", help="write the instrument file (YAML) with the A3 of --self-calibrate"
     )
+    jobs.add_jobs(parser)
     parser.set_defaults(run=run)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a night is worked: what is done with each frame, and what is known for all."""
+
+    night: Night
+    work: Solving | Listing
+    solver: Solver | None = None  # None where no frame can be read
+    tilts: TiltLog | None = None
+
+
+@dataclass(frozen=True)
+class Solved:
+    """As much of a Solution as is needed to the end of a night."""
+
+    fix: Fix
+    extrapolated_days: float
+    stars_detected: int
+    stars_matched: int
+    log_odds: float
+
+    @classmethod
+    def of(cls, s: Solution) -> "Solved":
+        light = replace(s.fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
+        return cls(light, s.extrapolated_days, s.stars_detected, len(s.names), s.attitude.log_odds)
 
 
 def run(args) -> int:
     common.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
-    vertical = common.vertical_of(args)
+    vertical, read = common.vertical_of(args), Reader(common.clock_of(args))
+    given = nights_of(args.frames, args.tilt)
+    if args.save is not None and len(given) > 1:
+        raise InstrumentError("--save writes the A3 of one night: give one")
+    nights = [night for night in given if isinstance(night, Night)]
+    statuses = [_refused(why, given) for why in given if not isinstance(why, Night)]
+    number = sum(len(night.frames) for night in nights)
+    with jobs.workers_of(args, number) as workers:
+        plans = []
+        abouts = workers.map((Look(read), night.frames) for night in nights)
+        for night, about in zip(nights, abouts, strict=True):
+            try:
+                plans.append(_plan(args, night, about, read))
+            except TiltError as error:
+                statuses.append(_refused(error, given))
+        calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
+        answers = jobs.watched(workers.map(calls), sum(len(plan.night.frames) for plan in plans))
+        for plan in plans:
+            rows = zip(plan.night.frames, answers, strict=False)  # as many of the answers as are this night's
+            if args.self_calibrate:
+                rows = _turned(args, plan, list(rows))
+            statuses.append(_tell(args, plan.night, rows, vertical))
+    return max(statuses)
+
+
+def _refused(why: StarposError, given: list) -> int:
+    """A night that cannot be worked is the call's failure where it is all there is; else its own."""
+    if len(given) == 1:
+        raise why
+    common.complain("solve", why)
+    return common.UNREADABLE
+
+
+def _plan(args, night: Night, about: About | None, read: Reader) -> Plan:
+    if about is None:
+        return Plan(night, Listing(read))  # each frame says why it cannot be read
+    instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
+    table = tilts(night.tilt, instrument.inclinometer.noise_rad)
+    jobs.prepare(instrument, about)
+    solver = Solver(instrument, catalogue.load(), air, progress=common.ProgressBar())
+    return Plan(
+        night,
+        Listing(read) if args.self_calibrate else Solving(read, instrument, air, night.tilt),
+        solver,
+        table,
+    )
+
+
+def _tell(args, night: Night, rows: Iterable, vertical: Vertical) -> int:
+    """Print (path, Solution or FrameError) of each frame and what they make together; the exit status."""
     solved, unreadable = [], False
-    for path, answer in (_turned if args.self_calibrate else _one_by_one)(args):
+    for path, answer in rows:
         if isinstance(answer, FrameError):
             unreadable = True
             answer = Solution(Status.BAD_INPUT, str(answer), path, None, 0)
         if answer.fix:
-            solved.append(answer)
+            solved.append(Solved.of(answer))
         else:
             common.complain("solve", answer.message)
         if args.json:
             common.print_json({"file": path} | _json_of(answer.fix, vertical) | _json_about(answer))
         else:
-            print(_line(path, answer))
+            print(_line(path, answer), flush=True)
     common.tell_extrapolation("solve", solved)
-    together = _combine(solved)
+    together = _combine(night, solved)
     if solved:
         last = solved[-1].fix
         common.tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        _print_combined(together, solved, args, vertical)
+        _print_combined(night, together, solved, args, vertical)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
 
-def _one_by_one(args):
-    """(path, Solution or FrameError) of each frame as it is solved."""
-    solver = tilts = None
-    for path, item in common.frames_of(args.frames, common.clock_of(args)):
-        if not isinstance(item, FrameError):
-            if solver is None:
-                solver, tilts = _solver(args, item)
-            item = solver.solve(common.stars_of(item), tilts.average)
-        yield path, item
-
-
-def _turned(args):
-    """The same of all frames together, solved with the A3 that they tell."""
-    solver, rows = None, []
-    for path, item in common.frames_of(args.frames, common.clock_of(args)):
-        if not isinstance(item, FrameError):
-            if solver is None:
-                solver, tilts = _solver(args, item)
-            item = common.stars_of(item)
-        rows.append((path, item))
+def _turned(args, plan: Plan, rows: list) -> Iterator:
+    """(path, Solution or FrameError) of frames (path, Stars or FrameError), solved with the A3 that all of them tell."""
     frames = [stars for _, stars in rows if isinstance(stars, Stars)]
-    answers = iter(_of_turn(args, solver, frames, tilts) if frames else ())
+    answers = iter(_of_turn(args, plan, frames) if frames else ())
     for path, item in rows:
         yield path, next(answers) if isinstance(item, Stars) else item
 
 
-def _of_turn(args, solver: Solver, frames: list[Stars], tilts: TiltLog) -> Sequence[Solution]:
+def _of_turn(args, plan: Plan, frames: list[Stars]) -> Sequence[Solution]:
+    solver = plan.solver
     try:
-        turned = turn(solver, frames, tilts.average, common.turn_of(args), solver.progress)
+        turned = turn(solver, frames, plan.tilts.average, common.turn_of(args), solver.progress)
     except FixError as e:
         return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames]
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
         kept = "" if args.save is None else f" {args.save} is not written:"
-        common.complain(
-            "solve", f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further"
-        )
+        _say(plan.night, f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further")
         return turned.solutions
     angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
-    common.complain("solve", f"calibrated: --misalignment {angles}; {error}")
+    _say(plan.night, f"calibrated: --misalignment {angles}; {error}")
     if args.save is not None:
         instrument_file.write(Path(args.save), turned.instrument, f"A3 by turning on the spot: {error}")
     return turned.solutions
 
 
-def _solver(args, first) -> tuple[Solver, TiltLog]:
-    instrument = common.instrument_of(args, first)
-    tilts = read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
-    solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args), progress=common.ProgressBar())
-    return solver, tilts
+def _say(night: Night, text: StarposError | str) -> None:
+    """A line on standard error about a whole night."""
+    common.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
 
 
-def _combine(solved: list[Solution]) -> Average | None:
+def _combine(night: Night, solved: list[Solved]) -> Average | None:
     """All fixes as one; None, with a sentence, where they do not belong together."""
     if not solved:
         return None
     try:
         whole = average([s.fix for s in solved])
     except FixError as e:
-        common.complain("solve", e)
+        _say(night, e)
         return None
     if whole.moved:
         begin = utc_text(whole.began_unix_s)
-        common.complain(
-            "solve", f"the instrument moved on: the average is of the {whole.frames} frames since {begin}"
-        )
+        _say(night, f"the instrument moved on: the average is of the {whole.frames} frames since {begin}")
     if whole.left_out:
-        common.complain(
-            "solve", f"{whole.left_out} fixes lie far from the others and are left out of the average"
-        )
+        _say(night, f"{whole.left_out} fixes lie far from the others and are left out of the average")
     return whole
 
 
@@ -206,17 +262,21 @@ def _where(fix: Fix | Average) -> str:
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
-def _print_combined(all_together: Average | None, solved: list[Solution], args, vertical: Vertical) -> None:
+def _print_combined(
+    night: Night, all_together: Average | None, solved: list[Solved], args, vertical: Vertical
+) -> None:
+    name = {} if night.folder is None else {"night": night.folder}
     if args.json:
         about = {
             "stars_detected": sum(s.stars_detected for s in solved),
-            "stars_matched": sum(len(s.names) for s in solved),
+            "stars_matched": sum(s.stars_matched for s in solved),
             "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved])),
-            "log_odds": sum(s.attitude.log_odds for s in solved),
+            "log_odds": sum(s.log_odds for s in solved),
             "status": (Status.OK if all_together else Status.POOR_FIT).value,
         }
         common.print_json(
             {"combined": True}
+            | name
             | (
                 dict.fromkeys(COUNTS)
                 if all_together is None
@@ -230,7 +290,8 @@ def _print_combined(all_together: Average | None, solved: list[Solution], args, 
         return
     ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, vertical)
     turned = f" (the last of {all_together.poses} poses)" if all_together.poses > 1 else ""
-    print(f"{all_together.frames} frames together: {_where(all_together)}{turned} (astronomic)")
+    of = "" if night.folder is None else f"{night.folder}: "
+    print(f"{of}{all_together.frames} frames together: {_where(all_together)}{turned} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "

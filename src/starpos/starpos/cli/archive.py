@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `solve` is given: the frames of one night with their table of tilts, or an archive, a folder a night."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from starpos.errors import FrameError, TiltError
+
+
+@dataclass(frozen=True)
+class Night:
+    """Frames that share one table of tilts, and make one fix together; folder: None where they were named one by one."""
+
+    frames: tuple[str, ...]
+    tilt: str  # absolute
+    folder: str | None = None
+
+
+def nights_of(given: list[str], tilt: str | None) -> list[Night | FrameError]:
+    """One night of frames and a table; without a table, a night of each folder, or why it is none.
+
+    FITS where there are any, else CSV, by name: as `report` takes a folder.  TiltError for frames without a table.
+    """
+    if tilt is not None:
+        return [Night(tuple(given), os.path.abspath(tilt))]
+    if not all(os.path.isdir(path) for path in given):
+        raise TiltError(
+            "no tilts: give --tilt with the frames, or nights: folders of frames, each with its tilt.csv"
+        )
+    return [_night(folder) for folder in given]
+
+
+def _night(folder: str) -> Night | FrameError:
+    from starpos.report.folder import TILTS, frames_in
+
+    try:
+        frames = tuple(map(str, frames_in(Path(folder))))
+    except FrameError as error:
+        return error
+    return Night(frames, os.path.abspath(os.path.join(folder, TILTS)), folder)

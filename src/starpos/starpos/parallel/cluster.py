@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A dask.distributed cluster that works calls: its workers need the files under the same paths, and the same starpos."""
+
+import logging
+import os
+import pickle
+import stat
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from starpos.errors import StarposError, one_line
+from starpos.parallel.call import Call, answer_of, given_up, worked
+from starpos.parallel.same import Same, differing, same_here
+
+PIP = "pip install 'starpos[cluster]'"
+ANSWER_WITHIN_S = 10
+AHEAD, FEWEST_AHEAD = (
+    3,
+    64,
+)  # calls a thread of the cluster, and calls, that are given to it before they are asked for
+SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")
+COUNT_EVERY = 100  # calls after which the cluster's threads are counted again
+
+
+class ClusterError(StarposError):
+    """The cluster cannot be used."""
+
+
+class Cluster:
+    """An existing cluster by its scheduler's address; it keeps nothing of ours on leaving."""
+
+    def __init__(self, address: str):
+        self._address, self._client = address, None
+
+    def __enter__(self) -> "Cluster":
+        try:
+            import distributed
+        except ImportError:
+            raise ClusterError(
+                f"--scheduler works through dask.distributed, which is not here: {PIP}"
+            ) from None
+        for name in [n for n in logging.root.manager.loggerDict if n.split(".")[0] == "distributed"]:
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what concerns us is said in a sentence
+        if not _is_address(self._address):
+            raise ClusterError(f"--scheduler {self._address}: no address: give one as tcp://HOST:8786")
+        if self._address.startswith("tls") and not (
+            distributed.Security().get_connection_args("client").get("ssl_context")
+        ):
+            raise ClusterError(
+                f"{self._address}: no keys for it: name them in dask's configuration, distributed.comm.tls"
+            )
+        try:
+            self._client = distributed.Client(
+                self._address, timeout=ANSWER_WITHIN_S, set_as_default=False, name="starpos"
+            )
+        except (OSError, ValueError, RuntimeError) as error:  # TimeoutError is an OSError
+            raise ClusterError(
+                f"{self._address}: no scheduler of dask.distributed answers there ({one_line(error)}): start one, or "
+                "give another address"
+            ) from None
+        try:
+            self._check()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._client.close()
+
+    def _check(self) -> None:
+        """ClusterError where a worker's starpos is not ours.  Those that come later are held to it call by call."""
+        here = same_here()
+        there = self._client.run(same_here, on_error="return")
+        if not there:
+            print(f"starpos: {self._address} has no workers yet: waiting for them", file=sys.stderr)
+        for worker, theirs in there.items():
+            if isinstance(theirs, BaseException):
+                raise ClusterError(
+                    f"{worker}: this worker cannot load this starpos ({one_line(theirs)}): install the same there"
+                )
+            if theirs != here:
+                raise ClusterError(f"{worker}: {differing(theirs, here)}")
+
+    def map(self, calls: Iterable[Call]) -> Iterator:
+        """As Workers has it.
+
+        A call that the scheduler gives up, as its workers died, is worked again when no other of ours is: dask blames
+        all that waited on such a worker.  One that ends its workers then too is given up.
+        """
+        calls, here, under_way = iter(calls), same_here(), deque()
+        told = ahead = 0
+        while True:
+            if told % COUNT_EVERY == 0:
+                ahead = max(FEWEST_AHEAD, AHEAD * sum(self._client.nthreads().values()))
+            while len(under_way) < ahead and (call := next(calls, None)) is not None:
+                under_way.append((call, self._begun(call, here)))
+            if not under_way:
+                return
+            call, future = under_way.popleft()
+            told += 1
+            try:
+                outcome = self._outcome(call, future, here, [f for _, f in under_way])
+            except (CancelledError, OSError) as error:
+                raise ClusterError(
+                    f"{self._address}: the scheduler has gone ({one_line(error)}): start it and run this again"
+                ) from None
+            except (ImportError, AttributeError) as error:  # of a worker that came later
+                raise ClusterError(
+                    f"{self._address}: a worker cannot load this starpos ({one_line(error)}): install the same there"
+                ) from None
+            yield answer_of(outcome)
+
+    def _outcome(self, call: Call, future, here: Same, others: list) -> bytes:
+        from distributed import KilledWorker
+
+        if isinstance(future, bytes):
+            return future
+        try:
+            return future.result()
+        except KilledWorker:
+            for other in others:
+                if not isinstance(other, bytes):
+                    other.exception()  # when it has ended
+        try:
+            return self._begun(call, here).result()
+        except KilledWorker as error:
+            return pickle.dumps(
+                given_up(call[1], f"the workers that worked it died, at last alone ({one_line(error)})")
+            )
+
+    def _begun(self, call: Call, here: Same):
+        """The call's future; its outcome, worked here, where its files are none that a worker could see."""
+        work, of = call
+        files = {}
+        for path in (*getattr(work, "files", ()), *([of] if isinstance(of, str) else ())):
+            try:
+                status = os.stat(path)
+            except (OSError, ValueError):
+                return worked(work, of)
+            if not stat.S_ISREG(status.st_mode):
+                return worked(work, of)
+            files[os.path.abspath(path)] = status.st_size
+        of = os.path.abspath(of) if isinstance(of, str) else tuple(map(os.path.abspath, of))
+        # a worker cannot do without what it is sent, but what it unpickles itself it can fail at, and say so
+        return self._client.submit(pickle.loads, pickle.dumps(_Task(work, of, files, here)), pure=False)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Unpickled it is its outcome."""
+
+    work: Callable
+    of: object
+    files: dict[str, int]  # size of each
+    here: Same
+
+    def __reduce__(self):
+        return _on_worker, (self.work, self.of, self.files, self.here)
+
+
+def _is_address(text: str) -> bool:
+    """What a Client may be made of: of others it complains while Python ends."""
+    try:
+        parts = urlsplit(text if "://" in text else f"tcp://{text}")
+        return parts.scheme in SCHEMES and bool(parts.hostname) and parts.port is not None
+    except ValueError:
+        return False
+
+
+def _on_worker(work: Callable, of, files: dict[str, int], here: Same) -> bytes:
+    """`worked`, where this worker's starpos and files are those of the one who asks."""
+    from distributed import get_worker
+
+    name = get_worker().address
+    there = same_here()
+    if there != here:
+        return pickle.dumps(ClusterError(f"{name}: {differing(there, here)}"))
+    for path, size in files.items():
+        try:
+            seen = os.stat(path).st_size
+        except OSError:
+            seen = None
+        if seen != size:
+            what = "does not see it" if seen is None else f"sees {seen} bytes of {size}"
+            return pickle.dumps(
+                ClusterError(
+                    f"{path}: worker {name} {what}: its machine needs the same files under the same paths"
+                )
+            )
+    if "cv2" in sys.modules:  # the worker's threads are what share its processors
+        sys.modules["cv2"].setNumThreads(1)
+    return worked(work, of)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes of this machine that work calls.
+
+Not concurrent.futures: its pool breaks as a whole where one process dies, without a word on which call that was at, and
+its processes outlive a parent that was killed.
+"""
+
+import os
+import pickle
+import signal
+import warnings
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context, resource_tracker
+from multiprocessing.connection import Connection, wait
+
+from starpos.errors import StarposError
+from starpos.parallel.call import Call, answer_of, given_up, worked
+
+AHEAD = 4  # calls a process that may wait for one before them
+STILLBORN = 3  # processes in a row that may end before they can work
+DYING_S = 1.0  # for a process that no longer answers to be gone
+# a process a processor: the threads of numpy's and scipy's BLAS and of OpenCV would be too many
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
+
+
+class ProcessError(StarposError):
+    """Processes do not start."""
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Processes:
+    """A number of processes, started on entering and ended on leaving.
+
+    One that dies is replaced, and its call is worked again when no other is, so that it has the machine's memory to
+    itself; a call that ends its process then too is given up.
+    """
+
+    def __init__(self, number: int):
+        self._number, self._workers, self._stillborn = number, [], 0
+
+    def __enter__(self) -> "Processes":
+        for _ in range(self._number):
+            self._workers.append(_Worker())
+        return self
+
+    def __exit__(self, *_) -> None:
+        for worker in self._workers:
+            worker.end()
+
+    def map(self, calls: Iterable[Call]) -> Iterator:
+        """As Workers has it."""
+        board = _Board(calls, AHEAD * self._number)
+        while True:
+            yield from board.answers()
+            for k, worker in enumerate(self._workers):
+                if worker.task is None and (task := board.take()) is not None and not worker.give(task):
+                    self._replace(k, board)
+            busy = {w.pipe: k for k, w in enumerate(self._workers) if w.task is not None}
+            if not busy:
+                if board.finished:
+                    return
+                continue
+            for pipe in wait(list(busy)):
+                k = busy[pipe]
+                try:
+                    outcome = self._workers[k].hear()
+                except (EOFError, OSError):
+                    self._replace(k, board)
+                    continue
+                self._stillborn = 0
+                if outcome is not None:
+                    board.came(self._workers[k].task, outcome)
+                    self._workers[k].task = None
+
+    def _replace(self, k: int, board: "_Board") -> None:
+        """A new process for one that has died, and its call back on the board."""
+        dead = self._workers[k]
+        why = dead.end(DYING_S)
+        self._stillborn += not dead.ready
+        if self._stillborn > STILLBORN:
+            del self._workers[k]
+            raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
+        self._workers[k] = _Worker()
+        board.died(dead.task, why)
+
+
+class _Board:
+    """Which call is next, and the answers in order."""
+
+    def __init__(self, calls: Iterable[Call], ahead: int):
+        self._coming, self._ahead = enumerate(calls), ahead
+        self._under_way: set[int] = set()
+        self._again: deque[tuple[int, Call]] = deque()
+        self._tried: set[int] = set()  # that have ended a process
+        self._done: dict[int, bytes] = {}
+        self._given = self._told = 0
+
+    def take(self) -> tuple[int, Call] | None:
+        """A call to work, with its number; None where there is none, or none may be worked beside those under way."""
+        if self._under_way & self._tried or (self._again and self._under_way):
+            return None
+        if self._again:
+            task = self._again.popleft()
+        elif self._given - self._told >= self._ahead or (task := next(self._coming, None)) is None:
+            return None
+        else:
+            self._given += 1
+        self._under_way.add(task[0])
+        return task
+
+    def came(self, task: tuple[int, Call], outcome: bytes) -> None:
+        self._under_way.discard(task[0])
+        self._done[task[0]] = outcome
+
+    def died(self, task: tuple[int, Call], why: str) -> None:
+        number, (_, of) = task
+        self._under_way.discard(number)
+        if number not in self._tried:
+            self._tried.add(number)
+            self._again.append(task)
+            return
+        error = given_up(of, f"the process that worked it ended twice, the second time alone ({why})")
+        self._done[number] = pickle.dumps(error)
+
+    def answers(self) -> Iterator:
+        while self._told in self._done:
+            outcome = self._done.pop(self._told)
+            self._told += 1
+            yield answer_of(outcome)
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left, where no call is under way and all answers are told."""
+        return not self._again and self._told == self._given
+
+
+class _Worker:
+    """A process; task: what it was given and has not answered; ready: whether it has said that it runs."""
+
+    def __init__(self):
+        self.pipe, theirs = get_context("spawn").Pipe()
+        self.task, self.ready = None, False
+        self._process = get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
+        with theirs, _for_one_that_starts():
+            self._process.start()
+
+    def give(self, task: tuple[int, Call]) -> bool:
+        """False where the process is no more."""
+        self.task = task
+        try:
+            self.pipe.send_bytes(pickle.dumps(task[1]))
+        except OSError:
+            return False
+        return True
+
+    def hear(self) -> bytes | None:
+        """The outcome; None for its first word.  EOFError or OSError where the process is no more."""
+        said, outcome = pickle.loads(self.pipe.recv_bytes())
+        for text in said:
+            warnings.warn(text, stacklevel=2)
+        self.ready = True
+        return outcome
+
+    def end(self, within_s: float = 0.0) -> str:
+        """By itself if it does within that time, else killed; how it ended, in words."""
+        self.pipe.close()
+        self._process.join(within_s)
+        self._process.kill()
+        self._process.join()
+        code = self._process.exitcode
+        self._process.close()
+        if code == -signal.SIGKILL:
+            return "killed, perhaps for want of memory: try fewer --jobs"
+        return f"exit status {code}" if code >= 0 else signal.strsignal(-code)
+
+
+@contextmanager
+def _for_one_that_starts() -> Iterator[None]:
+    """What a process inherits: one thread a library; and Ctrl-C, which a terminal sends to all, is for its parent."""
+    before = dict(os.environ)
+    os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
+    resource_tracker.ensure_running()  # which comes with the first process, and would let Ctrl-C through to it
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for name in ONE_THREAD.keys() - before.keys():
+            del os.environ[name]
+
+
+def _serve(pipe: Connection) -> None:
+    """Work what comes until the other end is closed."""
+    with suppress(EOFError, OSError):
+        pipe.send_bytes(pickle.dumps(((), None)))
+        while True:
+            work, of = pickle.loads(pipe.recv_bytes())
+            with warnings.catch_warnings(record=True) as said:
+                outcome = worked(work, of)
+            pipe.send_bytes(pickle.dumps(([str(w.message) for w in said], outcome)))

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What machines must have in common to give the same answers."""
+
+import hashlib
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+
+import starpos
+from starpos import catalogue
+
+Same = dict[str, str]  # what, and which of it
+
+
+@lru_cache(maxsize=1)
+def same_here() -> Same:
+    """Of this process: starpos itself, its catalogue, the Earth's rotation."""
+    root = Path(starpos.__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(root.rglob("*.py")):
+        digest.update(str(source.relative_to(root)).encode() + b"\0" + source.read_bytes())
+    return {
+        "starpos": f"{starpos.__version__} ({digest.hexdigest()[:8]})",
+        "star catalogue": catalogue.load().fingerprint,
+        "astropy-iers-data": metadata.version("astropy-iers-data"),
+    }
+
+
+def differing(there: Same, here: Same) -> str:
+    """A sentence on what is not the same."""
+    what = next(name for name in here if there.get(name) != here[name])
+    return f"the {what} of this worker is {there.get(what)}, here it is {here[what]}: install the same there"

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""--jobs, and nights in folders: the same answers, byte by byte, whoever works them and whatever happens on the way."""
+
+import json
+import os
+import pty
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from starpos.cli import main
+
+WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
+SIZE = ("--size", "1000", "700", *WIDE)
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """Two nights: of lists that turn, and of frames; the first has a broken frame among its good ones."""
+    folder = tmp_path_factory.mktemp("archive")
+    turned = ["simulate", str(folder / "turned"), "-n", "8", "--turn", "45", "--stars-only", *SIZE]
+    assert main(turned) == 0
+    assert main(["simulate", str(folder / "still"), "-n", "2", "--seed", "2", *SIZE]) == 0
+    (folder / "turned" / "stars_0002b.csv").write_text("no list of stars\n")
+    return folder
+
+
+def frames(night, pattern="*.csv"):
+    return [str(p) for p in sorted(night.glob(pattern)) if p.name != "tilt.csv"]
+
+
+def solve(night, *more):
+    return ["solve", *frames(night), "--tilt", str(night / "tilt.csv"), *WIDE, *map(str, more)]
+
+
+def run(capfd, command):
+    """Exit status, standard output, standard error without timings."""
+    capfd.readouterr()
+    try:
+        status = main(command)
+    except SystemExit as e:
+        status = e.code
+    out, err = capfd.readouterr()
+    return status, re.sub(r'"cpu_ms": [^,}]*|\d+ ms$', "", out, flags=re.M), err
+
+
+@pytest.mark.parametrize("more", [(), ("--self-calibrate",)], ids=["each", "turned"])
+def test_solve_gives_the_same_however_many_processes(more, archive, capfd):
+    one = run(capfd, solve(archive / "turned", "--json", *more))
+    assert one[0] == 2  # of the broken frame
+    assert one[1].count('"status": "ok"') == 8 + 1
+    assert one[2].count("stars_0002b.csv") == 1
+    for jobs in (2, 3):
+        assert run(capfd, solve(archive / "turned", "--json", "--jobs", jobs, *more)) == one
+    assert run(capfd, solve(archive / "turned", "--jobs", "auto", *more)) == run(
+        capfd, solve(archive / "turned", *more)
+    )
+
+
+@pytest.mark.parametrize("command", [("detect",), ("identify", *WIDE)], ids=["detect", "identify"])
+@pytest.mark.parametrize("as_json", [(), ("--json",)], ids=["table", "json"])
+def test_detect_and_identify_give_the_same(command, as_json, archive, capfd):
+    given = [*frames(archive / "turned"), *frames(archive / "still", "*.fits"), "none.fits"]
+    one = run(capfd, [*command, *given, *as_json])
+    assert one[0] == 2
+    assert run(capfd, [*command, *given, *as_json, "--jobs", "2"]) == one
+
+
+def test_frames_that_cannot_be_read_do_not_tell_the_instrument(archive, capfd, tmp_path):
+    """The header of the first that can be read does, here as there."""
+    none = [str(tmp_path / f"{k}.fits") for k in range(3)]
+    still = archive / "still"
+    for given, status in ((none, 2), ([*none, *frames(still, "*.fits")], 2), (frames(still, "*.fits"), 0)):
+        command = ["solve", *given, "--tilt", str(still / "tilt.csv"), "--json"]
+        one = run(capfd, command)
+        assert one[0] == status
+        assert run(capfd, [*command, "--jobs", "2"]) == one
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_folder_is_a_night_and_each_makes_its_own_fix(jobs, archive, capfd):
+    nights = [archive / "turned", archive / "still"]
+    status, out, _ = run(capfd, ["solve", *map(str, nights), *WIDE, "--json", "--jobs", jobs])
+    assert status == 2
+    alone = ""
+    for night in nights:
+        given = frames(night, "*.fits") or frames(night)
+        alone += run(capfd, ["solve", *given, "--tilt", str(night / "tilt.csv"), *WIDE, "--json"])[1]
+    rows = [json.loads(line) for line in out.splitlines()]
+    assert [r.pop("night") for r in rows if "combined" in r] == [str(n) for n in nights]
+    assert rows == [json.loads(line) for line in alone.splitlines()]
+
+
+def test_a_night_that_is_none_is_that_nights_failure(archive, tmp_path, capfd):
+    empty, untold = tmp_path / "empty", tmp_path / "untold"
+    empty.mkdir()
+    untold.mkdir()
+    shutil.copy(archive / "turned" / "stars_0000.csv", untold)
+    still = str(archive / "still")
+    status, out, err = run(capfd, ["solve", str(empty), still, str(untold), *WIDE])
+    assert (status, len(err.splitlines())) == (2, 2)
+    assert f"{empty}: no frames in it" in err
+    assert str(untold / "tilt.csv") in err
+    assert f"{still}: 2 frames together" in out
+    assert run(capfd, ["solve", str(empty), *WIDE])[0] == 2
+
+
+def test_a_night_without_a_fix_is_exit_1(archive, tmp_path, capfd):
+    dark = tmp_path / "dark"
+    dark.mkdir()
+    rows = (archive / "turned" / "stars_0000.csv").read_text().splitlines()
+    (dark / "stars.csv").write_text("\n".join(rows[:4]) + "\n")
+    shutil.copy(archive / "turned" / "tilt.csv", dark)
+    assert run(capfd, ["solve", str(dark), str(archive / "still"), *WIDE])[0] == 1
+    assert run(capfd, ["solve", str(archive / "still"), *WIDE])[0] == 0
+
+
+BAD_CALLS = {
+    "fewer processes than none": ("--jobs", "-1"),
+    "more processes than sense": ("--jobs", "100000"),
+    "a word for a number": ("--jobs", "many"),
+    "both": ("--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"),
+    "an address that is none": ("--scheduler", "mars"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_CALLS)
+@pytest.mark.parametrize("command", ["solve", "identify", "detect"])
+def test_a_bad_call_is_exit_2_and_one_line(kind, command, archive, capfd):
+    if kind == "an address that is none":
+        pytest.importorskip("distributed")
+    given = ["--tilt", str(archive / "turned" / "tilt.csv")] if command == "solve" else []
+    status, out, err = run(capfd, [command, *frames(archive / "turned"), *given, *BAD_CALLS[kind]])
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+
+
+def test_frames_without_tilts_and_save_of_several_nights_are_refused(archive, tmp_path, capfd):
+    status, _, err = run(capfd, ["solve", *frames(archive / "turned"), *WIDE])
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "--tilt" in err
+    nights = [str(archive / "turned"), str(archive / "still")]
+    save = ["--self-calibrate", "--save", str(tmp_path / "a.yaml")]
+    status, _, err = run(capfd, ["solve", *nights, *WIDE, *save])
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "one night" in err
+
+
+def test_without_distributed_the_line_to_install_it_is_told(archive, capfd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    status, _, err = run(capfd, ["detect", *frames(archive / "turned"), "--scheduler", "tcp://127.0.0.1:1"])
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "pip install 'starpos[cluster]'" in err
+
+
+@contextmanager
+def started(archive, **options):
+    """`starpos solve --jobs 2` of many frames in a process group of its own, its first answer, and its workers' ids."""
+    night = archive / "turned"
+    many = [p for p in frames(night) if "2b" not in p] * 6
+    command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *WIDE, "--json", "--jobs", "2"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+    process = subprocess.Popen(
+        [sys.executable, "-m", "starpos", *command], text=True, start_new_session=True, **pipes
+    )
+    try:
+        yield process, process.stdout.readline(), workers_of(process.pid), many
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def workers_of(pid):
+    """Ids of the process's children that work frames."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+
+
+def gone(pidfd):
+    """Whether the process ends within the test's patience."""
+    return bool(select.select([pidfd], [], [], 30)[0])
+
+
+def test_a_worker_killed_on_the_way_changes_no_answer(archive, capfd):
+    with started(archive) as (process, first, workers, many):
+        assert len(workers) == 2
+        os.kill(workers[0], signal.SIGKILL)
+        rest, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    *each, combined = (first + rest).splitlines()
+    assert len(each) == len(many)
+    known = {}
+    for path, line in zip(many, each, strict=True):
+        assert json.loads(line)["file"] == path
+        assert known.setdefault(path, line) == line
+    assert json.loads(combined)["frames"] == 8
+
+
+@pytest.mark.parametrize("ends", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
+def test_workers_end_with_their_parent(ends, archive):
+    with started(archive) as (process, _, workers, _):
+        fds = [os.pidfd_open(w) for w in workers]
+        if ends == signal.SIGINT:
+            os.killpg(process.pid, ends)  # as a terminal does
+        else:
+            process.kill()
+        _, err = process.communicate(timeout=30)
+        assert (process.returncode, err) == ((130, "") if ends == signal.SIGINT else (-ends, ""))
+        assert len(fds) == 2
+        assert all(gone(fd) for fd in fds)
+        for fd in fds:
+            os.close(fd)
+
+
+def test_workers_end_where_nobody_reads_on(archive):
+    with started(archive) as (process, _, workers, _):
+        fds = [os.pidfd_open(w) for w in workers]
+        process.stdout.close()
+        assert process.wait(timeout=30) == 0
+        assert process.stderr.read() == ""
+        assert all(gone(fd) for fd in fds)
+        for fd in fds:
+            os.close(fd)
+
+
+def test_a_terminal_is_shown_how_far_it_is(archive):
+    ours, theirs = pty.openpty()
+    with started(archive, stderr=theirs) as (process, _, _, many):
+        os.close(theirs)
+        while process.stdout.read(65536):
+            pass
+        shown = b""
+        while True:
+            try:
+                shown += os.read(ours, 65536)
+            except OSError:  # the other end is closed
+                break
+    os.close(ours)
+    assert f"frame {len(many)} of {len(many)}".encode() in shown
+    assert shown.endswith(b"100 %\r\n")

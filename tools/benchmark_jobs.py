@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much faster `starpos solve --jobs N` is than --jobs 1, on simulated frames of the paper's size and on star lists.
+
+`benchmark_jobs.py [--frames N] [--lists N] [--jobs N] [--rounds R]`.  Whole commands, start and end of the processes
+included, 1 and N by turns; the best of the rounds, for another's work only slows.  The answers are compared byte by byte.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import islice
+from pathlib import Path
+
+from starpos.cli import main as starpos
+from starpos.parallel.processes import Processes, processors
+
+OPTICS = ("--focal-mm", "600", "--pixel-um", "6.4")
+AT_ONCE = 8  # frames simulated; a night of more repeats them
+
+
+def timed(command: list[str]) -> tuple[float, bytes]:
+    """Wall time in s, and what it printed."""
+    begin = time.perf_counter()
+    done = subprocess.run([sys.executable, "-m", "starpos", *command], stdout=subprocess.PIPE, check=True)
+    return time.perf_counter() - begin, done.stdout
+
+
+def compare(what: str, folder: Path, number: int, jobs: int, rounds: int) -> None:
+    """One line of the table."""
+    some = sorted(str(p) for p in folder.iterdir() if p.stem.startswith(("frame", "stars")))
+    given = [some[k % len(some)] for k in range(number)]
+    command = ["solve", *given, "--tilt", str(folder / "tilt.csv"), *OPTICS, "--json", "--jobs"]
+    timed([*command, "1"])  # files and triangles into memory
+    best = {1: float("inf"), jobs: float("inf")}
+    answers = set()
+    for _ in range(rounds):
+        for n in best:
+            spent, out = timed([*command, str(n)])
+            best[n] = min(best[n], spent)
+            answers.add(out)
+    one, many = best[1], best[jobs]
+    print(
+        f"{what:<12}{number:6d}{one:10.2f}{many:10.2f}{many / one:8.2f}{1000 * one / number:12.1f}"
+        f"{1000 * many / number:10.1f}   {'yes' if len(answers) == 1 else 'NO'}",
+        flush=True,
+    )
+
+
+def nothing(of):
+    """The work whose cost is that of sending it."""
+    return of
+
+
+def overhead_ms(jobs: int, calls: int = 2000) -> tuple[float, float]:
+    """Of starting the processes, and of a call."""
+    begin = time.perf_counter()
+    with Processes(jobs) as workers:
+        answers = workers.map((nothing, str(k)) for k in range(calls + 100))
+        list(islice(answers, 100))
+        ready = time.perf_counter()
+        list(answers)
+        end = time.perf_counter()
+    return 1000 * (ready - begin), 1000 * (end - ready) / calls
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--lists", type=int, default=400)
+    parser.add_argument("--jobs", type=int, default=processors())
+    parser.add_argument("--rounds", type=int, default=3)
+    args = parser.parse_args()
+    start, call = overhead_ms(args.jobs)
+    print(f"{args.jobs} processes start within {start:.0f} ms; a call costs {call:.2f} ms besides its work")
+    print(
+        f"{'':12}{'number':>6}{'1 job, s':>10}{f'{args.jobs}, s':>10}{'ratio':>8}{'ms a frame':>12}{'':10}   same answers"
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        for what, number, more in (
+            ("frames", args.frames, ()),
+            ("star lists", args.lists, ("--stars-only",)),
+        ):
+            folder = Path(scratch) / what.replace(" ", "")
+            starpos(["simulate", str(folder), "-n", str(min(number, AT_ONCE)), *OPTICS, *more])
+            compare(what, folder, number, args.jobs, args.rounds)
+
+
+if __name__ == "__main__":
+    main()
