@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos_common.testing import Listener, Process, lacks, take_domain
-from starpos_interfaces.msg import Solution, Tilt
+from starpos_interfaces.msg import ErrorTerm, Solution, Tilt
 
 OK, WARN, ERROR = 0, 1, 2
 STALE_AFTER_S = 2.0
@@ -227,7 +227,7 @@ def test_the_numbers_are_those_of_the_messages(page):
         tilt_warmth="11.3 °C",
         stars="21 of 41",
         residual="0.83″",
-        status_sentence="21 stars fit",
+        status_sentence="± 300 m east, ± 100 m north, 21 stars",
         average="48°08′17.5″ N  11°34′32″ E",
         average_sigma="± 80.0 m east, ± 60.0 m north",
     )
@@ -370,6 +370,14 @@ def test_the_budget_is_bars_the_longest_the_largest(page):
     assert [b[0] for b in bars] == ["common", "random"]
     assert bars[0][1] == pytest.approx(1.0, abs=0.01) and bars[1][1] == pytest.approx(5 / 200, abs=0.01)
     assert bars[0][2].split("\n") == ["deflection", "200 m", "7.20″"]
+
+
+def test_what_is_too_small_to_see_is_summed_up(page):
+    message = said.solution()
+    message.budget += [ErrorTerm(name=f"t{k}", east=0.3, north=0.4, heading=0.001) for k in range(4)]
+    page.instrument.works(solver__solution=message)
+    last = "return document.querySelector('#budget li:last-child').innerText.split('\\n')"
+    page.until(lambda: page.run(last) == ["4 smaller ones", "1.00 m", "7.20″"])
 
 
 def test_the_frame_is_shown_and_drawn_only_while_a_page_looks(page, listener):

@@ -25,11 +25,15 @@ function makeLight(parent) {
   for (const part of ["name", "sentence", "level"]) add(item, "span", { class: part });
 }
 
+const LEAST = 0.01; // of the largest; smaller ones are told together
+
 // terms: [{name, position, heading, common}]
 export function showBudget(terms) {
   const known = terms.filter((t) => t.position !== null).sort((a, b) => b.position - a.position);
   const most = Math.max(...known.map((t) => t.position), 1e-9);
-  rows(element("budget"), known, makeBar, (item, term) => {
+  const small = known.filter((t) => t.position < LEAST * most);
+  const shown = small.length < 2 ? known : [...known.slice(0, -small.length), together(small)];
+  rows(element("budget"), shown, makeBar, (item, term) => {
     const [name, bar, metres, heading] = item.children;
     item.className = term.common ? "common" : "random";
     set(name, term.name);
@@ -37,6 +41,12 @@ export function showBudget(terms) {
     set(metres, text.metres(term.position));
     set(heading, text.angle(term.heading));
   });
+}
+
+function together(terms) {
+  const sum = (what) => Math.hypot(...terms.map((t) => t[what] ?? 0));
+  const name = `${terms.length} smaller ones`;
+  return { name, position: sum("position"), heading: sum("heading"), common: terms.every((t) => t.common) };
 }
 
 function makeBar(parent) {

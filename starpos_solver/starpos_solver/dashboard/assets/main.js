@@ -79,7 +79,13 @@ function verdict(fix, old) {
   if (stampAge(fix) < -AHEAD_S) {
     return ["old", "Fix", `its time lies ${text.age(-stampAge(fix))} ahead of this machine's clock`];
   }
-  return ["good", "Fix", fix.trouble || (state.solution?.good ? state.solution.sentence : "")];
+  return ["good", "Fix", fix.trouble || summary(fix)];
+}
+
+function summary(fix) {
+  const { east, north } = sigmas(fix);
+  const stars = state.solution?.good && !isOld(state.solution) ? `, ${state.solution.stars_matched} stars` : "";
+  return `± ${text.metres(east)} east, ± ${text.metres(north)} north${stars}`;
 }
 
 function showStatus(fix, old) {
