@@ -29,6 +29,7 @@ setup(
         "picture": ["matplotlib"],
         "raw": ["rawpy", "exifread>=3"],
         "report": ["matplotlib", "rosbags>=0.10"],
+        "cluster": ["distributed"],
         "test": ["pytest"],
     },
     entry_points={"console_scripts": ["starpos = starpos.cli:main"]},
