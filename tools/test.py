@@ -2,28 +2,33 @@
 """Run everything that can fail in this project: linters, each package's tests, the tests of the whole graph.
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
-linter counts as one test); the exit status is 0 only where nothing failed.
+linter counts as one test); the exit status is 0 only where nothing failed. With STARPOS_COMPLETE=1, as in CI, starpos is
+tested a second time with the versions that Ubuntu 24.04 has (tools/ubuntu-24.04.txt).
 """
 
+import os
 import shlex
 import subprocess
 import sys
 import time
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
 LINTERS = [f"ruff {check} --output-format concise" for check in ("check", "format --check")]
+PARALLEL = ["-n", "2"]
+NO_TESTS = 5  # pytest's exit status where a -k left none
 COLCON = (
     "--log-level error test --executor sequential "
     "--event-handlers console_direct+ console_stderr- status- summary- --packages-select"
 )
 
 
-def run(command: list[str]) -> int:
+def run(command: list[str], environment: dict[str, str] | None = None) -> int:
     """Run a command in the project's root with its output shown; its exit status."""
-    return subprocess.run(command, cwd=ROOT, check=False).returncode
+    return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
 
 def lint() -> Counter:
@@ -59,12 +64,41 @@ def package_tests(pytest_args: list[str]) -> Counter:
     packages = sorted(f.name for f in folders if has_tests(f / "test"))
     if not packages:
         return Counter()
+    alone = [
+        p for p in packages if p == "starpos"
+    ]  # the others' wait for nodes, on which work beside them tells
+    parallel = PARALLEL if find_spec("xdist") else []
+    return colcon_test(alone, [*parallel, *pytest_args]) + colcon_test(
+        [p for p in packages if p not in alone], pytest_args
+    )
+
+
+def colcon_test(packages: list[str], pytest_args: list[str]) -> Counter:
     since = time.time()
     colcon = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())"]
     command = [*colcon, *shlex.split(COLCON), *packages]
     broken = run(command + (["--pytest-args", *pytest_args] if pytest_args else []))
     total = sum((junit_counts(ROOT / "build" / p / "pytest.xml", since) for p in packages), Counter())
     return total + Counter(failed=int(broken != 0 and total["failed"] == 0))
+
+
+def older_tests(pytest_args: list[str]) -> Counter:
+    """starpos with the versions that Ubuntu 24.04 has, in an environment of its own."""
+    folder, report, since = ROOT / ".underlay" / "ubuntu", ROOT / "log" / "ubuntu.xml", time.time()
+    python = str(folder / "bin" / "python")
+    base = Path(ROOT / ".underlay" / "python").read_text().strip()
+    pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-input"]
+    needs = ["-c", "tools/ubuntu-24.04.txt", "-e", "src/starpos[report,test]", "pytest-xdist"]
+    if run([base, "-m", "venv", str(folder)]) or run([*pip, *needs]):
+        print("Ubuntu 24.04's versions could not be installed")
+        return Counter(failed=1)
+    environment = {"PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": ""}
+    environment["STARPOS_COMPLETE"] = ""  # what is optional was there with the newest versions
+    command = [python, "-m", "pytest", "src/starpos/test", f"--junit-xml={report}", *PARALLEL, *pytest_args]
+    print("starpos with the versions of Ubuntu 24.04", flush=True)
+    status = run(command, os.environ | environment)
+    total = junit_counts(report, since)
+    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
 
 
 def graph_tests(pytest_args: list[str]) -> Counter:
@@ -74,8 +108,7 @@ def graph_tests(pytest_args: list[str]) -> Counter:
     since, report = time.time(), ROOT / "log" / "graph.xml"
     status = run([sys.executable, "-m", "pytest", "test", f"--junit-xml={report}", *pytest_args])
     total = junit_counts(report, since)
-    no_tests = 5  # pytest's exit status where a -k left none
-    return total + Counter(failed=int(status not in (0, no_tests) and total["failed"] == 0))
+    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
 
 
 def main(args: list[str]) -> int:
@@ -83,6 +116,8 @@ def main(args: list[str]) -> int:
     if "--lint" not in args:
         total += package_tests(args)
         total += graph_tests(args)
+        if os.environ.get("STARPOS_COMPLETE"):
+            total += older_tests(args)
     print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
     return int(total["failed"] > 0)
 
