@@ -39,10 +39,9 @@ def _read(file, place):
             f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
         ) from e
     mid, exposure = times(header, place)
-    pattern = str(header.get("BAYERPAT", "")).strip().lower()
-    if pattern not in PATTERNS:
-        raise FrameError(f"{place}: BAYERPAT is {pattern!r}; it must be RGGB, BGGR, GRBG or GBRG.")
-    return Frame(to_unsigned(values, place), pattern, mid, exposure, place, focal_px(header)), header
+    return Frame(
+        to_unsigned(values, place), _pattern(header, place), mid, exposure, place, focal_px(header)
+    ), header
 
 
 def _first_image(hdus, place):
@@ -63,3 +62,17 @@ def _first_image(hdus, place):
         header = {key: hdu.header[key] for key in KEYS if key in hdu.header}
         return header, np.asarray(hdu.data).reshape(shape[-2:])
     raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
+
+
+def _pattern(header, place):
+    """The mosaic as it begins in the first pixel."""
+    pattern = str(header.get("BAYERPAT", "")).strip().lower()
+    if pattern not in PATTERNS:
+        raise FrameError(f"{place}: BAYERPAT is {pattern!r}; it must be RGGB, BGGR, GRBG or GBRG.")
+    try:
+        right, down = (int(header.get(key, 0)) % 2 for key in ("XBAYROFF", "YBAYROFF"))
+    except (TypeError, ValueError, OverflowError):
+        raise FrameError(f"{place}: XBAYROFF or YBAYROFF is no whole number; correct the header.") from None
+    if right and pattern:
+        pattern = pattern[1::-1] + pattern[:1:-1]
+    return pattern[2:] + pattern[:2] if down else pattern

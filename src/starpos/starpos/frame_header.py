@@ -13,7 +13,18 @@ import numpy as np
 from starpos.errors import FrameError
 
 START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
-KEYS = (*START, "TIME-OBS", "TIMESYS", "EXPTIME", "EXPOSURE", "BAYERPAT", "FOCALLEN", "XPIXSZ")
+KEYS = (
+    *START,
+    "TIME-OBS",
+    "TIMESYS",
+    "EXPTIME",
+    "EXPOSURE",
+    "BAYERPAT",
+    "XBAYROFF",
+    "YBAYROFF",
+    "FOCALLEN",
+    "XPIXSZ",
+)
 SCALES = ("utc", "tai", "tt", "tdb")  # of TIMESYS; UT1 would need tables
 MAX_EXPOSURE_S = 86400.0
 

@@ -41,6 +41,14 @@ def test_fits_rows_time_and_focal_length(tmp_path):
     assert frame.focal_px == pytest.approx(93750.0)
 
 
+@pytest.mark.parametrize(
+    ("right", "down", "pattern"), [(0, 0, "rggb"), (1, 0, "grbg"), (0, 1, "gbrg"), (3, -1, "bggr")]
+)
+def test_a_mosaic_that_is_shifted_begins_with_another_colour(tmp_path, right, down, pattern):
+    cards = {"BAYERPAT": "RGGB", "XBAYROFF": right, "YBAYROFF": down}
+    assert read_frame(write_fits(tmp_path / "a.fits", **cards)).pattern == pattern
+
+
 def test_an_exposure_across_a_leap_second_is_counted_in_real_seconds(tmp_path):
     # 23:59:59.5 + 3 s / 2 = 24:00:01.0 - one second inserted = 00:00:00.0 of the next day
     cards = {"DATE-OBS": "2016-12-31T23:59:59.5", "EXPTIME": 3.0}
