@@ -110,7 +110,7 @@ class Indi:
             raise
 
     def _take(self, settings):
-        """The BLOB of one exposure, and when it was asked for and there (Unix time)."""
+        """The BLOB of one exposure, the length asked for (s), and when it was asked for and there (Unix time)."""
         if self._closing:
             raise CaptureError("the node ends.")
         if self._server is None:
@@ -130,8 +130,8 @@ class Indi:
             await connect(device)
             await set_up(device, wish)
             commanded_s = self._now()
-            await expose(device, wish)
-            return server.blob, wish.exposure_s, commanded_s, self._now()
+            blob = await expose(device, wish)
+            return blob, wish.exposure_s, commanded_s, self._now()
 
         return server.run(take())
 

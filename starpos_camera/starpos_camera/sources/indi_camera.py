@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 from starpos_camera.sources import CaptureError
-from starpos_camera.sources.indi_server import Device, Server
+from starpos_camera.sources.indi_server import Blob, Device, Server
 
 LINK_S = 2.0
 ANSWER_S = 5.0  # of a driver that is asked or told something
@@ -88,14 +88,13 @@ async def set_up(device: Device, wish: Wish) -> None:
             raise CaptureError("it has no gain to be set: leave `gain` unset.")
         _check_limits(device, vector, member, wish.gain, "`gain`")
         if device.number(vector, member) != wish.gain:
-            await _set(
-                device, vector, **{member: repr(float(wish.gain))}
-            )  # it may be rounded to what there is
+            # a driver may round it to what there is
+            await _set(device, vector, **{member: repr(float(wish.gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", wish.exposure_s, "`exposure` (s)")
 
 
-async def expose(device: Device, wish: Wish) -> None:
-    """Start an exposure and wait until server.blob is there; aborted where it is given up."""
+async def expose(device: Device, wish: Wish) -> Blob:
+    """The frame of an exposure begun now; it is aborted where it is given up."""
     server = device.server
 
     def state():
@@ -120,6 +119,8 @@ async def expose(device: Device, wish: Wish) -> None:
         await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
         raise
     await server.until(lambda: state() != "Busy", ANSWER_S)  # the next exposure would abort this one
+    blob, server.blob = server.blob, None
+    return blob
 
 
 async def _set(device, vector, **members):

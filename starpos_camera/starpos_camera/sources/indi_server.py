@@ -39,7 +39,9 @@ class Server:
         self._client.rxevent = self._on_event
         self.lost = False
         self.blob: Blob | None = None  # the newest
-        self.definitions: dict[str, int] = {}  # of a device's CONNECTION, since it came or was disconnected
+        self.definitions: dict[
+            str, int
+        ] = {}  # of each device's CONNECTION, since it came or was disconnected
         self._loop = self._talking = self._working = None
         self._leaving = False
         self._changed = asyncio.Event()
@@ -50,20 +52,18 @@ class Server:
 
     def run(self, work: Coroutine):
         """What the coroutine returns or raises; CaptureError if `close` ends it."""
+        watched = self._watch(work)
         try:
-            future = asyncio.run_coroutine_threadsafe(self._work(work), self._loop)
+            future = asyncio.run_coroutine_threadsafe(watched, self._loop)
             while not future.done() and self._thread.is_alive():
                 concurrent.futures.wait([future], BEAT_S)
-            return future.result(0)
-        except (
-            concurrent.futures.CancelledError,
-            concurrent.futures.TimeoutError,
-            RuntimeError,
-        ):  # or the loop has ended, before or now
+        except RuntimeError:  # the loop has ended
+            watched.close()
+            future = None
+        if future is None or not future.done() or future.cancelled():
             work.close()
-            raise CaptureError(
-                "the connection to the INDI server was closed; the frame is given up."
-            ) from None
+            raise CaptureError("the connection to the INDI server was closed; the frame is given up.")
+        return future.result()
 
     def close(self):
         """Cancel the work, which may still tell the device of it, and leave the server."""
@@ -79,7 +79,7 @@ class Server:
 
     def device_names(self) -> list[str]:
         """Of those that are there now."""
-        return [name for name, found in self._client.items() if found.enable]
+        return [one_line(name) for name, found in self._client.items() if found.enable]
 
     def device(self, name: str) -> "Device":
         """One by its name, whether it is there or not."""
@@ -125,7 +125,7 @@ class Server:
         finally:
             self.lost = True
 
-    async def _work(self, work):
+    async def _watch(self, work):
         self._working = asyncio.current_task()
         return await work
 
