@@ -15,7 +15,7 @@ from starpos_common.messages import camera_to_message, frame_to_message, stars_t
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_interfaces.msg import Tilt as TiltMessage
 
-START_S = 1793728800.0  # 2026-11-03T18:00:00Z
+START_S = 1730656800.0  # 2024-11-03T18:00:00Z: what lies in the future is refused
 EXPOSURE_S, CADENCE_S, SAMPLES = 0.5, 10.0, 5
 PRESSURE_PA, TEMPERATURE_C, HUMIDITY = 95000.0, 8.0, 0.5
 LATITUDE_DEG, LONGITUDE_DEG = -23.1, -68.25
@@ -79,7 +79,11 @@ def shoot(azimuth_deg=40.0, **changes) -> Shot:
     """A shot 10 s after the one before, so that every one has a stamp of its own."""
     k = next(_count)
     scene = replace(scene_at(azimuth_deg), **changes)
-    start, rng = START_S + k * CADENCE_S, np.random.default_rng(k)
+    return shot_of(scene, START_S + k * CADENCE_S, np.random.default_rng(k))
+
+
+def shot_of(scene: Scene, start: float, rng) -> Shot:
+    """What the scene's instrument sends of an exposure that begins then (Unix s)."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     stars = detected(scene, light, start + EXPOSURE_S / 2, EXPOSURE_S, rng)
     return Shot(
@@ -111,11 +115,15 @@ def tilts_of(scene: Scene, start: float, rng) -> list[TiltMessage]:
 def photograph(azimuth_deg=40.0) -> tuple[Shot, Image, Capture]:
     """A shot of the small camera whose stars are still in the image."""
     k = next(_count)
-    scene = scene_at(azimuth_deg, SMALL)
-    start, rng = START_S + k * CADENCE_S, np.random.default_rng(k)
+    return photograph_of(scene_at(azimuth_deg, SMALL), START_S + k * CADENCE_S, np.random.default_rng(k))
+
+
+def photograph_of(scene: Scene, start: float, rng) -> tuple[Shot, Image, Capture]:
+    """The same of any scene and time; its frame is drawn, so a small one is quick."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     image = frame_to_message(render(scene, light, start, EXPOSURE_S, rng), FRAME)
     info = camera_to_message(scene.camera, FRAME, start + EXPOSURE_S / 2)
-    empty = stars_to_message(no_stars(*SMALL, start + EXPOSURE_S / 2), FRAME)
+    size = scene.camera.width, scene.camera.height
+    empty = stars_to_message(no_stars(*size, start + EXPOSURE_S / 2), FRAME)
     capture = Capture(header=image.header, exposure=EXPOSURE_S, stamp_source=Capture.SIMULATED)
     return Shot(info, empty, tilts_of(scene, start, rng), scene), image, capture

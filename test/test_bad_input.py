@@ -132,6 +132,8 @@ CASES = {
     "NaN exposure": (with_stars(lambda s: setattr(s, "exposure", NAN)), BAD, "exposure"),
     "NaN error of the stamp": (with_stars(lambda s: setattr(s, "stamp_stddev", NAN)), BAD, "stamp_stddev"),
     "negative error of the stamp": (with_stars(lambda s: setattr(s, "stamp_stddev", -1e-3)), BAD, "stamp_stddev"),
+    "an error of the stamp beyond numbers": (with_stars(lambda s: setattr(s, "stamp_stddev", 1e300)), BAD,
+                                             "stamp_stddev"),
     "another frame size": (with_stars(lambda s: setattr(s, "width", 5000)), BAD, "5000 x 3744"),
     "no tilt at all": (lambda shot: shot.tilts.clear(), Solution.NO_TILT, "tilt"),
     "tilts of another minute": (lambda shot: later(shot.tilts, HALF_MINUTE_S), Solution.NO_TILT, "tilt"),

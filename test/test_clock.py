@@ -5,10 +5,14 @@ import math
 import time
 
 import pytest
+from graph import stamp_of
+from sensor_msgs.msg import NavSatFix
 from shots import LATITUDE_DEG, shoot
+from std_srvs.srv import Trigger
 
-from starpos_common.messages import unix_to_stamp
+from starpos_common.messages import stamp_to_unix, unix_to_stamp
 from starpos_interfaces.msg import Solution
+from starpos_interfaces.srv import Solve
 
 OK, WARN = b"\x00", b"\x01"
 METRES_PER_S = 465.1 * math.cos(math.radians(LATITUDE_DEG))
@@ -60,10 +64,72 @@ def test_a_clocks_error_that_is_none_is_refused(graph, solver, value):
     assert solution.status == Solution.BAD_INPUT and "clock_stddev_s" in solution.status_text
 
 
-def test_frames_from_the_future_are_said(graph, solver):
+def late(shot, seconds):
+    """The shot's stamps moved."""
+    for m in (shot.stars, *shot.tilts):
+        m.header.stamp = unix_to_stamp(stamp_to_unix(m.header.stamp) + seconds)
+    return shot
+
+
+def test_a_frame_that_comes_late_does_not_begin_the_average_anew(graph, solver):
+    averaged = graph.hear(NavSatFix, "fix_averaged")
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    shots = [shoot() for _ in range(6)]
+    for shot in (*shots[:4], shots[5], shots[4]):
+        answered(graph, shot)
+    values = {v.key: v.value for v in graph.state("solver: Average", "of all frames here").values}
+    assert values["frames"] == "5"
+    assert stamp_of(averaged[-1]) == shots[5].stamp
+
+
+def test_a_stamp_that_the_stars_contradict_makes_a_wide_fix(graph, solver):
+    averaged = graph.hear(NavSatFix, "fix_averaged")
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    for _ in range(3):
+        answered(graph, told())
+    shot = late(told(), -3.0)
+    solution = answered(graph, shot)
+    assert of_budget(solution, "clock") == pytest.approx(3.0, rel=0.02)
+    assert abs(shot.error_m(solution)[0]) < 2 * solution.covariance[0] ** 0.5
+    state = graph.state("solver: Clock", "a clock was set")
+    assert state.level == WARN
+    assert graph.call(Solve, "solver/solve", Solve.Request()).solution.covariance[0] > 1e6
+    assert of_budget(answered(graph, told()), "clock") == pytest.approx(0.01, rel=0.01)
+    assert shot.stamp not in {stamp_of(m) for m in averaged}
+
+
+def test_a_clock_that_was_set_is_believed_again_when_somebody_says_so(graph, solver):
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    for _ in range(3):
+        answered(graph, told())
+    for _ in range(3):
+        assert of_budget(answered(graph, late(told(), 5.0)), "clock") == pytest.approx(5.0, rel=0.02)
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    assert of_budget(answered(graph, late(told(), 5.0)), "clock") == pytest.approx(0.01, rel=0.01)
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+
+
+def test_frames_and_tilts_from_the_future_are_refused(graph, solver):
     shot = shoot()
-    shot.stars.header.stamp = unix_to_stamp(time.time() + 100)
+    late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
     graph.send(shot)
+    assert graph.result(stamp_of(shot.stars))[0].status == Solution.NO_TILT
+    assert "a tilt is stamped" in solver.output
+    shot = shoot()
+    late(shot, time.time() + 1.8 - stamp_to_unix(shot.stars.header.stamp))
+    for tilt in shot.tilts:  # near enough to its exposure, and not so far ahead that they are refused too
+        tilt.header.stamp = unix_to_stamp(stamp_to_unix(tilt.header.stamp) - 1.1)
+    graph.send(shot)
+    solution, _, _ = graph.result(stamp_of(shot.stars))
+    assert solution.status == Solution.BAD_INPUT and "before its time" in solution.status_text
+    answer = graph.call(Solve, "solver/solve", Solve.Request())
+    assert not answer.success and "before its time" in answer.message
+    shot = shoot()  # but what the clock's stated error allows is used
+    late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
+    shot.tilts.clear()
+    shot.stars.clock_stddev = 60.0
+    graph.send(shot)
+    assert graph.result(stamp_of(shot.stars))[0].status == Solution.NO_TILT
     state = graph.state("solver: Clock", "before their time")
     assert (
         state.level == WARN and 90 < -float({v.key: v.value for v in state.values}["frame age (s)"]) < 100.5

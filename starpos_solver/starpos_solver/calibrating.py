@@ -31,6 +31,7 @@ from starpos_solver.worker import Outcome, Worker
 
 # Fewer headings hold no check that they are of one place; a service's caller says that they are.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
+LATE_FRAMES = 3  # so many older ones in their own order are no late ones: a bag is played again
 BETTER = 0.8  # of its error, by which a calibration must be to take the place of one that the solver has found itself
 OF_CALIBRATION = {"misalignment", "misalignment_stddev", "calibration_url"}
 OF_AVERAGE = OF_CALIBRATION | {
@@ -66,7 +67,8 @@ class Calibrating:
         self._values, self._solver, self._changed = values, solver, changed
         self._recent = RecentFrames(values["calibration_frames"])
         self._poses = Poses()
-        self._newest_unix_s = -math.inf
+        self._newest_unix_s = self._late_unix_s = -math.inf
+        self._late = 0  # frames in a row that are older than the newest, each younger than the one before
         self._plumb_arcsec = math.nan  # how well `found` has the plumb line; nan: it is not known
         self._era = 0  # what was begun in an older one is of another instrument or place
         self._worker = Worker(node)
@@ -92,27 +94,38 @@ class Calibrating:
 
     # what happens to the node ----------------------------------------------------------------------------------------
 
-    def learn(self, seen: Seen, fix: Fix | None) -> None:
-        """From one more frame, and the fix it gave."""
+    def learn(self, seen: Seen, fix: Fix | None) -> bool:
+        """From one more frame, and the fix it gave; whether the average is of this frame too."""
         mid = seen.stars.mid_unix_s
-        if mid == self._newest_unix_s:
-            return
-        if mid < self._newest_unix_s:  # a bag is played again
-            self.forget()
+        if mid == self._newest_unix_s or self._came_late(mid):
+            return False
         self._newest_unix_s = mid
         self._recent.add(seen)
         if fix is None:
-            return
+            return False
         news = self.average.add(fix)
         # while A3 is not known to be right, turning looks like moving
         if self._is_told and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
         if self._is_told and news is News.LEFT_OUT:
-            return
+            return False
         told_more = self._poses.add(seen, fix)
         if self._values["self_calibration"] and (told_more or self._again):
             self._turn_by_itself()
+        return news is not News.LEFT_OUT
+
+    def _came_late(self, mid_unix_s: float) -> bool:
+        """Whether a frame is older than one before it; where many are, time has begun anew, and so does all here."""
+        if mid_unix_s > self._newest_unix_s:
+            self._late = 0
+            return False
+        self._late = self._late + 1 if self._late and mid_unix_s > self._late_unix_s else 1
+        self._late_unix_s = mid_unix_s
+        if self._late < LATE_FRAMES:
+            return True
+        self.forget()
+        return False
 
     def _moved_on(self, since_unix_s: float):
         self._era += 1
@@ -122,7 +135,7 @@ class Calibrating:
     def forget(self) -> None:
         """The frames and the place; not what they have told of the instrument."""
         self._era += 1
-        self._newest_unix_s = -math.inf
+        self._newest_unix_s, self._late = -math.inf, 0
         self._recent.clear()
         self._poses.clear()
         self.average.begin_anew()

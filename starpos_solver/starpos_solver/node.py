@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 from starpos import catalogue
 from starpos.average import Average
 from starpos.camera import Camera
-from starpos.errors import InstrumentError, StarposError
+from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.geoid import Geoid
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
@@ -30,29 +30,32 @@ from starpos.stars import Stars
 from starpos.vertical import Geodetic
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
-from starpos_common.messages import message_to_camera, message_to_stars
+from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos_common.parameters import declare
 from starpos_interfaces.msg import Solution, StarArray, Tilt
 from starpos_interfaces.srv import SaveCalibration, Solve
 from starpos_solver import outputs, parameters, reports, saving
 from starpos_solver.calibrating import Calibrating
+from starpos_solver.clock_doubt import ClockDoubt
 from starpos_solver.memory import Seen
 from starpos_solver.tilts import TiltBuffer
 from starpos_solver.worker import Outcome, Worker
 
 WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
 POLL_S = 0.02
+CLOCK_SIGMAS = 6.0  # beyond the stated error, and AHEAD_S, a stamp in the future is wrong
 
 
 @dataclass(frozen=True)
 class Waiting:
     """A frame's stars, as they came and as they are; `since` in ns of the steady clock; by how much the middle of the
-    exposure lay ahead of this node's clock when it came."""
+    exposure lay ahead of this node's clock when it came; whether its stars speak against its time."""
 
     message: StarArray
     stars: Stars
     since_ns: int
     ahead_s: float
+    doubted: bool = False
 
 
 class SolverNode(Node):
@@ -78,6 +81,7 @@ class SolverNode(Node):
         self._latest: Waiting | None = None
         self._answer: Answer | None = None
         self._standing: Standing | None = None  # of the last fix
+        self._doubt = ClockDoubt()
         self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0, "broken messages": 0}
         self._last_seen_ns: dict[str, int] = {}
         self._logged: object = None
@@ -135,6 +139,8 @@ class SolverNode(Node):
             self._read_instrument()
         if "deflection.geoid" in names:
             self._read_geoid()
+        if "clock_stddev" in names:
+            self._doubt.clear()
         self._calibrating.parameters_set(names)
         self._remake_solver()
 
@@ -210,6 +216,10 @@ class SolverNode(Node):
     def _on_tilt(self, message: Tilt):
         self._seen("tilt")
         try:
+            ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
+            # when its time has come the instrument may lean otherwise
+            if ahead_s > reports.AHEAD_S:
+                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
             self._tilts.add(message, self._tilt_stddev())
         except StarposError as e:
             self._reject(str(e))
@@ -234,12 +244,17 @@ class SolverNode(Node):
         except StarposError as e:
             self._publish(message.header, Answer(Status.BAD_INPUT, str(e), "stars", None, len(message.stars)))
             return
-        ahead_s = (stars.mid_unix_s or 0.0) - self.get_clock().now().nanoseconds * 1e-9
+        ahead_s = self._ahead_s(stars.mid_unix_s)
         self._waiting.append(Waiting(message, stars, self._steady.now().nanoseconds, ahead_s))
         while len(self._waiting) > WAITING:
             self._waiting.popleft()
             self._counts["dropped frames"] += 1
         self._work()
+
+    def _ahead_s(self, unix_s: float | None) -> float:
+        """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet)."""
+        now_ns = self.get_clock().now().nanoseconds
+        return unix_s - now_ns * 1e-9 if unix_s is not None and now_ns else 0.0
 
     def _reject(self, sentence: str):
         self._counts["broken messages"] += 1
@@ -274,11 +289,22 @@ class SolverNode(Node):
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting):
-        self._latest = frame
         answer = self._answer_to(frame, self._standing)
+        if answer.ok:
+            frame, answer = self._with_doubt(frame, answer)
+        self._latest = frame
         self._publish(frame.message.header, answer)
         if self._solver is not None:
             self._learn(frame, answer)
+
+    def _with_doubt(self, frame: Waiting, answer: Answer) -> tuple[Waiting, Answer]:
+        """The frame, and its answer, with the error of its time that the stars of earlier frames tell."""
+        stated_s = math.hypot(self._solver.clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s)
+        self._doubt.add(answer.fix, stated_s)
+        if self._doubt.seconds <= stated_s:
+            return frame, answer
+        frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self._doubt.seconds), doubted=True)
+        return frame, self._answer_to(frame, answer.standing)
 
     def _solver_now(self) -> Solver:
         """InstrumentError with the reason while there is none."""
@@ -293,10 +319,14 @@ class SolverNode(Node):
     def _answer_to(self, frame: Waiting, standing: Standing | None) -> Answer:
         stars = frame.stars
         try:
-            return self._solver_now().solve(
-                stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing
-            )
-        except InstrumentError as e:
+            solver = self._solver_now()
+            answer = solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing)
+            if answer.ok and frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
+                raise TimeError(
+                    f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
+                )
+            return answer
+        except (InstrumentError, TimeError) as e:
             return Answer.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:  # a defect costs this frame, not the night
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
@@ -305,19 +335,24 @@ class SolverNode(Node):
             )
 
     def _learn(self, frame: Waiting, answer: Answer):
-        """What a calibration and the average take from a frame, also from one that a stale calibration refuses."""
+        """What a calibration and the average take from a frame, also from one that a stale calibration refuses.
+
+        One whose time is in doubt teaches nothing.  fix_averaged comes with the frames that are of it.
+        """
         stars = frame.stars
+        if frame.doubted or (answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S):
+            return
         try:
             tilt = answer.tilt or self._tilts.average(stars.mid_unix_s or math.nan, self._span(stars))
         except StarposError:
             return
         try:
-            self._calibrating.learn(Seen(stars, tilt), answer.fix)
+            if self._calibrating.learn(Seen(stars, tilt), answer.fix):
+                place = self._calibrating.average.place
+                self._fix_averaged.publish(self._averaged(frame.message.header, place))
         except Exception:  # fix and heading go on without
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
-        place = self._calibrating.average.place
-        if answer.ok and place is not None:
-            self._fix_averaged.publish(self._averaged(frame.message.header, place))
+            self._calibrating.forget()  # what cannot be worked with must not stay
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -379,6 +414,7 @@ class SolverNode(Node):
         self._tilts.clear()
         self._waiting.clear()
         self._latest = self._answer = self._standing = None
+        self._doubt.clear()
         self._calibrating.forget()
         response.success = True
         response.message = "tilts, frames and the place are forgotten; a calibration that was found is not"
@@ -412,7 +448,8 @@ class SolverNode(Node):
             return Report(Level.WARN, "no frame yet")
         stars = self._latest.stars
         clock_s = self._solver.clock_stddev_s(stars) if self._solver else stars.clock_stddev_s
-        return reports.of_clock(clock_s, stars.stamp_stddev_s, self._latest.ahead_s)
+        doubt_s = self._doubt.seconds if self._latest.doubted else 0.0
+        return reports.of_clock(clock_s, stars.stamp_stddev_s, self._latest.ahead_s, doubt_s)
 
     def _report_inputs(self) -> Report:
         now = self._steady.now().nanoseconds

@@ -13,6 +13,7 @@ STALE_S = 5.0
 WIDE_CLOCK_S = 0.1
 EQUATOR_M_PER_S = 465.1
 AHEAD_S = 1.0
+ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
 
 def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
@@ -36,13 +37,23 @@ def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
     return Report(Level.OK if answer.ok else Level.WARN, answer.message, values)
 
 
-def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float) -> Report:
-    """How well the time of the newest frame is known; ahead_s: by how much it was ahead of this node's clock."""
+def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt_s: float) -> Report:
+    """How well the time of the newest frame is known.
+
+    ahead_s: by how much it was ahead of this node's clock; doubt_s: by how much the stars contradict it, or 0.
+    """
     values = {"clock sigma (s)": clock_stddev_s, "stamp sigma (s)": stamp_stddev_s, "frame age (s)": -ahead_s}
     if ahead_s > AHEAD_S:
         return Report(
             Level.WARN,
-            f"frames come {ahead_s:.3g} s before their time: set the clocks of camera and solver by one source",
+            f"frames come {ahead_s:.3g} s before their time and are refused: {ONE_CLOCK}",
+            values,
+        )
+    if doubt_s:
+        return Report(
+            Level.WARN,
+            f"by their stamps the camera at rest has turned with the Earth for {doubt_s:.3g} s: a clock was set, or a "
+            "frame stamped wrongly. Fixes are as wide as that until it is back, or solver/reset is called",
             values,
         )
     wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))

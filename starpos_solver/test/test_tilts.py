@@ -52,6 +52,14 @@ def test_a_stated_covariance_is_used():
     assert tilt.covariance == pytest.approx(np.eye(2) * 1e-8 / 5)
 
 
+def test_samples_from_before_the_clock_was_set_back_are_none_of_the_same_times_now():
+    before = [sample(k / 10, 20.0) for k in range(-20, 300)]
+    buffer = buffer_of([*before, *(sample(k / 10 + 0.03) for k in range(-3, 4))])
+    tilt = buffer.average(T0, 0.5)
+    assert (tilt.samples, tilt.theta_x) == (5, pytest.approx(math.radians(1.0)))
+    assert buffer.average(T0 + 20.0, 0.5).theta_x == pytest.approx(math.radians(20.0))
+
+
 def test_a_gap_before_a_sample_does_not_spoil_it():
     assert buffer_of([sample(0.0, flags=Tilt.GAP)]).average(T0, 0.5).samples == 1
 

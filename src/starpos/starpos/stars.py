@@ -11,6 +11,7 @@ SATURATED = 1
 EDGE = 2
 ELONGATED = 4
 BLENDED = 8
+MOST_STDDEV_S = 1e9  # of a time: more says nothing, and its square must not overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +164,10 @@ def check_times(about, place):
         )
     for name in ("stamp_stddev_s", "clock_stddev_s"):
         value = getattr(about, name)
-        if not (np.isfinite(value) and value >= 0):
-            raise FrameError(f"{place}: {name} is {value}; it must be 0 (unknown) or more.")
+        if not 0 <= value <= MOST_STDDEV_S:
+            raise FrameError(
+                f"{place}: {name} is {value}; it must be from 0 (unknown) to {MOST_STDDEV_S:g} s."
+            )
 
 
 def check_focal(focal_px, place):

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stamps of a camera at rest that contradict each other widen the time, and those that agree do not."""
+
+from dataclasses import replace
+
+import pytest
+from fixes import fix_at
+
+from starpos import rotation
+from starpos.earth import ROTATION_RAD_S
+from starpos_solver.clock_doubt import ClockDoubt
+
+STATED_S = 0.01
+
+
+def stamped(off_s: float, azimuth_deg=40.0, **at):
+    """The fix of a frame whose stamp is off by so much: the Earth has turned under it."""
+    fix = fix_at(0.0, azimuth_deg, **at)
+    turn = rotation.about_axis(2, ROTATION_RAD_S * off_s)
+    return replace(fix, camera_to_itrs=turn @ fix.camera_to_itrs)
+
+
+def doubts_of(*fixes, stated_s=STATED_S) -> list[float]:
+    doubt, seconds = ClockDoubt(), []
+    for fix in fixes:
+        doubt.add(fix, stated_s)
+        seconds.append(doubt.seconds)
+    return seconds
+
+
+def test_stamps_that_agree_are_believed():
+    assert doubts_of(*(stamped(0.02 * (-1) ** k) for k in range(20))) == [0.0] * 20
+
+
+@pytest.mark.parametrize("off_s", [2.0, -2.0, 3600.0, -40000.0])
+def test_one_that_is_off_is_as_wide_as_that_and_the_next_is_believed(off_s):
+    doubts = doubts_of(stamped(0.0), stamped(0.0), stamped(off_s), stamped(0.0))
+    assert doubts == pytest.approx([0.0, 0.0, abs(off_s), 0.0], rel=1e-6)
+
+
+def test_a_clock_that_was_set_stays_in_doubt_until_it_is_back():
+    doubts = doubts_of(*[stamped(0.0)] * 2, *[stamped(3.0)] * 50, stamped(0.0))
+    assert doubts == pytest.approx([0.0] * 2 + [3.0] * 50 + [0.0], rel=1e-6)
+
+
+def test_it_stays_in_doubt_when_the_camera_is_turned():
+    doubts = doubts_of(*[stamped(0.0)] * 2, stamped(3.0), *[stamped(3.0, 130.0)] * 4)
+    assert doubts == pytest.approx([0.0] * 2 + [3.0] * 5, rel=1e-6)
+
+
+def test_a_turn_by_itself_is_no_doubt():
+    assert doubts_of(stamped(0.0), stamped(0.0, 41.0), stamped(0.0, 39.0), stamped(0.0, 220.0)) == [0.0] * 4
+
+
+def test_the_first_of_a_pose_alone_is_outvoted():
+    doubts = doubts_of(stamped(5.0), *[stamped(0.0)] * 11, stamped(5.0))
+    assert doubts == pytest.approx([0.0] + [5.0] * 9 + [0.0, 0.0, 5.0], rel=1e-6)
+
+
+def test_what_the_clocks_error_allows_is_no_contradiction():
+    assert doubts_of(stamped(0.0), stamped(30.0), stated_s=16.0) == [0.0, 0.0]
+
+
+def test_at_a_pole_a_turn_on_the_spot_is_no_contradiction():
+    assert doubts_of(stamped(0.0, latitude_deg=89.9), stamped(100.0, latitude_deg=89.9)) == [0.0, 0.0]
+
+
+def test_cleared_nothing_is_held_against_the_next():
+    doubt = ClockDoubt()
+    for off_s in (0.0, 0.0, 3.0):
+        doubt.add(stamped(off_s), STATED_S)
+    doubt.clear()
+    doubt.add(stamped(3.0), STATED_S)
+    assert doubt.seconds == 0.0
