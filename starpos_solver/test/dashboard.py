@@ -26,20 +26,16 @@ def fix(
         message.longitude = NAN
         message.position_covariance = [0.0] * 9
         message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_UNKNOWN
-    if stamp:
-        message.header.stamp = stamp
     return message
 
 
-def imu(azimuth_deg=217.25, sigma_deg=0.004, stamp=None) -> Imu:
+def imu(azimuth_deg=217.25, sigma_deg=0.004) -> Imu:
     """Level, its x axis towards an azimuth."""
     half = math.radians(90.0 - azimuth_deg) / 2
     message = Imu()
     message.header.frame_id = "starpos_link"
     message.orientation.z, message.orientation.w = math.sin(half), math.cos(half)
     message.orientation_covariance[[0, 4, 8]] = math.radians(sigma_deg) ** 2
-    if stamp:
-        message.header.stamp = stamp
     return message
 
 
@@ -54,7 +50,7 @@ def tilt(x_deg=12.0, y_deg=-6.0, sigma_deg=0.0035, flags=0) -> Tilt:
     )
 
 
-def solution(status=Solution.OK, sentence="21 stars fit", stamp=None) -> Solution:
+def solution(status=Solution.OK, sentence="21 stars fit") -> Solution:
     good = status == Solution.OK
     message = Solution(
         status=status, status_text=sentence, stars_detected=41, stars_matched=21 if good else 0
@@ -65,8 +61,6 @@ def solution(status=Solution.OK, sentence="21 stars fit", stamp=None) -> Solutio
             ErrorTerm(name="centroids", east=3.0, north=4.0, heading=0.001),
             ErrorTerm(name="deflection", east=120.0, north=160.0, heading=0.002, common=True),
         ]
-    if stamp:
-        message.header.stamp = stamp
     return message
 
 
@@ -77,13 +71,10 @@ def diagnostics(*statuses) -> DiagnosticArray:
     )
 
 
-def image(width=1600, height=1000, encoding="bgr8", stamp=None) -> Image:
-    """Blue on the left, green on the right."""
-    pixels = np.zeros((height, width, 3), np.uint8)
-    pixels[:, : width // 2, 0] = 200
-    pixels[:, width // 2 :, 1] = 200
+def image(width=1600, height=1000, encoding="bgr8", left=(200, 0, 0), right=(0, 200, 0)) -> Image:
+    """Two colours (blue, green, red): of the left half and of the right."""
+    pixels = np.empty((height, width, 3), np.uint8)
+    pixels[:, : width // 2], pixels[:, width // 2 :] = left, right
     message = Image(width=width, height=height, encoding=encoding, step=3 * width)
     message.data = array.array("B", pixels.tobytes())
-    if stamp:
-        message.header.stamp = stamp
     return message

@@ -39,7 +39,7 @@ TOPICS = {
     "detector/image_annotated": Image,
 }
 LIGHTS = said.diagnostics(
-    ("camera: Capture", OK, "frames arrive every 5.0 s"),
+    ("camera: Clock", OK, "the system's clock is kept to UTC within 0.0021 s"),
     ("solver: Clock", WARN, "the time is known to 0.12 s only"),
     ("solver: Inputs", ERROR, HOSTILE),
     ("wheels: Motor", ERROR, "not this instrument's"),
@@ -64,6 +64,23 @@ for (const e of document.querySelectorAll("body *")) {
   found.push([(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.id || e.className || e.tagName, e.textContent]);
 }
 return found;
+"""
+
+
+OVERLAPS = """
+const texts = [];
+for (const e of document.querySelectorAll("main *, header *")) {
+  if (!e.checkVisibility() || e.closest("svg, #map")) continue;
+  for (const n of e.childNodes) {
+    if (n.nodeType !== 3 || !n.data.trim()) continue;
+    const range = document.createRange();
+    range.selectNodeContents(n);
+    for (const r of range.getClientRects()) texts.push([n.data.trim(), r]);
+  }
+}
+const depth = (a, b) => Math.min(Math.min(a.right, b.right) - Math.max(a.left, b.left),
+                                 Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top));
+return texts.flatMap(([s, a], i) => texts.slice(i + 1).filter(([, b]) => depth(a, b) > 3).map(([t]) => [s, t]));
 """
 
 
@@ -349,7 +366,7 @@ LAMPS = """
 def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_text(page):
     lamps = page.until(lambda: page.run(LAMPS))
     assert [lamp[:3] for lamp in lamps] == [
-        ["camera: Capture", "OK", "frames arrive every 5.0 s"],
+        ["camera: Clock", "OK", "the system's clock is kept to UTC within 0.0021 s"],
         ["solver: Clock", "WARN", "the time is known to 0.12 s only"],
         ["solver: Inputs", "ERROR", HOSTILE],
     ]
@@ -357,7 +374,7 @@ def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_te
     assert green[1] > green[0] + 80 and red[0] > red[1] + 80
     assert amber[0] > 200 and amber[1] > amber[2] + 80
     clocks = page.run("return [...document.querySelectorAll('#clocks .name')].map((e) => e.textContent)")
-    assert clocks == ["solver: Clock"]
+    assert clocks == ["camera: Clock", "solver: Clock"]
     assert page.run("return document.images.length") == 2  # the icon and the frame
     assert page.run("return document.querySelectorAll('#lights img, #lights script').length") == 0
 
@@ -384,13 +401,16 @@ def test_the_frame_is_shown_and_drawn_only_while_a_page_looks(page, listener):
     image = "const i = document.images.frame; return [i.checkVisibility(), i.naturalWidth, i.naturalHeight, i.alt]"
     page.until(lambda: page.run(image)[:3] == [True, 800, 500])
     assert page.run(image)[3].startswith("annotated frame of ")
-    colours = page.run(
+    colours = (
         "const canvas = document.createElement('canvas'); [canvas.width, canvas.height] = [800, 500];"
         "const c = canvas.getContext('2d', {willReadFrequently: true});"
         "c.drawImage(document.getElementById('frame'), 0, 0);"
-        "return [...c.getImageData(100, 250, 1, 1).data, ...c.getImageData(700, 250, 1, 1).data]"
+        "return [100, 700].map((x) => [...c.getImageData(x, 250, 1, 1).data].slice(0, 3).map((v) => v > 120))"
     )
-    assert colours[2] > 180 > 90 > colours[0] and colours[5] > 180 > 90 > colours[6]
+    blue, green = [False, False, True], [False, True, False]
+    assert page.run(colours) == [blue, green]
+    page.instrument.works(detector__image_annotated=said.image(left=(0, 200, 0), right=(200, 0, 0)))
+    page.until(lambda: page.run(colours) == [green, blue])
     viewers = page.instrument.publishers["detector/image_annotated"].get_subscription_count
     assert viewers() == 1
     page.click("frame-switch")
@@ -420,7 +440,7 @@ def test_no_fix_looks_like_no_fix_and_nan_is_no_number(page):
     assert page.text("decimal").startswith("last fix 48.1373° 11.575°, ")
     page.until(lambda: page.is_dressed("missing") == ["position-card", "tilt-card", "budget-card"])
     page.until(lambda: "heading-card" in page.is_dressed("old"))
-    assert page.run("return document.querySelector('#ellipse-newest.old') !== null")
+    assert page.run("return document.querySelector('.old > #ellipse-newest') !== null")
     assert page.run("return document.querySelector('#bubble-dot').checkVisibility()") is False
     everything = page.run("return document.documentElement.outerHTML")
     assert "NaN" not in everything and "undefined" not in everything and "null" not in everything.lower()
@@ -458,6 +478,9 @@ def test_everything_grows_old_when_the_instrument_falls_silent_and_lives_again(p
     cards = {"position-card", "time-card", "heading-card", "tilt-card", "frame-card", "budget-card"}
     page.until(lambda: set(page.is_dressed("old")) == cards)
     page.until(lambda: page.text("status-word") == "No fix now")
+    tops = page.run("""return [...document.querySelectorAll("#clocks li")].flatMap((li) =>
+      [".name", ".sentence"].map((part) => li.querySelector(part).getBoundingClientRect().top))""")
+    assert len(tops) == 4 and tops == sorted(tops), "each clock's sentence stands under its name"
     lamps = page.until(lambda: all(lamp[1] == "SILENT" for lamp in page.run(LAMPS)) and page.run(LAMPS))
     for *_, colour in lamps:
         r, g, b = (int(v) for v in colour[4:-1].split(","))
@@ -467,6 +490,25 @@ def test_everything_grows_old_when_the_instrument_falls_silent_and_lives_again(p
     page.instrument.says = speaks
     page.shows(status_word="Fix", heading_age="", tilt_age="")
     page.until(lambda: page.is_dressed("old") == [])
+
+
+@pytest.mark.parametrize("width", [360, 820, 1440])
+@pytest.mark.parametrize("speaks", [True, False])
+def test_no_text_lies_over_another(page, width, speaks):
+    metrics = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    try:
+        page.until(lambda: page.is_dressed("missing") == [] and page.run(LAMPS))
+        if not speaks:
+            page.instrument.says = {}
+            page.until(
+                lambda: (
+                    all(lamp[1] == "SILENT" for lamp in page.run(LAMPS)) and len(page.is_dressed("old")) == 6
+                )
+            )
+        assert page.run(OVERLAPS) == []
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_a_page_one_too_many_says_so(page, listener):

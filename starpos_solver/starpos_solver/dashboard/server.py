@@ -48,7 +48,6 @@ class OpenPage:
     looks: bool
     news: asyncio.Event = field(default_factory=asyncio.Event)
     sent: int = 0
-    closed: bool = False
 
 
 def listen(address: str, port: int) -> list:
@@ -172,9 +171,6 @@ class Server:
         self._ready.set()
         await self._ended.wait()
         http.stop()
-        for page in self.open:
-            page.closed = True
-        self._wake()
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(http.close_all_connections(), END_S / 2)
 
@@ -289,7 +285,7 @@ class Events(Reply):
         self._page = page = OpenPage(looks=self.request.query == "frame")
         self.server.open.add(page)
         try:
-            while await self.deliver() and not page.closed:
+            while await self.deliver():
                 await page.news.wait()
                 page.news.clear()
                 self._write_news(page)
@@ -306,5 +302,4 @@ class Events(Reply):
 
     def on_connection_close(self):
         if self._page:
-            self._page.closed = True
-            self._page.news.set()
+            self._page.news.set()  # which it cannot deliver

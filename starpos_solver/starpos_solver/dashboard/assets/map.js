@@ -171,6 +171,7 @@ export class EarthMap {
   _drawTrack() {
     const points = this.data.track.map(([, lat, lon]) => [lon, lat]);
     this.track.setAttribute("d", points.length > 1 ? this._line(points) : "");
+    this.svg.classList.toggle("old", Boolean(this.data.old));
     const dot = ([x, y]) => `M${x.toFixed(1)} ${y.toFixed(1)}h0`;
     const here = points.slice(0, -1).filter((p) => this._isHere(p)).map((p) => this._project(p));
     const seen = here.filter(([x, y]) => x > -5 && y > -5 && x < this.width + 5 && y < this.height + 5);
@@ -181,7 +182,6 @@ export class EarthMap {
     const { group, inner, outer, mark } = this.ellipses[which];
     const shown = fix && this._isHere([fix.longitude, fix.latitude]);
     group.classList.toggle("hidden", !shown);
-    group.classList.toggle("old", Boolean(this.data.old));
     if (!shown) return;
     const [x, y] = this._project([fix.longitude, fix.latitude]);
     const move = `translate(${x.toFixed(2)} ${y.toFixed(2)})`;
