@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera, detector and inclinometer on one computer, the solver on another: what the cable carries and what it may do."""
+
+import json
+import time
+from pathlib import Path
+
+import hosts
+import numpy as np
+import pytest
+from link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, traffic, two_hosts
+from shots import SMALL
+
+from starpos.simulate import scene_of
+from starpos_interfaces.msg import Solution
+
+NIGHT = Path(__file__).parent / "data" / "night"
+LOSSY = Path(__file__).parents[1] / "starpos_solver" / "config" / "lossy_link.xml"
+PATIENCE_S = 90.0
+
+
+@pytest.fixture(autouse=True)
+def namespaces(domain):
+    hosts.need()
+
+
+def play(instrument, folder: Path, together: bool) -> dict:
+    """A recorded night with its detector on the mount, or all of it on the robot: solution and fix by stamp."""
+    robot, ear = instrument.robot, instrument.ear
+    mount = robot if together else instrument.mount
+    truth = json.loads(NIGHT.with_suffix(".json").read_text())
+    known = {
+        "use_sim_time": "true",
+        "refraction.pressure": truth["pressure_pa"],
+        "refraction.temperature": truth["temperature_c"],
+        "refraction.humidity": truth["humidity"],
+        "misalignment": truth["misalignment_deg"],
+        "misalignment_stddev": 0.1,
+    }
+    robot.start(folder / "solver", "starpos_solver", "solver", *(f"{k}:={v}" for k, v in known.items()))
+    mount.start(folder / "detector", "starpos_camera", "detector", "use_sim_time:=true")
+    arguments = (str(NIGHT), "--rate", "0", "--wait", "30")
+    replay = mount.start(folder / "replay", "starpos_solver", "replay", arguments=arguments)
+    count = len(truth["frames"])
+    instrument.wait(lambda: all(len(heard) == count for heard in ear.heard.values()))
+    assert replay.wait() == 0, replay.output
+    for solution in ear.solutions.values():
+        assert solution.status == Solution.OK, solution.status_text
+        solution.identify_seconds = solution.fix_seconds = 0.0
+    return {stamp: (ear.solutions[stamp], ear.heard["fix"][stamp]) for stamp in sorted(ear.solutions)}
+
+
+def test_two_computers_give_the_fixes_of_one_to_the_last_bit(tmp_path):
+    found = []
+    for k, together in enumerate((True, False)):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        with two_hosts() as instrument:
+            found.append(play(instrument, folder, together))
+    one, two = found
+    assert list(one) == list(two) and len(one) == 13
+    for stamp, (solution, fix) in one.items():
+        other, other_fix = two[stamp]
+        for name in ("latitude", "longitude", "heading", "covariance", "stars_matched"):
+            assert np.array_equal(getattr(solution, name), getattr(other, name)), (stamp, name)
+        assert repr(solution) == repr(other) and repr(fix) == repr(other_fix)  # repr: NaN equals NaN
+
+
+def test_only_stars_and_tilts_cross_the_cable(tmp_path):
+    seen = traffic(tmp_path, frames=5, cadence_s=2.0)
+    print(seen)
+    star_bytes, tilt_bytes = 80 * seen.stars, 80 * TILT_RATE_HZ  # of the messages alone
+    # a frame at the edge of the window may fall to either side
+    assert 0.6 * star_bytes < seen.bytes_per_frame < 2 * star_bytes < FULL_FRAME_BYTES / 400
+    assert tilt_bytes < seen.bytes_per_second < 10_000
+
+
+@pytest.mark.parametrize("away_s", [5.0, 25.0])  # beyond 20 s DDS gives up the other host
+def test_a_cable_that_is_pulled_and_plugged_in_again(tmp_path, away_s):
+    with two_hosts() as instrument:
+        ear = instrument.ear
+        start(instrument, tmp_path, SMALL, cadence_s=1.0)
+        instrument.wait(lambda: len(ear.fixed) > 2)
+        instrument.mount.ip("link", "set", hosts.DEVICE, "down")
+        pulled = divmod(time.time_ns(), 10**9)
+        assert not ear.comes(lambda: max(ear.solutions) > pulled, away_s)
+        instrument.mount.ip("link", "set", hosts.DEVICE, "up")
+        plugged = divmod(time.time_ns(), 10**9)
+        instrument.wait(lambda: len([s for s in ear.fixed if s > plugged]) > 2)
+        first = next(s for s in ear.fixed if s > plugged)
+        print(
+            f"away {away_s:g} s: a fix again of the frame {first[0] - plugged[0]} s after it was plugged in"
+        )
+        assert all(p.process.poll() is None for h in (instrument.mount, instrument.robot) for p in h.running)
+
+
+def test_a_link_that_loses_a_fifth_of_the_packets_costs_time_but_no_fix_is_wrong(tmp_path):
+    """And takes a tenth of a second, either way. Without the profile hardly one list of stars comes through whole."""
+    with two_hosts(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOSSY)) as instrument:
+        ear = instrument.ear
+        instrument.cable.loss, instrument.cable.delay_s = 0.2, 0.1
+        start(instrument, tmp_path, SMALL, 1.0, "tilt_timeout:=10.0")
+        instrument.wait(lambda: len(ear.fixed) > 1, seconds=PATIENCE_S)  # they have met
+        before = set(ear.solutions)
+        instrument.wait(lambda: len(set(ear.solutions) - before) >= 15, seconds=PATIENCE_S)
+        later = sorted(set(ear.solutions) - before)
+        taken = 1 + later[-1][0] - min(later)[0]  # one a second
+        fixed = [s for s in later if s in ear.fixed]
+        print(f"{taken} frames, {len(later)} came, {len(fixed)} fixes")
+        assert len(fixed) > taken / 2
+        for solution in (ear.solutions[stamp] for stamp in ear.fixed):
+            off_m = (solution.latitude - scene_of().site.latitude_deg) * 111e3
+            assert abs(off_m) < 5 * solution.covariance[4] ** 0.5
+
+
+@pytest.mark.parametrize("peers", [True, False])
+def test_a_network_without_multicast_takes_static_peers(tmp_path, peers):
+    static = {"ROS_STATIC_PEERS": ";".join(hosts.Cable.ADDRESSES)} if peers else {}
+    with two_hosts(**static) as instrument:
+        instrument.cable.multicast = False
+        start(instrument, tmp_path, SMALL, cadence_s=1.0)
+        if peers:
+            instrument.wait(lambda: len(instrument.ear.fixed) > 1)
+            return
+        # they call each other in vain
+        instrument.wait(lambda: min(instrument.cable.refused) > 20)
+        assert not instrument.ear.solutions and instrument.cable.bytes < 10_000
