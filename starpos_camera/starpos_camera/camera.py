@@ -169,11 +169,7 @@ class CameraNode(Node):
             # a source that knows the error has the clock of another machine
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
-        frame = replace(
-            exposure.frame,
-            stamp_stddev_s=float(exposure.stamp_stddev_s),
-            clock_stddev_s=clock.stddev_s if clock else exposure.frame.clock_stddev_s,
-        )
+        frame = replace(exposure.frame, clock_stddev_s=clock.stddev_s) if clock else exposure.frame
         header = Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=self._values["frame_id"])
         capture = Capture(
             header=header,

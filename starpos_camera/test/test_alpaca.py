@@ -66,7 +66,7 @@ def test_a_frame_has_its_rows_on_top_its_exposure_and_the_drivers_time(simulator
     assert level[0, 1:].mean() > 2 * level[1:, 0].mean() > 10 * abs(level[1:, 1:].mean())
     assert frame.exposure_s == 0.1
     assert begin + 0.05 <= frame.mid_unix_s <= time.time() - 0.05
-    assert (exposure.stamp_source, exposure.stamp_stddev_s) == (Capture.DRIVER, 0.005)
+    assert (exposure.stamp_source, exposure.frame.stamp_stddev_s) == (Capture.DRIVER, 0.005)
 
 
 def test_the_mosaic_is_that_of_the_bayer_offset_and_other_sensors_are_refused(simulator):
@@ -337,14 +337,14 @@ def test_the_drivers_time_counts_with_its_resolution(liar, decimals, stamp, stdd
     exposure = make(liar).capture(SHORT)
     assert exposure.stamp_source == stamp and exposure.remark == ""
     assert abs(exposure.frame.mid_unix_s - liar.started_s - 0.05) < 0.13
-    assert exposure.stamp_stddev_s == pytest.approx(stddev_s, rel=0.01)
+    assert exposure.frame.stamp_stddev_s == pytest.approx(stddev_s, rel=0.01)
 
 
 @pytest.mark.parametrize("off_s", [-7200.0, -0.3, 0.3, 3600.0])
 def test_a_drivers_clock_that_is_off_is_not_believed_and_said(liar, off_s):
     liar.values["lastexposurestarttime"] = lambda: iso(liar.started_s + off_s, 3)
     exposure = make(liar, command_lag=0.25, command_lag_stddev=0.03).capture(SHORT)
-    assert (exposure.stamp_source, exposure.stamp_stddev_s) == (Capture.COMMAND, 0.03)
+    assert (exposure.stamp_source, exposure.frame.stamp_stddev_s) == (Capture.COMMAND, 0.03)
     assert exposure.frame.mid_unix_s == pytest.approx(liar.started_s + 0.25 + 0.05, abs=0.1)
     assert "set its machine's clock, to UTC" in exposure.remark
 
@@ -357,7 +357,7 @@ def test_the_clock_of_another_machine_is_used_where_its_error_is_given(liar, mon
     assert make(liar).capture(SHORT).stamp_source == Capture.COMMAND
     exposure = make(liar, alpaca__clock_stddev=0.02).capture(SHORT)
     assert exposure.stamp_source == Capture.DRIVER
-    assert (exposure.stamp_stddev_s, exposure.frame.clock_stddev_s) == (0.005, 0.02)
+    assert (exposure.frame.stamp_stddev_s, exposure.frame.clock_stddev_s) == (0.005, 0.02)
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_a_jpeg_has_its_rows_on_top_the_shutters_exposure_and_the_commands_time(
     assert begin + 0.55 < frame.mid_unix_s < time.time() + 0.55
     assert frame.exposure_s == pytest.approx(0.1)
     assert taken.stamp_source == Capture.COMMAND
-    assert taken.stamp_stddev_s == pytest.approx(np.hypot(0.02, named_off_s(0.1) / 2))
+    assert taken.frame.stamp_stddev_s == pytest.approx(np.hypot(0.02, named_off_s(0.1) / 2))
     assert taken.remark == ""
 
 

@@ -77,7 +77,7 @@ def test_every_frame_as_it_was_written_at_the_time_of_its_place(film):
         np.testing.assert_array_equal(exposure.frame.pixels, PICTURES[k] >> 8)
         assert exposure.frame.mid_unix_s == pytest.approx(START_S + (k + 0.5) / RATE, abs=1e-3)
         assert exposure.stamp_source == Capture.FILE and exposure.frame.exposure_s is None
-        assert exposure.stamp_stddev_s == pytest.approx(math.hypot(1 / RATE, 0.01) / math.sqrt(12))
+        assert exposure.frame.stamp_stddev_s == pytest.approx(math.hypot(1 / RATE, 0.01) / math.sqrt(12))
     assert isinstance(end, SourceEnded) and isinstance(still_ended, SourceEnded)
 
 

@@ -42,16 +42,14 @@ class Settings:
 class Exposure:
     """One frame and how it was taken.
 
-    frame           with its time: mid_unix_s is set
-    stamp_source    one of starpos_interfaces/Capture's constants
-    stamp_stddev_s  standard deviation of frame.mid_unix_s; 0 unknown
-    camera          intrinsics that the source knows to be true; None: the node's
-    remark          what is wrong with the camera, though the frame is good: a sentence; '' for nothing
+    frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s where another machine told it
+    stamp_source  one of starpos_interfaces/Capture's constants
+    camera        intrinsics that the source knows to be true; None: the node's
+    remark        what is wrong with the camera, though the frame is good: a sentence; '' for nothing
     """
 
     frame: Frame
     stamp_source: int
-    stamp_stddev_s: float = 0.0
     camera: Camera | None = None
     remark: str = ""
 

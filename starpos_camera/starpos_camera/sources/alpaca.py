@@ -139,10 +139,11 @@ class Alpaca:
             stamp.mid_s,
             exposure_s,
             self.hardware_id,
+            stamp_stddev_s=stamp.stddev_s,
             clock_stddev_s=stamp.clock_stddev_s,
         )
         remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else remark
-        return Exposure(frame, stamp.source, stamp.stddev_s, remark=remark)
+        return Exposure(frame, stamp.source, remark=remark)
 
     def _set_gain(self, gain):
         """Set it where it is another than was asked last; a remark where the camera has another."""

@@ -174,7 +174,7 @@ class Files:
                 "vouch for its camera's clock (files.exif)" if by_camera else "add DATE-OBS and EXPTIME to it"
             )
             raise FrameError(f"{path}: it does not say when it was taken; {lack}, or set files.restamp.")
-        return Exposure(frame, Capture.EXIF if by_camera else Capture.FILE, frame.stamp_stddev_s)
+        return Exposure(frame, Capture.EXIF if by_camera else Capture.FILE)
 
     def _next_arrived(self, watched: WatchedFolder) -> Exposure:
         try:

@@ -157,8 +157,8 @@ class Gphoto2:
         mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
         if not bulb:
             stddev_s = math.hypot(stddev_s, named_off_s(exposure_s) / 2)
-        frame = replace(frame, exposure_s=exposure_s, mid_unix_s=mid_s)
-        return Exposure(frame, Capture.COMMAND, stddev_s, remark=remark)
+        frame = replace(frame, exposure_s=exposure_s, mid_unix_s=mid_s, stamp_stddev_s=stddev_s)
+        return Exposure(frame, Capture.COMMAND, remark=remark)
 
     def _delete(self, camera, files) -> str:
         """Remove from the camera what this exposure put there; a sentence where that failed."""

@@ -155,10 +155,11 @@ class Indi:
             mid_unix_s=stamp.mid_s,
             exposure_s=exposure_s,
             source=self.hardware_id,
+            stamp_stddev_s=stamp.stddev_s,
             clock_stddev_s=stamp.clock_stddev_s,
         )
         remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else ""
-        return Exposure(frame, stamp.source, stamp.stddev_s, remark=remark)
+        return Exposure(frame, stamp.source, remark=remark)
 
 
 def _unpacked(blob: Blob) -> bytes:

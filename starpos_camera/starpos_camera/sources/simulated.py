@@ -2,6 +2,7 @@
 """A simulated sky, live: what a camera standing at a place would have seen until now."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -120,7 +121,7 @@ class Simulated:
         scene = self._scene
         stars = expose(scene, load_catalogue(), start, exposure_s, self._rng)
         frame = render(scene, stars, start, exposure_s, self._rng)
-        return Exposure(frame, Capture.SIMULATED, STAMP_ROUNDING_S, scene.camera)
+        return Exposure(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)
 
     def update(self, values: Mapping):
         self._scene = scene_from(values)

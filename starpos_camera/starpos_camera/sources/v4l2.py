@@ -72,8 +72,8 @@ class Device:
             self.close()
             text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
             raise CaptureError(f"{self._path}: {' '.join(text.split())}") from error
-        frame = Frame(pixels, pattern, mid_s, exposure_s, self._path)
-        return Exposure(frame, stamp, stddev_s, remark=remark and f"{self._path}: {remark}")
+        frame = Frame(pixels, pattern, mid_s, exposure_s, self._path, stamp_stddev_s=stddev_s)
+        return Exposure(frame, stamp, remark=remark and f"{self._path}: {remark}")
 
     def close(self):
         if self._capture is not None:

@@ -77,7 +77,8 @@ class Film:
         # exposed at some time within its period, for how long is not known
         mid_s = self._start_s + at_s - self._first_s + self._period_s / 2
         stddev_s = math.hypot(self._period_s, self._start_resolution_s) / math.sqrt(12)
-        return Exposure(Frame(pixels, mid_unix_s=mid_s, source=self._path), Capture.FILE, stddev_s)
+        frame = Frame(pixels, mid_unix_s=mid_s, source=self._path, stamp_stddev_s=stddev_s)
+        return Exposure(frame, Capture.FILE)
 
     def close(self):
         if self._capture is not None:
