@@ -27,6 +27,9 @@ ENCODINGS = {
     **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
 }
 HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
+MOST_TILT_VARIANCE = 1.0  # rad2: more says nothing, and must not overflow
+MOST_CELSIUS = 300.0  # of an inclinometer that still measures
+MAX_STARS = 100_000  # the most a detector publishes
 MAX_UNIX_S = 2**31 - 1e-6  # the end of Time.sec, in January 2038
 
 
@@ -76,6 +79,8 @@ def stars_to_message(stars: Stars, frame_id: str) -> StarArray:
 def message_to_stars(message: StarArray, source: str = "stars") -> Stars:
     """Stars; FrameError where the message does not hold together (sizes, NaN, order, covariance)."""
     rows = message.stars
+    if len(rows) > MAX_STARS:
+        raise FrameError(f"{source}: {len(rows)} stars are more than {MAX_STARS}: send the brightest.")
     return Stars(
         x=np.array([s.x for s in rows]),
         y=np.array([s.y for s in rows]),
@@ -109,7 +114,7 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
 def message_to_tilt(message: TiltMessage, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
     """A starpos Tilt; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
-    The flags are the caller's to judge. TiltError for NaN, no stamp, over 30 deg, an impossible covariance.
+    The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over 30 deg, an impossible covariance.
     """
     covariance = np.array(message.covariance, float).reshape(2, 2)
     unix_s = stamp_to_unix(message.header.stamp)
@@ -123,7 +128,10 @@ def message_to_tilt(message: TiltMessage, unknown_stddev_rad: float = SCA100T_NO
             raise TiltError(
                 "a tilt message's covariance is not symmetric and positive: send zeros where it is unknown."
             )
-    return Tilt(message.x, message.y, covariance, unix_s, 1, message.temperature)
+        if max(xx, yy) > MOST_TILT_VARIANCE:
+            raise TiltError("a tilt message's covariance is beyond 1 rad2: send zeros where it is unknown.")
+    celsius = message.temperature if abs(message.temperature) <= MOST_CELSIUS else math.nan
+    return Tilt(message.x, message.y, covariance, unix_s, 1, celsius)
 
 
 def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None) -> CameraInfo:

@@ -97,6 +97,8 @@ def test_tilt_round_trip_and_unknown_covariance():
     got = messages.message_to_tilt(message)
     assert (got.theta_x, got.theta_y, got.temperature_c) == (0.1, -0.2, 21.5)
     assert np.array_equal(got.covariance, tilt.covariance)
+    message.temperature = 1e300
+    assert math.isnan(messages.message_to_tilt(message).temperature_c)
     message.covariance = [0.0] * 4
     assert np.array_equal(messages.message_to_tilt(message, 1e-4).covariance, np.eye(2) * 1e-8)
 
@@ -110,6 +112,7 @@ def test_tilt_round_trip_and_unknown_covariance():
         ("covariance", [1.0, 2.0, 2.0, 1.0]),
         ("covariance", [1.0, 0.5, 0.0, 1.0]),
         ("covariance", [math.nan, 0.0, 0.0, 1.0]),
+        ("covariance", [1e-9, 0.0, 0.0, 1e300]),
     ],
 )
 def test_bad_tilts_are_refused(field, value):

@@ -347,12 +347,14 @@ class SolverNode(Node):
         except StarposError:
             return
         try:
-            if self._calibrating.learn(Seen(stars, tilt), answer.fix):
-                place = self._calibrating.average.place
-                self._fix_averaged.publish(self._averaged(frame.message.header, place))
+            used = self._calibrating.learn(Seen(stars, tilt), answer.fix)
+            message = self._averaged(frame.message.header, self._calibrating.average.place) if used else None
         except Exception:  # fix and heading go on without
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
             self._calibrating.forget()  # what cannot be worked with must not stay
+            return
+        if message is not None:
+            self._fix_averaged.publish(message)
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
