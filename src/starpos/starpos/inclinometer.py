@@ -18,6 +18,7 @@ OUTLIER_SIGMA, REST = 6.0, 6.0  # readings further out are left out; more scatte
 SIGMA_PER_MAD = 1.4826
 KEPT, KEPT_VARIANCE = 0.8, 0.4377  # the smaller part of a Gaussian's deviations, and the variance of that
 SIGNIFICANT = 4.0  # over sqrt(steps): three times the share by which `white_noise` of so many errs
+MAX_CSV_BYTES = 300_000_000  # a week at 10 Hz
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
@@ -225,6 +226,8 @@ def read_tilt_csv(path, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
     path = Path(path)
     cure = "give a CSV with a line of names, utc_unix_s,theta_x_deg,theta_y_deg[,temperature_c], and readings"
     try:
+        if path.stat().st_size > MAX_CSV_BYTES:
+            raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
         with path.open(encoding="utf-8-sig") as f, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # 'empty input file' is said below
             names = [name.strip() for name in f.readline().lstrip("# ").split(",")]

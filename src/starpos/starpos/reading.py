@@ -23,7 +23,7 @@ FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff")
 JPEG = (".jpg", ".jpeg")  # beside raw files it is but a copy of them
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
-MAX_BYTES = 2_000_000_000
+MAX_BYTES, MAX_CSV_BYTES = 2_000_000_000, 20_000_000
 DEFAULT_SIGMA_PX = 0.1  # of a centroid whose file has no sigma
 
 
@@ -86,9 +86,13 @@ def _reader_of(path):
 
 
 def _bytes_of(path):
-    if path.stat().st_size > MAX_BYTES:
-        raise FrameError(f"{path}: it is larger than {MAX_BYTES // 10**9} GB, too large for a frame.")
+    _check_size(path, MAX_BYTES)
     return path.read_bytes()
+
+
+def _check_size(path, most):
+    if path.stat().st_size > most:
+        raise FrameError(f"{path}: it is larger than {most // 10**6} MB, too large for a frame.")
 
 
 def decode_frame(data: bytes, source: str) -> Frame:
@@ -113,6 +117,7 @@ def why_no_time(source: str) -> str:
 
 
 def _read_csv(path):
+    _check_size(path, MAX_CSV_BYTES)
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:

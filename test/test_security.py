@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What comes from outside stays data and of bounded size, in all of the product, so that new code is looked at too."""
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from starpos import camera_yaml, geoid_file, instrument_file
+from starpos.errors import StarposError
+from starpos.inclinometer import read_tilt_csv
+from starpos.reading import read_frame
+from starpos_common.messages import MAX_STARS, message_to_stars
+from starpos_interfaces.msg import Star, StarArray
+
+ROOT = Path(__file__).parents[1]
+PRODUCT = [
+    ROOT / package
+    for package in ("src/starpos/starpos", *(f"{p}/{p}" for p in ("starpos_camera", "starpos_common",
+                                                                  "starpos_inclinometer", "starpos_solver")))
+]  # fmt: skip
+# bytes that become code or objects, or call a shell
+FORBIDDEN_MODULES = {
+    "pickle",
+    "marshal",
+    "shelve",
+    "dill",
+    "cloudpickle",
+    "joblib",
+    "subprocess",
+    "xml",
+}
+FORBIDDEN_NAMES = {"eval", "exec", "compile", "__import__"}
+FORBIDDEN_ATTRIBUTES = {
+    ("os", name) for name in ("system", "popen", "execv", "execvp", "spawnv", "startfile")
+}
+YAML = {"safe_load", "safe_dump", "YAMLError", "YAMLObject", "SafeDumper"}
+ALLOWED = {
+    # between the processes of one command; a cluster runs what its scheduler sends, by its nature (README)
+    "starpos/parallel/call.py": {"pickle"},
+    "starpos/parallel/cluster.py": {"pickle"},
+    "starpos/parallel/processes.py": {"pickle"},
+    # the nodes of a test
+    "starpos_common/testing.py": {"subprocess"},
+}
+# Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
+READS_WHOLE = {
+    "starpos/geotiff.py": "MAX_BYTES",
+    "starpos/inclinometer.py": "MAX_CSV_BYTES",
+    "starpos/parallel/same.py": "our own source",
+    "starpos/paper.py": "of the package",
+    "starpos/reading.py": "MAX_BYTES, MAX_CSV_BYTES",
+    "starpos/report/bag.py": "installed messages; METADATA_LIMIT",
+    "starpos/report/folder.py": "TRUTH_LIMIT",
+    "starpos/tycho2.py": "the catalogue's own files, at `catalogue build`",
+    "starpos_solver/bag.py": "installed messages",
+    "starpos_solver/bag_writer.py": "installed messages",
+    "starpos_solver/dashboard/server.py": "of the package",
+}
+WHOLE = {"read_text", "read_bytes", "loadtxt", "genfromtxt", "fromfile", "readlines"}
+
+
+@cache
+def sources() -> dict[str, ast.Module]:
+    """The product's modules by package/path."""
+    found = {}
+    for package in PRODUCT:
+        for path in sorted(package.rglob("*.py")):
+            found[str(path.relative_to(package.parent))] = ast.parse(path.read_text())
+    return found
+
+
+def calls_and_names():
+    """(file, node) of everything in the product."""
+    for name, tree in sources().items():
+        for node in ast.walk(tree):
+            yield name, node
+
+
+def imported(node) -> list[str]:
+    """Top-level names of the modules that a statement imports."""
+    if isinstance(node, ast.Import):
+        return [alias.name.split(".")[0] for alias in node.names]
+    return [(node.module or "").split(".")[0]] if isinstance(node, ast.ImportFrom) else []
+
+
+def dotted(node) -> tuple[str, str]:
+    """("yaml", "load") of yaml.load; empty words otherwise."""
+    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+        return node.value.id, node.attr
+    return "", ""
+
+
+def test_nothing_that_is_read_becomes_code():
+    found = []
+    for name, node in calls_and_names():
+        used = set(imported(node)) & FORBIDDEN_MODULES
+        if isinstance(node, ast.Name) and node.id in FORBIDDEN_NAMES:
+            used.add(node.id)
+        if dotted(node) in FORBIDDEN_ATTRIBUTES or (
+            dotted(node)[0] == "yaml" and dotted(node)[1] not in YAML
+        ):
+            used.add(".".join(dotted(node)))
+        if isinstance(node, ast.ImportFrom) and node.module == "yaml":
+            used.add("from yaml import")
+        if isinstance(node, ast.keyword) and node.arg == "shell":
+            used.add("shell=")
+        found += [(name, what) for what in used - ALLOWED.get(name, set())]
+    assert not found
+
+
+def test_numpy_files_hold_arrays_only():
+    loads = [n for _, n in calls_and_names() if isinstance(n, ast.Call) and dotted(n.func) == ("np", "load")]
+    assert loads
+    for call in loads:
+        said = {k.arg: getattr(k.value, "value", None) for k in call.keywords}
+        assert said.get("allow_pickle") is False, ast.unparse(call)
+
+
+def test_who_reads_whole_files_is_known():
+    found = {
+        name
+        for name, node in calls_and_names()
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WHOLE
+    }
+    assert found == set(READS_WHOLE), "bound what it reads, and enter it here"
+
+
+def test_the_search_covers_the_product_and_would_find(monkeypatch):
+    assert len(sources()) > 100
+    for package in PRODUCT:
+        assert any(name.startswith(f"{package.name}/") for name in sources())
+    bad = "import pickle, yaml\nx = eval('1')\nyaml.load(f)\nos.system('ls')\np.read_text()\nnp.load(f)\n"
+    monkeypatch.setattr(f"{__name__}.sources", lambda: {"starpos/bad.py": ast.parse(bad)})
+    for test in (
+        test_nothing_that_is_read_becomes_code,
+        test_numpy_files_hold_arrays_only,
+        test_who_reads_whole_files_is_known,
+    ):
+        with pytest.raises(AssertionError):
+            test()
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "size", "read"),
+    [
+        ("stars.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n', 1 << 40, read_frame),
+        ("frame.png", b"\x89PNG\r\n\x1a\n", 1 << 40, read_frame),
+        ("frame.cr2", b"II*\0", 1 << 40, read_frame),
+        ("tilt.csv", b"utc_unix_s,theta_x_deg,theta_y_deg\n", 1 << 40, read_tilt_csv),
+        ("instrument.yaml", b"starpos_instrument: 1\n", 1 << 40, instrument_file.read),
+        ("camera.yaml", b"image_width: 1\n", 1 << 40, camera_yaml.read),
+        ("geoid.tif", b"II*\0", 1 << 40, geoid_file.read_grid),
+        ("geoid.gtx", b"\x40" * 40, 1 << 40, geoid_file.read_grid),
+    ],
+)
+def test_a_file_of_a_terabyte_is_refused_unread(tmp_path, name, head, size, read):
+    path = tmp_path / name
+    with path.open("wb") as file:
+        file.write(head)
+        file.truncate(size)  # no disk holds that: a hole
+    with pytest.raises(StarposError, match=name):
+        read(path)
+
+
+def test_more_stars_than_a_detector_sends_are_refused():
+    message = StarArray(width=100, height=100, stars=[Star()] * (MAX_STARS + 1))
+    with pytest.raises(StarposError, match="100001 stars"):
+        message_to_stars(message)
