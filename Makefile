@@ -12,7 +12,8 @@ export PYTHON
 # What a build copies or compiles. Python modules are links into the source tree: an edit needs no build.
 PACKAGES := $(patsubst %/package.xml,%,$(wildcard */package.xml src/*/package.xml))
 INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/package.xml $(p)/setup.* $(p)/CMakeLists.txt \
-  $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* $(p)/resource/*))
+  $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* \
+  $(p)/layouts $(p)/layouts/* $(p)/resource/*))
 
 .PHONY: build demo emulated test lint clean distclean FORCE
 build: install/.built

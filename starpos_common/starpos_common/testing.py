@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """For the nodes' own tests: a node as a process, and someone who listens to it; it waits for events, never sleeps."""
 
+import atexit
 import os
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
+from functools import cache
+from importlib.util import find_spec
 
 import pytest
 import rclpy
@@ -16,9 +20,18 @@ from rclpy.parameter import Parameter
 WAIT_S = 30.0  # for anything
 
 
+@cache
 def take_domain() -> None:
-    """A ROS domain of this process, on this machine only."""
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 99)
+    """A ROS domain of this process, on this machine only; no other test session has it where domain_coordinator is."""
+    if find_spec("domain_coordinator"):
+        from domain_coordinator import domain_id
+
+        held = ExitStack()
+        number = held.enter_context(domain_id())
+        atexit.register(held.close)
+    else:
+        number = 1 + os.getpid() % 99
+    os.environ["ROS_DOMAIN_ID"] = str(number)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
