@@ -130,6 +130,16 @@ def test_frames_and_tilts_from_the_future_are_refused(graph, solver):
     shot.stars.clock_stddev = 60.0
     graph.send(shot)
     assert graph.result(stamp_of(shot.stars))[0].status == Solution.NO_TILT
+    shot = shoot()  # a night that is played, of another time
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    late(shot, time.time() + 30 * 86400 - stamp_to_unix(shot.stars.header.stamp))
+    graph.send(shot)
+    assert graph.result(stamp_of(shot.stars))[0].status == Solution.OK
+    assert graph.state("solver: Clock", "the time is known").level == OK
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    shot = shoot()
+    late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
+    graph.send(shot)
     state = graph.state("solver: Clock", "before their time")
     assert (
         state.level == WARN and 90 < -float({v.key: v.value for v in state.values}["frame age (s)"]) < 100.5

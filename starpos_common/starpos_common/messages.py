@@ -114,7 +114,8 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
 def message_to_tilt(message: TiltMessage, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
     """A starpos Tilt; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
-    The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over 30 deg, an impossible covariance.
+    The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over
+    30 deg, an impossible covariance.
     """
     covariance = np.array(message.covariance, float).reshape(2, 2)
     unix_s = stamp_to_unix(message.header.stamp)

@@ -43,6 +43,7 @@ from starpos_solver.worker import Outcome, Worker
 
 WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
 POLL_S = 0.02
+ANOTHER_TIME_S = 3600.0  # clocks that differ by more are not those of one evening
 CLOCK_SIGMAS = 6.0  # beyond the stated error, and AHEAD_S, a stamp in the future is wrong
 
 
@@ -252,9 +253,13 @@ class SolverNode(Node):
         self._work()
 
     def _ahead_s(self, unix_s: float | None) -> float:
-        """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet)."""
+        """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet), or where it
+        is of another time altogether: a night that is played without /clock, or a robot that does not know the date."""
         now_ns = self.get_clock().now().nanoseconds
-        return unix_s - now_ns * 1e-9 if unix_s is not None and now_ns else 0.0
+        if unix_s is None or not now_ns:
+            return 0.0
+        ahead_s = unix_s - now_ns * 1e-9
+        return 0.0 if ahead_s > ANOTHER_TIME_S and not self.get_clock().ros_time_is_active else ahead_s
 
     def _reject(self, sentence: str):
         self._counts["broken messages"] += 1
