@@ -31,7 +31,7 @@ def main() -> None:
     bits = 8 * pixels.itemsize
     least = np.log2(noise * np.sqrt(2 * np.pi * np.e)) / bits
     print(
-        f"{pixels.shape[1]} x {pixels.shape[0]} px of {bits} bits; noise of {noise:.1f} DN takes {least:.2f} of it at least\n"
+        f"{pixels.shape[1]} x {pixels.shape[0]} px of {bits} bits; noise of {noise:.1f} DN leaves {least:.2f}\n"
     )
     print("| | of the size | CPU s |\n| --- | --- | --- |")
     for name, code in {
