@@ -2,14 +2,18 @@
 """The whole instrument under a simulated sky, live: four nodes as they are installed, an emulated inclinometer on a pty.
 
 The place is drawn at random; nothing tells it to the solver.  Exit status 0 if the truth lies within 4 sigma and no
-node took more memory than it may.  All of it runs in a ROS domain of its own: no other graph hears it.
+node took more memory than it may.  All of it runs in a ROS domain of its own: no other graph hears it.  The dashboard
+shows it meanwhile, and with --stay goes on until Ctrl-C.
 """
 
 import json
+import math
 import shutil
+import socket
 import sys
 import tempfile
 from collections import deque
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +65,7 @@ class PictureWatcher(Watcher):
 
 
 def start(processes: Processes, place: Place, seed: int):
-    """The emulated inclinometer and the nodes."""
+    """The emulated inclinometer and the nodes that make a fix."""
     theta_x, theta_y = np.degrees(place.scene().tilt)
     link = str(processes.folder / "inclinometer-port")
     tilt = ["--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}", "--seed", str(seed)]
@@ -95,13 +99,26 @@ def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray,
     return True
 
 
+def show(processes: Processes) -> str:
+    """Start the dashboard; its address, '' where what serves it is not installed."""
+    if not find_spec("tornado"):
+        return ""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    processes.node("starpos_solver", "dashboard", {"port": port})
+    return f"http://127.0.0.1:{port}"
+
+
 def main() -> int:
-    args = parse(parser_of(__doc__, FRAMES, "demo"))
+    parser = parser_of(__doc__, FRAMES, "demo")
+    parser.add_argument("--stay", action="store_true", help="go on after the last frame, for the dashboard")
+    args = parse(parser)
     with own_domain():
-        return run(args.seed, args.frames, args.out)
+        return run(args.seed, args.frames, args.out, args.stay)
 
 
-def run(seed: int, frames: int, out: Path) -> int:
+def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
     """The demo; its exit status."""
     out.mkdir(parents=True, exist_ok=True)
     place = Place.drawn(np.random.default_rng(seed))
@@ -110,16 +127,34 @@ def run(seed: int, frames: int, out: Path) -> int:
         processes = Processes(Path(scratch))
         watcher = PictureWatcher(place)
         start(processes, place, seed)
+        if page := show(processes):
+            print(f"to look at meanwhile: {page}", flush=True)
         try:
             trouble = watcher.watch(frames, processes)
             memory = {} if trouble else processes.peak_mb()
+            if stay and not trouble:
+                look(watcher, processes, page)
         except KeyboardInterrupt:
             trouble, memory = "interrupted", {}
         codes = processes.stop()
         for log in processes.folder.glob("*.log"):
             shutil.copy(log, out)
     watcher.close()
-    return conclude(watcher, codes, memory, trouble, out)
+    status = conclude(watcher, codes, memory, trouble, out)
+    if page:
+        print(
+            f"dashboard: it was at {page}; `make demo ARGS=--stay` leaves it there (python tools/demo.py --stay)"
+        )
+    return status
+
+
+def look(watcher: PictureWatcher, processes: Processes, page: str):
+    """Go on until Ctrl-C, or until a process ends."""
+    print(f"\nit goes on: {page}, Ctrl-C ends it", flush=True)
+    try:
+        watcher.watch(math.inf, processes, patience_s=math.inf)
+    except KeyboardInterrupt:
+        print()
 
 
 def conclude(watcher: PictureWatcher, codes: dict, memory: dict, trouble: str | None, out: Path) -> int:

@@ -162,16 +162,16 @@ class Watcher:
         self.seconds.append(time.monotonic() - self._heard.get(stamp, math.nan))
         print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
 
-    def watch(self, frames: int, *processes: Processes) -> str | None:
+    def watch(self, frames: float, *processes: Processes, patience_s: float = PATIENCE_S) -> str | None:
         """Until so many frames are solved; a sentence if it will not come to that."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + patience_s
         while len(self.solutions) < frames:
             self.rclpy.spin_once(self.node, timeout_sec=0.2)
             if dead := next((sentence for p in processes if (sentence := p.dead())), None):
                 return dead
             if time.monotonic() > end:
                 logs = processes[0].folder
-                return f"{len(self.solutions)} of {frames} frames in {PATIENCE_S:.0f} s: see {logs}/*.log"
+                return f"{len(self.solutions)} of {frames} frames in {patience_s:.0f} s: see {logs}/*.log"
         return None
 
     def good(self) -> list:

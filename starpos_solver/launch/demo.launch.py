@@ -28,7 +28,7 @@ ARGUMENTS = (
     ("azimuth", "40", "of the optical axis, deg"),
     ("altitude", "78", "of the optical axis, deg; the inclinometer reaches to 60"),
     ("cadence", "3", "from frame to frame, s"),
-    ("dashboard", "true", "the web page, at http://127.0.0.1:8080"),
+    ("dashboard", "true", "the web page, at http://127.0.0.1:8042"),
 )
 POINTING = ("latitude", "longitude", "azimuth", "altitude")
 MISALIGNMENT_DEG = (0.4, -0.3, 12.0)

@@ -18,7 +18,7 @@ ARGUMENTS = (
     ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
     ("rate", "1", "times real time; 0: as fast as the solver answers, with the same result"),
     ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
-    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8080"),
+    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
 )
 SIMULATED = {"**": {"use_sim_time": True}}
 

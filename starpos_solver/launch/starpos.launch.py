@@ -18,7 +18,7 @@ ARGUMENTS = (
     ("use_sim_time", "", "true: time from /clock"),
     ("camera", "", "source of frames: files, simulated, gphoto2, indi, alpaca, video"),
     ("port", "", "serial port of the inclinometer; prefer a path under /dev/serial/by-id"),
-    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8080"),
+    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
 )
 
 
