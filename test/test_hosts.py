@@ -107,7 +107,7 @@ def test_a_link_that_loses_a_fifth_of_the_packets_costs_time_but_no_fix_is_wrong
         taken = 1 + later[-1][0] - min(later)[0]  # one a second
         fixed = [s for s in later if s in ear.fixed]
         print(f"{taken} frames, {len(later)} came, {len(fixed)} fixes")
-        assert len(fixed) > taken / 2
+        assert len(fixed) > taken / 4  # without the profile a twelfth
         for solution in (ear.solutions[stamp] for stamp in ear.fixed):
             off_m = (solution.latitude - scene_of().site.latitude_deg) * 111e3
             assert abs(off_m) < 5 * solution.covariance[4] ** 0.5
