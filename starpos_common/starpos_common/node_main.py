@@ -50,6 +50,7 @@ def leave(status: int) -> int:
 
 def _run(make_nodes, args, stopped) -> int:
     import rclpy
+    from rclpy._rclpy_pybind11 import RCLError
     from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions, install_signal_handlers
@@ -77,7 +78,7 @@ def _run(make_nodes, args, stopped) -> int:
             executor.spin_once(timeout_sec=NOTICE_S)
     except ExternalShutdownException:
         pass
-    except (StarposError, ParameterException) as error:
+    except (StarposError, ParameterException, RCLError) as error:
         if not made and not stopped:
             return _refuse(error)
         if not stopped and rclpy.ok():
