@@ -52,7 +52,7 @@ COMMON = (
         "command_lag",
         0.0,
         "From the command to the start of the exposure, of cameras that do not tell when it began. Longitudes come out "
-        "15 arcsec too far west for each second it is set too small: so it is found at a known place.",
+        "15 arcsec too far east for each second it is set too small: so it is found at a known place.",
         "s",
         -10.0,
         60.0,
