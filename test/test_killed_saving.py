@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""kill -9 in the middle of saving: the file is whole, the old one or the new one; what is left over does no harm."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+from sensor_msgs.srv import SetCameraInfo
+from shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
+
+from starpos import camera_yaml, instrument_file
+from starpos.camera import Camera
+from starpos.instrument import Instrument
+from starpos_common.messages import camera_to_message
+from starpos_interfaces.srv import SaveCalibration
+
+KILLS, KILLED_NODES = 100, 3
+CALLS = 8  # that a service keeps
+# Forks a child that saves two contents in turn, kills it at a random moment, looks at the file; says how often which.
+KILLER = """
+import os, random, signal, sys, time
+from pathlib import Path
+from starpos import camera_yaml, instrument_file
+from starpos.camera import Camera
+from starpos.instrument import Instrument
+
+folder, kills = Path(sys.argv[1]), int(sys.argv[2])
+cameras = [Camera.from_focal(100, 80, focal) for focal in (1000.0, 2000.0)]
+files = {
+    "instrument.yaml": (lambda p, c: instrument_file.write(p, Instrument(c.fx, c)),
+                        lambda p: instrument_file.read(p).focal_px),
+    "camera.yaml": (lambda p, c: camera_yaml.write(p, c, "camera"), lambda p: camera_yaml.read(p).fx),
+}
+for name, (write, read) in files.items():
+    path, found = folder / name, []
+    write(path, cameras[0])
+    begin = time.perf_counter()
+    write(path, cameras[0])
+    once_s = time.perf_counter() - begin
+    for _ in range(kills):
+        child = os.fork()
+        if child == 0:
+            while True:
+                for camera in cameras:
+                    write(path, camera)
+        time.sleep(random.uniform(0, 4 * once_s))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        found.append(read(path))
+    print(name, found.count(1000.0), found.count(2000.0))
+"""
+
+
+def test_a_file_is_the_old_or_the_new_one_whenever_its_writer_is_killed(tmp_path, record_property):
+    made = subprocess.run([sys.executable, "-c", KILLER, str(tmp_path), str(KILLS)],
+                          check=False, capture_output=True, text=True, timeout=100)  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    for line in made.stdout.splitlines():
+        _, old, new = line.split()
+        assert int(old) + int(new) == KILLS and int(old) and int(new), line
+    record_property("fault", f"kill -9 at any moment of saving, {KILLS} times for each kind of file")
+    record_property("result", f"always a whole file: {'; '.join(made.stdout.splitlines())}")
+
+
+@pytest.mark.parametrize("round_", range(KILLED_NODES))
+def test_a_solver_killed_while_it_saves_starts_again_with_a_whole_file(graph, run, tmp_path, round_):
+    path = tmp_path / "instrument.yaml"
+    instrument_file.write(path, Instrument(FULL_FOCAL_PX))
+    (tmp_path / ".instrument.yaml.left").write_text("starpos_instrument: 1\nmisalignment_deg: [0")
+    process = run("starpos_solver", "solver", *SOLVER, f"calibration_url:={path}")
+    graph.wait(lambda: _is_solved(graph), "for a fix")
+    client = graph.node.create_client(SaveCalibration, "solver/save_calibration")
+    graph.wait(client.service_is_ready)
+    graph.wait(lambda: graph.comes(client.call_async(SaveCalibration.Request()).done, 1.0))
+    asked = [client.call_async(SaveCalibration.Request()) for _ in range(CALLS)]
+    graph.wait(asked[2 * round_].done)
+    process.signal(signal.SIGKILL)
+    process.wait()
+    graph.node.destroy_client(client)
+    assert instrument_file.read(path).focal_px == FULL_FOCAL_PX
+    again = run("starpos_solver", "solver", *SOLVER, f"calibration_url:={path}")
+    graph.solutions.clear()
+    graph.wait(lambda: _is_solved(graph), "for a fix with the calibration that was kept")
+    assert again.process.poll() is None
+
+
+def _is_solved(graph) -> bool:
+    shot = shoot()
+    graph.send(shot)
+    graph.comes(lambda: shot.stamp in graph.solutions, 1.0)
+    return any(s.status == s.OK for s in graph.solutions.get(shot.stamp, ()))
+
+
+@pytest.mark.parametrize("round_", range(KILLED_NODES))
+def test_a_camera_killed_while_it_saves_starts_again_with_a_whole_file(graph, run, tmp_path, round_):
+    path = tmp_path / "camera.yaml"
+    cameras = [Camera.from_focal(*FULL, FULL_FOCAL_PX * k) for k in (1.0, 1.01)]
+    camera_yaml.write(path, cameras[0], "camera")
+    parameters = ("source:=simulated", "cadence:=100.0", f"calibration_url:={path}")
+    process = run("starpos_camera", "camera", *parameters)
+    client = graph.node.create_client(SetCameraInfo, "camera/set_camera_info")
+    graph.wait(client.service_is_ready)
+    requests = [SetCameraInfo.Request(camera_info=camera_to_message(c, "camera")) for c in cameras] * (
+        CALLS // 2
+    )
+    # the killed one before it still seems to be there: until this one answers
+    graph.wait(lambda: graph.comes(client.call_async(requests[0]).done, 1.0))
+    asked = [client.call_async(request) for request in requests]
+    graph.wait(asked[2 * round_].done)
+    process.signal(signal.SIGKILL)
+    process.wait()
+    graph.node.destroy_client(client)
+    assert camera_yaml.read(path) in cameras
+    again = run("starpos_camera", "camera", *parameters)
+    graph.wait(lambda: graph.state("camera: Capture", "").level is not None)
+    values = {v.key: v.value for v in graph.state("camera: Capture", "").values}
+    assert values["calibrated"] == "True" and again.process.poll() is None
