@@ -161,9 +161,12 @@ def test_without_distributed_the_line_to_install_it_is_told(archive, capfd, monk
 
 @contextmanager
 def started(archive, **options):
-    """`starpos solve --jobs 2` of many frames in a process group of its own, its first answer, and its workers' ids."""
+    """`starpos solve --jobs 2` of many frames in a process group of its own, its first answer, and its workers' ids.
+
+    The answers are more than a pipe holds: it cannot have ended before somebody reads them.
+    """
     night = archive / "turned"
-    many = [p for p in frames(night) if "2b" not in p] * 6
+    many = [p for p in frames(night) if "2b" not in p] * 20
     command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *WIDE, "--json", "--jobs", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     process = subprocess.Popen(
