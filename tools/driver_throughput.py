@@ -52,7 +52,7 @@ def serial(samples: int, values) -> float:
     readings, began_s = 0, time.process_time()
     for k, line in enumerate(lines):
         arrivals = decoder.feed(line, Moment(k / RATE_HZ, k * 10**9 // RATE_HZ))
-        readings += len(tilts.read(arrivals, decoder.identity))
+        readings += len(tilts.read(arrivals))
     took_s = time.process_time() - began_s
     assert readings == samples and isinstance(decoder.identity, protocol.Identity)
     return 1e6 * took_s / samples

@@ -72,7 +72,7 @@ class McuDecoder:
         self.answered = False
         for message in self._parser.feed(data):
             if isinstance(message, protocol.Sample):
-                believed += self._admit(Arrival(message, moment))
+                believed += self._admit(Arrival(message, moment, self.identity))
                 continue
             self.answered = True
             if isinstance(message, Identity):
@@ -91,7 +91,10 @@ class McuDecoder:
 
     def _admit(self, arrival: Arrival) -> list[Arrival]:
         rejected = self._gate.rejected
-        believed = [Arrival(self._continuity.follow(a.sample), a.moment) for a in self._gate.admit(arrival)]
+        believed = [
+            Arrival(self._continuity.follow(a.sample), a.moment, a.identity)
+            for a in self._gate.admit(arrival)
+        ]
         if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
             # After a reset it is at the default rate, perhaps with another firmware; so it may be where nobody saw one.
             self._ask = True
@@ -117,24 +120,30 @@ class McuTilts:
         self.sensor.calibration = self._calibration(values)
         self._latency_s = values["latency"]
 
-    def read(self, arrivals: list[Arrival], identity: Identity | None) -> list[Reading]:
-        """identity: what the MCU says of itself, if it has."""
-        if identity:
-            self._delay_ms = identity.delay_ms
-            if identity.rate_hz != self._rate_hz:  # a slower sample is a mean of more conversions
-                self._rate_hz = identity.rate_hz
-                self.sensor.noise.restart()
-        delay_s = self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s
-        return [self._reading(arrival, delay_s + self._line_s) for arrival in arrivals]
+    def read(self, arrivals: list[Arrival]) -> list[Reading]:
+        """The readings of what an `McuDecoder` believed, in order."""
+        return [self._reading(arrival) for arrival in arrivals]
 
-    def _reading(self, arrival: Arrival, latency_s: float) -> Reading:
+    def _follow(self, identity: Identity):
+        """What the MCU had said of itself when it sent the sample that comes next."""
+        if identity.rate_hz != self._rate_hz:  # a slower sample is a mean of more conversions
+            self._rate_hz = identity.rate_hz
+            self.sensor.noise.restart()
+        if identity.delay_ms != self._delay_ms:  # all that comes from now on is so much later, or earlier
+            self._delay_ms = identity.delay_ms
+            self.arrivals.restart()
+
+    def _reading(self, arrival: Arrival) -> Reading:
         sample, moment = arrival.sample, arrival.moment
+        if arrival.identity:
+            self._follow(arrival.identity)
         if sample.restarted or sample.resumed:
             self.arrivals.restart()
         late_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        delay_s = self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s
         measured = self.sensor.measure(sample, moment.monotonic_s - late_s)
         return Reading(
-            max(moment.host_ns - round((late_s + latency_s) * 1e9), 0),
+            max(moment.host_ns - round((late_s + delay_s + self._line_s) * 1e9), 0),
             measured.x,
             measured.y,
             measured.covariance,
@@ -169,7 +178,7 @@ class McuSource:
         self._decoder.wanted_rate_hz = values["rate"]
 
     def take(self) -> list[Reading]:
-        return self._tilts.read(self._link.take(), self._decoder.identity)
+        return self._tilts.read(self._link.take())
 
     def health(self) -> Health:
         state = self._link.state()

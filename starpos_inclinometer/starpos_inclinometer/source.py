@@ -45,6 +45,7 @@ class Arrival:
 
     sample: Any
     moment: Moment
+    identity: Any = None  # what the device had said of itself when it sent this
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ class Host:
         moment = Moment(self.now_s, 1_700_000_000_000_000_000 + round(self.now_s * 1e9))
         arrivals = self.decoder.feed(data, moment)
         self.samples += [a.sample for a in arrivals]
-        for reading in self.tilts.read(arrivals, self.decoder.identity):
+        for reading in self.tilts.read(arrivals):
             assert all(map(math.isfinite, (reading.x, reading.y, *reading.covariance)))
             xx, xy, yx, yy = reading.covariance
             assert xx > 0 and yy > 0 and xx * yy > xy * yx and reading.stamp_ns > 0

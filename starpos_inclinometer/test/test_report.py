@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.host_clock import Moment, Step
-from starpos_inclinometer.mcu import McuTilts
+from starpos_inclinometer.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.parameters import PARAMETERS, calibration
 from starpos_inclinometer.protocol import Identity, Sample
 from starpos_inclinometer.report import Reporter
@@ -74,9 +75,9 @@ def test_a_flag_is_urgent_until_it_was_told():
     assert reporter.count(STUCK)
 
 
-def arrival(k, at_s, **more):
+def arrival(k, at_s, identity=None, **more):
     sample = Sample(k, 20 * k, 0x800000 + 37 * k % 1009, 0x800000 + k, 175, 0, **more)
-    return Arrival(sample, Moment(at_s, round(at_s * 1e9)))
+    return Arrival(sample, Moment(at_s, round(at_s * 1e9)), identity)
 
 
 def identity(rate_hz, delay_ms=14):
@@ -85,27 +86,75 @@ def identity(rate_hz, delay_ms=14):
 
 def test_another_rate_is_another_noise():
     tilts = McuTilts(VALUES, calibration)
-    tilts.read([arrival(k, 0.02 * k) for k in range(500)], identity(50))
+    tilts.read([arrival(k, 0.02 * k, identity(50)) for k in range(500)])
     assert tilts.sensor.noise.sigma is not None
-    tilts.read([], identity(50))
+    tilts.read([arrival(500, 10.0, identity(50))])
     assert tilts.sensor.noise.sigma is not None
-    tilts.read([], identity(10))
+    tilts.read([arrival(501, 10.1, identity(10))])
     assert tilts.sensor.noise.sigma is None
+
+
+def played(rates_hz, at_once):
+    """(stamp less the truth of each sample, s), of a decoder and an emulated MCU that is told one rate after another.
+
+    at_once: the samples are taken when all are there, not each as it comes.
+    """
+    mcu = Mcu(rate_hz=10, noise_rad=0.0035, seed=1)
+    decoder, tilts = McuDecoder(10), McuTilts(VALUES, calibration)
+    now_s, waiting, errors, arrivals = 0.0, mcu.reset(0.0), [], []
+    for rate_hz in rates_hz:
+        decoder.wanted_rate_hz = rate_hz
+        for _ in range(12):
+            arrivals += decoder.feed(waiting, Moment(now_s, round(now_s * 1e9)))
+            waiting = mcu.receive(decoder.command())
+            arrivals += decoder.feed(waiting, Moment(now_s, round(now_s * 1e9)))
+            now_s = mcu.due
+            waiting = mcu.sample()
+            if not at_once:
+                errors += _errors(tilts, arrivals)
+                arrivals = []
+    return errors + _errors(tilts, arrivals)
+
+
+def _errors(tilts, arrivals):
+    """The emulated MCU was started at 0 and its clock is right: its milliseconds are the truth."""
+    readings = tilts.read(arrivals)
+    return [r.stamp_ns * 1e-9 - a.sample.milliseconds * 1e-3 for r, a in zip(readings, arrivals, strict=True)]
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_change_of_rate_moves_no_stamp(at_once):
+    """At 1 Hz a line leaves 0.45 s later after its sample than at 10 Hz: that is the rate's, not lateness."""
+    errors = played((10, 1, 50, 5, 1, 10), at_once)
+    assert len(errors) >= 66
+    assert np.abs(errors).max() < 2e-3
+
+
+def test_samples_before_the_microcontroller_has_said_its_rate_move_none_after():
+    """It had another rate from before, so the delay was a guess until then."""
+    tilts = McuTilts(VALUES, calibration)
+    early = tilts.read([arrival(k, 0.02 * k + 0.014) for k in range(5)])
+    later = tilts.read([arrival(k, 0.02 * k + 0.014, identity(50)) for k in range(5, 20)])
+    line_s = 430 / 38400
+    assert early[-1].stamp_ns * 1e-9 == pytest.approx(0.08 + 0.014 - 0.054 - line_s, abs=1e-6)
+    assert [r.stamp_ns * 1e-9 + line_s for r in later] == pytest.approx(
+        [0.02 * k for k in range(5, 20)], abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("cause", ["restarted", "resumed"])
 def test_after_a_reset_or_a_new_connection_the_clocks_are_related_anew(cause):
     """The MCU's milliseconds go on by chance where they were, 1 s off: that is no lateness."""
     tilts = McuTilts(VALUES, calibration)
-    tilts.read([arrival(k, 0.02 * k) for k in range(500)], identity(50))
-    (reading,) = tilts.read([arrival(500, 11.0, **{cause: True})], identity(50))
+    tilts.read([arrival(k, 0.02 * k, identity(50)) for k in range(500)])
+    (reading,) = tilts.read([arrival(500, 11.0, identity(50), **{cause: True})])
     assert 11.0 - reading.stamp_ns * 1e-9 == pytest.approx(0.014 + 43 * 10 / 38400, abs=1e-6)
 
 
 def test_the_latency_is_the_devices_or_the_parameters():
     for latency, delay_ms, expected in ((math.nan, 14, 0.014), (math.nan, 9, 0.009), (0.1, 14, 0.1)):
         tilts = McuTilts(VALUES | {"latency": latency}, calibration)
-        (reading,) = tilts.read([arrival(0, 5.0)], identity(50, delay_ms))
+        (reading,) = tilts.read([arrival(0, 5.0, identity(50, delay_ms))])
         assert 5.0 - reading.stamp_ns * 1e-9 == pytest.approx(expected + 430 / 38400, abs=1e-6)
-    (unknown,) = McuTilts(VALUES, calibration).read([arrival(0, 5.0)], None)
+    (unknown,) = McuTilts(VALUES, calibration).read([arrival(0, 5.0)])
     assert np.isfinite(unknown.x) and unknown.stamp_ns < 5_000_000_000
