@@ -3,6 +3,7 @@
 
 import contextlib
 import errno
+import fcntl
 import os
 import termios
 import threading
@@ -23,6 +24,7 @@ UNFIT_PATIENCES = 3.0  # so many times longer lines may come of which none is be
 READ_BYTES = 4096
 QUEUE_SAMPLES = 512  # 10 s at the highest rate
 RATE_WINDOW_S = 5.0
+PTY_MAJORS = range(136, 144)  # pseudo-terminals, Linux's devices.txt
 
 # pyserial raises its own error, passes some of the system's through, and a TypeError where its fd has gone.
 PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueError)
@@ -151,9 +153,14 @@ class SerialLink:
             self._stop.wait(RETRY_S)
 
     def _open(self) -> serial.Serial:
-        return serial.Serial(
+        device = serial.Serial(
             self._port, self._baud, timeout=READ_TIMEOUT_S, write_timeout=0.5, exclusive=True
         )
+        # pyserial's lock binds only who asks for it; this binds all but root. A pseudo-terminal would stay closed after
+        # a reader that was killed, for as long as its other end is open.
+        if os.major(os.fstat(device.fileno()).st_rdev) not in PTY_MAJORS:
+            fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
+        return device
 
     def _serve(self, device: serial.Serial):
         """Read until the link is stopped or the path leads elsewhere; raises when something goes wrong."""

@@ -2,10 +2,16 @@
 """The link and the emulated device on a real pseudo-terminal: openings, rates, silence, wrong devices."""
 
 import os
+import subprocess
 import threading
 
+import pytest
+
+from starpos_inclinometer import link
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.source import Phase
+
+NOBODY = 65534
 
 
 def test_samples_identity_and_rate(bench, read):
@@ -75,3 +81,18 @@ def test_lines_that_never_fit_one_another_are_said(bench, read):
     reader = read()
     state = reader.wait(lambda state, samples: state.phase is Phase.GARBLED)
     assert "do not fit" in state.sentence and not reader.samples
+
+
+@pytest.mark.parametrize("pseudo_terminal", [True, False])
+def test_nobody_else_opens_the_port(bench, read, monkeypatch, pseudo_terminal):
+    """`cat` and terminal programs ask for no lock. A pseudo-terminal stays open to all: here one is taken for a port."""
+    if not pseudo_terminal:
+        monkeypatch.setattr(link, "PTY_MAJORS", ())
+    bench.plug(Mcu(seed=1, rate_hz=50))
+    read().wait(lambda state, samples: samples)
+    port = os.path.realpath(bench.path)
+    os.chmod(port, 0o666)
+    other = {"user": NOBODY} if os.geteuid() == 0 else {}  # root may always
+    opened = subprocess.run(["sh", "-c", f": < {port}"], capture_output=True, text=True, check=False, **other)
+    assert (opened.returncode == 0) == pseudo_terminal, opened.stderr
+    assert pseudo_terminal or "busy" in opened.stderr
