@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from starpos import catalogue
 from starpos.average import Average
 from starpos.camera import Camera
+from starpos.earth import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.geoid import Geoid
 from starpos.inclinometer import SCA100T_NOISE_RAD
@@ -44,6 +45,7 @@ from starpos_solver.worker import Outcome, Worker
 WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
 POLL_S = 0.02
 ANOTHER_TIME_S = 3600.0  # clocks that differ by more are not those of one evening
+J2000_UNIX_S = 946_728_000.0
 CLOCK_SIGMAS = 6.0  # beyond the stated error, and AHEAD_S, a stamp in the future is wrong
 
 
@@ -73,6 +75,9 @@ class SolverNode(Node):
         self._read_instrument()
         self._read_geoid()
         self._catalogue = catalogue.load()
+        earth_state(
+            J2000_UNIX_S
+        )  # reads the tables of the Earth's rotation, so that the first frame is not slow
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
@@ -221,6 +226,9 @@ class SolverNode(Node):
             # when its time has come the instrument may lean otherwise
             if ahead_s > reports.AHEAD_S:
                 raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
+            if ahead_s:  # both times are known, and of one evening
+                now_s = stamp_to_unix(message.header.stamp) - ahead_s
+                self._tilts.forget_after(now_s + reports.AHEAD_S)
             self._tilts.add(message, self._tilt_stddev())
         except StarposError as e:
             self._reject(str(e))

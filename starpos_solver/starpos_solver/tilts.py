@@ -22,7 +22,7 @@ class TiltBuffer:
 
     def __init__(self):
         self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with its number as it came
-        self._came = 0
+        self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
 
     def __len__(self) -> int:
@@ -44,6 +44,13 @@ class TiltBuffer:
             raise
         self._came += 1
         self._good.append((self._came, sample))
+        self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
+
+    def forget_after(self, unix_s: float) -> None:
+        """Samples of a clock that was ahead then: when their time comes the instrument may lean otherwise."""
+        if self._latest_unix_s > unix_s:
+            self._latest_unix_s = unix_s
+            self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether no further sample of this exposure is to come: one is here that leaves no room for another."""

@@ -60,6 +60,14 @@ def test_samples_from_before_the_clock_was_set_back_are_none_of_the_same_times_n
     assert buffer.average(T0 + 20.0, 0.5).theta_x == pytest.approx(math.radians(20.0))
 
 
+def test_samples_of_a_clock_that_was_ahead_are_forgotten_when_it_is_right():
+    buffer = buffer_of([sample(100 + k / 10, 20.0) for k in range(-2, 3)] + [sample(0.0)])
+    buffer.forget_after(T0 + 1.0)
+    assert len(buffer) == 1 and not buffer.complete(T0 + 100.0, 0.5)
+    with pytest.raises(TiltError, match="no sample near"):
+        buffer.average(T0 + 100.0, 0.5)
+
+
 def test_a_gap_before_a_sample_does_not_spoil_it():
     assert buffer_of([sample(0.0, flags=Tilt.GAP)]).average(T0, 0.5).samples == 1
 
