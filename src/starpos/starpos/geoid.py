@@ -5,7 +5,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 
 from starpos.earth import curvature_radii_m
 from starpos.geoid_file import Grid, read_grid
@@ -53,6 +52,8 @@ class Geoid:
 
     def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
         """xi and eta in arcsec; NaN without data."""
+        from scipy.interpolate import RectBivariateSpline  # slow to import: only where there is a grid
+
         north_m, east_m, stride = self._spacing_m(phi)
         for reach in REACHES:
             nodes, row, column = self._window(phi, lam, reach, reach, stride)
