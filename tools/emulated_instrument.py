@@ -75,7 +75,7 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
     sky = devices.start("sky", [*sky, json.dumps(asdict(place))], stdout=subprocess.PIPE, text=True)
     if sky.stdout.readline() != "ready\n":
         raise RuntimeError(f"the sky does not come up: see {folder}/sky.log")
-    camera = {"source": "indi", "indi.port": port, "indi.device": DEVICE}
+    camera = {"source": "indi", "indi.port": port, "indi.device": DEVICE, "driver_lag_stddev": LATE_MS / 1000}
     return {"inclinometer": {"port": link}, "camera": camera}
 
 

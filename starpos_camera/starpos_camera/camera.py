@@ -106,7 +106,8 @@ class CameraNode(Node):
         self.create_service(SetCapture, "~/set_capture", self._on_set_capture)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._take, self._wake.trigger, "capture")
-        tasks = {"Capture": self._report, "Clock": ClockReport(self, self._stamped_by_system)}
+        self._clock_report = ClockReport(self, self._stamped_by_system)
+        tasks = {"Capture": self._report, "Clock": self._clock_report}
         self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
         self._timer = None
         self._start_timer()
@@ -165,7 +166,7 @@ class CameraNode(Node):
         if self.get_clock().ros_time_is_active:
             exposure, clock = self._source.capture(settings), None
         else:
-            exposure = in_one_time(lambda: self._source.capture(settings), system_clock.StepWatch())
+            exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
             # a source that knows the error has the clock of another machine
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None

@@ -59,8 +59,25 @@ COMMON = (
     ),
     Parameter(
         "command_lag_stddev",
-        0.1,
-        "How much that lag varies from frame to frame; 0.1 s is 46 m at the equator.",
+        0.3,
+        "How far that lag may be off; 0.1 s is 46 m at the equator. The default is that of a camera nobody has measured.",
+        "s",
+        0.0,
+        60.0,
+    ),
+    Parameter(
+        "driver_lag",
+        0.0,
+        "From the start of an exposure that a driver tells (INDI, Alpaca) to that of the light: a driver tells when it "
+        "told the camera. A single-lens reflex takes tenths of a second more. Of the same effect as command_lag.",
+        "s",
+        -10.0,
+        60.0,
+    ),
+    Parameter(
+        "driver_lag_stddev",
+        0.05,
+        "How far that lag may be off; 0.05 s is 23 m at the equator. Too small makes fixes claim too much.",
         "s",
         0.0,
         60.0,

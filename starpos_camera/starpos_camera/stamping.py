@@ -11,9 +11,13 @@ OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)
 
 
 def in_one_time(capture: Callable[[], Exposure], watch: StepWatch) -> Exposure:
-    """What `capture` gives; CaptureError where the system's clock, which stamped it, was set meanwhile."""
+    """What `capture` gives; CaptureError where the system's clock, which stamped it, was set meanwhile.
+
+    watch: one that is asked every second, also while the capture lasts.
+    """
+    before_s = watch.set_s()
     exposure = capture()
-    step_s = watch.step_s()
+    step_s = watch.set_s() - before_s
     if step_s and exposure.stamp_source in OF_SYSTEM_CLOCK:
         raise CaptureError(
             f"a frame is left out: the system's clock was set by {step_s:+.3g} s while it was taken, so that its time is "

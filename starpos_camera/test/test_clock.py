@@ -50,12 +50,12 @@ def test_a_step_is_said_and_the_next_frames_are_in_the_new_time(
     node = start("camera", f"files.path:={folder}", *PLAYED)
     listener.wait(lambda: len(captures) >= 3)
 
-    def ahead_s():
-        return stamp_to_unix(captures[-1].header.stamp) - listener.node.get_clock().now().nanoseconds * 1e-9
+    def steps():
+        return np.diff([stamp_to_unix(c.header.stamp) for c in captures])
 
-    assert abs(ahead_s()) < 1.0
     set_clock(step)
-    listener.wait(lambda: abs(ahead_s() - step) < 0.9)
+    # forward by 2 s more than the cadence, or back: frames are otherwise no further apart than a busy machine makes them
+    listener.wait(lambda: steps().max() > 1.5 if step > 0 else steps().min() < -1.0)
     state = listener.wait_for_state("camera: Clock", WARN, f"by {abs(step):.3g} s")
     assert float(state["last step (s)"]) == pytest.approx(step, abs=0.05)
     seen = len(captures)
@@ -67,17 +67,25 @@ def test_a_step_is_said_and_the_next_frames_are_in_the_new_time(
     )
 
 
+@pytest.mark.parametrize("exposure_s", [0.5, 60.0])
 @pytest.mark.parametrize("step", [2.0, -2.0, 0.0])
-def test_a_frame_during_which_the_clock_was_set_is_left_out_unless_its_time_is_its_own(step):
+def test_a_frame_during_which_the_clock_was_set_is_left_out_unless_its_time_is_its_own(step, exposure_s):
     clocks = [1.8e9, 100.0]
+    watch = StepWatch(lambda: tuple(clocks))
+
+    def go(seconds, step=0.0):
+        clocks[0] += seconds + step
+        clocks[1] += seconds
 
     def take(source):
         def capture():
-            clocks[0] += 0.5 + step
-            clocks[1] += 0.5
+            go(0.3, step)
+            for _ in range(int(exposure_s)):  # the diagnostics ask once a second
+                watch.step_s()
+                go(1.0)
             return Exposure(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)
 
-        return in_one_time(capture, StepWatch(lambda: tuple(clocks)))
+        return in_one_time(capture, watch)
 
     assert take(Capture.FILE).frame.width == 4
     if step:

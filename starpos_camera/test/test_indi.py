@@ -88,7 +88,10 @@ def test_a_device_nobody_has_connected_gives_frames_with_the_drivers_time(source
     assert (frame.pixels.shape, frame.pixels.dtype, frame.pattern) == (SIZE, np.uint16, "")
     assert frame.exposure_s == 0.4
     assert begin + 0.2 <= frame.mid_unix_s <= time.time() - 0.2
-    assert (exposure.stamp_source, exposure.frame.stamp_stddev_s) == (Capture.DRIVER, 0.005)
+    assert (exposure.stamp_source, exposure.frame.stamp_stddev_s) == (
+        Capture.DRIVER,
+        pytest.approx(0.05, rel=1e-3),
+    )
     assert exposure.remark == ""
 
 
@@ -295,7 +298,7 @@ def test_a_drivers_clock_that_is_wrong_is_not_used_and_said(liar, year):
     begin = time.time()
     exposure = source.capture(QUICK)
     assert begin < exposure.frame.mid_unix_s < time.time()
-    assert (exposure.stamp_source, exposure.frame.stamp_stddev_s) == (Capture.COMMAND, 0.1)
+    assert (exposure.stamp_source, exposure.frame.stamp_stddev_s) == (Capture.COMMAND, 0.3)
     assert "set its machine's clock, to UTC" in exposure.remark
 
 
@@ -313,7 +316,10 @@ def test_the_clock_of_another_machine_is_used_where_its_error_is_given(server, m
     exposure = source.capture(SHORT)
     source.close()
     assert exposure.stamp_source == Capture.DRIVER
-    assert (exposure.frame.stamp_stddev_s, exposure.frame.clock_stddev_s) == (0.005, 0.02)
+    assert (exposure.frame.stamp_stddev_s, exposure.frame.clock_stddev_s) == (
+        pytest.approx(0.05, rel=1e-3),
+        0.02,
+    )
 
 
 def test_the_node_publishes_frames_and_ends_at_once_in_a_long_exposure(server, other, start, listener):

@@ -14,21 +14,25 @@ ARCSEC_PER_S = 15.041  # of longitude
 
 
 class ClockReport:
-    """Whether stamps can be believed; a step is logged once. `matters`: False while no stamp comes from this clock."""
+    """Whether stamps can be believed; a step is logged once. `matters`: False while no stamp comes from this clock.
+
+    `watch`: of the system's clock, asked with every report, once a second.
+    """
 
     def __init__(self, node: Node, matters: Callable[[], bool] = lambda: True):
         self._node = node
         self._matters = matters
-        self._watch = system_clock.StepWatch()
-        self._step_s = 0.0
+        self.watch = system_clock.StepWatch()
+        self._set_s = self._step_s = 0.0
         self._stepped_at = -TOLD_S  # monotonic, s
 
     def __call__(self) -> Status:
         if self._node.get_clock().ros_time_is_active:
             return Status(Level.OK, "time is simulated (use_sim_time).")
         now = time.monotonic()
-        if step := self._watch.step_s():
-            self._step_s, self._stepped_at = step, now
+        set_s = self.watch.set_s()
+        if step := set_s - self._set_s:
+            self._set_s, self._step_s, self._stepped_at = set_s, step, now
             self._node.get_logger().warning(f"{self._said(step)}.")
         state = system_clock.read()
         values = {"last step (s)": self._step_s}

@@ -7,6 +7,7 @@ Source: adjtimex(2); maxerror is in NTP's sense, the most the clock may be off (
 
 import ctypes
 import math
+import threading
 import time
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ STA_UNSYNC = 0x0040
 TIME_ERROR = 5  # adjtimex's answer of a clock that is not synchronised
 UNIFORM = math.sqrt(3)  # bound over standard deviation of what is as likely anywhere within it
 STEP_S = 0.1
+UNKNOWN_S = 86400 / math.sqrt(12)  # any time of the day
 SLEW = 0.1  # the quickest slewing in use (chrony's maxslewrate is 0.083): more than this is a step
 
 
@@ -46,9 +48,12 @@ class SystemClock:
 
     @property
     def stddev_s(self) -> float:
-        """Standard deviation to claim: of anything within the bound; all of the bound where nothing holds it there."""
+        """Standard deviation to claim: of anything within the bound.
+
+        Where nothing keeps the clock there is no bound (the kernel's own number stops at 16 s): any time of the day.
+        """
         if not self.synchronised:
-            return max(self.max_error_s, self.est_error_s)
+            return UNKNOWN_S
         return max(self.max_error_s / UNIFORM, self.est_error_s)
 
     @property
@@ -56,8 +61,8 @@ class SystemClock:
         if self.synchronised:
             return f"the system's clock is kept to UTC within {self.max_error_s:.2g} s."
         return (
-            "the system's clock is not synchronised, fixes are as wide as it may be off: start chrony, systemd-timesyncd "
-            "or linuxptp, or set the solver's clock_stddev where you know better."
+            "the system's clock is not synchronised, and fixes tell no longitude: start chrony, systemd-timesyncd or "
+            "linuxptp, or set the solver's clock_stddev where you know how good the clock is."
         )
 
 
@@ -77,17 +82,33 @@ def read() -> SystemClock | None:
 class StepWatch:
     """Tells when the system's clock was set: moved against the clock that nobody sets, faster than any slewing.
 
+    To be asked often, once a second or more: over a long time slewing moves a clock as far as a step does.
     clocks: gives (UTC, monotonic) in s at one moment.
     """
 
     def __init__(self, clocks=lambda: (time.time(), time.monotonic())):
         self._clocks = clocks
+        self._lock = threading.Lock()  # one thread takes frames, another reports
         self._utc, self._monotonic = clocks()
+        self._set_s = 0.0
 
     def step_s(self) -> float:
         """How far it was set since the last call, ahead counts positive; 0 where it was not."""
+        with self._lock:
+            before = self._set_s
+            self._look()
+            return self._set_s - before
+
+    def set_s(self) -> float:
+        """How far it was set in all since this watch began: what another thread asked meanwhile is in it."""
+        with self._lock:
+            self._look()
+            return self._set_s
+
+    def _look(self):
         utc, monotonic = self._clocks()
         elapsed = monotonic - self._monotonic
         moved = (utc - self._utc) - elapsed
         self._utc, self._monotonic = utc, monotonic
-        return moved if abs(moved) > STEP_S + SLEW * elapsed else 0.0
+        if abs(moved) > STEP_S + SLEW * elapsed:
+            self._set_s += moved

@@ -39,7 +39,7 @@ def test_the_kernels_structure_has_its_size():
 def test_what_is_claimed_of_a_clock():
     assert SystemClock(True, 0.03, 0.002).stddev_s == pytest.approx(0.03 / math.sqrt(3))
     assert SystemClock(True, 0.001, 0.02).stddev_s == 0.02  # the kernel's own estimate, where that is larger
-    assert SystemClock(False, 16.0, 16.0).stddev_s == 16.0
+    assert SystemClock(False, 16.0, 16.0).stddev_s > 20000  # nobody knows the hour
     assert "not synchronised" in SystemClock(False, 16.0, 16.0).sentence
     assert "0.03 s" in SystemClock(True, 0.03, 0.002).sentence
 

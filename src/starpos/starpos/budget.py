@@ -181,7 +181,7 @@ def error_terms(
         *_of_inclinometer(sensitivity.level @ levelling, tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], ALWAYS),
         ErrorTerm("clock", second_of_time * clock_stddev_s, ALWAYS),
-        ErrorTerm("time stamp", second_of_time * stamp_stddev_s),
+        ErrorTerm("time stamp", second_of_time * stamp_stddev_s, ALWAYS),  # lags are: nobody may count on it
         ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, ALWAYS),
         ErrorTerm("pole", pole, ALWAYS),
     )

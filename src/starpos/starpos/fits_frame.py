@@ -38,10 +38,17 @@ def _read(file, place):
         raise FrameError(
             f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
         ) from e
-    mid, exposure = times(header, place)
-    return Frame(
-        to_unsigned(values, place), _pattern(header, place), mid, exposure, place, focal_px(header)
-    ), header
+    mid, exposure, rounding = times(header, place)
+    frame = Frame(
+        to_unsigned(values, place),
+        _pattern(header, place),
+        mid,
+        exposure,
+        place,
+        focal_px(header),
+        stamp_stddev_s=rounding,
+    )
+    return frame, header
 
 
 def _first_image(hdus, place):

@@ -4,6 +4,7 @@
 A header is a mapping of FITS keywords (those of KEYS) to values of any kind, of which nothing is believed unchecked.
 """
 
+import math
 import re
 import warnings
 from collections.abc import Mapping
@@ -29,8 +30,10 @@ SCALES = ("utc", "tai", "tt", "tdb")  # of TIMESYS; UT1 would need tables
 MAX_EXPOSURE_S = 86400.0
 
 
-def times(header: Mapping, place: str) -> tuple[float | None, float | None]:
-    """Middle of the exposure (Unix, UTC) and its length in s, None where the header has none; FrameError of a bad one."""
+def times(header: Mapping, place: str) -> tuple[float | None, float | None, float]:
+    """Middle of the exposure (Unix, UTC) and its length in s, None where the header has none; and the middle's standard
+    deviation, which is that of its last digit, rounded or cut off.  FrameError of a bad one.
+    """
     exposure = next((header[k] for k in ("EXPTIME", "EXPOSURE") if header.get(k) not in (None, "")), None)
     if exposure is not None:
         try:
@@ -43,16 +46,26 @@ def times(header: Mapping, place: str) -> tuple[float | None, float | None]:
             )
     key = next((k for k in START if header.get(k) not in (None, "")), None)
     if key is None or exposure is None:
-        return None, exposure
+        return None, exposure, 0.0
     start = header[key]
     if key == "DATE-OBS" and "T" not in str(start) and header.get("TIME-OBS"):
         start = f"{start}T{header['TIME-OBS']}"
     if isinstance(start, str) and re.fullmatch(r"\d{4}-\d\d-\d\d", start.strip()):
-        return None, exposure  # a day without an hour is no time
+        return None, exposure, 0.0  # a day without an hour is no time
     scale = str(header.get("TIMESYS", "UTC")).strip().lower()
     if scale not in SCALES:
         raise FrameError(f"{place}: its TIMESYS is {scale!r}; it must be one of {', '.join(SCALES)}.")
-    return _middle(start, exposure, scale, f"{place}: its {key}"), exposure
+    return _middle(start, exposure, scale, f"{place}: its {key}"), exposure, _rounding(start)
+
+
+def _rounding(start) -> float:
+    """Standard deviation (s) of a text's last digit, as likely rounded as cut off; an MJD has more digits than matter."""
+    if not isinstance(start, str):
+        return 0.0
+    decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
+    if decimals is None:  # without seconds
+        return 60 / math.sqrt(3)
+    return 10.0 ** -len(decimals[1] or "") / math.sqrt(3)
 
 
 def _middle(start, exposure_s, scale, what):

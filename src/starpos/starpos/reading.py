@@ -155,7 +155,7 @@ def _read_csv(path):
             f"{path}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
         )
     order = np.argsort(-column["flux"], kind="stable")
-    mid, exposure = times(header, path)
+    mid, exposure, rounding = times(header, path)
     return Stars(
         x=column["x"][order],
         y=column["y"][order],
@@ -169,4 +169,5 @@ def _read_csv(path):
         exposure_s=exposure,
         source=str(path),
         focal_px=focal_px(header),
+        stamp_stddev_s=rounding,
     )

@@ -11,14 +11,13 @@ from starpos_interfaces.msg import Capture
 
 LOCAL = ("127.0.0.1", "localhost", "::1")  # hosts whose clock is this machine's
 CLOCK_TOLERANCE_S = 0.05  # between what a driver says of its exposure and when it was commanded and had
-DRIVER_STDDEV_S = 0.005  # a driver reads its clock, then tells the camera, or the other way round
 
 
 @dataclass(frozen=True)
 class Stamp:
     """When an exposure had its middle (Unix time), and how that is known.
 
-    stddev_s        standard deviation of mid_s, new in each frame
+    stddev_s        standard deviation of mid_s
     source          one of starpos_interfaces/Capture's constants
     clock_stddev_s  standard deviation against UTC of a clock that is not this machine's; 0: it is
     remark          what is wrong with the driver's clock, without a full stop; '' for nothing
@@ -50,7 +49,7 @@ def stamp_of(
     if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
         off = f"its times of exposures are off by more than {tolerance_s:.2g} s and not used"
         return replace(commanded, remark=f"{off}; set its machine's clock, to UTC")
-    mid_s, stddev_s = middle_of_started(start_s, resolution_s, exposure_s)
+    mid_s, stddev_s = middle_of_started(start_s, resolution_s, exposure_s, values)
     if math.hypot(stddev_s, clock_stddev_s) > commanded.stddev_s:
         return commanded
     return Stamp(mid_s, stddev_s, Capture.DRIVER, clock_stddev_s)
@@ -61,10 +60,12 @@ def middle_of_commanded(commanded_s: float, exposure_s: float, values: Mapping) 
     return commanded_s + values["command_lag"] + exposure_s / 2, values["command_lag_stddev"]
 
 
-def middle_of_started(start_s: float, resolution_s: float, exposure_s: float) -> tuple[float, float]:
+def middle_of_started(
+    start_s: float, resolution_s: float, exposure_s: float, values: Mapping
+) -> tuple[float, float]:
     """The same of an exposure whose start the driver tells, rounded to or cut off at a resolution: nobody says which."""
-    stddev_s = max(DRIVER_STDDEV_S, 1.5 * resolution_s / math.sqrt(12))
-    return start_s + resolution_s / 4 + exposure_s / 2, stddev_s
+    stddev_s = math.hypot(values["driver_lag_stddev"], 1.5 * resolution_s / math.sqrt(12))
+    return start_s + values["driver_lag"] + resolution_s / 4 + exposure_s / 2, stddev_s
 
 
 def read_utc(text: str) -> tuple[float, float] | None:
