@@ -10,15 +10,15 @@ import os
 import shlex
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
-from importlib.util import find_spec
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
 LINTERS = [f"ruff {check} --output-format concise" for check in ("check", "format --check")]
-PARALLEL = ["-n", "2"]
 NO_TESTS = 5  # pytest's exit status where a -k left none
 COLCON = (
     "--log-level error test --executor sequential "
@@ -26,9 +26,12 @@ COLCON = (
 )
 
 
-def run(command: list[str], environment: dict[str, str] | None = None) -> int:
-    """Run a command in the project's root with its output shown; its exit status."""
-    return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
+def run(command: list[str], out=None, environment: dict[str, str] | None = None) -> int:
+    """Run a command in the project's root, its output to a file or shown; its exit status."""
+    result = subprocess.run(
+        command, cwd=ROOT, env=environment, stdout=out, stderr=out and subprocess.STDOUT, check=False
+    )
+    return result.returncode
 
 
 def lint() -> Counter:
@@ -59,21 +62,11 @@ def has_tests(folder: Path) -> bool:
 
 
 def package_tests(pytest_args: list[str]) -> Counter:
-    """`colcon test`: the tests each package carries, in the environment it was built for."""
-    folders = [p.parent for pattern in ("*/package.xml", "src/*/package.xml") for p in ROOT.glob(pattern)]
+    """`colcon test`: the tests each package of ROS carries, in the environment it was built for."""
+    folders = [p.parent for p in ROOT.glob("*/package.xml")]
     packages = sorted(f.name for f in folders if has_tests(f / "test"))
     if not packages:
         return Counter()
-    alone = [
-        p for p in packages if p == "starpos"
-    ]  # the others' wait for nodes, on which work beside them tells
-    parallel = PARALLEL if find_spec("xdist") else []
-    return colcon_test(alone, [*parallel, *pytest_args]) + colcon_test(
-        [p for p in packages if p not in alone], pytest_args
-    )
-
-
-def colcon_test(packages: list[str], pytest_args: list[str]) -> Counter:
     since = time.time()
     colcon = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())"]
     command = [*colcon, *shlex.split(COLCON), *packages]
@@ -82,42 +75,52 @@ def colcon_test(packages: list[str], pytest_args: list[str]) -> Counter:
     return total + Counter(failed=int(broken != 0 and total["failed"] == 0))
 
 
-def older_tests(pytest_args: list[str]) -> Counter:
-    """starpos with the versions that Ubuntu 24.04 has, in an environment of its own."""
-    folder, report, since = ROOT / ".underlay" / "ubuntu", ROOT / "log" / "ubuntu.xml", time.time()
+def pytest(python: str, folder: str, name: str, pytest_args: list[str], **options) -> Counter:
+    """A folder's tests; options: those of `run`."""
+    since, report = time.time(), ROOT / "log" / f"{name}.xml"
+    status = run([python, "-m", "pytest", folder, f"--junit-xml={report}", *pytest_args], **options)
+    total = junit_counts(report, since)
+    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
+
+
+def starpos_tests(pytest_args: list[str], out) -> Counter:
+    """The mathematics, which wants no ROS; in CI with the versions that Ubuntu 24.04 has as well."""
+    total = pytest(sys.executable, "src/starpos/test", "starpos", pytest_args, out=out)
+    if not os.environ.get("STARPOS_COMPLETE"):
+        return total
+    folder = ROOT / ".underlay" / "ubuntu"
     python = str(folder / "bin" / "python")
     base = Path(ROOT / ".underlay" / "python").read_text().strip()
     pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-input"]
-    needs = ["-c", "tools/ubuntu-24.04.txt", "-e", "src/starpos[report,test]", "pytest-xdist"]
-    if run([base, "-m", "venv", str(folder)]) or run([*pip, *needs]):
-        print("Ubuntu 24.04's versions could not be installed")
-        return Counter(failed=1)
+    needs = ["-c", "tools/ubuntu-24.04.txt", "-e", "src/starpos[report,test]"]
+    if run([base, "-m", "venv", str(folder)], out=out) or run([*pip, *needs], out=out):
+        print("Ubuntu 24.04's versions could not be installed", file=out)
+        return total + Counter(failed=1)
     environment = {"PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": ""}
     environment["STARPOS_COMPLETE"] = ""  # what is optional was there with the newest versions
-    command = [python, "-m", "pytest", "src/starpos/test", f"--junit-xml={report}", *PARALLEL, *pytest_args]
-    print("starpos with the versions of Ubuntu 24.04", flush=True)
-    status = run(command, os.environ | environment)
-    total = junit_counts(report, since)
-    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
+    print("with the versions of Ubuntu 24.04", file=out, flush=True)
+    return total + pytest(
+        python, "src/starpos/test", "ubuntu", pytest_args, out=out, environment=os.environ | environment
+    )
 
 
-def graph_tests(pytest_args: list[str]) -> Counter:
-    """The tests of the whole graph."""
-    if not has_tests(ROOT / "test"):
-        return Counter()
-    since, report = time.time(), ROOT / "log" / "graph.xml"
-    status = run([sys.executable, "-m", "pytest", "test", f"--junit-xml={report}", *pytest_args])
-    total = junit_counts(report, since)
-    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
+def all_tests(pytest_args: list[str]) -> Counter:
+    """Those that compute beside those that wait for nodes; the former's output comes when it is whole."""
+    with tempfile.TemporaryFile("w+") as out, ThreadPoolExecutor(1) as beside:
+        computing = beside.submit(starpos_tests, pytest_args, out)
+        total = package_tests(pytest_args)
+        if has_tests(ROOT / "test"):
+            total += pytest(sys.executable, "test", "graph", pytest_args)
+        total += computing.result()
+        out.seek(0)
+        print(f"starpos\n{out.read()}")
+    return total
 
 
 def main(args: list[str]) -> int:
     total = lint()
     if "--lint" not in args:
-        total += package_tests(args)
-        total += graph_tests(args)
-        if os.environ.get("STARPOS_COMPLETE"):
-            total += older_tests(args)
+        total += all_tests(args)
     print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
     return int(total["failed"] > 0)
 

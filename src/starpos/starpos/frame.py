@@ -22,7 +22,7 @@ class Frame:
     exposure_s  None: unknown
     source      where it came from, for messages: a path or a topic
     focal_px    focal length the file's header claims (FOCALLEN / XPIXSZ), px; a hint only; None: unknown
-    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, taken for common to all frames, s; 0: unknown
+    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, common to all frames, s; 0: unknown
     clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common, s; 0: unknown
 
     Raises FrameError on anything else.

@@ -28,7 +28,7 @@ class Stars:
     exposure_s      None: unknown
     source          where it came from, for messages: a path or a topic
     focal_px        focal length a file's header claims, px; a hint only; None: unknown
-    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, taken for common to all frames; 0: unknown
+    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, common to all frames; 0: unknown
     clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common; 0: unknown
 
     Sequences are converted; what does not fit together raises FrameError.
