@@ -79,15 +79,14 @@ class Truth:
     longitude: float
     heading: float
 
-    def sigmas_off(self, latitude: float, longitude: float, covariance_m2) -> float:
-        """How far a place is from here in its own sigmas."""
+    def sigmas_off(self, latitude: float, longitude: float, covariance_m2) -> tuple[float, str]:
+        """How far a place is from here in its own sigmas, and in words."""
         prime, meridian = curvature_radii_m(math.radians(self.latitude))
         east = math.radians((longitude - self.longitude + 180) % 360 - 180)
         north = math.radians(latitude - self.latitude)
         apart = np.array([east * prime * math.cos(math.radians(self.latitude)), north * meridian])
-        return float(
-            np.sqrt(apart @ np.linalg.solve(covariance_m2, apart))
-        )  # NaN, which is wrong, of what is none
+        sigmas = float(np.sqrt(apart @ np.linalg.solve(covariance_m2, apart)))  # NaN of what is none: wrong
+        return sigmas, f"{np.hypot(*apart):.0f} m, {math.sqrt(np.trace(covariance_m2) / 2):.0f} claimed"
 
 
 class World:
@@ -233,13 +232,13 @@ class World:
 
     def _judge_place(self, topic: str, message, covariance_m2):
         truth = self._truth_of(message)
-        self._judge(topic, message, truth.sigmas_off(message.latitude, message.longitude, covariance_m2))
+        self._judge(topic, message, *truth.sigmas_off(message.latitude, message.longitude, covariance_m2))
 
-    def _judge(self, topic: str, message, sigmas: float):
+    def _judge(self, topic: str, message, sigmas: float, in_words: str = ""):
         if sigmas <= WRONG_SIGMA:
             self.right[topic] += 1
         else:
-            self.wrong.append(f"{topic} of {stamp_of(message)}: {sigmas:.1f} sigma from the truth")
+            self.wrong.append(f"{topic} of {stamp_of(message)}: {sigmas:.1f} sigma from the truth {in_words}")
 
 
 def _all(kept: dict) -> list:

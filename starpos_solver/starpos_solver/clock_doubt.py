@@ -38,6 +38,8 @@ class ClockDoubt:
         elif slip_s == 0:
             self._agree += 1
             self._other, self.seconds = None, self._first_doubt_s
+            if fix.attitude_sigma < self._first.attitude_sigma:  # of a blurred one little is a contradiction
+                self._first, self._first_stated_s = fix, stated_s
         else:
             again = self._other is not None and self._slip_s(fix, self._other, stated_s) == 0
             self._other_agree = self._other_agree + 1 if again else 1

@@ -57,6 +57,11 @@ def test_the_first_of_a_pose_alone_is_outvoted():
     assert doubts == pytest.approx([0.0] + [5.0] * 9 + [0.0, 0.0, 5.0], rel=1e-6)
 
 
+def test_a_blurred_frame_is_not_what_others_are_held_against():
+    blurred = replace(stamped(0.0), attitude_sigma=4e-4)  # a quarter of a minute of time
+    assert doubts_of(blurred, stamped(0.0), stamped(20.0)) == pytest.approx([0.0, 0.0, 20.0], rel=1e-6)
+
+
 def test_what_the_clocks_error_allows_is_no_contradiction():
     assert doubts_of(stamped(0.0), stamped(30.0), stated_s=16.0) == [0.0, 0.0]
 
