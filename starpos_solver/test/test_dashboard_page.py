@@ -478,9 +478,15 @@ def test_everything_grows_old_when_the_instrument_falls_silent_and_lives_again(p
     cards = {"position-card", "time-card", "heading-card", "tilt-card", "frame-card", "budget-card"}
     page.until(lambda: set(page.is_dressed("old")) == cards)
     page.until(lambda: page.text("status-word") == "No fix now")
-    tops = page.run("""return [...document.querySelectorAll("#clocks li")].flatMap((li) =>
-      [".name", ".sentence"].map((part) => li.querySelector(part).getBoundingClientRect().top))""")
-    assert len(tops) == 4 and tops == sorted(tops), "each clock's sentence stands under its name"
+
+    def tops():
+        return page.run("""return [...document.querySelectorAll("#clocks li")].flatMap((li) =>
+          [".name", ".sentence"].map((part) => li.querySelector(part).getBoundingClientRect().top))""")
+
+    page.until(
+        lambda: len(tops()) == 4 and min(tops()) > 0
+    )  # each is old and has its sentence, which else is not shown
+    assert tops() == sorted(tops()), "each clock's sentence stands under its name"
     lamps = page.until(lambda: all(lamp[1] == "SILENT" for lamp in page.run(LAMPS)) and page.run(LAMPS))
     for *_, colour in lamps:
         r, g, b = (int(v) for v in colour[4:-1].split(","))
