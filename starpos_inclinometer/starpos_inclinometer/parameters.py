@@ -227,6 +227,8 @@ def complaint(values: Mapping[str, Any]) -> str | None:
             "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
             f"{list(values['cross_axis'])} was given."
         )
+    if values["source"] != "imu" and not values["port"].strip():
+        return "parameter port must name the serial port, such as /dev/serial/by-id/...; it is empty."
     if values["source"] != "ascii":
         return None
     if not values["ascii.request"].isascii() or len(values["ascii.request"]) > MAX_REQUEST:
