@@ -5,7 +5,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-STEP_S = 0.1  # more than any slewing between two readings; adjtime and NTP slew by 0.5 ms a second at most
+from starpos_common.system_clock import StepWatch
+
 QUICK_S = 1e-3  # the two clocks are read together within that, or again
 TRIES = 4
 
@@ -43,7 +44,8 @@ class HostClock:
         self.now_ns = now_ns
         self._monotonic_ns = monotonic_ns
         self._simulated = simulated
-        self._offset_ns: int | None = None  # host's clock less the monotonic one
+        self._moment = Moment(0.0, 0)  # the last one
+        self._watch: StepWatch | None = None  # of these moments; none over a simulation's
 
     def monotonic_s(self) -> float:
         """The monotonic clock alone; any thread may ask."""
@@ -54,13 +56,17 @@ class HostClock:
         for _ in range(TRIES):
             before = self._monotonic_ns()
             host_ns = self.now_ns()
-            took_ns = self._monotonic_ns() - before
-            if took_ns < QUICK_S * 1e9:
+            took_s = (self._monotonic_ns() - before) * 1e-9
+            if took_s < QUICK_S:
                 break
-        offset_ns = None if self._simulated() else host_ns - before
-        if offset_ns is not None and self._offset_ns is not None:
-            jump_s = (offset_ns - self._offset_ns) * 1e-9
-            if abs(jump_s) > STEP_S + took_ns * 1e-9:
-                self.step = Step(jump_s, before * 1e-9)
-        self._offset_ns = offset_ns
-        return Moment(before * 1e-9, host_ns)
+        self._moment = Moment(before * 1e-9, host_ns)
+        if self._simulated():
+            self._watch = None
+        elif took_s < QUICK_S:  # what was interrupted between the clocks tells nothing
+            self._watch = self._watch or StepWatch(self._clocks)
+            if step_s := self._watch.step_s():
+                self.step = Step(step_s, self._moment.monotonic_s)
+        return self._moment
+
+    def _clocks(self) -> tuple[float, float]:
+        return self._moment.host_ns * 1e-9, self._moment.monotonic_s
