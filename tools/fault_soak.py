@@ -169,7 +169,7 @@ def _yaml(value) -> str:
 
 def run(faults: int, seed: int, folder: Path, restarts: int) -> tuple[Soak, dict[str, tuple[float, float]]]:
     """The soak; and of each node its memory (MB) early and late."""
-    from soak import memory_mb
+    from memory import memory_mb
 
     soak, sizes, begin = Soak(folder, seed), {}, time.monotonic()
     try:

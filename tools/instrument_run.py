@@ -281,6 +281,8 @@ def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
         args.seed = int.from_bytes(os.urandom(4), "big") >> 1
     if not 0 <= args.seed < 2**31:
         parser.error(f"--seed {args.seed} is not from 0 to 2147483647")
+    if args.frames < 1:
+        parser.error(f"--frames {args.frames} is not 1 or more")
     return args
 
 

@@ -11,6 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from memory import memory_mb
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 DAY, WARM, ALLOWED_MB = 17280, 500, 2.0
@@ -51,12 +53,6 @@ def main() -> int:
         f"{frames} frames: {each_ms:.1f} ms of CPU each; the last half's memory {grown:+.2f} MB against the first's"
     )
     return int(grown > ALLOWED_MB)
-
-
-def memory_mb(pid: int) -> float:
-    """Resident memory of a process."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def cpu_s(pid: int) -> float:

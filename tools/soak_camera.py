@@ -11,17 +11,17 @@ before, or a frame did not come.
 """
 
 import gc
-import os
 import sys
 import time
-from pathlib import Path
 
 import yaml
+from memory import memory_mb
 
 from starpos.errors import StarposError
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings
 from starpos_camera.sources.registry import SOURCES
+from starpos_common.parameters import ParameterError
 
 HALF_HOUR, ALLOWED_MB = 360, 2.0
 
@@ -31,13 +31,15 @@ def main() -> int:
     if name not in SOURCES:
         print(__doc__)
         return 2
-    frames = HALF_HOUR if not words or ":=" in words[-1] else int(words.pop())
-    values = {p.name: p.default for p in PARAMETERS} | {"source": name}
-    table = {p.name: p for p in PARAMETERS}
-    for word in words:
-        key, value = word.split(":=", 1)
-        text = isinstance(table[key].default, str)
-        values[key] = table[key].convert(value if text else yaml.safe_load(value))
+    frames = int(words.pop()) if words and words[-1].isdecimal() else HALF_HOUR
+    try:
+        values = values_of(words) | {"source": name}
+    except ParameterError as error:
+        print(error)
+        return 2
+    if not frames:
+        print("0 frames are no soak: give 1 or more.")
+        return 2
     settings = Settings(set_or_none(values["exposure"]), set_or_none(values["gain"]), values["cadence"])
     if refusal := SOURCES[name].refusal(values, settings):
         print(refusal)
@@ -70,14 +72,26 @@ def main() -> int:
     return int(grown > ALLOWED_MB or failed > 0)
 
 
+def values_of(words: list[str]) -> dict:
+    """The camera's parameters as the words NAME:=VALUE say; ParameterError in a sentence."""
+    table = {p.name: p for p in PARAMETERS}
+    values = {p.name: p.default for p in PARAMETERS}
+    for word in words:
+        key, given, value = word.partition(":=")
+        if not given or key not in table:
+            raise ParameterError(
+                f"{word} is no NAME:=VALUE of a parameter of the node camera: see its README."
+            )
+        text = isinstance(table[key].default, str)
+        try:
+            values[key] = table[key].convert(value if text else yaml.safe_load(value))
+        except yaml.YAMLError:
+            raise ParameterError(f"{word}: the value is no YAML.") from None
+    return values
+
+
 def set_or_none(value: float) -> float | None:
     return None if value != value else value
-
-
-def memory_mb() -> float:
-    """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 if __name__ == "__main__":

@@ -7,13 +7,14 @@ A line in twenty is spoiled, the microcontroller is reset each 5 minutes, the ca
 the resident memory of the last half has grown by more than 1 MB against the half before, or too few samples came.
 """
 
-import os
 import random
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
+
+from memory import memory_mb
 
 from starpos_inclinometer.emulator import Faults, Mcu, Pty
 from starpos_inclinometer.host_clock import HostClock
@@ -91,12 +92,6 @@ def main() -> int:
     print(health.counts, {k: health.values[k] for k in ("openings", "unfetched samples")})
     print(f"{got} of {samples} samples; the last half's memory {grown:+.2f} MB against the first's")
     return int(grown > ALLOWED_MB or got < ENOUGH * samples)
-
-
-def memory_mb() -> float:
-    """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 if __name__ == "__main__":
