@@ -29,13 +29,17 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def needs(*modules: str):
+    for module in modules:
+        if not find_spec(module):
+            lacks("-r tools/counterparts.txt", "pip install")
+
+
 class Simulator:
     """Cameras 0 (monochrome), 1 (Bayer, offset 1 in x) and 2 (colour), which look at a sky of their own: no network."""
 
     def __init__(self, folder: Path):
-        for package in ("alpaca", "alpaca_simulators"):
-            if not find_spec(package):
-                lacks("-r tools/counterparts.txt", "pip install")
+        needs("alpaca", "alpaca_simulators")
         import alpaca_simulators
 
         template = Path(alpaca_simulators.__file__).parent / "config" / "template.yaml"

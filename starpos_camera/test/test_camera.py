@@ -231,6 +231,11 @@ def test_a_calibration_that_cannot_be_written_holds_for_the_session(start, liste
         (("source:=simulated", "calibration_url:=http://x/y.yaml"), "file:///"),
         (("source:=simulated", "calibration_url:=/etc/hostname"), "calibration file"),
         (("files.path:=/x", "exposure:=1.0"), "own exposure"),
+        (
+            ("indi.clock_stddev:=0.0",),
+            "indi.clock_stddev must be a number from 1e-09 to 60 s, or nan for unset",
+        ),
+        (("alpaca.clock_stddev:=0.0",), "alpaca.clock_stddev must be a number from 1e-09 to 60 s, or nan"),
     ],
 )
 def test_bad_parameters_end_with_one_line(start, options, sentence):
