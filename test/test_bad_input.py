@@ -130,6 +130,7 @@ CASES = {
     "unsorted stars": (swap, BAD, "brightest first"),
     "no size": (with_stars(lambda s: setattr(s, "width", 0)), BAD, "width"),
     "NaN exposure": (with_stars(lambda s: setattr(s, "exposure", NAN)), BAD, "exposure"),
+    "an exposure beyond any": (with_stars(lambda s: setattr(s, "exposure", 1e300)), BAD, "exposure"),
     "NaN error of the stamp": (with_stars(lambda s: setattr(s, "stamp_stddev", NAN)), BAD, "stamp_stddev"),
     "negative error of the stamp": (with_stars(lambda s: setattr(s, "stamp_stddev", -1e-3)), BAD, "stamp_stddev"),
     "an error of the stamp beyond numbers": (with_stars(lambda s: setattr(s, "stamp_stddev", 1e300)), BAD,

@@ -11,6 +11,7 @@ SATURATED = 1
 EDGE = 2
 ELONGATED = 4
 BLENDED = 8
+MOST_EXPOSURE_S = 3600.0  # tilts of more than one pose would be averaged
 MOST_STDDEV_S = 1e9  # of a time: more says nothing, and its square must not overflow
 
 
@@ -158,9 +159,9 @@ def check_times(about, place):
         raise FrameError(
             f"{place}: the time of the exposure's middle is {mid_unix_s}; give a Unix time or None."
         )
-    if exposure_s is not None and not (np.isfinite(exposure_s) and exposure_s >= 0):
+    if exposure_s is not None and not 0 <= exposure_s <= MOST_EXPOSURE_S:
         raise FrameError(
-            f"{place}: the exposure is {exposure_s} s; give 0 or more, or None where it is unknown."
+            f"{place}: the exposure is {exposure_s} s; give 0 to {MOST_EXPOSURE_S:g} s, or None where it is unknown."
         )
     for name in ("stamp_stddev_s", "clock_stddev_s"):
         value = getattr(about, name)

@@ -25,6 +25,7 @@ def test_depths_and_colours_a_camera_gives_are_accepted():
         ({"pixels": np.zeros((4, 4, 3), np.uint8), "pattern": "rggb"}, "pattern"),
         ({"mid_unix_s": float("nan")}, "time"),
         ({"exposure_s": -1.0}, "exposure"),
+        ({"exposure_s": 1e300}, "exposure"),
         ({"focal_px": 0.0}, "focal"),
     ],
 )
