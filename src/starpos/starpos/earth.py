@@ -2,12 +2,13 @@
 """A1: from ICRS to the Earth's own frame ITRS, as the IERS Conventions (2010) have it, through ERFA.
 
 Places are geocentric apparent ones (light deflection and annual aberration in them); what depends on the site, the
-diurnal aberration, is `station_velocity`, which the fix applies.  Offline: the IERS table that astropy ships.
+diurnal aberration, is `station_velocity`, which the fix applies.  Offline: the IERS table that comes with astropy.
 """
 
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import erfa
 import numpy as np
@@ -17,6 +18,7 @@ from starpos.utc import utc_text
 
 UNIX_EPOCH_JD = 2440587.5
 DAY_S = 86400.0
+ARCSEC = np.radians(1 / 3600)
 TT_MINUS_TAI_S = 32.184
 TT_MINUS_UTC_S = 69.184  # since 2017; in 1900 it was 72 s less, which is 0.3 mas of aberration
 SPEED_OF_LIGHT = erfa.CMPS
@@ -153,31 +155,39 @@ class _Table:
 
 @lru_cache(maxsize=1)
 def _table() -> _Table:
-    from astropy.utils import iers  # slow to import: only where a time is needed
+    """finals2000A of the IERS as astropy-iers-data has it; astropy's own reader takes 0.6 s of a node's start."""
     from astropy_iers_data import IERS_A_FILE
 
+    text = Path(IERS_A_FILE).read_bytes()
+    lines = np.frombuffer(text, "S1").reshape(-1, text.index(b"\n") + 1)
+
+    def column(first: int, last: int) -> np.ndarray:
+        """Numbers of these columns, counted from 1 (IERS, readme.finals2000A); NaN where they are blank."""
+        field = np.ascontiguousarray(lines[:, first - 1 : last]).view(f"S{last - first + 1}").ravel()
+        return np.where(np.char.strip(field) == b"", b"nan", field).astype(float)
+
+    mjd, ut1_minus_utc = column(8, 15), column(59, 68)
+    known = np.flatnonzero(np.isfinite(ut1_minus_utc))[-1] + 1
+    mjd = mjd[:known]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        t = iers.IERS_A.open(IERS_A_FILE)
-        mjd = np.asarray(t["MJD"].to_value("d"), float)
+        warnings.simplefilter("ignore")  # of years that ERFA does not know the leap seconds of
         tai = erfa.utctai(2400000.5, mjd)
-        leap = np.round((tai[1] - mjd) * DAY_S)
+    leap = np.round((tai[1] - mjd) * DAY_S)
 
-    def column(name, unit):
-        return np.nan_to_num(np.ma.filled(t[name], np.nan).to_value(unit).astype(float), nan=0.0)
+    def filled(first: int, last: int) -> np.ndarray:
+        return np.nan_to_num(column(first, last)[:known], nan=0.0)
 
-    known = np.flatnonzero(np.isfinite(np.ma.filled(t["UT1_UTC_A"], np.nan).to_value("s")))[-1] + 1
-    ut1 = column("UT1_UTC_A", "s") - leap
-    pole_sigma = np.hypot(column("e_PM_x_A", "rad"), column("e_PM_y_A", "rad"))
+    ut1 = filled(59, 68) - leap
+    pole_sigma = np.hypot(filled(28, 36), filled(47, 55)) * ARCSEC
     return _Table(
-        mjd[:known],
-        leap[:known],
-        ut1[:known],
-        np.maximum(column("e_UT1_UTC_A", "s"), 1e-5)[:known],
-        column("PM_x_A", "rad")[:known],
-        column("PM_y_A", "rad")[:known],
-        np.maximum(pole_sigma, 1e-10)[:known],
-        float((ut1[known - 1] - ut1[known - 366]) / 365),
+        mjd,
+        leap,
+        ut1,
+        np.maximum(filled(69, 78), 1e-5),
+        filled(19, 27) * ARCSEC,
+        filled(38, 46) * ARCSEC,
+        np.maximum(pole_sigma, 1e-10),
+        float((ut1[-1] - ut1[-366]) / 365),
     )
 
 
