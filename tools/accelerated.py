@@ -33,8 +33,8 @@ from starpos.sky import Site
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Solution
 
-CADENCE_S, LATENCY_S = 0.8, 0.1
-TILT_TIMEOUT_S = 0.05  # of the solver here: a missing tilt costs no more of the run
+CADENCE_S, LATENCY_S = 0.8, 0.5
+TILT_TIMEOUT_S = 0.2  # of the solver here: a missing tilt costs less of the run
 WRONG_SIGMA = 5.0
 ANSWER_S = 1.0  # a good frame has its answer by then, or a fault still works
 # An instrument far better than usual, so that small errors count: 15 m, where the paper's claims 190.

@@ -19,7 +19,7 @@ def tilts_late(w: World):
     for tilt in early:
         w.graph.tilt.publish(tilt)
     w.stars(shot)
-    w.spin(w.rng.uniform(0, 0.1))
+    w.spin(w.rng.uniform(0, 0.3))
     w.tilts(shot)
 
 
