@@ -31,8 +31,9 @@ class ClockReport:
             return Status(Level.OK, "time is simulated (use_sim_time).")
         now = time.monotonic()
         set_s = self.watch.set_s()
-        if step := set_s - self._set_s:
-            self._set_s, self._step_s, self._stepped_at = set_s, step, now
+        step, self._set_s = set_s - self._set_s, set_s
+        if abs(step) > system_clock.STEP_S:  # not what was set and set back at once
+            self._step_s, self._stepped_at = step, now
             self._node.get_logger().warning(f"{self._said(step)}.")
         state = system_clock.read()
         values = {"last step (s)": self._step_s}

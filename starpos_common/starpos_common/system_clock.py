@@ -15,6 +15,7 @@ STA_UNSYNC = 0x0040
 TIME_ERROR = 5  # adjtimex's answer of a clock that is not synchronised
 UNIFORM = math.sqrt(3)  # bound over standard deviation of what is as likely anywhere within it
 STEP_S = 0.1
+QUICK_S, TRIES = 1e-3, 10
 UNKNOWN_S = 86400 / math.sqrt(12)  # any time of the day
 SLEW = 0.1  # the quickest slewing in use (chrony's maxslewrate is 0.083): more than this is a step
 
@@ -79,6 +80,16 @@ def read() -> SystemClock | None:
     return SystemClock(synchronised, state.maxerror * 1e-6, state.esterror * 1e-6)
 
 
+def both_clocks() -> tuple[float, float]:
+    """UTC and the monotonic clock at one moment (s): read again where something came between the two."""
+    for _ in range(TRIES):
+        before = time.monotonic()
+        utc = time.time()
+        if time.monotonic() - before < QUICK_S:
+            break
+    return utc, before
+
+
 class StepWatch:
     """Tells when the system's clock was set: moved against the clock that nobody sets, faster than any slewing.
 
@@ -86,7 +97,7 @@ class StepWatch:
     clocks: gives (UTC, monotonic) in s at one moment.
     """
 
-    def __init__(self, clocks=lambda: (time.time(), time.monotonic())):
+    def __init__(self, clocks=both_clocks):
         self._clocks = clocks
         self._lock = threading.Lock()  # one thread takes frames, another reports
         self._utc, self._monotonic = clocks()

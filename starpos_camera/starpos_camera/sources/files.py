@@ -166,7 +166,8 @@ class Files:
             raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
         if self._restamp:
             # as if the exposure had just ended: the tilts that belong to it are there
-            frame = replace(frame, mid_unix_s=self._now() - (frame.exposure_s or 0.0) / 2)
+            middle_s = self._now() - (frame.exposure_s or 0.0) / 2
+            frame = replace(frame, mid_unix_s=middle_s, stamp_stddev_s=0.0)
             return Exposure(frame, Capture.DRIVER)
         by_camera = path.suffix.lower() in PICTURE + JPEG + RAW
         if frame.mid_unix_s is None:
