@@ -521,10 +521,20 @@ def test_a_page_one_too_many_says_so(page, listener):
     assert listener.set("dashboard", clients=1).successful
     first = page.driver.current_window_handle
     page.driver.switch_to.new_window("tab")
+    second = page.driver.current_window_handle
+
+    def refused():  # whichever came last: a page whose connection broke on a busy machine comes again
+        for window in (second, first):
+            page.driver.switch_to.window(window)
+            if page.text("status-word") == "No place":
+                return True
+        return False
+
     try:
         page.driver.get(page.url)
-        page.shows(status_word="No place")
+        page.until(refused)
     finally:
+        page.driver.switch_to.window(second)
         page.driver.close()
         page.driver.switch_to.window(first)
         assert listener.set("dashboard", clients=8).successful
