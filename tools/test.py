@@ -2,8 +2,8 @@
 """Run everything that can fail in this project: linters, each package's tests, the tests of the whole graph.
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
-linter counts as one test); the exit status is 0 only where nothing failed. With STARPOS_COMPLETE=1, as in CI, starpos is
-tested a second time with the versions that Ubuntu 24.04 has (tools/ubuntu-24.04.txt).
+linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` tests starpos with the
+versions that Ubuntu 24.04 has (tools/ubuntu-24.04.txt) in an environment of its own.
 """
 
 import os
@@ -83,31 +83,25 @@ def pytest(python: str, folder: str, name: str, pytest_args: list[str], **option
     return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
 
 
-def starpos_tests(pytest_args: list[str], out) -> Counter:
-    """The mathematics, which wants no ROS; in CI with the versions that Ubuntu 24.04 has as well."""
-    total = pytest(sys.executable, "src/starpos/test", "starpos", pytest_args, out=out)
-    if not os.environ.get("STARPOS_COMPLETE"):
-        return total
+def older_tests(pytest_args: list[str]) -> Counter:
+    """The mathematics with the versions that Ubuntu 24.04 has."""
     folder = ROOT / ".underlay" / "ubuntu"
     python = str(folder / "bin" / "python")
     base = Path(ROOT / ".underlay" / "python").read_text().strip()
     pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-input"]
     needs = ["-c", "tools/ubuntu-24.04.txt", "-e", "src/starpos[report,test]"]
-    if run([base, "-m", "venv", str(folder)], out=out) or run([*pip, *needs], out=out):
-        print("Ubuntu 24.04's versions could not be installed", file=out)
-        return total + Counter(failed=1)
+    if run([base, "-m", "venv", str(folder)]) or run([*pip, *needs]):
+        print("Ubuntu 24.04's versions could not be installed")
+        return Counter(failed=1)
     environment = {"PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": ""}
     environment["STARPOS_COMPLETE"] = ""  # what is optional was there with the newest versions
-    print("with the versions of Ubuntu 24.04", file=out, flush=True)
-    return total + pytest(
-        python, "src/starpos/test", "ubuntu", pytest_args, out=out, environment=os.environ | environment
-    )
+    return pytest(python, "src/starpos/test", "ubuntu", pytest_args, environment=os.environ | environment)
 
 
 def all_tests(pytest_args: list[str]) -> Counter:
     """Those that compute beside those that wait for nodes; the former's output comes when it is whole."""
     with tempfile.TemporaryFile("w+") as out, ThreadPoolExecutor(1) as beside:
-        computing = beside.submit(starpos_tests, pytest_args, out)
+        computing = beside.submit(pytest, sys.executable, "src/starpos/test", "starpos", pytest_args, out=out)
         total = package_tests(pytest_args)
         if has_tests(ROOT / "test"):
             total += pytest(sys.executable, "test", "graph", pytest_args)
@@ -118,9 +112,12 @@ def all_tests(pytest_args: list[str]) -> Counter:
 
 
 def main(args: list[str]) -> int:
-    total = lint()
-    if "--lint" not in args:
-        total += all_tests(args)
+    if "--ubuntu" in args:
+        total = older_tests([a for a in args if a != "--ubuntu"])
+    else:
+        total = lint()
+        if "--lint" not in args:
+            total += all_tests(args)
     print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
     return int(total["failed"] > 0)
 

@@ -56,9 +56,9 @@ def test_the_errors_of_the_cameras_clock_are_in_the_budget(night, capsys):
     assert first["budget"]["time stamp"][0] == pytest.approx(M_PER_S / np.sqrt(12), rel=0.01)
     east_m = (together["longitude"] - LONGITUDE_DEG) * 111_320 * np.cos(np.radians(47.3))
     assert abs(east_m) < 3 * together["sigma_east_m"] < 11 * M_PER_S
-    # the clock's error is common to all frames, that of their whole seconds is not
-    assert together["budget"]["clock"][0] == pytest.approx(first["budget"]["clock"][0], rel=0.01)
-    assert together["budget"]["time stamp"][0] < 0.75 * first["budget"]["time stamp"][0]
+    # frames at whole seconds of cadence are all rounded alike: nobody may count on an average
+    for name in ("clock", "time stamp"):
+        assert together["budget"][name][0] == pytest.approx(first["budget"][name][0], rel=0.01)
 
 
 def test_an_untended_clock_may_be_a_minute_off(night, capsys):

