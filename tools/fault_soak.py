@@ -27,6 +27,7 @@ WARM = 0.1  # of the faults, before memory is compared
 FAULTS_A_RESTART = 400
 LEGITIMATE = 0.04  # chance of a turn or a drive before a fault
 PATIENCE = 30  # good frames after a fault, of at most a second each
+FEWEST_FOR_MEMORY = 2000  # faults; the first of each kind takes memory for good
 GROWN_MB = 8.0  # of a node: glibc's arenas and the average's state wander by a few
 
 
@@ -246,7 +247,8 @@ def report(soak: Soak, memory: dict[str, tuple[float, float]], options: str, sec
     print(f"\n{UNTOLD}")
     for line in (*soak.world.wrong, *soak.crashes, *soak.stuck):
         print(line, file=sys.stderr)
-    flat = all(last - first < GROWN_MB for first, last in memory.values())
+    told = sum(row.injected for row in soak.rows.values()) >= FEWEST_FOR_MEMORY
+    flat = not told or all(last - first < GROWN_MB for first, last in memory.values())
     return int(bool(soak.world.wrong or soak.crashes or soak.stuck or not flat))
 
 
