@@ -46,6 +46,7 @@ ALLOWED = {
 }
 # Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
 READS_WHOLE = {
+    "starpos/earth.py": "the table of the Earth's rotation that astropy brings",
     "starpos/geotiff.py": "MAX_BYTES",
     "starpos/inclinometer.py": "MAX_CSV_BYTES",
     "starpos/parallel/same.py": "our own source",
