@@ -10,8 +10,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
@@ -21,7 +19,7 @@ from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.frame import Frame
 from starpos.instrument import focal_px_of
-from starpos_camera.camera_parameters import PARAMETERS, path_of
+from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import NothingYet, Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
@@ -31,6 +29,8 @@ from starpos_common.clock_report import ClockReport
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera, unix_to_stamp
 from starpos_common.parameters import declare
+from starpos_common.paths import path_of
+from starpos_common.topics import publisher
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 
@@ -41,8 +41,10 @@ STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated"
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """A frame with its Capture, the intrinsics and the remark of its source, how long it took; the message of it where
-    somebody subscribes."""
+    """A frame with its Capture, the intrinsics and the remark of its source, and how long it took.
+
+    The message of it where somebody subscribes.
+    """
 
     frame: Frame
     capture: Capture
@@ -92,16 +94,9 @@ class CameraNode(Node):
         self._state = (Level.WARN, "no frame has been taken yet.")
         self._said_s = -math.inf
         self._logged = ""
-        overriding = QoSOverridingOptions.with_default_policies()
-        self._images = self.create_publisher(
-            Image, "~/image_raw", QoSProfile(depth=IMAGE_DEPTH), qos_overriding_options=overriding
-        )
-        self._infos = self.create_publisher(
-            CameraInfo, "~/camera_info", QoSProfile(depth=10), qos_overriding_options=overriding
-        )
-        self._captures = self.create_publisher(
-            Capture, "~/capture", QoSProfile(depth=10), qos_overriding_options=overriding
-        )
+        self._images = publisher(self, Image, "~/image_raw", IMAGE_DEPTH)
+        self._infos = publisher(self, CameraInfo, "~/camera_info", 10)
+        self._captures = publisher(self, Capture, "~/capture", 10)
         self.create_service(SetCameraInfo, "~/set_camera_info", self._on_set_camera_info)
         self.create_service(SetCapture, "~/set_capture", self._on_set_capture)
         self._wake = self.create_guard_condition(self._on_wake)
@@ -325,5 +320,5 @@ def _settings(values) -> Settings:
     return Settings(exposure_s, gain, values["cadence"])
 
 
-def _complaint(values) -> str | None:
+def _complaint(values, names) -> str | None:
     return SOURCES[values["source"]].refusal(values, _settings(values))

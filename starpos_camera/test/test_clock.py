@@ -22,7 +22,7 @@ PLAYED = ("files.loop:=true", "files.restamp:=true", "cadence:=0.1")
 
 @pytest.fixture
 def set_clock(tmp_path, monkeypatch):
-    """set_clock(seconds): the clock of processes that start from now on is so much ahead; again while they run."""
+    """A function of seconds: the clock of processes that start from now on is so much ahead; again while they run."""
     library = next(Path("/usr/lib").glob("**/libfaketimeMT.so.1"), None)
     if library is None:
         lacks("faketime")

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter file of all nodes, from their own tables: python -m starpos_solver.defaults > config/starpos.yaml"""
+"""The parameter file of all nodes, from their own tables.
+
+python -m starpos_solver.defaults > config/starpos.yaml
+"""
 
 from starpos_camera.camera_parameters import PARAMETERS as CAMERA
 from starpos_camera.detector_parameters import PARAMETERS as DETECTOR

@@ -61,7 +61,7 @@ def process(
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:
-    """A parameter file, gone with this process. (A -p reaches all nodes of a process, or one of no namespace.)"""
+    """A parameter file, gone with this process: a -p reaches all nodes of a process, or one of no namespace."""
     content = {
         ("/**" if name == "**" else f"/**/{name}"): {"ros__parameters": values}
         for name, values in parameters.items()

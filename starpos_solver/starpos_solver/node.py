@@ -51,8 +51,11 @@ CLOCK_SIGMAS = 6.0  # beyond the stated error, and AHEAD_S, a stamp in the futur
 
 @dataclass(frozen=True)
 class Waiting:
-    """A frame's stars, as they came and as they are; `since` in ns of the steady clock; by how much the middle of the
-    exposure lay ahead of this node's clock when it came; whether its stars speak against its time."""
+    """A frame's stars, as they came and as they are.
+
+    `since` in ns of the steady clock; by how much the middle of the exposure lay ahead of this node's clock when it came;
+    whether its stars speak against its time.
+    """
 
     message: StarArray
     stars: Stars
@@ -261,8 +264,11 @@ class SolverNode(Node):
         self._work()
 
     def _ahead_s(self, unix_s: float | None) -> float:
-        """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet), or where it
-        is of another time altogether: a night that is played without /clock, or a robot that does not know the date."""
+        """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet).
+
+        0 too where it is of another time altogether: a night that is played without /clock, or a robot that does not know
+        the date.
+        """
         now_ns = self.get_clock().now().nanoseconds
         if unix_s is None or not now_ns:
             return 0.0

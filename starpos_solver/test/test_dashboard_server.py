@@ -44,7 +44,7 @@ def server_of_little_patience(monkeypatch, server):
 
 
 def ask(server, path="/", method="GET", **headers):
-    """(status, headers, body)"""
+    """Ask for a page: (status, headers, body)."""
     with closing(http.client.HTTPConnection("127.0.0.1", server.port, timeout=WAIT_S)) as connection:
         connection.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
         reply = connection.getresponse()
