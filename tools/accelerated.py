@@ -104,6 +104,7 @@ class World:
         )
         self._truths: dict[tuple[int, int], Truth] = {}
         self.right = Counter()  # by topic
+        self.sigmas: dict[str, list[float]] = {}  # by topic: how far off every fix was, in its own
         self.wrong: list[str] = []
         self.scene = scene_at(40.0, SMALL)
         self.drive()
@@ -235,6 +236,7 @@ class World:
         self._judge(topic, message, *truth.sigmas_off(message.latitude, message.longitude, covariance_m2))
 
     def _judge(self, topic: str, message, sigmas: float, in_words: str = ""):
+        self.sigmas.setdefault(topic, []).append(sigmas)
         if sigmas <= WRONG_SIGMA:
             self.right[topic] += 1
         else:

@@ -10,6 +10,7 @@ defect in a log, recovery after every fault, and memory that stays.
 """
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -198,6 +199,14 @@ def _halves(mb: list[float]) -> tuple[float, float]:
     return max(mb[: len(mb) // 2]), max(mb[len(mb) // 2 :])
 
 
+def _spread(sigmas: dict[str, list[float]]) -> str:
+    """rms and most of the errors by topic: how near a wrong one was (of a place two coordinates: 1.41 were true)."""
+    return "; ".join(
+        f"{topic} {math.sqrt(sum(s * s for s in of) / len(of)):.2f}, {max(of):.1f}"
+        for topic, of in sigmas.items()
+    )
+
+
 def table(rows: dict[str, Row]) -> str:
     """Markdown."""
     lines = ["| fault | what | injected | answered | right | wrong | frames to a fix | s to a fix |"]
@@ -242,6 +251,7 @@ def report(soak: Soak, memory: dict[str, tuple[float, float]], options: str, sec
     right = ", ".join(f"{n} of {topic}" for topic, n in soak.world.right.items())
     print(f"\n{injected} faults in {seconds / 60:.0f} min; right: {right}; wrong: {len(soak.world.wrong)}; "
           f"crashes and defects: {len(soak.crashes)}; without recovery: {len(soak.stuck)}")  # fmt: skip
+    print(f"off by, in their own sigmas, rms and most: {_spread(soak.world.sigmas)}")
     grown = [f"{name} {first:.0f} then {last:.0f} MB" for name, (first, last) in memory.items()]
     print(f"most memory in the first and in the last half: {'; '.join(grown)}")
     print(f"\n{UNTOLD}")

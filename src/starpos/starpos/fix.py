@@ -17,7 +17,7 @@ from starpos.earth import EarthState, station_velocity
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.mounting import Mounting
-from starpos.scatter import judged
+from starpos.scatter import expected_extra, judged
 
 MAX_ROUNDS = 6
 MAX_SCATTER = 0.003  # of the frame's diagonal: identified stars that scatter more are not these stars
@@ -116,21 +116,20 @@ def solve_fix(
         if settled:
             break
         residual, before = problem.residual(state), (keep, jitter2)
-        # of the stars' 2 N coordinates the four parameters leave free
-        share = max(1 - 2 / keep.sum(), 1 / keep.sum())
-        jitter2, keep = judged(residual, stated, keep, share)
+        jitter2, keep = judged(residual, stated, keep, _share_free(keep))
         settled = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
     if jitter2 > (MAX_SCATTER * np.hypot(camera.width, camera.height)) ** 2:
         raise FixError(
             f"the identified stars lie {np.sqrt(jitter2):.1f} px off the best attitude: check the camera's distortion"
         )
-    centroids = stars.covariance_px2[keep] + np.eye(2) * jitter2
+    residual = problem.residual(state)[keep]
+    claimed2 = expected_extra(residual, stated[keep], _share_free(keep))
+    centroids = stars.covariance_px2[keep] + np.eye(2) * claimed2
     same_stars = ALWAYS if stars.index is None else tuple(stars.index[keep][:MARKS].tolist())
     errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep], same_stars)
     terms = _terms(
         problem, state, keep, errors, tilt, mounting, atmosphere, earth, (clock_stddev_s, stamp_stddev_s)
     )
-    residual = problem.residual(state)[keep]
     place = place_of(state.a4)
     link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
     axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
@@ -154,6 +153,11 @@ def solve_fix(
         camera_to_itrs=state.a4.T @ problem.g,
         attitude_sigma=float(np.sqrt(np.linalg.eigvalsh(errors.rotation_covariance(centroids))[-1])),
     )
+
+
+def _share_free(keep: np.ndarray) -> float:
+    """Of the kept stars' 2 N coordinates, those that the four parameters leave free."""
+    return max(1 - 2 / keep.sum(), 1 / keep.sum())
 
 
 @dataclass(frozen=True)

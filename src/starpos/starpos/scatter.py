@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 OUTLIER_SIGMA = 5.0
+GRID, GRID_LEAST, GRID_MOST = 128, 1e-3, 1e2  # of variances, in units of the stated and of all residuals
 MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
 
 
@@ -23,6 +24,25 @@ def judged(
     )
     extra = _extra_variance(residual[keep], covariance[keep], lambda d2: d2.mean() / 2 - share)
     return extra, distance2(residual, covariance, typical) < OUTLIER_SIGMA**2
+
+
+def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -> float:
+    """The same variance (px2) as a fit's errors have to be claimed with: its mean over all that it may be.
+
+    Few stars hardly tell how much they scatter, and the likeliest value is mostly too small: the errors of a fit of N
+    stars go as Student's t.  This is the mean of the posterior under Jeffreys' prior of the whole variance, which for
+    errors that are all alike is that of the inverse gamma distribution.  Of many stars it is what `judged` says.
+    """
+    stated = np.median(np.trace(covariance, axis1=1, axis2=2)) / 2
+    most = max(stated, float(np.sum(residual**2)))
+    extra = np.geomspace(GRID_LEAST * stated, GRID_MOST * most, GRID)
+    xx, xy, yy = (covariance[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    determinant = (xx + extra) * (yy + extra) - xy * xy
+    x, y = residual.T[:, :, None]
+    d2 = ((yy + extra) * x * x - 2 * xy * x * y + (xx + extra) * y * y) / determinant
+    log_density = -0.5 * (d2 + share * np.log(determinant)).sum(0) - np.log(stated + extra) + np.log(extra)
+    density = np.exp(log_density - log_density.max())
+    return float(density @ extra / density.sum())
 
 
 def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float = 0.0) -> np.ndarray:

@@ -126,6 +126,18 @@ def test_scatter_beyond_the_centroids_errors_widens_the_fix(rng):
     assert ratio == pytest.approx(8, rel=0.2)
 
 
+def test_few_stars_do_not_claim_what_they_cannot_tell(rng):
+    """Four of unknown scatter: their errors go as Student's t of four, 63 % within the likeliest sigma; 77 within its."""
+    within = []
+    for k in range(400):
+        if k % 10 == 0:
+            field = random_field(rng, stars=4, latitude=rng.uniform(-60, 60))
+            xy, places = field.places(STATE, rng)
+        fix = field.solve(xy + rng.normal(0, 0.5, xy.shape), places, STATE)
+        within.append(abs(error_arcsec(fix, field)[2]) * ARCSEC < np.sqrt(fix.covariance[2, 2]))
+    assert np.mean(within) == pytest.approx(0.77, abs=0.06)
+
+
 def test_too_few_stars(rng):
     field = Field(stars=2)
     xy, places = field.places(STATE, rng)
