@@ -2,8 +2,13 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
+
+from starpos.parallel import BLAS_THREADS
+
+os.environ |= dict.fromkeys(BLAS_THREADS, "1")  # before numpy is loaded, as the command does
+
+import numpy as np
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 

@@ -23,32 +23,11 @@ ARCSEC = np.radians(1 / 3600)
 def night(shared, tmp_path_factory):
     """Star lists from an independent simulator that rests on astropy's AltAz, without tilt noise."""
     out = tmp_path_factory.mktemp("independent")
-    command = [
-        sys.executable,
-        str(shared / "night" / "night.py"),
-        str(out),
-        "--level",
-        "stars",
-        "-n",
-        "3",
-        "--tilt-noise",
-        "0",
-    ]
-    more = [
-        "--lat",
-        "-33.2",
-        "--lon",
-        "149.1",
-        "--azimuth",
-        "310",
-        "--altitude",
-        "85",
-        "--roll",
-        "200",
-        "--seed",
-        "11",
-    ]
-    done = subprocess.run(command + more, capture_output=True, text=True, timeout=300, check=False)
+    # in the final table too (IERS B), all that astropy 6.0 looks at: a date beyond it would have UT1 = UTC there
+    options = "--start 2025-11-02T18:00:00 --level stars -n 3 --tilt-noise 0 --seed 11"
+    options += " --lat -33.2 --lon 149.1 --azimuth 310 --altitude 85 --roll 200"
+    command = [sys.executable, str(shared / "night" / "night.py"), str(out), *options.split()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     return out
 

@@ -9,6 +9,7 @@ from importlib import import_module
 
 from starpos import __version__
 from starpos.errors import StarposError
+from starpos.parallel import BLAS_THREADS
 
 COMMANDS = {
     "solve": "position and heading of frames with their tilts",
@@ -49,6 +50,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     given = sys.argv[1:] if argv is None else argv
+    for name in BLAS_THREADS:  # a command is what loads numpy
+        os.environ.setdefault(name, "1")
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if given and given[0] == name:  # only the command in use is imported: --help stays quick

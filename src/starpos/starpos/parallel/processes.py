@@ -16,15 +16,14 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 
 from starpos.errors import StarposError
+from starpos.parallel import BLAS_THREADS
 from starpos.parallel.call import Call, answer_of, given_up, worked
 
 AHEAD = 4  # calls a process that may wait for one before them
 STILLBORN = 3  # processes in a row that may end before they can work
 DYING_S = 1.0  # for a process that no longer answers to be gone
 # a process a processor: the threads of numpy's and scipy's BLAS and of OpenCV would be too many
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
-)
+ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 
 class ProcessError(StarposError):
