@@ -11,6 +11,7 @@ from shots import LATITUDE_DEG, shoot
 
 RECIPE = Path(get_package_share_directory("starpos_solver")) / "config" / "robot_localization.yaml"
 X, Y, YAW = 0, 1, 5  # of robot_localization's 15 state variables
+WIDEST_FIX_M = 1e6  # self_calibration's first
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +48,19 @@ def test_yaw_needs_no_offset_and_no_declination(graph, solver, recipe):
     assert imu.angular_velocity_covariance[0] == imu.linear_acceleration_covariance[0] == -1
     assert [k for k, used in enumerate(ekf["imu0_config"]) if used] == [YAW]
     assert [k for k, used in enumerate(ekf["odom1_config"]) if used] == [X, Y]
+
+
+def test_the_map_is_not_turned_by_the_robots_first_heading(recipe):
+    """navsat_transform turns it by the filter's yaw less this one: of one message, or of two around the first fix."""
+    assert recipe["navsat_transform_node"]["use_odometry_yaw"] is True
+
+
+def test_a_fix_that_becomes_better_is_not_shut_out(recipe):
+    ekf = recipe["ekf_map"]
+    assert not [name for name in ekf if name.endswith("rejection_threshold")]
+    start = ekf["initial_estimate_covariance"]
+    assert len(start) == 15 and start[X] == start[Y] >= WIDEST_FIX_M**2 and start[YAW] >= math.pi**2
+    assert sum(variance > 1e-9 for variance in start) == 3  # of what is measured only
 
 
 def test_a_lagging_fix_is_put_where_it_belongs(graph, solver, recipe):
