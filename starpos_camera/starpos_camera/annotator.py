@@ -8,8 +8,6 @@ import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -18,6 +16,7 @@ from starpos.frame import Frame
 from starpos.stars import Stars
 from starpos_camera.worker import Worker
 from starpos_common.messages import frame_to_message
+from starpos_common.topics import publisher, subscription
 from starpos_interfaces.msg import Solution
 
 PATIENCE_S = 2.0  # for a frame's solution; then it is shown without
@@ -43,11 +42,11 @@ class Annotator:
 
     def __init__(self, node: Node):
         self._node = node
-        self._override = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
-        self._publisher = node.create_publisher(
-            Image, "~/image_annotated", QoSProfile(depth=1), **self._override
-        )
+        self._publisher = publisher(node, Image, "~/image_annotated", 1)
         self._solutions = None  # the subscription, while somebody looks
+        node.destroy_subscription(
+            self._subscribe_solutions()
+        )  # a bad qos_override is refused now, not by a viewer
         self._waiting: Subject | None = None
         self._drawing = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -64,9 +63,7 @@ class Annotator:
             self._forget()
             return
         if self._solutions is None:
-            self._solutions = self._node.create_subscription(
-                Solution, "solver/solution", self._on_solution, QoSProfile(depth=10), **self._override
-            )
+            self._solutions = self._subscribe_solutions()
         if self._waiting or self._drawing:
             return
         self._waiting = Subject(frame, stars, header)
@@ -74,6 +71,9 @@ class Annotator:
             self._patience.reset()
         else:
             self._begin(Identified(), ["no solver"])
+
+    def _subscribe_solutions(self):
+        return subscription(self._node, Solution, "solver/solution", self._on_solution, 10)
 
     def _forget(self):
         self._patience.cancel()

@@ -71,7 +71,9 @@ class CameraNode(Node):
     def __init__(self, **options):
         """options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("camera", **options)
-        self._values = declare(self, PARAMETERS, apply=self._apply, check=_complaint)
+        self._values = declare(
+            self, PARAMETERS, apply=self._apply, check=lambda values, _: _complaint(values)
+        )
         self._calibration_path = None
         self._calibration: Camera | None = None
         if self._values["calibration_url"]:
@@ -320,5 +322,5 @@ def _settings(values) -> Settings:
     return Settings(exposure_s, gain, values["cadence"])
 
 
-def _complaint(values, names) -> str | None:
+def _complaint(values) -> str | None:
     return SOURCES[values["source"]].refusal(values, _settings(values))

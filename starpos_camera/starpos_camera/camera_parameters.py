@@ -2,10 +2,7 @@
 """The parameters of the node `camera`; those of a source stand in its module."""
 
 import math
-from pathlib import Path
-from urllib.parse import unquote, urlsplit
 
-from starpos.errors import InstrumentError
 from starpos_camera.sources.registry import SOURCES
 from starpos_common.parameters import Parameter
 
@@ -107,13 +104,3 @@ COMMON = (
     ),
 )
 PARAMETERS = (*COMMON, *(p for source in SOURCES.values() for p in source.parameters))
-
-
-def path_of(url: str) -> Path:
-    """The file a `calibration_url` names: file:///a/b.yaml or a path; InstrumentError for anything else."""
-    parts = urlsplit(url)
-    if not parts.scheme:
-        return Path(url).expanduser()
-    if parts.scheme != "file" or parts.netloc not in ("", "localhost") or not parts.path:
-        raise InstrumentError(f"calibration_url {url!r}: give file:///path/to/camera.yaml, or a path.")
-    return Path(unquote(parts.path))

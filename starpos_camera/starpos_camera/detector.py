@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -21,6 +19,7 @@ from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import encoding_of, message_to_frame, stars_to_message
 from starpos_common.parameters import declare
+from starpos_common.topics import publisher, subscription
 from starpos_interfaces.msg import Capture, StarArray
 
 IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB
@@ -63,10 +62,7 @@ class DetectorNode(Node):
         self._last: Outcome | None = None
         self._size = ""  # of the last frame, in words
         self._last_frame_s = self._interval_s = None  # monotonic
-        overriding = QoSOverridingOptions.with_default_policies()
-        self._publisher = self.create_publisher(
-            StarArray, "stars", QoSProfile(depth=10), qos_overriding_options=overriding
-        )
+        self._publisher = publisher(self, StarArray, "stars", 10)
         self._where = ""  # frames come from, for messages
         self._annotator = Annotator(self)
         self._wake = self.create_guard_condition(self._on_wake)
@@ -77,22 +73,9 @@ class DetectorNode(Node):
 
     def listen(self):
         """Take the frames of `camera/image_raw`; beside a camera in this process `submit` is called instead."""
-        overriding = QoSOverridingOptions.with_default_policies()
         # This one first: the executor takes what is ready in this order, and an image needs its Capture.
-        self.create_subscription(
-            Capture,
-            "camera/capture",
-            self._on_capture,
-            QoSProfile(depth=CAPTURES_KEPT),
-            qos_overriding_options=overriding,
-        )
-        images = self.create_subscription(
-            Image,
-            "camera/image_raw",
-            self._on_image,
-            QoSProfile(depth=IMAGE_DEPTH),
-            qos_overriding_options=overriding,
-        )
+        subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
+        images = subscription(self, Image, "camera/image_raw", self._on_image, IMAGE_DEPTH)
         self._where = f" on {images.topic_name}"
 
     def destroy_node(self):

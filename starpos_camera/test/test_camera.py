@@ -21,10 +21,8 @@ from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
-from starpos.errors import InstrumentError
 from starpos.reading import read_frame
 from starpos.simulate import expose
-from starpos_camera.camera_parameters import path_of
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
@@ -166,14 +164,6 @@ def test_a_cadence_that_is_too_short_is_reported(start, listener):
     node = start("camera", *SMALL, *size, "exposure:=0.01", "cadence:=0.01")
     listener.wait_for_state("camera: Capture", WARN, "longer than the cadence of 0.01 s")
     assert node.end(signal.SIGINT)[0] == 0
-
-
-def test_urls():
-    assert str(path_of("file:///a/b%20c.yaml")) == "/a/b c.yaml"
-    assert str(path_of("/a/b.yaml")) == "/a/b.yaml"
-    for url in ("http://a/b.yaml", "package://a/b.yaml", "file://host/b.yaml"):
-        with pytest.raises(InstrumentError, match="file:///"):
-            path_of(url)
 
 
 def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, listener, tmp_path):

@@ -56,6 +56,7 @@ def _run(make_nodes, args, stopped) -> int:
     from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
     from starpos.errors import StarposError
+    from starpos_common.parameters import warn_of_unknown
 
     if stopped:
         return 0
@@ -69,6 +70,7 @@ def _run(make_nodes, args, stopped) -> int:
         for node in make_nodes():
             nodes.append(node)
         made = True
+        warn_of_unknown(nodes)
         # rclpy's handlers shut the context down, which would trip over a node half made; ours run as well.
         install_signal_handlers(SignalHandlerOptions.ALL)
         executor = SingleThreadedExecutor()

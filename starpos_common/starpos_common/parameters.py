@@ -13,8 +13,6 @@ from rclpy.parameter import Parameter as RosParameter
 from starpos.errors import StarposError
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
-# what rclpy itself takes, some of it only after the node is made
-OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
 class ParameterError(StarposError):
@@ -153,14 +151,14 @@ def declare(
     node: Node,
     parameters: Sequence[Parameter],
     apply: Callable[[frozenset[str]], None] | None = None,
-    check: Callable[[Mapping[str, Any]], str | None] | None = None,
+    check: Callable[[Mapping[str, Any], frozenset[str]], str | None] | None = None,
 ) -> Values:
     """Declare a node's parameters; a live view of their values.
 
     apply: called with the names that were set, after a successful change at run time (not here).
-    check: called with all values as they would be; a sentence where they do not fit together, or None.
-    Raises ParameterError where a value given at start-up (command line, YAML) is not allowed; a name given there that
-    nobody knows is a warning in the log.
+    check: called with all values as they would be, and the names that are set (here: all); a sentence where they do not
+    fit together, or None.
+    Raises ParameterError where a value given at start-up (command line, YAML) is not allowed.
     """
     table = {p.name: p for p in parameters}
     values = Values(node, table)
@@ -170,10 +168,9 @@ def declare(
         value = p.convert(node.get_parameter(p.name).value)
         node.set_parameters([RosParameter(p.name, value=p.ros_value(value))])
         node.set_descriptor(p.name, p.descriptor())
-    complaint = check(values) if check else None
+    complaint = check(values, frozenset(table)) if check else None
     if complaint:
         raise ParameterError(complaint)
-    _warn_of_unknown(node, table)
 
     def widen(changes: list[RosParameter]) -> list[RosParameter]:
         return [_widened(table[c.name], c) if c.name in table else c for c in changes]
@@ -183,7 +180,7 @@ def declare(
             wanted = {c.name: table[c.name].convert(c.value) for c in changes if c.name in table}
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        reason = check({**values, **wanted}) if check and wanted else None
+        reason = check({**values, **wanted}, frozenset(wanted)) if check and wanted else None
         return SetParametersResult(successful=not reason, reason=reason or "")
 
     def applied(changes: list[RosParameter]):
@@ -198,17 +195,26 @@ def declare(
     return values
 
 
-def _warn_of_unknown(node: Node, table: Mapping[str, Parameter]):
-    """ROS drops them without a word, and a mistyped parameter would stay at its default."""
-    given = node._parameter_overrides  # rclpy has no public way to what was given
-    for name in sorted(given):
-        if name in table or node.has_parameter(name) or name.startswith(OF_ROS):
-            continue
-        from difflib import get_close_matches
+def warn_of_unknown(nodes: Sequence[Node]) -> None:
+    """A line in the log for each parameter given to one of a process's nodes that it does not have, once all are made.
 
-        near = get_close_matches(name, table, 1)
-        meant = f"did you mean {near[0]}?" if near else "see `ros2 param list` for those there are."
-        node.get_logger().warning(f"there is no parameter {name}, it is ignored: {meant}")
+    ROS drops them without a word, and a mistyped one would stay at its default. `-p NAME:=VALUE` reaches every node of a
+    process: what one of them has, and was given as well, is meant for that one.
+    """
+    for node in nodes:
+        known = node.list_parameters([], 0).names
+        for name in sorted(_given(node).keys() - known):
+            if any(name in _given(other) and other.has_parameter(name) for other in nodes):
+                continue
+            from difflib import get_close_matches
+
+            near = get_close_matches(name, known, 1)
+            meant = f"did you mean {near[0]}?" if near else "see `ros2 param list` for those there are."
+            node.get_logger().warning(f"there is no parameter {name}, it is ignored: {meant}")
+
+
+def _given(node: Node) -> Mapping[str, Any]:
+    return node._parameter_overrides  # rclpy has no public way to what was given
 
 
 def _widened(parameter: Parameter, change: RosParameter) -> RosParameter:

@@ -8,7 +8,7 @@ import rclpy
 import yaml
 from rclpy.parameter import Parameter as RosParameter
 
-from starpos_common.parameters import Parameter, ParameterError, declare, to_yaml
+from starpos_common.parameters import Parameter, ParameterError, declare, to_yaml, warn_of_unknown
 from starpos_common.testing import take_domain
 
 TABLE = (
@@ -92,16 +92,40 @@ def test_bad_start_values_are_refused_with_the_constraint(make, override, senten
 
 
 def test_a_mistyped_name_is_a_warning_with_the_nearest_one(make, tmp_path, capfd):
-    make("noise:=2.0", "use_sim_time:=false", "qos_overrides./a.publisher.depth:=3")
+    node, _ = make("noise:=2.0", "use_sim_time:=false")
+    warn_of_unknown([node])
     assert capfd.readouterr().err == ""
     file = tmp_path / "mine.yaml"
     file.write_text("/**/params:\n  ros__parameters:\n    refraction: {presure: 95000.0}\n    bogus: 3\n")
-    _, values = make("nois:=2.0", file=file)
+    node, values = make("nois:=2.0", file=file)
+    warn_of_unknown([node])
     said = capfd.readouterr().err
     assert values["refraction.pressure"] == 1.0e5 and said.count("is ignored") == 3
     assert "no parameter refraction.presure, it is ignored: did you mean refraction.pressure?" in said
     assert "no parameter nois, it is ignored: did you mean noise?" in said
     assert "no parameter bogus, it is ignored: see `ros2 param list`" in said
+
+
+def test_what_is_meant_for_another_node_of_the_process_is_no_mistyped_name(context, tmp_path, capfd):
+    file = tmp_path / "mine.yaml"
+    file.write_text("/**/second:\n  ros__parameters:\n    noise: 3.0\n")
+    arguments = ["--ros-args", "-p", "noise:=2.0", "-p", "depth:=3", "--params-file", str(file)]
+    rclpy.init(args=arguments, context=(both := rclpy.Context()))
+    nodes = [rclpy.create_node(name, context=both) for name in ("first", "second")]
+    declare(nodes[0], TABLE[1:2])
+    declare(nodes[1], (Parameter("depth", 1, "Of another."),))
+    warn_of_unknown(nodes)
+    assert capfd.readouterr().err == ""  # a -p reaches both
+    misplaced = rclpy.create_node(
+        "second", context=context, cli_args=["--ros-args", "--params-file", str(file)]
+    )
+    beside, _ = rclpy.create_node("third", context=context), declare(misplaced, TABLE[:1])
+    declare(beside, TABLE[1:2])
+    warn_of_unknown([misplaced, beside])
+    assert "[second]: there is no parameter noise" in capfd.readouterr().err
+    for node in (*nodes, misplaced, beside):
+        node.destroy_node()
+    rclpy.shutdown(context=both)
 
 
 def test_descriptors_say_what_and_how_far(make):
@@ -143,14 +167,18 @@ def test_changes_are_validated_then_applied(make):
 
 
 def test_values_must_fit_together(make):
-    def check(values):
+    def check(values, names):
+        told.append(names)
         return "noise must not exceed cadence." if values["noise"] > values["cadence"] else None
 
+    told = []
     with pytest.raises(ParameterError, match="must not exceed"):
         make("noise:=2.0", check=check)
+    assert told == [{p.name for p in TABLE}]
     node, _ = make(check=check)
     assert change(node, noise=2.0).reason == "noise must not exceed cadence."
     assert change(node, noise=2.0, cadence=3.0).successful
+    assert told[-1] == {"noise", "cadence"}  # those that are set: what a file held may be read again for them
 
 
 def test_other_parameters_of_the_node_are_left_alone(make):

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from starpos.inclinometer import LIMIT_RAD
+from starpos_common.topics import subscription
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.source import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
@@ -162,13 +162,7 @@ class ImuSource:
         self._unrest = self._frame = ""
         self._gap = self._has_noise = False
         self.configure(values)
-        self._subscription = node.create_subscription(
-            Imu,
-            TOPIC,
-            self._hear,
-            QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        self._subscription = subscription(node, Imu, TOPIC, self._hear, 1000, ReliabilityPolicy.BEST_EFFORT)
         self._topic = self._subscription.topic_name
 
     def start(self):

@@ -4,12 +4,11 @@
 import time
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 
 from starpos_common.diagnostics import Diagnostics, Status
 from starpos_common.parameters import declare
+from starpos_common.topics import publisher
 from starpos_inclinometer.ascii_line import AsciiSource
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.imu import TOPIC, ImuSource
@@ -25,13 +24,8 @@ class InclinometerNode(Node):
 
     def __init__(self):
         super().__init__("inclinometer")
-        self._values = declare(self, PARAMETERS, apply=self._apply, check=complaint)
-        self._publisher = self.create_publisher(
-            Tilt,
-            "tilt",
-            QoSProfile(depth=100),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        self._values = declare(self, PARAMETERS, apply=self._apply, check=lambda values, _: complaint(values))
+        self._publisher = publisher(self, Tilt, "tilt", 100)
         self._logged: tuple[Phase, str] | None = None
         self._logged_step = None
         self._reporter = Reporter()

@@ -10,8 +10,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -21,9 +19,6 @@ from starpos.average import Average
 from starpos.camera import Camera
 from starpos.earth import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
-from starpos.geoid import Geoid
-from starpos.inclinometer import SCA100T_NOISE_RAD
-from starpos.instrument import Instrument
 from starpos.solve import Solution as Answer
 from starpos.solve import Solver, Status
 from starpos.standing import Standing
@@ -32,13 +27,15 @@ from starpos.vertical import Geodetic
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
 from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix
-from starpos_common.parameters import declare
+from starpos_common.paths import path_of
+from starpos_common.topics import publisher, subscription
 from starpos_interfaces.msg import Solution, StarArray, Tilt
 from starpos_interfaces.srv import SaveCalibration, Solve
-from starpos_solver import outputs, parameters, reports, saving
+from starpos_solver import outputs, reports, saving
 from starpos_solver.calibrating import Calibrating
 from starpos_solver.clock_doubt import ClockDoubt
 from starpos_solver.memory import Seen
+from starpos_solver.settings import Settings
 from starpos_solver.tilts import TiltBuffer
 from starpos_solver.worker import Outcome, Worker
 
@@ -70,17 +67,11 @@ class SolverNode(Node):
     def __init__(self):
         super().__init__("solver")
         self._camera: Camera | None = None
-        self._known: Instrument | None = None
-        self._known_url = ""
-        self._geoid: Geoid | None = None
-        self._geoid_name = ""
-        self._values = declare(self, parameters.PARAMETERS, apply=self._apply, check=self._check)
-        self._read_instrument()
-        self._read_geoid()
+        self._settings = Settings(self, lambda: self._camera, self._apply)
+        self._values = self._settings.values
         self._catalogue = catalogue.load()
-        earth_state(
-            J2000_UNIX_S
-        )  # reads the tables of the Earth's rotation, so that the first frame is not slow
+        # reads the tables of the Earth's rotation, so that the first frame is not slow
+        earth_state(J2000_UNIX_S)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
@@ -97,15 +88,13 @@ class SolverNode(Node):
         self._connect()
 
     def _connect(self):
-        qos = QoSProfile(depth=10)
-        override = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
-        self._fix = self.create_publisher(NavSatFix, "fix", qos, **override)
-        self._fix_averaged = self.create_publisher(NavSatFix, "fix_averaged", qos, **override)
-        self._imu = self.create_publisher(Imu, "heading/imu", qos, **override)
-        self._solution = self.create_publisher(Solution, "solver/solution", qos, **override)
-        self.create_subscription(CameraInfo, "camera/camera_info", self._on_camera, qos, **override)
-        self.create_subscription(Tilt, "tilt", self._on_tilt, QoSProfile(depth=1000), **override)
-        self.create_subscription(StarArray, "stars", self._on_stars, qos, **override)
+        self._fix = publisher(self, NavSatFix, "fix", 10)
+        self._fix_averaged = publisher(self, NavSatFix, "fix_averaged", 10)
+        self._imu = publisher(self, Imu, "heading/imu", 10)
+        self._solution = publisher(self, Solution, "solver/solution", 10)
+        subscription(self, CameraInfo, "camera/camera_info", self._on_camera, 10)
+        subscription(self, Tilt, "tilt", self._on_tilt, 1000)
+        subscription(self, StarArray, "stars", self._on_stars, 10)
         self.create_service(Solve, "solver/solve", self._on_solve)
         self.create_service(Trigger, "solver/reset", self._on_reset)
         self.create_service(SaveCalibration, "solver/save_calibration", self._on_save_calibration)
@@ -125,29 +114,7 @@ class SolverNode(Node):
 
     # parameters ------------------------------------------------------------------------------------------------------
 
-    def _check(self, values) -> str | None:
-        """Values that are each allowed but make no instrument together, such as a broken calibration file."""
-        try:
-            known = self._known
-            if values["calibration_url"] != self._known_url:
-                known = parameters.known_instrument(values["calibration_url"])
-                if self._camera is not None:
-                    parameters.check_camera(known, values["calibration_url"], self._camera)
-            parameters.instrument_of(values, Camera.from_focal(100, 100, 1000.0), known)
-            parameters.atmosphere_of(values)
-            grid = self._geoid
-            if values["deflection.geoid"] != self._geoid_name:
-                grid = parameters.geoid_file(values["deflection.geoid"])
-            parameters.vertical_of(values, grid)
-        except StarposError as e:
-            return str(e)
-        return None
-
     def _apply(self, names: frozenset[str]):
-        if "calibration_url" in names:
-            self._read_instrument()
-        if "deflection.geoid" in names:
-            self._read_geoid()
         if "clock_stddev" in names:
             self._doubt.clear()
         self._calibrating.parameters_set(names)
@@ -162,23 +129,8 @@ class SolverNode(Node):
         else:
             self._solver = self._make_solver(self._camera)
 
-    def _read_instrument(self):
-        """Read once for each value of calibration_url: a file that goes away later is no matter."""
-        self._known_url = self._values["calibration_url"]
-        self._known = parameters.known_instrument(self._known_url)
-
-    def _read_geoid(self):
-        self._geoid_name = self._values["deflection.geoid"]
-        self._geoid = parameters.geoid_file(self._geoid_name)
-
     def _make_solver(self, camera: Camera) -> Solver:
-        parameters.check_camera(self._known, self._known_url, camera)
-        return Solver(
-            parameters.instrument_of(self._values, camera, self._known, self._calibrating.found),
-            self._catalogue,
-            parameters.atmosphere_of(self._values),
-            self._values["min_stars"],
-        )
+        return self._settings.solver(camera, self._calibrating.found, self._catalogue)
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
@@ -232,26 +184,18 @@ class SolverNode(Node):
             if ahead_s:  # both times are known, and of one evening
                 now_s = stamp_to_unix(message.header.stamp) - ahead_s
                 self._tilts.forget_after(now_s + reports.AHEAD_S)
-            self._tilts.add(message, self._tilt_stddev())
+            self._tilts.add(message, self._settings.tilt_stddev_rad)
         except StarposError as e:
             self._reject(str(e))
         if self._waiting:
             self._work()
 
-    def _tilt_stddev(self) -> float:
-        """Of a sample that states none, rad."""
-        stated = math.radians(self._values["tilt_stddev"])
-        if not math.isnan(stated):
-            return stated
-        return self._known.inclinometer.noise_rad if self._known else SCA100T_NOISE_RAD
-
     def _on_stars(self, message: StarArray):
         self._seen("stars")
         try:
             stars = message_to_stars(message)
-            if not math.isnan(
-                self._values["clock_stddev"]
-            ):  # who sets it knows better than the camera's host
+            # who sets it knows better than the camera's host
+            if not math.isnan(self._values["clock_stddev"]):
                 stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             self._publish(message.header, Answer(Status.BAD_INPUT, str(e), "stars", None, len(message.stars)))
@@ -391,7 +335,7 @@ class SolverNode(Node):
         self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
 
     def _messages(self, header: Header, answer: Answer):
-        ground = outputs.on_ground(answer, parameters.vertical_of(self._values, self._geoid))
+        ground = outputs.on_ground(answer, self._settings.vertical)
         message = outputs.solution(header, answer, ground)
         if self._solver is None and self._camera is None:
             message.status = Solution.NO_CAMERA
@@ -403,7 +347,7 @@ class SolverNode(Node):
 
     def _averaged(self, about: Header, place: Average) -> NavSatFix:
         header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
-        vertical = parameters.vertical_of(self._values, self._geoid)
+        vertical = self._settings.vertical
         return self._nav_sat_fix(header, outputs.average_on_ground(place, vertical))
 
     def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
@@ -451,8 +395,8 @@ class SolverNode(Node):
         except StarposError as e:
             response.message = str(e)
             return response
-        if written == saving.path_of(url):  # what a restart would read
-            self._known = instrument
+        if written == path_of(url):  # what a restart would read
+            self._settings.saved(instrument)
         response.success, response.message = True, f"{written}: the calibration in use is written"
         return response
 

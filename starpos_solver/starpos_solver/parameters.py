@@ -14,7 +14,7 @@ from starpos.instrument import Calibration, Instrument
 from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos_common.parameters import Parameter
-from starpos_solver import saving
+from starpos_common.paths import path_of
 
 NAN = math.nan
 SAME_FOCAL = 0.05  # of the focal length, by which that of one camera may change
@@ -184,7 +184,7 @@ def instrument_of(
 
 def known_instrument(url: str) -> Instrument | None:
     """The Instrument that calibration_url names, None for ''; InstrumentError with the reason where it is broken."""
-    return instrument_file.read(saving.path_of(url)) if url else None
+    return instrument_file.read(path_of(url)) if url else None
 
 
 def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:

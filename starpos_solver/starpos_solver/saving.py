@@ -6,11 +6,7 @@ from pathlib import Path
 from starpos import instrument_file
 from starpos.errors import InstrumentError
 from starpos.instrument import Instrument
-
-
-def path_of(url: str) -> Path:
-    """The file that calibration_url, or a request, names."""
-    return Path(url.removeprefix("file://"))
+from starpos_common.paths import path_of
 
 
 def save(path: str, calibration_url: str, instrument: Instrument) -> Path:

@@ -7,14 +7,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos.errors import FrameError
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import stamp_to_unix
 from starpos_common.parameters import declare
+from starpos_common.topics import subscription
 from starpos_interfaces.msg import Solution, Tilt
 from starpos_solver.dashboard import access, picture
 from starpos_solver.dashboard.board import Board
@@ -48,8 +47,7 @@ class DashboardNode(Node):
         self._announce(address)
 
     def _connect(self):
-        self._override = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
-        qos, board = QoSProfile(depth=10), self._board
+        board = self._board
         for kind, topic, hear in (
             (NavSatFix, "fix", board.hear_fix),
             (NavSatFix, "fix_averaged", board.hear_average),
@@ -57,8 +55,9 @@ class DashboardNode(Node):
             (Tilt, "tilt", board.hear_tilt),
             (Solution, "solver/solution", board.hear_solution),
         ):
-            self.create_subscription(kind, topic, hear, qos, **self._override)
+            subscription(self, kind, topic, hear, 10)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        self.destroy_subscription(self._subscribe_frames())  # a bad qos_override is refused now, not by the first page
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1 / self._values["rate"], self._tell, clock=steady)
         self._diagnostics = Diagnostics(self, {"Page": self._report})
@@ -108,14 +107,15 @@ class DashboardNode(Node):
         """Subscribe the frames while somebody looks: until then the detector draws none."""
         looking = self._server.looking
         if looking and self._images is None:
-            self._images = self.create_subscription(
-                Image, "detector/image_annotated", self._on_image, QoSProfile(depth=1), **self._override
-            )
+            self._images = self._subscribe_frames()
         elif not looking and self._images is not None:
             self.destroy_subscription(self._images)
             self._images = self._image = None
             self._server.show_frame(None)
             self._board.hide_frame()
+
+    def _subscribe_frames(self):
+        return subscription(self, Image, "detector/image_annotated", self._on_image, 1)
 
     def _show_frame(self, now_s: float):
         image, self._image = self._image, None

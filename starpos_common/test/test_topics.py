@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""QoS overrides reach the topic they name, and no other."""
+
+import pytest
+import rclpy
+from rclpy.qos import ReliabilityPolicy
+from std_msgs.msg import String
+
+from starpos_common.parameters import ParameterError
+from starpos_common.testing import take_domain
+from starpos_common.topics import publisher, subscription
+
+
+@pytest.fixture
+def make():
+    take_domain()
+    context, nodes = rclpy.Context(), []
+    rclpy.init(context=context)
+
+    def make(*overrides):
+        arguments = [word for o in overrides for word in ("-p", f"qos_overrides.{o}")]
+        nodes.append(rclpy.create_node("topics", context=context, cli_args=["--ros-args", *arguments]))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_an_override_of_one_topic_leaves_the_others_alone(make):
+    node = make("/fix.publisher.reliability:=best_effort", "/stars.subscription.reliability:=best_effort")
+    for topic in ("fix", "heading"):
+        publisher(node, String, topic, 10)
+    for topic in ("stars", "tilt"):
+        subscription(node, String, topic, print, 10)
+    best_effort = {
+        about.topic_type and topic
+        for topic in ("/fix", "/heading", "/stars", "/tilt")
+        for about in (*node.get_publishers_info_by_topic(topic), *node.get_subscriptions_info_by_topic(topic))
+        if about.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    }
+    assert best_effort == {"/fix", "/stars"}
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("/fix.publisher.reliability:=perhaps", "qos_overrides./fix reliability perhaps"),
+        ("/fix.publisher.depth:=0", "qos_overrides./fix depth 1 100000"),
+        ("/fix.publisher.depth:=-3", "qos_overrides./fix depth 1 100000"),
+    ],
+)
+def test_an_override_that_makes_no_sense_is_refused_in_a_sentence(make, override, words):
+    with pytest.raises(ParameterError) as error:
+        publisher(make(override), String, "fix", 10)
+    assert all(word in str(error.value) for word in words.split())

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solver's parameters, and what is in the files that they name."""
+
+import math
+from collections.abc import Callable, Mapping
+
+from rclpy.node import Node
+
+from starpos.camera import Camera
+from starpos.catalogue import Catalogue
+from starpos.errors import StarposError
+from starpos.geoid import Geoid
+from starpos.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument import Calibration, Instrument
+from starpos.solve import Solver
+from starpos.vertical import Vertical
+from starpos_common.parameters import declare
+from starpos_solver import parameters
+
+ANY_CAMERA = Camera.from_focal(100, 100, 1000.0)
+
+
+class Settings:
+    """`values` by name, and what they make of files.
+
+    A file is read once, when its parameter is set and the value validated: what is applied is what was found sound, and a
+    file that breaks or goes away later is no matter until the parameter is set again.
+
+    camera: the one in use, None before there is one.  apply: called with the names that were set.
+    """
+
+    def __init__(
+        self, node: Node, camera: Callable[[], Camera | None], apply: Callable[[frozenset[str]], None]
+    ):
+        self._camera, self._apply = camera, apply
+        self._known: Instrument | None = None
+        self._geoid: Geoid | None = None
+        self._read: tuple[Instrument | None, Geoid | None] = None, None  # by the last validation
+        self.values = declare(node, parameters.PARAMETERS, apply=self._adopt, check=self._check)
+        self._known, self._geoid = self._read
+
+    def _check(self, values: Mapping, names: frozenset[str]) -> str | None:
+        """Values that are each allowed but make no instrument together, such as a broken calibration file."""
+        known, grid, camera = self._known, self._geoid, self._camera()
+        try:
+            if "calibration_url" in names:
+                known = parameters.known_instrument(values["calibration_url"])
+                if camera is not None:
+                    parameters.check_camera(known, values["calibration_url"], camera)
+            if "deflection.geoid" in names:
+                grid = parameters.geoid_file(values["deflection.geoid"])
+            parameters.instrument_of(values, ANY_CAMERA, known)
+            parameters.atmosphere_of(values)
+            parameters.vertical_of(values, grid)
+        except StarposError as e:
+            return str(e)
+        self._read = known, grid
+        return None
+
+    def _adopt(self, names: frozenset[str]):
+        self._known, self._geoid = self._read
+        self._apply(names)
+
+    def saved(self, instrument: Instrument) -> None:
+        """The file of calibration_url holds this now."""
+        self._known = instrument
+
+    @property
+    def vertical(self) -> Vertical:
+        return parameters.vertical_of(self.values, self._geoid)
+
+    @property
+    def tilt_stddev_rad(self) -> float:
+        """Of a sample that states none."""
+        stated = math.radians(self.values["tilt_stddev"])
+        if not math.isnan(stated):
+            return stated
+        return self._known.inclinometer.noise_rad if self._known else SCA100T_NOISE_RAD
+
+    def solver(self, camera: Camera, found: Calibration | None, catalogue: Catalogue) -> Solver:
+        """For a camera, with the calibration that frames have told (`found`); InstrumentError where it is another one."""
+        parameters.check_camera(self._known, self.values["calibration_url"], camera)
+        return Solver(
+            parameters.instrument_of(self.values, camera, self._known, found),
+            catalogue,
+            parameters.atmosphere_of(self.values),
+            self.values["min_stars"],
+        )

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solver's parameters with the files they name, on a real node."""
+
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+
+from starpos import instrument_file
+from starpos.camera import Camera
+from starpos.instrument import Instrument
+from starpos_common.testing import take_domain
+from starpos_solver.settings import Settings
+
+CAMERA = Camera.from_focal(1000, 800, 2000.0)
+
+
+@pytest.fixture
+def make():
+    take_domain()
+    context, nodes = rclpy.Context(), []
+    rclpy.init(context=context)
+
+    def make(**given):
+        overrides = [Parameter(name, value=value) for name, value in given.items()]
+        nodes.append(rclpy.create_node("settings", context=context, parameter_overrides=overrides))
+        applied = []
+        return nodes[-1], Settings(nodes[-1], lambda: CAMERA, applied.append), applied
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def change(node, **values):
+    return node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+
+
+def test_a_file_is_read_again_when_it_is_set_again_and_a_broken_one_changes_nothing(make, tmp_path):
+    path = tmp_path / "instrument.yaml"
+    instrument_file.write(path, Instrument(2000.0, clock_stddev_s=0.5))
+    node, settings, applied = make(calibration_url=str(path))
+
+    def clock_s():
+        return settings.solver(CAMERA, None, None).instrument.clock_stddev_s
+
+    assert clock_s() == 0.5
+    path.write_text("broken: [")
+    assert change(node, min_stars=6).successful and clock_s() == 0.5  # it is not looked at
+    result = change(node, calibration_url=str(path))
+    assert not result.successful and "instrument.yaml" in result.reason and clock_s() == 0.5
+    instrument_file.write(path, Instrument(2000.0, clock_stddev_s=0.25))
+    assert change(node, calibration_url=str(path)).successful and clock_s() == 0.25
+    assert applied == [{"min_stars"}, {"calibration_url"}]
+    path.unlink()
+    result = change(node, calibration_url=str(path), min_stars=7)
+    assert not result.successful and clock_s() == 0.25 and settings.values["min_stars"] == 6  # all or none
+
+
+def test_a_file_of_another_camera_is_refused_when_it_is_set(make, tmp_path):
+    instrument_file.write(tmp_path / "other.yaml", Instrument(3000.0))
+    node, settings, _ = make()
+    result = change(node, calibration_url=f"file://{tmp_path}/other.yaml")
+    assert not result.successful and "of another camera" in result.reason
+    assert settings.values["calibration_url"] == ""
