@@ -19,7 +19,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 from launch_ros.substitutions import ExecutableInPackage
 
-from starpos_solver.launching import COMMON_ARGUMENTS, declared, given, process
+from starpos_solver.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
@@ -58,7 +58,7 @@ def nodes(context):
     folder = tempfile.mkdtemp(prefix="starpos_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     link = os.path.join(folder, "inclinometer")
-    common = told["params_file"], told["log_level"]
+    common = Common.of(told)
     simulated = {f"simulated.{name}": value for name, value in (place | AIR).items()} | {
         "simulated.roll": roll_deg
     }
@@ -70,12 +70,12 @@ def nodes(context):
     device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]
     processes = [
         ExecuteProcess(cmd=device, name="emulator", output="screen"),  # a device, no node
-        process("starpos_inclinometer", "inclinometer", *common, {"inclinometer": {"port": link}}),
-        process("starpos_camera", "camera_detector", *common, {"camera": camera}),
-        process("starpos_solver", "solver", *common, {"solver": solver}),
+        process("starpos_inclinometer", "inclinometer", common, {"inclinometer": {"port": link}}),
+        process("starpos_camera", "camera_detector", common, {"camera": camera}),
+        process("starpos_solver", "solver", common, {"solver": solver}),
     ]
-    if told["dashboard"].lower() == "true":
-        processes.append(process("starpos_solver", "dashboard", *common))
+    if is_true(told, "dashboard"):
+        processes.append(process("starpos_solver", "dashboard", common))
     return processes
 
 

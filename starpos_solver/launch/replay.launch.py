@@ -11,7 +11,7 @@ from launch.actions import OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 
-from starpos_solver.launching import COMMON_ARGUMENTS, declared, given, process
+from starpos_solver.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
@@ -25,18 +25,18 @@ SIMULATED = {"**": {"use_sim_time": True}}
 
 def nodes(context):
     told = given(context, ARGUMENTS)
-    common = told["params_file"], told["log_level"]
-    processes = [process("starpos_solver", "solver", *common, SIMULATED)]
+    common = Common.of(told)
+    processes = [process("starpos_solver", "solver", common, SIMULATED)]
     inputs = "stars"
-    if told["detector"].lower() == "true":
-        processes.append(process("starpos_camera", "detector", *common, SIMULATED))
+    if is_true(told, "detector"):
+        processes.append(process("starpos_camera", "detector", common, SIMULATED))
         inputs = "images"
-    if told["dashboard"].lower() == "true":
-        processes.append(process("starpos_solver", "dashboard", *common, SIMULATED))
+    if is_true(told, "dashboard"):
+        processes.append(process("starpos_solver", "dashboard", common, SIMULATED))
     player = ["--rate", told["rate"], "--inputs", inputs, "--", told["bag"]]
     processes.append(
         process(
-            "starpos_solver", "replay", "", "", arguments=player, on_exit=Shutdown(reason="the bag is played")
+            "starpos_solver", "replay", common, arguments=player, on_exit=Shutdown(reason="the bag is played")
         )
     )
     return processes

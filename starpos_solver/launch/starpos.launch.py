@@ -11,7 +11,7 @@ from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 
-from starpos_solver.launching import COMMON_ARGUMENTS, declared, given, process
+from starpos_solver.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
@@ -19,22 +19,23 @@ ARGUMENTS = (
     ("camera", "", "source of frames: files, simulated, gphoto2, indi, alpaca, video"),
     ("port", "", "serial port of the inclinometer; prefer a path under /dev/serial/by-id"),
     ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
+    ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
 )
 
 
 def nodes(context):
     told = given(context, ARGUMENTS)
-    clock = {"use_sim_time": told["use_sim_time"].lower() == "true"} if told["use_sim_time"] else {}
+    clock = {"use_sim_time": is_true(told, "use_sim_time")} if told["use_sim_time"] else {}
     source = {"source": told["camera"]} if told["camera"] else {}
     port = {"port": told["port"]} if told["port"] else {}
-    common = told["params_file"], told["log_level"]
+    common = Common.of(told)
     processes = [
-        process("starpos_camera", "camera_detector", *common, {"**": clock, "camera": source}),
-        process("starpos_inclinometer", "inclinometer", *common, {"**": clock, "inclinometer": port}),
-        process("starpos_solver", "solver", *common, {"**": clock}),
+        process("starpos_camera", "camera_detector", common, {"**": clock, "camera": source}),
+        process("starpos_inclinometer", "inclinometer", common, {"**": clock, "inclinometer": port}),
+        process("starpos_solver", "solver", common, {"**": clock}),
     ]
-    if told["dashboard"].lower() == "true":
-        processes.append(process("starpos_solver", "dashboard", *common, {"**": clock}))
+    if is_true(told, "dashboard"):
+        processes.append(process("starpos_solver", "dashboard", common, {"**": clock}))
     return processes
 
 

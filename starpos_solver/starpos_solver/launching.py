@@ -5,6 +5,8 @@ import atexit
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import yaml
 from launch.actions import DeclareLaunchArgument
@@ -20,7 +22,46 @@ COMMON_ARGUMENTS = (  # name, default, what it is
         "parameters of all nodes",
     ),
     ("log_level", "info", "debug, info, warn or error"),
+    (
+        "enclaves",
+        "/starpos",
+        "where the SROS2 enclaves are: each process has enclaves/EXECUTABLE, if security is enabled",
+    ),
 )
+RESPAWN_DELAY_S = 2.0
+
+
+class LaunchError(Exception):
+    """An argument is not what it must be: one sentence."""
+
+
+@dataclass(frozen=True)
+class Common:
+    """What all processes of a launch share; params_file: '' for none."""
+
+    params_file: str
+    log_level: str
+    enclaves: str
+    respawn: bool = False
+
+    @classmethod
+    def of(cls, told: Mapping[str, str]) -> "Common":
+        """From the arguments; LaunchError where there is no such parameter file."""
+        # launch_ros only warns of one that is not there, and the instrument would run with defaults
+        path = Path(told["params_file"]).expanduser()
+        if not path.is_file():
+            raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
+        respawn = is_true(told, "respawn") if "respawn" in told else False
+        return cls(str(path), told["log_level"], told["enclaves"].rstrip("/"), respawn)
+
+
+def is_true(told: Mapping[str, str], name: str) -> bool:
+    """What an argument says; LaunchError where it is neither true nor false."""
+    words = {"true": True, "1": True, "false": False, "0": False}
+    try:
+        return words[told[name].lower()]
+    except KeyError:
+        raise LaunchError(f"{name}:={told[name]}: give true or false") from None
 
 
 def declared(arguments) -> list[DeclareLaunchArgument]:
@@ -38,26 +79,32 @@ def given(context, arguments) -> dict[str, str]:
 def process(
     package: str,
     executable: str,
-    params_file: str,
-    log_level: str,
+    common: Common,
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
     **options,
 ) -> Node:
     """An executable with its nodes' parameters: a file's, and over it some of each node (by its name; '**' is all)."""
-    files = [params_file] if params_file else []
+    files = [common.params_file]
     parameters = {name: dict(values) for name, values in parameters.items() if values}
     if parameters:
         files.append(_written(parameters))
-    ros = ["--ros-args", "--log-level", log_level] if log_level else []
     return Node(
         package=package,
         executable=executable,
         parameters=files,
-        arguments=[*arguments, *ros],
+        arguments=[*arguments, *ros_arguments(executable, common)],
         output="screen",
+        respawn=common.respawn,
+        respawn_delay=RESPAWN_DELAY_S,
         **options,
     )
+
+
+def ros_arguments(executable: str, common: Common) -> list[str]:
+    """The enclave is but a name while security is not enabled (ROS_SECURITY_ENABLE)."""
+    enclave = f"{common.enclaves}/{executable}"
+    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave]
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:

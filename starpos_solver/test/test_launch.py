@@ -2,16 +2,21 @@
 """The launch files, where launch is installed: it is no part of the ROS that PyPI carries."""
 
 import importlib.util
+import os
+import re
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import yaml
 from sensor_msgs.msg import NavSatFix
 
-from starpos_common.testing import Listener, take_domain
+from starpos_common.testing import WAIT_S, Listener, take_domain
+from starpos_solver.launching import LaunchError
 
 pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
 
@@ -67,7 +72,7 @@ def test_the_instrument_takes_the_arguments_it_names():
     assert {name for name, _, _ in module_of("starpos").ARGUMENTS} >= {
         "namespace", "params_file", "use_sim_time", "camera", "port", "log_level",
     }  # fmt: skip
-    silent = started("starpos", params_file="mine.yaml")
+    silent = started("starpos")
     assert list(silent) == ["camera_detector", "inclinometer", "solver"]
     assert all(over == {} for over, _ in silent.values())  # what is not given, the file says
     told = started(
@@ -75,19 +80,46 @@ def test_the_instrument_takes_the_arguments_it_names():
     )
     assert told["camera_detector"][0] == {"/**": {"use_sim_time": True}, "/**/camera": {"source": "indi"}}
     assert told["inclinometer"][0]["/**/inclinometer"] == {"port": "/dev/x"}
-    assert told["solver"][1][-2:] == ["--log-level", "warn"] and "dashboard" in told
+    assert told["solver"][1] == ["--ros-args", "--log-level", "warn", "--enclave", "/starpos/solver"]
+    assert "dashboard" in told
+
+
+def test_each_process_is_in_its_enclave_of_the_policy():
+    policy = ElementTree.parse(FOLDER.parent / "sros2" / "policies.xml")
+    enclaves = {e.attrib["path"] for e in policy.iter("enclave")}
+    for name, given in (
+        ("starpos", {"dashboard": "true"}),
+        ("replay", {"bag": "night", "detector": "true"}),
+        ("demo", {}),
+    ):
+        named = {words[words.index("--enclave") + 1] for _, words in started(name, **given).values()}
+        assert len(named) >= 3 and named <= enclaves
+    elsewhere = started("starpos", enclaves="/rover/")["solver"][1]
+    assert elsewhere[-1] == "/rover/solver"
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "words"),
+    [
+        (
+            "starpos",
+            {"params_file": "/nowhere/mine.yaml"},
+            "params_file:=/nowhere/mine.yaml: there is no such file",
+        ),
+        ("starpos", {"use_sim_time": "perhaps"}, "use_sim_time:=perhaps: give true or false"),
+        ("starpos", {"respawn": "yes"}, "respawn:=yes: give true or false"),
+        ("replay", {"bag": "night", "detector": "on"}, "detector:=on: give true or false"),
+    ],
+)
+def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, given, words):
+    with pytest.raises(LaunchError, match=words):
+        started(name, **given)
 
 
 def test_a_replay_takes_the_stars_or_finds_them_again():
     stars = started("replay", bag="night", rate="0")
-    assert list(stars) == ["solver", "replay"] and stars["replay"][1] == [
-        "--rate",
-        "0",
-        "--inputs",
-        "stars",
-        "--",
-        "night",
-    ]
+    assert list(stars) == ["solver", "replay"]
+    assert stars["replay"][1][:6] == ["--rate", "0", "--inputs", "stars", "--", "night"]
     assert stars["solver"][0] == {"/**": {"use_sim_time": True}}
     images = started("replay", bag="night", detector="true")
     assert "detector" in images and "images" in images["replay"][1]
@@ -126,6 +158,25 @@ def test_the_demo_gives_its_place_in_a_namespace_and_ends_cleanly(run):
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=30)
     assert "Traceback" not in out and "has died" not in out
+
+
+def test_a_process_that_is_killed_is_started_again_where_that_is_asked_for(run):
+    process = run("starpos", "respawn:=true", "camera:=simulated", "port:=/nowhere")
+    patience = threading.Timer(WAIT_S, process.kill)
+    patience.start()
+
+    def pid_of_next_inclinometer() -> int:
+        for line in process.stdout:
+            if match := re.search(r"\[inclinometer-\d+\]: process started with pid \[(\d+)\]", line):
+                return int(match[1])
+        raise AssertionError(f"not started within {WAIT_S} s")
+
+    first = pid_of_next_inclinometer()
+    os.kill(first, signal.SIGKILL)
+    assert pid_of_next_inclinometer() != first
+    patience.cancel()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=WAIT_S)
 
 
 @pytest.mark.skipif(not NIGHT.is_dir(), reason="no bag beside the package")
