@@ -57,7 +57,9 @@ class DashboardNode(Node):
         ):
             subscription(self, kind, topic, hear, 10)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
-        self.destroy_subscription(self._subscribe_frames())  # a bad qos_override is refused now, not by the first page
+        self.destroy_subscription(
+            self._subscribe_frames()
+        )  # a bad qos_override is refused now, not by the first page
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1 / self._values["rate"], self._tell, clock=steady)
         self._diagnostics = Diagnostics(self, {"Page": self._report})
