@@ -71,7 +71,7 @@ class Listener:
         end = time.monotonic() + WAIT_S
         while not condition():
             assert time.monotonic() < end, self.states
-            self._executor.spin_once(timeout_sec=0.5)
+            self._executor.spin_once(timeout_sec=0.1)
 
     def wait_for_state(self, name: str, level: int, text: str = "") -> dict[str, str]:
         """The values of the next diagnostic of that name that has the level and the text in its sentence."""

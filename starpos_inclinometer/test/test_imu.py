@@ -195,26 +195,19 @@ def test_the_node_reads_an_imu(listener):
 
         imu.skip(5)
         n = len(tilts)
-        send_until(lambda: len(tilts) >= n + 4)
-        assert sorted(t.flags for t in tilts[n : n + 4]) == [0, 0, 0, Tilt.GAP]
+        send_until(lambda: len(tilts) >= n + 4 and any(t.flags for t in tilts[n:]))
+        assert [t.flags for t in tilts[n:] if t.flags] == [Tilt.GAP]
         assert listener.set("inclinometer", noise_stddev=0.1).successful
         send_until(lambda: math.degrees(math.sqrt(tilts[-1].covariance[3])) == pytest.approx(0.1))
-        n = len(tilts)
-        send_until(lambda: len(tilts) >= n + 5, tilt=(3.0, 40.0))
-        assert tilts[-1].flags == Tilt.OUT_OF_RANGE
-        n = len(tilts)
-        send_until(lambda: len(tilts) >= n + 5, noise=0.0)
-        assert tilts[-1].flags == Tilt.STUCK
-        n = len(tilts)
-        send_until(lambda: len(tilts) >= n + 5, scale=-1.0)
-        assert tilts[-1].flags == Tilt.OUT_OF_RANGE  # upside down
+        send_until(lambda: tilts[-1].flags == Tilt.OUT_OF_RANGE, tilt=(3.0, 40.0))
+        send_until(lambda: tilts[-1].flags == Tilt.STUCK, noise=0.0)
+        send_until(lambda: tilts[-1].flags == Tilt.OUT_OF_RANGE, scale=-1.0)  # upside down
 
         def unusable():
             return listener.states.get(state) and "no usable messages" in listener.states[state].message
 
-        n = len(tilts)
         send_until(unusable, ahead_ns=3600 * 10**9)
-        assert len(tilts) == n
+        assert tilts[-1].header.stamp.sec < time.time() + 60
         values = {v.key: v.value for v in listener.states[state].values}
         assert int(values["messages from the future"]) > 0
         status, out = node.end(signal.SIGTERM)
