@@ -22,6 +22,7 @@ import numpy as np
 from instrument_run import Place, Processes, own_domain
 
 PICTURE = Path(__file__).resolve().parent.parent / "starpos_solver" / "dashboard.png"
+PORT = Path(tempfile.gettempdir()) / "inclinometer"  # in the picture: as in the inclinometer's README
 SIZE = (1440, 1000)
 FIXES = 6  # on the map
 PATIENCE_S = 120.0
@@ -106,6 +107,8 @@ def save(png: bytes, path: Path) -> None:
 @contextmanager
 def own_instrument(seed: int):
     """The demo's instrument and a dashboard in a ROS domain of their own; the page's address."""
+    if PORT.is_symlink() or PORT.exists():
+        raise ScreenshotError(f"{PORT} exists: another emulated inclinometer? end it, or remove what it left")
     with own_domain(), tempfile.TemporaryDirectory() as scratch:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
@@ -113,7 +116,7 @@ def own_instrument(seed: int):
         processes = Processes(Path(scratch))
         try:
             processes.node("starpos_solver", "dashboard", {"port": port})
-            demo.start(processes, Place.drawn(np.random.default_rng(seed)), seed)
+            demo.start(processes, Place.drawn(np.random.default_rng(seed)), seed, PORT)
             yield f"http://127.0.0.1:{port}"
         finally:
             processes.stop()

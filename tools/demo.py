@@ -64,10 +64,10 @@ class PictureWatcher(Watcher):
             self.pictured = next((f for f in self.frames if stamp_of(f) == stamp_of(message)), None)
 
 
-def start(processes: Processes, place: Place, seed: int):
-    """The emulated inclinometer and the nodes that make a fix."""
+def start(processes: Processes, place: Place, seed: int, port: Path):
+    """The emulated inclinometer, a link to it at `port`, and the nodes that make a fix."""
     theta_x, theta_y = np.degrees(place.scene().tilt)
-    link = str(processes.folder / "inclinometer-port")
+    link = str(port)
     tilt = ["--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}", "--seed", str(seed)]
     processes.start("emulator", [executable("starpos_inclinometer", "emulator"), "--link", link, *tilt])
     processes.node("starpos_inclinometer", "inclinometer", {"port": link})
@@ -126,7 +126,7 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
     with tempfile.TemporaryDirectory() as scratch:  # a pty's link wants a short path
         processes = Processes(Path(scratch))
         watcher = PictureWatcher(place)
-        start(processes, place, seed)
+        start(processes, place, seed, processes.folder / "inclinometer-port")
         if page := show(processes):
             print(f"to look at meanwhile: {page}", flush=True)
         try:

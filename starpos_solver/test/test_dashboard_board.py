@@ -17,6 +17,7 @@ from starpos_solver.dashboard.board import Board
 from starpos_solver.dashboard.picture import jpeg
 
 NAN, INF = math.nan, math.inf
+ALL = frozenset()
 
 
 class Clock:
@@ -31,7 +32,7 @@ def told(board: Board, now_s=1000.0, slow_s=15.0) -> dict:
 
 
 def test_a_fix_comes_with_its_covariance_and_where_it_was_before():
-    b = Board(10)
+    b = Board(10, ALL)
     b.hear_fix(said.fix(10.0, 20.0, (4.0, 1.0, 9.0)))
     fix = told(b)["fix"]
     assert (fix["good"], fix["latitude"], fix["longitude"]) == (True, 10.0, 20.0)
@@ -48,7 +49,7 @@ def test_a_place_that_is_not_on_earth_is_no_fix(latitude, longitude):
     message = said.fix(1.0, longitude)
     message.latitude = latitude
     assert not readings.position(message)["good"]
-    b = Board(10)
+    b = Board(10, ALL)
     b.hear_fix(message)
     assert b.track == () and "last_fix" not in told(b)
 
@@ -83,14 +84,14 @@ def test_no_attitude_is_no_heading(broken):
         message.orientation.z = message.orientation.w = 0.0
     else:
         message.orientation_covariance[0] = -1.0
-    b = Board(10)
+    b = Board(10, ALL)
     b.hear_heading(said.imu())
     b.hear_heading(message)
     assert "heading" not in told(b)
 
 
 def test_nan_everywhere_is_null_everywhere():
-    b = Board(10)
+    b = Board(10, ALL)
     b.hear_tilt(Tilt(x=NAN, y=INF, temperature=NAN, covariance=[NAN, NAN, NAN, INF]))
     message = said.solution()
     message.residual, message.budget[0].east, message.budget[1].heading = NAN, NAN, INF
@@ -114,28 +115,41 @@ def test_texts_are_short_and_cannot_rearrange_the_page():
 
 def test_lights_are_the_newest_of_their_name_and_bounded():
     clock = Clock()
-    b = Board(10, clock)
-    b.hear_diagnostics(said.diagnostics(("solver: Inputs", 0, "good")), frozenset())
+    b = Board(10, ALL, clock)
+    b.hear_diagnostics(said.diagnostics(("solver: Inputs", 0, "good")))
     clock.now += 7.0
     assert told(b)["lights"][0]["age"] == 7.0
-    b.hear_diagnostics(said.diagnostics(("solver: Inputs", 1, "bad"), ("x: Y", 200, "?")), frozenset())
+    b.hear_diagnostics(said.diagnostics(("solver: Inputs", 1, "bad"), ("x: Y", 200, "?")))
     assert [(x["name"], x["level"], x["age"]) for x in told(b)["lights"]] == [
         ("solver: Inputs", 1, 0.0),
         ("x: Y", readings.ERROR, 0.0),
     ]
     for k in range(1000):
-        b.hear_diagnostics(said.diagnostics((f"n{k}: T", 0, "")), frozenset())
+        b.hear_diagnostics(said.diagnostics((f"n{k}: T", 0, "")))
     assert len(told(b)["lights"]) == board.LIGHTS
     many = said.diagnostics(*((f"m{k}: T", 0, "z" * 999) for k in range(3000)))
-    b.hear_diagnostics(many, frozenset())
+    b.hear_diagnostics(many)
     assert len(b.told(0.0, 15.0)) < board.LIGHTS * 600
 
 
 def test_only_lights_of_the_nodes_asked_for():
-    b = Board(10)
-    nodes = frozenset({"solver"})
-    b.hear_diagnostics(said.diagnostics(("solver: A", 0, ""), ("wheels: B", 2, "")), nodes)
+    b = Board(10, frozenset({"solver"}))
+    b.hear_diagnostics(said.diagnostics(("solver: A", 0, ""), ("wheels: B", 2, "")))
     assert [x["name"] for x in told(b)["lights"]] == ["solver: A"]
+
+
+def test_a_node_that_has_said_nothing_has_a_light_too_or_all_seems_green_without_it():
+    clock = Clock()
+    b = Board(10, frozenset({"camera", "solver"}), clock)
+    clock.now += 6.0
+    b.hear_diagnostics(said.diagnostics(("camera: Capture", 0, "")))
+    lights = told(b)["lights"]
+    assert [(x["name"], x["level"], x["age"]) for x in lights] == [
+        ("camera: Capture", 0, 0.0),
+        ("solver", readings.STALE, 6.0),
+    ]
+    b.only_lights_of(frozenset({"camera"}))
+    assert len(told(b)["lights"]) == 1
 
 
 def test_a_hostile_budget_is_cut():
@@ -145,7 +159,7 @@ def test_a_hostile_budget_is_cut():
 
 
 def test_the_track_forgets_its_oldest_and_counts_on():
-    b = Board(3)
+    b = Board(3, ALL)
     for k in range(5):
         b.hear_fix(said.fix(float(k), 0.0))
     assert [n for n, _, _ in b.track] == [3, 4, 5]
@@ -155,7 +169,7 @@ def test_the_track_forgets_its_oldest_and_counts_on():
 
 def test_ages_are_told_on_a_clock_that_nobody_sets():
     clock = Clock()
-    b = Board(10, clock)
+    b = Board(10, ALL, clock)
     b.hear_tilt(said.tilt())
     clock.now += 3.5
     assert told(b)["tilt"]["age"] == 3.5 and told(b)["old_after"] == {"slow": 15.0, "fast": 5.0}

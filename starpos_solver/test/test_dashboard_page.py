@@ -364,7 +364,7 @@ LAMPS = """
 
 
 def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_text(page):
-    lamps = page.until(lambda: page.run(LAMPS))
+    lamps = [lamp for lamp in page.until(lambda: page.run(LAMPS)) if ":" in lamp[0]]
     assert [lamp[:3] for lamp in lamps] == [
         ["camera: Clock", "OK", "the system's clock is kept to UTC within 0.0021 s"],
         ["solver: Clock", "WARN", "the time is known to 0.12 s only"],
@@ -377,6 +377,13 @@ def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_te
     assert clocks == ["camera: Clock", "solver: Clock"]
     assert page.run("return document.images.length") == 2  # the icon and the frame
     assert page.run("return document.querySelectorAll('#lights img, #lights script').length") == 0
+
+
+def test_a_node_that_has_never_spoken_is_silent_not_missing(page):
+    def silent():
+        return [lamp[0] for lamp in page.run(LAMPS) if lamp[1] == "SILENT" and "nothing heard" in lamp[2]]
+
+    page.until(lambda: silent() == ["detector", "inclinometer"])
 
 
 def test_the_budget_is_bars_the_longest_the_largest(page):
@@ -548,8 +555,10 @@ def test_the_night_is_red_and_is_remembered(page):
     reds = page.run("""
       return [...document.querySelectorAll("body, body *")].filter((e) => e.checkVisibility()).flatMap((e) => {
         const s = getComputedStyle(e);
-        return [s.color, s.backgroundColor, s.fill, s.stroke].filter((c) => c.startsWith("rgb("));
+        return [s.color, s.backgroundColor, s.fill, s.stroke, ...s.scrollbarColor.split(/ (?=rgb)/)]
+          .filter((c) => c.startsWith("rgb("));
       })""")
+    assert page.run("return getComputedStyle(document.documentElement).scrollbarColor") != "auto"
     for r, g, b in ([float(v) for v in c[4:-1].split(",")] for c in set(reds)):
         assert g <= 0.55 * r and b <= 0.55 * r, (r, g, b)
 

@@ -18,11 +18,15 @@ STATUSES = 256  # of one message that are looked at
 
 
 class Board:
-    """Messages in, one JSON text out; all of it bounded. `changed`: something came since the last `told`."""
+    """Messages in, one JSON text out; all of it bounded. `changed`: something came since the last `told`.
 
-    def __init__(self, track: int, clock: Callable[[], float] = time.monotonic):
+    nodes: whose diagnostics are lights; all where there are none.
+    """
+
+    def __init__(self, track: int, nodes: frozenset[str], clock: Callable[[], float] = time.monotonic):
         self.changed = False
-        self._clock = clock
+        self._nodes = nodes
+        self._clock, self._since = clock, clock()
         self._heard: dict[str, tuple[float, dict]] = {}  # (when, what)
         self._lights: dict[str, tuple[float, dict]] = {}
         self._track: deque[tuple[int, float, float]] = deque(maxlen=track)
@@ -57,10 +61,10 @@ class Board:
     def hear_solution(self, message: Solution) -> None:
         self._keep("solution", readings.solution(message))
 
-    def hear_diagnostics(self, message: DiagnosticArray, nodes: frozenset[str]) -> None:
-        """Those of these nodes; of all where there are none."""
+    def hear_diagnostics(self, message: DiagnosticArray) -> None:
+        """Those of the nodes that are to have lights."""
         for status in message.status[:STATUSES]:
-            if nodes and status.name.split(":", 1)[0].strip() not in nodes:
+            if self._nodes and _node_of(status.name) not in self._nodes:
                 continue
             told = readings.light(status)
             self._lights.pop(told["name"], None)  # the newest is the last
@@ -78,9 +82,10 @@ class Board:
         self._heard.pop("frame", None)
 
     def only_lights_of(self, nodes: frozenset[str]) -> None:
-        """Forget the others'."""
+        """Of these nodes, from now on; of all where there are none."""
+        self._nodes, self._since = nodes, self._clock()
         if nodes:
-            self._lights = {n: light for n, light in self._lights.items() if n.split(":", 1)[0] in nodes}
+            self._lights = {n: light for n, light in self._lights.items() if _node_of(n) in nodes}
 
     def _keep(self, name: str, told: dict | None):
         self.changed = True
@@ -98,7 +103,14 @@ class Board:
         now = self._clock()
         told = {name: {**what, "age": now - since} for name, (since, what) in self._heard.items()}
         lights = [{**light, "age": now - since} for since, light in self._lights.values()]
+        silent = self._nodes - {_node_of(name) for name in self._lights}
+        lights += [{**readings.silence(node), "age": now - self._since} for node in silent]
         told["lights"] = sorted(lights, key=lambda light: light["name"])
         told["now"] = now_s
         told["old_after"] = {"slow": slow_s, "fast": min(FAST_S, slow_s)}
         return json.dumps(told, allow_nan=False, separators=(",", ":"))
+
+
+def _node_of(name: str) -> str:
+    """`solver` of the diagnostic `solver: Solution`."""
+    return name.split(":", 1)[0].strip()

@@ -29,14 +29,13 @@ class DashboardNode(Node):
     def __init__(self):
         super().__init__("dashboard")
         self._values = declare(self, PARAMETERS, apply=self._apply)
-        self._board = Board(self._values["track"])
+        self._board = Board(self._values["track"], names(self._values["lights"]))
         address = self._values["address"]
         self._server = Server(
             listen(address, self._values["port"]),
             access.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
             self._values["clients"],
         )
-        self._lights = names(self._values["lights"])
         self._image: Image | None = None  # the newest that is not shown yet
         self._images = None  # the subscription, while a page shows the frame
         self._shown = 0  # frames
@@ -79,14 +78,13 @@ class DashboardNode(Node):
         if "track" in changed:
             self._board.keep_track_of(self._values["track"])
         if "lights" in changed:
-            self._lights = names(self._values["lights"])
-            self._board.only_lights_of(self._lights)
+            self._board.only_lights_of(names(self._values["lights"]))
         self._server.clients = self._values["clients"]
 
     # what comes ------------------------------------------------------------------------------------------------------
 
     def _on_diagnostics(self, message: DiagnosticArray):
-        self._board.hear_diagnostics(message, self._lights)
+        self._board.hear_diagnostics(message)
 
     def _on_image(self, message: Image):
         self._image = message

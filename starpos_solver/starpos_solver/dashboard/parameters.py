@@ -58,7 +58,8 @@ PARAMETERS = (
     Parameter(
         "lights",
         "camera, detector, inclinometer, solver",
-        "Nodes whose diagnostics are shown, separated by commas; '' shows those of every node there is.",
+        "Nodes whose diagnostics are shown, separated by commas, and named where they say nothing; '' shows those of "
+        "every node there is.",
     ),
 )
 

@@ -127,3 +127,9 @@ def light(status: DiagnosticStatus) -> dict:
         "level": level if 0 <= level <= STALE else ERROR,
         "sentence": text(status.message),
     }
+
+
+def silence(node: str) -> dict:
+    """The light of a node that has said nothing yet: without it a page where all is green might lack the solver."""
+    name = text(node, NAME_LETTERS)
+    return {"name": name, "level": STALE, "sentence": "nothing heard yet"}
