@@ -41,7 +41,7 @@ def set_clock(tmp_path, monkeypatch):
     return set_clock
 
 
-@pytest.mark.parametrize("step", [2.0, -2.0])
+@pytest.mark.parametrize("step", [10.0, -10.0])
 def test_a_step_is_said_and_the_next_frames_are_in_the_new_time(
     start, listener, folder, set_clock, step, record_property
 ):
@@ -54,8 +54,8 @@ def test_a_step_is_said_and_the_next_frames_are_in_the_new_time(
         return np.diff([stamp_to_unix(c.header.stamp) for c in captures])
 
     set_clock(step)
-    # forward by 2 s more than the cadence, or back: frames are otherwise no further apart than a busy machine makes them
-    listener.wait(lambda: steps().max() > 1.5 if step > 0 else steps().min() < -1.0)
+    # two frames are further apart than a busy machine makes them, or stand the other way round
+    listener.wait(lambda: steps().max() > 9.0 if step > 0 else steps().min() < -1.0)
     state = listener.wait_for_state("camera: Clock", WARN, f"by {abs(step):.3g} s")
     assert float(state["last step (s)"]) == pytest.approx(step, abs=0.05)
     seen = len(captures)
