@@ -101,41 +101,33 @@ def test_the_solution_of_the_frame_names_its_stars(viewer):
     assert 30 < away.max() < 150  # a text beside it, and nothing elsewhere
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_a_solution_that_does_not_hold_together_or_is_of_another_frame_names_nobody(viewer):
+    viewer.start_solver()
+    for changes in (
         {"indices": [4_000_000_000]},
         {"indices": [0, 1]},
         {"magnitudes": []},
         {"ids": ["HIP 1"] * 50_000},
-    ],
-)
-def test_a_solution_that_does_not_hold_together_names_nobody(viewer, changes):
+        {"header": Header()},
+    ):
+        picture, stars = viewer.see(changes)
+        assert not has(picture[:480], stars[0], IDENTIFIED), changes.keys()
+
+
+def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer):
     viewer.start_solver()
-    picture, stars = viewer.see(changes)
-    assert not has(picture[:480], stars[0], IDENTIFIED)
-
-
-@pytest.mark.parametrize("unknown", [float("nan"), -1.0])
-def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer, unknown):
-    viewer.start_solver()
-    picture, stars = viewer.see(
-        {
-            "ids": ["\N{SNOWMAN}\n%s" * 10_000],
-            "magnitudes": [float("inf")],
-            "status": Solution.OK,
-            "status_text": "x" * 100_000,
-            "heading": float("nan"),
-            "covariance_geodetic": [unknown] * 9,
-        }
-    )
-    assert stars[0].flags or has(picture[:480], stars[0], IDENTIFIED)
-
-
-def test_a_solver_that_stays_silent_or_speaks_of_other_frames_holds_nothing_up(viewer):
-    viewer.start_solver()
-    picture, stars = viewer.see({"header": Header()})
-    assert not has(picture[:480], stars[0], IDENTIFIED)
+    for unknown in (float("nan"), -1.0):
+        picture, stars = viewer.see(
+            {
+                "ids": ["\N{SNOWMAN}\n%s" * 10_000],
+                "magnitudes": [float("inf")],
+                "status": Solution.OK,
+                "status_text": "x" * 100_000,
+                "heading": float("nan"),
+                "covariance_geodetic": [unknown] * 9,
+            }
+        )
+        assert stars[0].flags or has(picture[:480], stars[0], IDENTIFIED)
 
 
 class Inside:
