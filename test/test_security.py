@@ -52,7 +52,7 @@ READS_WHOLE = {
     "starpos/parallel/same.py": "our own source",
     "starpos/paper.py": "of the package",
     "starpos/reading.py": "MAX_BYTES, MAX_CSV_BYTES",
-    "starpos/report/bag.py": "installed messages; METADATA_LIMIT",
+    "starpos/report/bag.py": "installed messages",
     "starpos/report/folder.py": "TRUTH_LIMIT",
     "starpos/tycho2.py": "the catalogue's own files, at `catalogue build`",
     "starpos_solver/bag.py": "installed messages",

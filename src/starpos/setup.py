@@ -28,7 +28,7 @@ setup(
     extras_require={
         "picture": ["matplotlib"],
         "raw": ["rawpy", "exifread>=3"],
-        "report": ["matplotlib", "rosbags>=0.10"],
+        "report": ["matplotlib", "rosbags>=0.11"],
         "cluster": ["distributed"],
         "test": ["pytest"],
     },

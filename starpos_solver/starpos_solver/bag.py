@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from starpos import bags
+
 TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
-METADATA_LIMIT = 1 << 24
 LAST_NS = (2**31 - 1) * 10**9  # what a Clock message holds
 
 
@@ -44,11 +45,12 @@ class Bag:
             raise ReplayError(
                 f"{self.path}: a folder without metadata.yaml is no bag: name its .mcap or .db3 file"
             )
-        if self.path.is_dir() and metadata.stat().st_size > METADATA_LIMIT:
-            raise ReplayError(f"{metadata}: over {METADATA_LIMIT >> 20} MB, not the description of a bag")
         try:
+            bags.check_folder(self.path)
+            bags.bound_rosbags()
             self._reader = Reader(self.path)
             self._reader.open()
+            bags.check_chunks(self._reader)
         except Exception as error:  # rosbags, ruamel.yaml, zstd and sqlite have their own for a broken file
             raise self._broken(error) from None
         return self
@@ -57,6 +59,8 @@ class Bag:
         self._reader.close()
 
     def _broken(self, error: Exception) -> ReplayError:
+        if isinstance(error, bags.BagError):
+            return ReplayError(f"{self.path}: {error}")
         return ReplayError(f"{self.path}: not a readable bag ({type(error).__name__}: {str(error)[:200]})")
 
     def inputs(self, needed: str, others: tuple[str, ...]) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos import bags
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError
 from starpos.inclinometer import TiltLog
@@ -22,7 +23,6 @@ PACKAGE = "starpos_interfaces"
 STARS, TILT, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Tilt", "Solution"))
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TOPICS = {"stars": STARS, "tilt": TILT, "solver/solution": SOLUTION, "camera/camera_info": CAMERA_INFO}
-METADATA_LIMIT = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +90,12 @@ class _Bag:
     def __enter__(self):
         from rosbags.highlevel import AnyReader
 
-        metadata = self.path / "metadata.yaml"
-        if self.path.is_dir() and metadata.stat().st_size > METADATA_LIMIT:
-            raise FrameError(f"{metadata}: over {METADATA_LIMIT >> 20} MB, not the description of a bag")
         try:
+            bags.check_folder(self.path)
+            bags.bound_rosbags()
             self._reader = AnyReader([self.path], default_typestore=_usual_types())
             self._reader.open()
+            bags.check_chunks(self._reader.readers[0])
         except Exception as error:  # rosbags, its YAML, zstd and sqlite have their own for a broken file
             raise self._broken(error) from None
         return self
@@ -129,6 +129,8 @@ class _Bag:
             yield connection.msgtype, message
 
     def _broken(self, error: Exception) -> FrameError:
+        if isinstance(error, bags.BagError):
+            return FrameError(f"{self.path}: {error}")
         reason = " ".join(str(error).split())[:200]
         return FrameError(f"{self.path}: not a readable bag ({type(error).__name__}: {reason})")
 

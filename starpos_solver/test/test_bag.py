@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a replay refuses of a bag, in a sentence that names it."""
+
+import pytest
+
+pytest.importorskip("rosbags")
+
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from starpos import bags
+from starpos_solver.bag import Bag, ReplayError
+
+KIND = "std_msgs/msg/UInt8MultiArray"
+
+
+def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatch):
+    writer = Writer(tmp_path / "night", version=9)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        topic = writer.add_connection("/a", KIND, typestore=get_typestore(Stores.ROS2_JAZZY))
+        for size in (1 << 20, 1 << 21):
+            writer.write(topic, size, bytes(size))
+    monkeypatch.setattr(bags, "MOST_UNPACKED", 1 << 20)
+    with Bag(tmp_path / "night") as bag:
+        messages = bag.messages(bag.topics(None, left_out=pytest.fail))
+        assert next(messages)[2] == bytes(1 << 20)
+        with pytest.raises(ReplayError, match="night: a part of it unpacks to more than"):
+            next(messages)
+
+
+def test_metadata_of_many_megabytes_is_not_read(tmp_path):
+    with (tmp_path / "metadata.yaml").open("wb") as file:
+        file.truncate(bags.MOST_METADATA + 1)
+    with pytest.raises(ReplayError, match="not the description of a bag"), Bag(tmp_path):
+        pass
