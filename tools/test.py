@@ -2,8 +2,8 @@
 """Run everything that can fail in this project: linters, each package's tests, the tests of the whole graph.
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
-linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` tests starpos with the
-versions that Ubuntu 24.04 has (tools/ubuntu-24.04.txt) in an environment of its own.
+linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
+the versions that Ubuntu 24.04 has (tools/ubuntu-24.04.txt) in an environment of its own; `test.py --both` runs all.
 """
 
 import os
@@ -11,19 +11,32 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
 LINTERS = [f"ruff {check} --output-format concise" for check in ("check", "format --check")]
 NO_TESTS = 5  # pytest's exit status where a -k left none
-COLCON = (
-    "--log-level error test --executor sequential "
-    "--event-handlers console_direct+ console_stderr- status- summary- --packages-select"
+COLCON = "--event-handlers console_direct+ console_stderr- status- summary- --packages-select"
+LANES = 3  # at once: some compute, others wait for nodes
+LONGEST_FIRST = (
+    "starpos",
+    "graph",
+    "starpos_inclinometer",
+    "starpos, Ubuntu's",
+    "starpos_camera",
 )
+VERSIONS = "tools/ubuntu-24.04.txt"
+UBUNTU = ("src/starpos", "starpos_common", "starpos_camera", "starpos_inclinometer", "starpos_solver")
+PRINTING, MAKING = threading.Lock(), threading.Lock()
+
+Tests = dict[str, Callable]  # of a name: what runs them, given a file for their output, and counts
 
 
 def run(command: list[str], out=None, environment: dict[str, str] | None = None) -> int:
@@ -39,85 +52,122 @@ def lint() -> Counter:
     return Counter("failed" if run(shlex.split(linter)) else "passed" for linter in LINTERS)
 
 
-def junit_counts(path: Path, since: float) -> Counter:
-    """Counts of a JUnit file written after `since` (Unix s); a missing, stale or broken one is a failure."""
+def junit_counts(path: Path, since: float, status: int, out) -> Counter:
+    """Counts of a JUnit file written after `since` (Unix s); a missing, stale or broken one is a failure.
+
+    So is an exit status that no failed test explains.
+    """
     if not path.is_file() or path.stat().st_mtime < since:
-        print(f"{path}: the tests ended without a result")
+        print(f"{path}: the tests ended without a result", file=out)
         return Counter(failed=1)
     try:
         suites = list(ElementTree.parse(path).getroot().iter("testsuite"))
     except ElementTree.ParseError as error:
-        print(f"{path}: the tests ended with half a result ({error})")
+        print(f"{path}: the tests ended with half a result ({error})", file=out)
         return Counter(failed=1)
     total = Counter()
     for suite in suites:
         failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
         skipped = int(suite.get("skipped", 0))
         total += Counter(passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped)
-    return total
+    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
 
 
 def has_tests(folder: Path) -> bool:
     return any(folder.glob("**/test_*.py"))
 
 
-def package_tests(pytest_args: list[str]) -> Counter:
-    """`colcon test`: the tests each package of ROS carries, in the environment it was built for."""
-    folders = [p.parent for p in ROOT.glob("*/package.xml")]
-    packages = sorted(f.name for f in folders if has_tests(f / "test"))
-    if not packages:
-        return Counter()
+def colcon(package: str, pytest_args: list[str], out) -> Counter:
+    """`colcon test`: the tests a package of ROS carries, in the environment it was built for."""
     since = time.time()
-    colcon = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())"]
-    command = [*colcon, *shlex.split(COLCON), *packages]
-    broken = run(command + (["--pytest-args", *pytest_args] if pytest_args else []))
-    total = sum((junit_counts(ROOT / "build" / p / "pytest.xml", since) for p in packages), Counter())
-    return total + Counter(failed=int(broken != 0 and total["failed"] == 0))
+    command = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())"]
+    command += ["--log-level", "error", "--log-base", f"log/{package}", "test", *shlex.split(COLCON), package]
+    status = run(command + (["--pytest-args", *pytest_args] if pytest_args else []), out)
+    return junit_counts(ROOT / "build" / package / "pytest.xml", since, status, out)
 
 
-def pytest(python: str, folder: str, name: str, pytest_args: list[str], **options) -> Counter:
+def pytest(
+    folder: str, report: str, pytest_args: list[str], out, python=sys.executable, **options
+) -> Counter:
     """A folder's tests; options: those of `run`."""
-    since, report = time.time(), ROOT / "log" / f"{name}.xml"
-    status = run([python, "-m", "pytest", folder, f"--junit-xml={report}", *pytest_args], **options)
-    total = junit_counts(report, since)
-    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
+    since, path = time.time(), ROOT / "log" / f"{report}.xml"
+    status = run([python, "-m", "pytest", folder, f"--junit-xml={path}", *pytest_args], out, **options)
+    return junit_counts(path, since, status, out)
 
 
-def older_tests(pytest_args: list[str]) -> Counter:
-    """The mathematics with the versions that Ubuntu 24.04 has."""
+def newest(pytest_args: list[str]) -> Tests:
+    """Those of all packages and of the graph, in the workspace."""
+    packages = [p.parent.name for p in ROOT.glob("*/package.xml") if has_tests(p.parent / "test")]
+    tests = {name: partial(colcon, name, pytest_args) for name in packages}
+    tests["starpos"] = partial(pytest, "src/starpos/test", "starpos", pytest_args)
+    if has_tests(ROOT / "test"):
+        tests["graph"] = partial(pytest, "test", "graph", pytest_args)
+    return tests
+
+
+def made(folder: Path, out) -> bool:
+    """Whether there is an environment with the versions that Ubuntu 24.04 has; made once.
+
+    ROS, and what the list leaves out, are the workspace's.
+    """
+    wanted, stamp = (ROOT / VERSIONS).read_text(), folder / "stamp"
+    with MAKING:
+        if stamp.is_file() and stamp.read_text() == wanted:
+            return True
+        base = (ROOT / ".underlay" / "python").read_text().strip()
+        pip = [str(folder / "bin" / "python"), "-m", "pip", "--disable-pip-version-check", "install", "-q"]
+        alone = os.environ | {"PYTHONPATH": ""}
+        for command in ([base, "-m", "venv", "--clear", str(folder)], [*pip, "--no-input", "-r", VERSIONS]):
+            if run(command, out, alone):
+                return False
+        [packages] = folder.glob("lib/python*/site-packages")
+        behind = ROOT / ".underlay" / "venv" / packages.relative_to(folder)
+        (packages / "workspace.pth").write_text(f"{behind}\n")
+        stamp.write_text(wanted)
+        return True
+
+
+def older(package: str, pytest_args: list[str], out) -> Counter:
+    """A package's tests with the versions that Ubuntu 24.04 has."""
     folder = ROOT / ".underlay" / "ubuntu"
-    python = str(folder / "bin" / "python")
-    base = Path(ROOT / ".underlay" / "python").read_text().strip()
-    pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-input"]
-    needs = ["-c", "tools/ubuntu-24.04.txt", "-e", "src/starpos[report,test]"]
-    if run([base, "-m", "venv", str(folder)]) or run([*pip, *needs]):
-        print("Ubuntu 24.04's versions could not be installed")
+    if not made(folder, out):
+        print("Ubuntu 24.04's versions could not be installed", file=out)
         return Counter(failed=1)
-    environment = {"PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": ""}
-    environment["STARPOS_COMPLETE"] = ""  # what is optional was there with the newest versions
-    return pytest(python, "src/starpos/test", "ubuntu", pytest_args, environment=os.environ | environment)
+    environment = os.environ | {"PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+    python, name = str(folder / "bin" / "python"), Path(package).name
+    return pytest(
+        f"{package}/test", f"{name}-ubuntu", pytest_args, out, python=python, environment=environment
+    )
 
 
-def all_tests(pytest_args: list[str]) -> Counter:
-    """Those that compute beside those that wait for nodes; the former's output comes when it is whole."""
-    with tempfile.TemporaryFile("w+") as out, ThreadPoolExecutor(1) as beside:
-        computing = beside.submit(pytest, sys.executable, "src/starpos/test", "starpos", pytest_args, out=out)
-        total = package_tests(pytest_args)
-        if has_tests(ROOT / "test"):
-            total += pytest(sys.executable, "test", "graph", pytest_args)
-        total += computing.result()
+def shown(name: str, tests: Callable) -> Counter:
+    """Run tests and show their output when it is whole."""
+    begin = time.monotonic()
+    with tempfile.TemporaryFile("w+") as out:
+        counts = tests(out)
         out.seek(0)
-        print(f"starpos\n{out.read()}")
-    return total
+        with PRINTING:
+            print(f"== {name}, {time.monotonic() - begin:.0f} s\n{out.read()}", flush=True)
+    return counts
+
+
+def all_of(tests: Tests) -> Counter:
+    """The counts of all, some at once."""
+    names = sorted(
+        tests, key=lambda n: (LONGEST_FIRST.index(n) if n in LONGEST_FIRST else len(LONGEST_FIRST), n)
+    )
+    with ThreadPoolExecutor(LANES) as lanes:
+        return sum(lanes.map(lambda name: shown(name, tests[name]), names), Counter())
 
 
 def main(args: list[str]) -> int:
-    if "--ubuntu" in args:
-        total = older_tests([a for a in args if a != "--ubuntu"])
-    else:
-        total = lint()
-        if "--lint" not in args:
-            total += all_tests(args)
+    which = {"--lint", "--ubuntu", "--both"} & set(args)
+    pytest_args = [a for a in args if a not in which]
+    total = Counter() if which == {"--ubuntu"} else lint()
+    tests = {} if which & {"--lint", "--ubuntu"} else newest(pytest_args)
+    if which & {"--ubuntu", "--both"}:
+        tests |= {f"{Path(p).name}, Ubuntu's": partial(older, p, pytest_args) for p in UBUNTU}
+    total += all_of(tests)
     print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
     return int(total["failed"] > 0)
 
