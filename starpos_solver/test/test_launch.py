@@ -16,12 +16,13 @@ import yaml
 from sensor_msgs.msg import NavSatFix
 
 from starpos_common.testing import WAIT_S, Listener, take_domain
-from starpos_solver.launching import LaunchError
 
 pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
 
 import launch
 import launch_ros
+
+from starpos_solver.launching import LaunchError
 
 FOLDER = Path(__file__).parent.parent / "launch"
 NIGHT = Path(__file__).parents[2] / "test" / "data" / "night"
