@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong. Every message is one sentence: what happened, where, and what to do about it."""
 
+LETTERS = 120  # of what a library says
+
 
 class StarposError(Exception):
     """The root of all errors starpos raises on purpose."""
@@ -44,4 +46,7 @@ class FixError(StarposError):
 
 def one_line(error) -> str:
     """What a library says of its trouble, short enough to stand in a sentence of ours."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
+    said = " ".join(str(error).split())
+    if len(said) > LETTERS:
+        said = said[:LETTERS].rsplit(" ", 1)[0] + " ..."
+    return said or type(error).__name__

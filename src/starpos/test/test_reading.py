@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from starpos.errors import FrameError
+from starpos.errors import LETTERS, FrameError, one_line
 from starpos.fits_frame import decode_fits
 from starpos.frame import Frame
 from starpos.reading import read_frame
@@ -325,3 +325,10 @@ def test_the_bytes_of_a_fits_file_are_read_like_the_file_and_short_ones_refused(
     for length in (0, 100, 2880, 2881, len(data) - 2880):
         with pytest.raises(FrameError, match=r"^the camera's frame: .*\.$"):
             decode_fits(data[:length], "the camera's frame")
+
+
+def test_what_a_library_says_is_cut_between_words():
+    said = one_line("not a\nword of it " * 100)
+    assert len(said) <= LETTERS + 4 and "\n" not in said
+    assert said.split()[-2] in ("not", "a", "word", "of", "it") and said.endswith(" ...")
+    assert one_line(ValueError()) == "ValueError"

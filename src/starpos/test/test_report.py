@@ -228,7 +228,7 @@ def test_without_matplotlib_the_pip_line_is_said(still, tmp_path, capsys, monkey
     monkeypatch.setattr(command, "find_spec", lambda name: None)
     status, _, errors = report(capsys, still, tmp_path / "out")
     assert (status, len(errors)) == (2, 1)
-    assert "pip install 'starpos[report]'" in errors[0]
+    assert "pip install matplotlib rosbags" in errors[0]
 
 
 def test_a_report_leaves_matplotlib_as_it_was(still, tmp_path, capsys):

@@ -276,7 +276,7 @@ def test_without_rosbags_the_pip_line_is_said(lists, tilts, tmp_path, capsys, mo
     monkeypatch.setattr(command, "find_spec", lambda name: None if name == "rosbags" else name)
     status, _, errors = report(capsys, bag, tmp_path / "out")
     assert (status, len(errors)) == (2, 1)
-    assert "pip install 'starpos[report]'" in errors[0]
+    assert "pip install matplotlib rosbags" in errors[0]
 
 
 def test_solutions_of_nonsense_are_no_fix_and_no_crash(said, lists, tmp_path, capsys):

@@ -20,13 +20,16 @@ class Night:
 def nights_of(given: list[str], tilt: str | None) -> list[Night | FrameError]:
     """One night of frames and a table; without a table, a night of each folder, or why it is none.
 
-    FITS where there are any, else CSV, by name: as `report` takes a folder.  TiltError for frames without a table.
+    FITS where there are any, else CSV, by name: as `report` takes a folder.  FrameError for what is not there,
+    TiltError for frames without a table.
     """
     if tilt is not None:
         return [Night(tuple(given), os.path.abspath(tilt))]
-    if not all(os.path.isdir(path) for path in given):
+    if missing := next((path for path in given if not os.path.exists(path)), None):
+        raise FrameError(f"{missing}: there is no such file or folder")
+    if single := next((path for path in given if not os.path.isdir(path)), None):
         raise TiltError(
-            "no tilts: give --tilt with the frames, or nights: folders of frames, each with its tilt.csv"
+            f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv"
         )
     return [_night(folder) for folder in given]
 

@@ -54,9 +54,7 @@ def run(args) -> int:
         raise InstrumentError("--map is of the camera: give --camera OUT.yaml too")
     calibrate_site.check(args)
     if args.map is not None and find_spec("matplotlib") is None:
-        raise InstrumentError(
-            "--map draws with matplotlib, which is not here: pip install 'starpos[picture]'"
-        )
+        raise InstrumentError("--map draws with matplotlib, which is not here: pip install matplotlib")
     frames, unreadable = _stars_of_all(args)
     if not frames:
         return common.UNREADABLE

@@ -36,10 +36,10 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
 
 
 def _jobs(text: str) -> int:
-    return 0 if text == AUTO else common.number(0, MOST_JOBS, int)(text)
-
-
-_jobs.__name__ = "int"  # what argparse calls it
+    try:
+        return 0 if text == AUTO else common.number(0, MOST_JOBS, int)(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor {AUTO}") from None
 
 
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:

@@ -16,7 +16,7 @@ from starpos.utc import utc_text
 
 NO_FIX = 1
 ALL_FIGURES = 6  # nights that have all their figures; of more there are the table and the errors
-PIP = "pip install 'starpos[report]'"
+PIP = "pip install matplotlib rosbags"
 
 
 def define(parser) -> None:

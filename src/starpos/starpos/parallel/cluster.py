@@ -16,7 +16,7 @@ from starpos.errors import StarposError, one_line
 from starpos.parallel.call import Call, answer_of, given_up, worked
 from starpos.parallel.same import Same, differing, same_here
 
-PIP = "pip install 'starpos[cluster]'"
+PIP = "pip install distributed"
 ANSWER_WITHIN_S = 10
 AHEAD, FEWEST_AHEAD = (
     3,
