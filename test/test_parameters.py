@@ -103,6 +103,24 @@ def test_solve_says_why_there_is_no_fix(graph, solver):
     assert response.solution.status == Solution.NO_TILT
 
 
+def test_tilts_that_are_refused_are_one_line_in_the_log_and_a_warning_in_the_diagnostics(graph, solver):
+    before = solver.output.count("has no time stamp")
+    for _ in range(3):
+        shot = shoot()
+        graph.answer(shot)
+        for tilt in shot.tilts:
+            tilt.header.stamp.sec = tilt.header.stamp.nanosec = 0
+            graph.tilt.publish(tilt)
+        assert graph.state("solver: Inputs", "refused: a tilt message has no time stamp").level == b"\x01"
+    assert solver.output.count("has no time stamp") == before + 1
+
+
+def test_the_diagnostics_follow_the_frame(graph, solver):
+    assert graph.set("solver", frame_id="elsewhere")[0]
+    graph.wait(lambda: graph.state("solver: Inputs", "").hardware_id == "elsewhere")
+    assert graph.set("solver", frame_id="starpos_link")[0]
+
+
 def test_diagnostics_come_once_a_second_and_name_what_is_missing(graph, solver):
     graph.answer(shoot())
     graph.state("solver: Solution", "fix")

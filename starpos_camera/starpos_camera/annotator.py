@@ -17,10 +17,10 @@ from starpos.stars import Stars
 from starpos_camera.worker import Worker
 from starpos_common.messages import frame_to_message
 from starpos_common.topics import publisher, subscription
+from starpos_common.troubles import Troubles
 from starpos_interfaces.msg import Solution
 
 PATIENCE_S = 2.0  # for a frame's solution; then it is shown without
-COMPLAINT_PERIOD_S = 5.0
 NAME_LETTERS, SENTENCE_LETTERS = 24, 300  # of a text from outside, at most
 
 
@@ -42,6 +42,7 @@ class Annotator:
 
     def __init__(self, node: Node):
         self._node = node
+        self._troubles = Troubles(node)
         self._publisher = publisher(node, Image, "~/image_annotated", 1)
         self._solutions = None  # the subscription, while somebody looks
         node.destroy_subscription(
@@ -103,11 +104,12 @@ class Annotator:
             self._drawing = False
             if isinstance(result, Image):
                 self._publisher.publish(result)
+                self._troubles.right("annotation")
             else:
                 kind = type(result).__name__
-                self._node.get_logger().warning(
+                self._troubles.wrong(
+                    "annotation",
                     f"a frame could not be annotated ({kind}: {result}); keep it and report this.",
-                    throttle_duration_sec=COMPLAINT_PERIOD_S,
                 )
 
 

@@ -20,11 +20,11 @@ from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import encoding_of, message_to_frame, stars_to_message
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
+from starpos_common.troubles import Troubles
 from starpos_interfaces.msg import Capture, StarArray
 
 IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB
 CAPTURES_KEPT = 16
-COMPLAINT_PERIOD_S = 5.0
 MIN_SILENCE_S = 5.0  # without a frame, and three times as long as between the last two, before it is reported
 
 
@@ -58,6 +58,7 @@ class DetectorNode(Node):
         self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
         self._frames = self._bad = self._dropped = 0
         self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
+        self._troubles = Troubles(self)
         self._complaint = ""  # about a frame since the last report
         self._last: Outcome | None = None
         self._size = ""  # of the last frame, in words
@@ -164,6 +165,7 @@ class DetectorNode(Node):
             if isinstance(result, Outcome):
                 self._publisher.publish(result.message)
                 self._frames += 1
+                self._troubles.right("frames")
                 self._annotator.take(result.frame, result.detection.stars, result.message.header)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
@@ -176,7 +178,7 @@ class DetectorNode(Node):
     def _complain(self, sentence: str):
         self._bad += 1
         self._complaint = sentence
-        self.get_logger().warning(sentence, throttle_duration_sec=COMPLAINT_PERIOD_S)
+        self._troubles.wrong("frames", sentence)
 
     def _report(self) -> Status:
         level, sentence = Level.OK, "no stars in the last frame."

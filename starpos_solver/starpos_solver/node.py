@@ -34,6 +34,7 @@ from starpos_interfaces.srv import SaveCalibration, Solve
 from starpos_solver import outputs, reports, saving
 from starpos_solver.calibrating import Calibrating
 from starpos_solver.clock_doubt import ClockDoubt
+from starpos_solver.inputs import Inputs
 from starpos_solver.memory import Seen
 from starpos_solver.settings import Settings
 from starpos_solver.tilts import TiltBuffer
@@ -82,8 +83,8 @@ class SolverNode(Node):
         self._answer: Answer | None = None
         self._standing: Standing | None = None  # of the last fix
         self._doubt = ClockDoubt()
-        self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0, "broken messages": 0}
-        self._last_seen_ns: dict[str, int] = {}
+        self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
+        self._inputs = Inputs(self)
         self._logged: object = None
         self._connect()
 
@@ -105,7 +106,7 @@ class SolverNode(Node):
         )
         tasks = {
             "Solution": self._report_solution,
-            "Inputs": self._report_inputs,
+            "Inputs": lambda: self._inputs.report(len(self._tilts)),
             "Clock": self._report_clock,
             "Calibration": self._calibrating.report,
             "Average": self._calibrating.average.report,
@@ -115,6 +116,7 @@ class SolverNode(Node):
     # parameters ------------------------------------------------------------------------------------------------------
 
     def _apply(self, names: frozenset[str]):
+        self._diagnostics.hardware_id = self._values["frame_id"]
         if "clock_stddev" in names:
             self._doubt.clear()
         self._calibrating.parameters_set(names)
@@ -134,18 +136,15 @@ class SolverNode(Node):
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def _seen(self, what: str):
-        self._last_seen_ns[what] = self._steady.now().nanoseconds
-
     def _on_camera(self, message: CameraInfo):
-        self._seen("camera_info")
         try:
             camera = message_to_camera(message)
         except StarposError as e:
             if self._camera is None:
                 self._trouble = str(e)
-            self._reject(str(e))
+            self._inputs.refuse("camera_info", str(e))
             return
+        self._inputs.came("camera_info")
         if camera == self._camera:
             return
         self._camera, self._solver, self._trouble, self._standing = camera, None, "", None
@@ -175,7 +174,6 @@ class SolverNode(Node):
         self._work()
 
     def _on_tilt(self, message: Tilt):
-        self._seen("tilt")
         try:
             ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
             # when its time has come the instrument may lean otherwise
@@ -185,13 +183,14 @@ class SolverNode(Node):
                 now_s = stamp_to_unix(message.header.stamp) - ahead_s
                 self._tilts.forget_after(now_s + reports.AHEAD_S)
             self._tilts.add(message, self._settings.tilt_stddev_rad)
+            self._inputs.came("tilt")
         except StarposError as e:
-            self._reject(str(e))
+            self._inputs.refuse("tilt", str(e))
         if self._waiting:
             self._work()
 
     def _on_stars(self, message: StarArray):
-        self._seen("stars")
+        self._inputs.came("stars")
         try:
             stars = message_to_stars(message)
             # who sets it knows better than the camera's host
@@ -218,10 +217,6 @@ class SolverNode(Node):
             return 0.0
         ahead_s = unix_s - now_ns * 1e-9
         return 0.0 if ahead_s > ANOTHER_TIME_S and not self.get_clock().ros_time_is_active else ahead_s
-
-    def _reject(self, sentence: str):
-        self._counts["broken messages"] += 1
-        self.get_logger().warning(sentence, throttle_duration_sec=10.0)
 
     # work ------------------------------------------------------------------------------------------------------------
 
@@ -415,8 +410,3 @@ class SolverNode(Node):
         clock_s = self._solver.clock_stddev_s(stars) if self._solver else stars.clock_stddev_s
         doubt_s = self._doubt.seconds if self._latest.doubted else 0.0
         return reports.of_clock(clock_s, stars.stamp_stddev_s, self._latest.ahead_s, doubt_s)
-
-    def _report_inputs(self) -> Report:
-        now = self._steady.now().nanoseconds
-        ages = {name: (now - seen) * 1e-9 for name, seen in self._last_seen_ns.items()}
-        return reports.of_inputs(ages, len(self._tilts))

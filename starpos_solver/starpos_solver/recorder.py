@@ -8,9 +8,9 @@ from importlib import import_module
 
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.topics import subscription
 from starpos_solver.bag_writer import BagError, BagWriter
 
 LITTLE_BYTES = 1_000_000_000  # left on the disk
@@ -32,8 +32,8 @@ class Recorder(Node):
             kind = getattr(import_module(f"{package}.msg"), message)
             topic = self.resolve_topic_name(name)
             writer.add_topic(topic, type_name)
-            qos = QoSProfile(depth=IMAGE_DEPTH if message == "Image" else DEPTH)
-            self.create_subscription(kind, topic, partial(self._keep, name, topic), qos, raw=True)
+            depth = IMAGE_DEPTH if message == "Image" else DEPTH
+            subscription(self, kind, topic, partial(self._keep, name, topic), depth, raw=True)
         self._counts = dict.fromkeys(topics, 0)
         self._diagnostics = Diagnostics(self, {"Bag": self._report}, str(writer.folder))
         say(f"{writer.folder}: recording {len(topics)} topics until Ctrl-C")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the solver says of its frames and its inputs in /diagnostics."""
+"""What the solver says of its frames in /diagnostics."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,6 @@ from starpos.solve import Solution as Answer
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 
-STALE_S = 5.0
 WIDE_CLOCK_S = 0.1
 EQUATOR_M_PER_S = 465.1
 AHEAD_S = 1.0
@@ -65,12 +64,3 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
             values,
         )
     return Report(Level.OK, f"the time is known to {wide:.2g} s", values)
-
-
-def of_inputs(ages_s: Mapping[str, float], tilts_kept: int) -> Report:
-    """ages_s: how long ago the last message of each input came that has come at all."""
-    missing = [name for name in ("camera_info", "stars", "tilt") if ages_s.get(name, 1e9) > STALE_S]
-    values = {f"{name} age (s)": age for name, age in ages_s.items()} | {"tilts kept": tilts_kept}
-    if missing:
-        return Report(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
-    return Report(Level.OK, "all inputs arrive", values)

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What comes to the solver: when, and what was refused of it."""
+
+import time
+
+from rclpy.node import Node
+
+from starpos_common.diagnostics import Level
+from starpos_common.diagnostics import Status as Report
+from starpos_common.troubles import Troubles
+
+STALE_S = 5.0
+NAMES = ("camera_info", "stars", "tilt")
+
+
+class Inputs:
+    """To be told of each message, by its topic's relative name."""
+
+    def __init__(self, node: Node):
+        self.refused = 0
+        self._came_s: dict[str, float] = {}
+        self._troubles = Troubles(node)
+
+    def came(self, name: str) -> None:
+        """A message, and it is sound as far as is known."""
+        self._came_s[name] = time.monotonic()
+        self._troubles.right(name)
+
+    def refuse(self, name: str, sentence: str) -> None:
+        """The one that came, for that reason."""
+        self._came_s[name] = time.monotonic()
+        self.refused += 1
+        self._troubles.wrong(name, sentence)
+
+    def report(self, tilts_kept: int) -> Report:
+        """For /diagnostics."""
+        now = time.monotonic()
+        ages_s = {name: now - came for name, came in self._came_s.items()}
+        missing = [name for name in NAMES if ages_s.get(name, STALE_S) >= STALE_S]
+        values = {f"{name} age (s)": age for name, age in ages_s.items()}
+        values |= {"tilts kept": tilts_kept, "refused": self.refused}
+        refusals = self._troubles.lately(STALE_S)
+        if missing:
+            return Report(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
+        if refusals:
+            return Report(Level.WARN, f"refused: {'; '.join(refusals)}", values)
+        return Report(Level.OK, "all inputs arrive", values)
