@@ -6,6 +6,7 @@ import signal
 
 import numpy as np
 import pytest
+from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
 from shots import photograph, shoot
@@ -104,6 +105,19 @@ def test_a_full_disk_ends_the_recording_with_a_sentence(graph, solver, recorded)
         graph.comes(lambda: process.process.poll() is not None, 0.1)
     assert process.wait() == 1
     assert "cannot be written" in process.output and "Traceback" not in process.output
+
+
+def test_the_recorder_hears_a_publisher_of_best_effort_where_it_is_told(graph, run, tmp_path):
+    override = "qos_overrides./tilt.subscription.reliability:=best_effort"
+    process = run("starpos_solver", "record", override, arguments=(str(tmp_path / "bag"),))
+    graph.wait(lambda: "recording" in process.output)
+
+    def reliability(topic):
+        ears = graph.node.get_subscriptions_info_by_topic(topic)
+        return {ear.qos_profile.reliability for ear in ears if ear.node_name == "record"}
+
+    graph.wait(lambda: reliability("/tilt") == {ReliabilityPolicy.BEST_EFFORT})
+    graph.wait(lambda: reliability("/stars") == {ReliabilityPolicy.RELIABLE})
 
 
 def test_nothing_is_overwritten_and_nothing_made_in_a_place_that_is_none(run, tmp_path):
