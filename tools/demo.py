@@ -8,7 +8,6 @@ shows it meanwhile, and with --stay goes on until Ctrl-C.
 
 import json
 import math
-import shutil
 import socket
 import sys
 import tempfile
@@ -124,9 +123,9 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
     place = Place.drawn(np.random.default_rng(seed))
     introduce(seed, place, "four nodes and an emulated inclinometer")
     with tempfile.TemporaryDirectory() as scratch:  # a pty's link wants a short path
-        processes = Processes(Path(scratch))
+        processes = Processes(out)
         watcher = PictureWatcher(place)
-        start(processes, place, seed, processes.folder / "inclinometer-port")
+        start(processes, place, seed, Path(scratch) / "inclinometer-port")
         if page := show(processes):
             print(f"to look at meanwhile: {page}", flush=True)
         try:
@@ -137,8 +136,6 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
         except KeyboardInterrupt:
             trouble, memory = "interrupted", {}
         codes = processes.stop()
-        for log in processes.folder.glob("*.log"):
-            shutil.copy(log, out)
     watcher.close()
     status = conclude(watcher, codes, memory, trouble, out)
     if page:

@@ -158,6 +158,8 @@ class Watcher:
         stamp = stamp_of(message)
         if stamp in self.solutions:  # a frame that is solved again is no other frame
             return
+        if not self.solutions:
+            print(f"\n{HEADER}")
         self.solutions[stamp] = message
         self.seconds.append(time.monotonic() - self._heard.get(stamp, math.nan))
         print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
@@ -292,5 +294,4 @@ def introduce(seed: int, place: Place, who: str):
     print(
         f"seed {seed}: the instrument stands at {place.latitude:+.5f} {place.longitude:+.5f}, {air}; it is not told where"
     )
-    print(f"{who}; the first run sorts the sky's triangles, some seconds, once\n")
-    print(HEADER)
+    print(f"{who}; the first run sorts the sky's triangles, some seconds, once")
