@@ -353,9 +353,9 @@ def test_a_drivers_clock_that_is_off_is_not_believed_and_said(liar, off_s):
 
 
 def test_the_clock_of_another_machine_is_used_where_its_error_is_given(liar, monkeypatch):
-    from starpos_camera.sources import alpaca
+    from starpos_camera.sources import timing
 
-    monkeypatch.setattr(alpaca, "LOCAL", ())
+    monkeypatch.setattr(timing, "LOCAL", ())
     liar.values["lastexposurestarttime"] = lambda: iso(liar.started_s, 6)
     assert make(liar).capture(SHORT).stamp_source == Capture.COMMAND
     exposure = make(liar, alpaca__clock_stddev=0.02).capture(SHORT)

@@ -13,7 +13,7 @@ from astropy.io import fits
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings, indi
+from starpos_camera.sources import CaptureError, Settings, timing
 from starpos_camera.sources.indi import Indi
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
@@ -308,7 +308,7 @@ def test_a_driver_that_tells_no_time_leaves_the_commands(liar, told):
 
 
 def test_the_clock_of_another_machine_is_used_where_its_error_is_given(server, monkeypatch):
-    monkeypatch.setattr(indi, "LOCAL", ())
+    monkeypatch.setattr(timing, "LOCAL", ())
     source = make(server)
     assert source.capture(SHORT).stamp_source == Capture.COMMAND
     source.close()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras behind an ASCOM Alpaca server, through PyPI's alpyca."""
 
-import math
 import re
 import threading
 import time
@@ -11,7 +10,7 @@ import numpy as np
 
 from starpos.frame import MAX_PIXELS, Frame
 from starpos_camera.sources import CaptureError, Exposure, Settings, missing
-from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, LOCAL, stamp_of
+from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 
 DEFAULT_EXPOSURE_S = 0.5
@@ -37,15 +36,7 @@ PARAMETERS = (
         2**32 - 1,
         read_only=True,
     ),
-    Parameter(
-        "alpaca.clock_stddev",
-        math.nan,
-        "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
-        "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
-        "s",
-        1e-9,  # 0 says that it is this machine's
-        60.0,
-    ),
+    server_clock("alpaca"),
 )
 
 
@@ -131,7 +122,7 @@ class Alpaca:
             )
         pixels = camera.rqs.picture(f"{camera.base_url}/imagearray", *self._size)
         told = _optional(camera, "LastExposureStartTime", "")
-        clock_s = 0.0 if self._address.rpartition(":")[0] in LOCAL else self._values["alpaca.clock_stddev"]
+        clock_s = clock_stddev_of("alpaca", self._address.rpartition(":")[0], self._values)
         stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
         frame = Frame(
             _unsigned(pixels),

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras behind an INDI server (indilib.org), through PyPI's indipyclient."""
 
-import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,7 +11,7 @@ from starpos.frame import MAX_PIXELS
 from starpos_camera.sources import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
 from starpos_camera.sources.indi_server import Blob, Server
-from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, LOCAL, stamp_of
+from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 
 DEFAULT_EXPOSURE_S = 0.5
@@ -48,15 +47,7 @@ PARAMETERS = (
         0.5,
         600.0,
     ),
-    Parameter(
-        "indi.clock_stddev",
-        math.nan,
-        "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
-        "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
-        "s",
-        1e-9,  # 0 says that it is this machine's
-        60.0,
-    ),
+    server_clock("indi"),
 )
 
 
@@ -148,7 +139,7 @@ class Indi:
                 f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
             )
         told = str(header.get("DATE-OBS", ""))
-        clock_s = 0.0 if self._host in LOCAL else self._values["indi.clock_stddev"]
+        clock_s = clock_stddev_of("indi", self._host, self._values)
         stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
         frame = replace(
             frame,

@@ -7,10 +7,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
+from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 LOCAL = ("127.0.0.1", "localhost", "::1")  # hosts whose clock is this machine's
 CLOCK_TOLERANCE_S = 0.05  # between what a driver says of its exposure and when it was commanded and had
+
+
+def server_clock(source: str) -> Parameter:
+    """`SOURCE.clock_stddev` of a source whose camera is behind a server."""
+    return Parameter(
+        f"{source}.clock_stddev",
+        math.nan,
+        "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
+        "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
+        "s",
+        1e-9,  # 0 says that it is this machine's
+        60.0,
+    )
+
+
+def clock_stddev_of(source: str, host: str, values: Mapping) -> float:
+    """What `stamp_of` wants to know of the clock of a server on that host."""
+    return 0.0 if host in LOCAL else values[f"{source}.clock_stddev"]
 
 
 @dataclass(frozen=True)
