@@ -14,7 +14,7 @@ import socket
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from pathlib import Path
 
 import demo
@@ -22,7 +22,7 @@ import numpy as np
 from instrument_run import Place, Processes, own_domain
 
 PICTURE = Path(__file__).resolve().parent.parent / "starpos_solver" / "dashboard.png"
-PORT = Path(tempfile.gettempdir()) / "inclinometer"  # in the picture: as in the inclinometer's README
+PORT = Path("ttyUSB0")  # in the picture, where a robot's port has its name
 SIZE = (1440, 1000)
 FIXES = 6  # on the map
 PATIENCE_S = 120.0
@@ -107,9 +107,7 @@ def save(png: bytes, path: Path) -> None:
 @contextmanager
 def own_instrument(seed: int):
     """The demo's instrument and a dashboard in a ROS domain of their own; the page's address."""
-    if PORT.is_symlink() or PORT.exists():
-        raise ScreenshotError(f"{PORT} exists: another emulated inclinometer? end it, or remove what it left")
-    with own_domain(), tempfile.TemporaryDirectory() as scratch:
+    with own_domain(), tempfile.TemporaryDirectory() as scratch, chdir(scratch):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
@@ -129,7 +127,7 @@ def main() -> int:
     parser.add_argument(
         "--url", help="of a dashboard that runs (default: the demo's instrument, started for it)"
     )
-    parser.add_argument("--out", type=Path, default=PICTURE)
+    parser.add_argument("--out", type=lambda text: Path(text).resolve(), default=PICTURE)
     parser.add_argument("--seed", type=int, default=4, help="place and sky of the demo's instrument")
     args = parser.parse_args()
     try:
