@@ -2,6 +2,7 @@
 """The node `camera`: frames from a source to `~/image_raw`, each with its intrinsics and how it was taken."""
 
 import math
+import os
 import time
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -78,7 +79,7 @@ class CameraNode(Node):
         self._calibration: Camera | None = None
         if self._values["calibration_url"]:
             self._calibration_path = path_of(self._values["calibration_url"])
-            if self._calibration_path.exists():
+            if os.path.exists(self._calibration_path):  # Path.exists raises where a name is too long
                 self._calibration = camera_yaml.read(self._calibration_path)
             else:
                 self.get_logger().warning(

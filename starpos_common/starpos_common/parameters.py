@@ -180,7 +180,10 @@ def declare(
             wanted = {c.name: table[c.name].convert(c.value) for c in changes if c.name in table}
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        reason = check({**values, **wanted}, frozenset(wanted)) if check and wanted else None
+        try:
+            reason = check({**values, **wanted}, frozenset(wanted)) if check and wanted else None
+        except Exception as error:  # a defect costs this change, not the night
+            reason = f"the new values could not be checked ({type(error).__name__}: {str(error)[:200]})"
         return SetParametersResult(successful=not reason, reason=reason or "")
 
     def applied(changes: list[RosParameter]):

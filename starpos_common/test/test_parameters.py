@@ -181,6 +181,16 @@ def test_values_must_fit_together(make):
     assert told[-1] == {"noise", "cadence"}  # those that are set: what a file held may be read again for them
 
 
+def test_a_check_that_fails_refuses_the_change_and_the_node_lives(make):
+    def check(values, names):
+        return 1 / (values["noise"] - 3.0) and None
+
+    node, values = make(check=check)
+    result = change(node, noise=3.0)
+    assert not result.successful and "could not be checked (ZeroDivisionError" in result.reason
+    assert values["noise"] == 0.5 and change(node, noise=4.0).successful
+
+
 def test_other_parameters_of_the_node_are_left_alone(make):
     node, _ = make(apply=lambda names: pytest.fail("not ours"))
     node.declare_parameter("theirs", 1)

@@ -135,13 +135,13 @@ def read_grid(path) -> Grid:
 def find(path) -> Path:
     """`path`, or, of a bare file name that is not here, where PROJ keeps its grids."""
     path = Path(path)
-    if len(path.parts) != 1 or path.exists():
+    if len(path.parts) != 1 or os.path.exists(path):  # Path.exists raises where a name is too long
         return path
     told = [
         folder for name in ("PROJ_DATA", "PROJ_LIB") for folder in os.environ.get(name, "").split(os.pathsep)
     ]
     places = [Path(folder) / path for folder in (*filter(None, told), *PROJ_FOLDERS)]
-    return next((place for place in places if place.is_file()), path)
+    return next((place for place in places if os.path.isfile(place)), path)
 
 
 def _read_gtx(path: Path, head: bytes, size: int):

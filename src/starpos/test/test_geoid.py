@@ -10,7 +10,7 @@ import pytest
 from starpos import geoid
 from starpos.earth import curvature_radii_m
 from starpos.errors import GeoidError
-from starpos.geoid_file import find
+from starpos.geoid_file import find, read_grid
 from starpos.vertical import ARCSEC, UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
 
 EVERYWHERE = [(90, 0), (90, 77), (89.9, -130), (-90, 10), (-89.95, 200), (85.03, 33), (60, 179.99), (47.3, -179.99),
@@ -398,3 +398,9 @@ def test_it_answers_everywhere(egm96):
     assert np.sqrt(np.mean(slopes**2)) == pytest.approx(5, abs=1.2)
     assert abs(slopes).max() < 60
     assert 1 < np.median([d.stddev_arcsec for d in found]) < 4
+
+
+@pytest.mark.parametrize("name", ["x" * 100_000, "a\0b", "a/" + "x" * 300])
+def test_a_name_that_no_file_can_have_is_refused_as_one_that_is_not_there(name):
+    with pytest.raises(GeoidError):
+        read_grid(name)
