@@ -9,9 +9,9 @@ from starpos.average import MOVED_FIXES, Average, Averager
 from starpos.earth import curvature_radii_m
 from starpos.fix import Fix
 from starpos.plumb import EARTH_RADIUS_M
+from starpos.pose import slip_s
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
-from starpos_solver.memory import touched
 
 WIDE_RAD = np.radians(600 / 3600)  # its square, which a linear filter does not know of, is 2 arcsec
 ELSEWHERE_SIGMA = 3.0  # from the place of a turn; wrongly taken for another place it only costs precision
@@ -61,7 +61,7 @@ class Averaging:
 
     def add(self, fix: Fix) -> News:
         """One more fix, later than all before."""
-        if self._pose is None or touched(fix, self._pose):
+        if self._pose is None or slip_s(fix, self._pose) != 0:
             self._pose = fix
             if self._turned is not None or _is_wide(fix):
                 self._averager = Averager()

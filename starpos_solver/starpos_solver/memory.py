@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from starpos.average import POSE_RAD, POSE_SIGMA
 from starpos.errors import TiltError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, TiltLog
+from starpos.pose import slip_s
 from starpos.stars import Stars
 
 MOST_POSES = 36
@@ -50,13 +50,6 @@ class RecentFrames:
         self._frames.clear()
 
 
-def touched(fix: Fix, first: Fix) -> bool:
-    """Whether the camera has turned against the Earth since the first fix of its pose."""
-    turned = np.linalg.norm(fix.camera_to_itrs - first.camera_to_itrs) / np.sqrt(2)
-    sigma = np.hypot(fix.attitude_sigma, first.attitude_sigma)
-    return bool(turned > max(POSE_RAD, POSE_SIGMA * sigma))
-
-
 @dataclass
 class _Pose:
     """A camera that stands still against the Earth since `first`."""
@@ -83,7 +76,7 @@ class Poses:
 
     def add(self, seen: Seen, fix: Fix) -> bool:
         """One more frame; whether this is worth a look at all of them: a new pose, or one with twice the frames."""
-        if not self._poses or touched(fix, self._poses[-1].first):
+        if not self._poses or slip_s(fix, self._poses[-1].first) != 0:
             self._poses.append(_Pose(fix, seen))
         pose = self._poses[-1]
         pose.add(seen)

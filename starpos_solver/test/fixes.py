@@ -46,7 +46,7 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
     terms = (ErrorTerm("tilt", np.diag(rows * noise_m)), ErrorTerm("calibration", slip, ALWAYS))
     return Fix(T0 + seconds, math.radians(latitude_deg), math.radians(10.0), heading_of(link), link, terms,
                np.arange(3), np.zeros((3, 2)), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05, site.enu.T @ attitude,
-               1e-6)  # fmt: skip
+               np.eye(3) * 1e-12)  # fmt: skip
 
 
 def north_of(fix: Fix, metres: float) -> Fix:

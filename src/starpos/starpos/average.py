@@ -10,20 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos import rotation
 from starpos.budget import ErrorTerm
 from starpos.errors import FixError
 from starpos.fix import Fix
+from starpos.pose import slip_s
 from starpos.running import Running
 
 GATE_SIGMA = 6.0  # further off a fix is not of this place, or wrong
 MOVED_FIXES, MOVED_SIGMA = 3, 4.5  # so many fixes of a turned camera, so far off, are another place
 RIVAL_FIXES = 10  # a rival is replaced by a newer one no sooner
-HIGHEST_LATITUDE = np.radians(89.0)
-POSE_RAD, POSE_SIGMA = (
-    np.radians(10 / 3600),
-    6.0,
-)  # a camera that turned by more against the Earth was touched
 
 
 @dataclass(frozen=True)
@@ -146,11 +141,11 @@ class Averager:
         if self._track is None:
             self._track, self._last, self._pose = _Track.before(f).add(f, f), f, f
             return
-        slipped = self._slipped(f)
-        if not slipped and self._touched(f):
+        slip = slip_s(f, self._pose)
+        if slip is None:
             self._turn(f)
         self._last = f
-        before, with_it = self._track, None if slipped else self._track.add(f, self._pose)
+        before, with_it = self._track, None if slip else self._track.add(f, self._pose)
         rival = self._rival.add(f, self._pose) if self._rival else None
         if with_it is not None:
             self._track, self._disbelieved = with_it, 0
@@ -169,21 +164,6 @@ class Averager:
         # of a camera nobody touched it takes the majority to say that the average is wrong
         if self._disbelieved >= MOVED_FIXES if self._rival_turned else rival.frames > self._track.in_pose:
             self._move(f)
-
-    def _touched(self, f: Fix) -> bool:
-        """Whether the camera has turned against the Earth since its pose began."""
-        turned = np.linalg.norm(f.camera_to_itrs - self._pose.camera_to_itrs) / np.sqrt(2)
-        return bool(turned > self._allowed(f))
-
-    def _slipped(self, f: Fix) -> bool:
-        """Whether it seems to have turned about the Earth's axis, as no hand turns it: the time stamp is off."""
-        x, y, z = rotation.to_small_vector(f.camera_to_itrs @ self._pose.camera_to_itrs.T)
-        near_pole = abs(f.latitude) > HIGHEST_LATITUDE  # there any turn on the spot is one about that axis
-        return bool(abs(z) > self._allowed(f) > np.hypot(x, y) and not near_pole)
-
-    def _allowed(self, f: Fix) -> float:
-        """By how much a camera may seem to turn that nobody touched, rad."""
-        return max(POSE_RAD, POSE_SIGMA * float(np.hypot(f.attitude_sigma, self._pose.attitude_sigma)))
 
     def _turn(self, f: Fix) -> None:
         """The camera was touched: its heading is another, and its place may be."""

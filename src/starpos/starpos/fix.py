@@ -47,7 +47,7 @@ class Fix:
     link_to_enu (3, 3): attitude of the base link.  used (M,): which of the given stars were kept.  focal_scale: factor
     on the given focal length.  residual_px (M, 2): where the fit has them less where they were seen.  jitter_px: scatter
     beyond the centroids' own errors (seeing, optics).  camera_to_itrs (3, 3): how the camera stands on the Earth by the
-    stars alone, attitude_sigma rad about its worst axis.
+    stars alone; camera_covariance (3, 3) rad2, of a small rotation about the Earth's axes.
     """
 
     utc_unix_s: float
@@ -66,7 +66,7 @@ class Fix:
     diurnal_aberration_arcsec: float
     ut1_minus_utc_s: float
     camera_to_itrs: np.ndarray
-    attitude_sigma: float
+    camera_covariance: np.ndarray
 
     @property
     def covariance(self) -> np.ndarray:
@@ -151,7 +151,7 @@ def solve_fix(
         diurnal_aberration_arcsec=float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
         ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
         camera_to_itrs=state.a4.T @ problem.g,
-        attitude_sigma=float(np.sqrt(np.linalg.eigvalsh(errors.rotation_covariance(centroids))[-1])),
+        camera_covariance=state.a4.T @ errors.rotation_covariance(centroids) @ state.a4,
     )
 
 
