@@ -276,6 +276,8 @@ def test_a_port_in_use_is_said_in_a_sentence(server):
         listen("192.0.2.1", 0)
     with pytest.raises(DashboardError, match="set the parameter address"):
         listen("no.such.name.invalid", 0)
+    with pytest.raises(DashboardError, match="is no address: set the parameter address"):
+        listen("x" * 5000, 0)
 
 
 def test_it_ends_while_pages_are_open(server):

@@ -54,6 +54,10 @@ def listen(address: str, port: int) -> list:
     """Bound sockets; DashboardError with what to do where that cannot be."""
     try:
         return bind_sockets(port, address)
+    except UnicodeError:
+        raise DashboardError(
+            f"{address[:80]!r} is no address: set the parameter address to one of this machine's"
+        ) from None
     except OSError as e:
         cures = {
             98: "another program has this port: stop it, or set the parameter port",
