@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos report` on folders: the numbers of `starpos solve`, a page that needs nothing else, failures that say why."""
 
+import io
 import json
 import re
 import shutil
 import sys
+from contextlib import redirect_stdout
 
 import numpy as np
 import pytest
 from reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
 
 from starpos.atmosphere import Atmosphere
+from starpos.cli import main
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
 from starpos.report import folder, measures
@@ -31,6 +34,15 @@ def turned(tmp_path_factory):
     """Four frames at several headings, A3 off by half a degree."""
     misaligned = ("--turn", 80, "--misalignment", 0.5, -0.3, 0.2)
     return simulate(tmp_path_factory.mktemp("turned") / "turned", *misaligned, frames=4)
+
+
+@pytest.fixture(scope="module")
+def drawn(still, tmp_path_factory):
+    """The folder of the still night's report."""
+    out = tmp_path_factory.mktemp("drawn") / "out"
+    with redirect_stdout(io.StringIO()):
+        assert main(["report", *map(str, (still, "-o", out, *OPTICS, *AIR))]) == 0
+    return out
 
 
 def report(capsys, night, out, *more):
@@ -65,18 +77,18 @@ def test_the_page_says_what_solve_says(still, tmp_path, capsys):
     assert numbers_after(page, "Error against the truth")[0] == pytest.approx(np.hypot(east, north), rel=0.02)
 
 
-def test_the_page_needs_nothing_else(still, tmp_path, capsys):
-    _, page, _ = report(capsys, still, tmp_path / "out")
+def test_the_page_needs_nothing_else(drawn):
+    page = Page(drawn / "index.html")
     assert page.references and all(r.startswith(("data:image/png;base64,", "#")) for r in page.references)
     assert not page.tags & {"script", "link", "iframe", "object", "form"}
     assert not re.search(r"https?:|url\(|@import", page.source)
 
 
-def test_pictures_are_drawn_and_lie_beside_the_page(still, tmp_path, capsys):
-    _, page, _ = report(capsys, still, tmp_path / "out")
-    names = {p.stem for p in (tmp_path / "out").glob("*.png")}
+def test_pictures_are_drawn_and_lie_beside_the_page(drawn):
+    page = Page(drawn / "index.html")
+    names = {p.stem for p in drawn.glob("*.png")}
     assert names == {"stability", "frames", "scatter", "budget", "residuals", "sky", "health"}
-    files = {(tmp_path / "out" / f"{n}.png").read_bytes() for n in names}
+    files = {(drawn / f"{n}.png").read_bytes() for n in names}
     assert files == set(page.pictures.values())
     for png in files:
         assert_drawn(png)
@@ -204,9 +216,8 @@ def test_a_file_of_somebody_else_is_not_overwritten(still, tmp_path, capsys):
     assert (out / "index.html").read_text() == "<h1>mine</h1>"
 
 
-def test_its_own_report_is_overwritten_whole(still, turned, tmp_path, capsys):
-    out = tmp_path / "out"
-    report(capsys, still, out)
+def test_its_own_report_is_overwritten_whole(drawn, turned, tmp_path, capsys):
+    out = shutil.copytree(drawn, tmp_path / "out")
     first = (out / "scatter.png").read_bytes()
     status, page, _ = report(capsys, turned, out, "--misalignment", 0.5, -0.3, 0.2)
     assert status == 0 and "turned" in page.text
