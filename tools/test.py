@@ -25,13 +25,7 @@ LINTERS = [f"ruff {check} --output-format concise" for check in ("check", "forma
 NO_TESTS = 5  # pytest's exit status where a -k left none
 COLCON = "--event-handlers console_direct+ console_stderr- status- summary- --packages-select"
 LANES = 3  # at once: some compute, others wait for nodes
-LONGEST_FIRST = (
-    "starpos",
-    "graph",
-    "starpos_inclinometer",
-    "starpos, Ubuntu's",
-    "starpos_camera",
-)
+LONGEST_FIRST = ("starpos", "graph", "starpos_camera", "starpos, Ubuntu's", "starpos_camera, Ubuntu's")
 VERSIONS = "tools/ubuntu-24.04.txt"
 UBUNTU = ("src/starpos", "starpos_common", "starpos_camera", "starpos_inclinometer", "starpos_solver")
 PRINTING, MAKING = threading.Lock(), threading.Lock()
