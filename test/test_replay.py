@@ -33,6 +33,12 @@ def truth():
     return json.loads(NIGHT.with_suffix(".json").read_text())
 
 
+def test_a_replay_that_nobody_hears_says_so(graph, run):  # before there is an instrument
+    replay = run("starpos_solver", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
+    assert replay.wait() == 0
+    assert "nobody subscribes to" in replay.output and "/stars" in replay.output, replay.output
+
+
 @pytest.fixture(scope="module")
 def instrument(graph, truth, tmp_path_factory):
     """Detector and solver that know what the bag's instrument is."""

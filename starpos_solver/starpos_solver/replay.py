@@ -171,7 +171,9 @@ class Player:
         self._executor.add_node(self._node)
         self._clock_type = Clock
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
+        topics = list(topics)
         self._publishers = {t.name: self._publisher(t) for t in topics}
+        self._frame_topics = [t.name for t in topics if t.type_name in FRAMES]
         self._answers = 0
         self._awaited: tuple[str, tuple[int, int]] | None = None  # topic and stamp of the frame that is out
         self._unanswered: dict[str, int] = {}
@@ -201,9 +203,15 @@ class Player:
         self._node.create_subscription(Solution, SOLUTION, hear, 10)
 
     def wait_for_subscribers(self, at_most_s: float):
-        """Until every topic has one, or the time is up; and say which topic somebody else publishes as well."""
+        """Until every topic has one, or the time is up; and say who is deaf, or speaks as well."""
         every = [*self._publishers.values(), self._clock]
         self._spin(at_most_s, lambda: all(p.get_subscription_count() for p in every))
+        heard = [n for n in self._frame_topics if self._publishers[n].get_subscription_count()]
+        if self._frame_topics and not heard and not self._stopped:
+            _say(
+                f"nobody subscribes to {', '.join(self._frame_topics)}: start detector or solver in its namespace, with "
+                "use_sim_time, or remap (--ros-args -r)"
+            )
         doubled = [n for n in self._publishers if self._node.count_publishers(n) > 1]
         if doubled:
             _say(
