@@ -40,13 +40,15 @@ class Bag:
             raise ReplayError("rosbags, which reads bags, is not installed: pip install rosbags") from None
         if not self.path.exists():
             raise ReplayError(f"{self.path}: there is no such bag")
-        metadata = self.path / "metadata.yaml"
-        if self.path.is_dir() and not metadata.is_file():
+        try:
+            bags.check_folder(self.path)
+        except (bags.BagError, OSError) as error:
+            raise self._broken(error) from None
+        if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
             raise ReplayError(
                 f"{self.path}: a folder without metadata.yaml is no bag: name its .mcap or .db3 file"
             )
         try:
-            bags.check_folder(self.path)
             bags.bound_rosbags()
             self._reader = Reader(self.path)
             self._reader.open()

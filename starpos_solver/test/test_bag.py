@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from starpos import bags
 from starpos_solver.bag import Bag, ReplayError
+from starpos_solver.bag_writer import BagWriter
 
 KIND = "std_msgs/msg/UInt8MultiArray"
 
@@ -33,4 +34,17 @@ def test_metadata_of_many_megabytes_is_not_read(tmp_path):
     with (tmp_path / "metadata.yaml").open("wb") as file:
         file.truncate(bags.MOST_METADATA + 1)
     with pytest.raises(ReplayError, match="not the description of a bag"), Bag(tmp_path):
+        pass
+
+
+def test_a_recording_that_was_killed_says_how_to_get_it_back(tmp_path):
+    writer = BagWriter(tmp_path / "night")
+    writer.add_topic("/tilt", "starpos_interfaces/msg/Tilt")
+    for k in range(20000):
+        writer.write("/tilt", k, bytes(120))  # what is in the file now is there after kill -9 too
+    for path in (tmp_path / "night", tmp_path / "night" / "night.mcap"):
+        with pytest.raises(ReplayError, match=r"mcap recover night\.mcap"), Bag(path):
+            pass
+    writer.close()
+    with Bag(tmp_path / "night"):
         pass

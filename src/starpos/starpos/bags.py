@@ -14,18 +14,33 @@ from starpos.errors import StarposError
 MOST_METADATA = 1 << 24
 MOST_UNPACKED = 1 << 29  # of a chunk or a message; a frame of 21 megapixels is a twelfth of it
 MOST_AT_ONCE = 1 << 30  # of the chunks of a file that overlap in time: all are in memory then
+MCAP = b"\x89MCAP0\r\n"  # its first bytes, and its last
 LEFT_ON_DISK = 1 << 30  # by a bag that is packed as a file, and unpacked beside the others of /tmp
 
 
 class BagError(StarposError):
-    """What is read from a bag goes beyond a bound; what, not where."""
+    """What is read from a bag goes beyond a bound, or was never ended; what, not where."""
 
 
 def check_folder(path: Path) -> None:
-    """Before a bag is opened. BagError where its metadata.yaml is none."""
+    """Before a bag is opened. BagError where its metadata.yaml is none, or an MCAP has a beginning and no end."""
+    for file in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
+        if file.suffix == ".mcap" and _is_cut_off(file):
+            raise BagError(
+                f"{file.name} was cut off, by a kill or a power failure, or is being recorded still: `mcap recover "
+                f"{file.name} -o whole.mcap` (https://mcap.dev) gets back what is in it, to the last second or minute"
+            )
     metadata = path / "metadata.yaml"
-    if path.is_dir() and metadata.stat().st_size > MOST_METADATA:
+    if metadata.is_file() and metadata.stat().st_size > MOST_METADATA:
         raise BagError(f"its metadata.yaml has over {MOST_METADATA >> 20} MB, not the description of a bag")
+
+
+def _is_cut_off(file: Path) -> bool:
+    with file.open("rb") as content:
+        if content.read(len(MCAP)) != MCAP:
+            return False
+        content.seek(-len(MCAP), 2)
+        return content.tell() == 0 or content.read() != MCAP
 
 
 def bound_rosbags() -> None:

@@ -252,6 +252,20 @@ def test_what_is_no_bag_is_refused_in_one_line(damage, lists, tilts, tmp_path, c
     status, _, errors = report(capsys, bag, tmp_path / "out")
     assert (status, len(errors)) == (2, 1)
     assert str(bag) in errors[0]
+    assert ("mcap recover" in errors[0]) == (damage == "cut")
+
+
+def test_a_recording_that_was_killed_says_how_to_get_it_back(lists, tilts, tmp_path, capsys):
+    bag = record(tmp_path / "bag", lists, tilts)
+    (bag / "metadata.yaml").unlink()  # both come at the end
+    (file,) = bag.glob("*.mcap")
+    whole = file.read_bytes()
+    for left in (0, 8, 9, len(whole) - 1):
+        file.write_bytes(whole[:left])
+        for path in (bag, file):
+            status, _, errors = report(capsys, path, tmp_path / "out")
+            assert (status, len(errors)) == (2, 1), left
+            assert ("mcap recover bag.mcap" in errors[0]) == (left > 0), left
 
 
 def test_broken_star_lists_cost_their_frame_only(night, lists, tilts, tmp_path, capsys):

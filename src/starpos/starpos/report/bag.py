@@ -45,8 +45,10 @@ class Recorded:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it should be one: a folder with metadata.yaml, or a file of a bag's suffix."""
-    return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix.lower() in SUFFIXES)
+    """Whether it should be one: a folder with metadata.yaml or a bag's files, or a file of a bag's suffix."""
+    if path.is_file():
+        return path.suffix.lower() in SUFFIXES
+    return (path / "metadata.yaml").is_file() or any(next(path.glob(f"*{s}"), None) for s in SUFFIXES)
 
 
 def read(path: Path, namespace: str | None, tilt_noise_rad: float, progress: Progress) -> Recorded:
