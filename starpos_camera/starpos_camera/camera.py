@@ -261,7 +261,10 @@ class CameraNode(Node):
         except InstrumentError as error:
             response.success = False
             response.status_message = str(error)
-        self.get_logger().info(f"set_camera_info: {response.status_message}")
+        if response.success:
+            self.get_logger().info(f"set_camera_info: {response.status_message}")
+        else:
+            self.get_logger().warning(response.status_message)
         return response
 
     def _keep(self, camera: Camera):

@@ -190,6 +190,9 @@ def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, list
     assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
     status, out = node.end(signal.SIGINT)
     assert status == 0 and "there is no calibration yet" in out
+    said = [line for line in out.splitlines() if "set_camera_info:" in line]
+    assert [line.split("]")[0] for line in said] == ["[WARN", "[WARN", "[INFO"]
+    assert all(line.count("set_camera_info:") == 1 for line in said)
 
     infos = listener.hear(CameraInfo, "camera/camera_info")
     node = start("camera", *options)
