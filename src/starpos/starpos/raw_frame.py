@@ -38,7 +38,10 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
             if not pixels[-1].any():  # no sensor gives that
                 raise ValueError("its last row is empty")
             colours = raw.color_desc.decode("ascii", "replace")
-            pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
+            try:
+                pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
+            except NotImplementedError as e:  # of mosaics that rawpy does not know; now and then of a broken file
+                pattern = str(e)
     except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError, AttributeError) as e:
         raise FrameError(f"{place}: this is not a whole raw file ({_words(e)}); copy it again.") from e
     if pattern not in PATTERNS or not pattern:
