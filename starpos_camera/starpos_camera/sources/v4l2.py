@@ -147,7 +147,7 @@ class Device:
         stale = buffers if 1 <= buffers <= 32 else 4
         period_s = max(self._period_s(cv2), exposure_s or 0.0)
         end_s = asked_s + MAX_WAIT_S + (stale + SETTLE_FRAMES) * period_s
-        before_s, apart_s, unstamped = None, math.inf, 0
+        before_s, apart_s, unstamped = None, [], 0
         while time.monotonic() < end_s and not self.closing:
             if not self._capture.grab():
                 raise CaptureError("it gives no frame; look after its plug.")
@@ -159,8 +159,9 @@ class Device:
                 age_s, unstamped = 0.0, unstamped + 1
             at_s = steady_s - age_s
             if before_s is not None:  # in the dark a camera may be slower than it says
-                apart_s = min(apart_s, at_s - before_s) if stamped else at_s - before_s
-                lag_s, stddev_s, latest_s = self._lag(exposure_s, max(period_s, apart_s))
+                apart_s.append(at_s - before_s)  # of reads: one that was late makes the next look early
+                frame_s = min(apart_s) if stamped else max(apart_s)
+                lag_s, stddev_s, latest_s = self._lag(exposure_s, max(period_s, frame_s))
                 # Without stamps: after the buffers that had been filled before, and one that was being so.
                 if at_s - latest_s >= asked_s and (stamped or unstamped > stale + 1):
                     return now_s - age_s - lag_s, stddev_s, Capture.HARDWARE if stamped else Capture.DRIVER
