@@ -40,7 +40,7 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
             colours = raw.color_desc.decode("ascii", "replace")
             try:
                 pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
-            except NotImplementedError as e:  # of mosaics that rawpy does not know; now and then of a broken file
+            except NotImplementedError as e:  # a mosaic rawpy does not know, now and then a broken file
                 pattern = str(e)
     except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError, AttributeError) as e:
         raise FrameError(f"{place}: this is not a whole raw file ({_words(e)}); copy it again.") from e
