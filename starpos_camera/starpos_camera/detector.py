@@ -6,7 +6,10 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -25,6 +28,7 @@ from starpos_interfaces.msg import Capture, StarArray
 
 IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB
 CAPTURES_KEPT = 16
+CAPTURE_PATIENCE_S = 0.5  # an image waits so long for its Capture, which two topics may bring after it
 MIN_SILENCE_S = 5.0  # without a frame, and three times as long as between the last two, before it is reported
 
 
@@ -56,6 +60,9 @@ class DetectorNode(Node):
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = self._detection_settings()
         self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
+        self._held: Job | None = None  # the newest frame, while its Capture has not come
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._late: Timer | None = None
         self._frames = self._bad = self._dropped = 0
         self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
         self._troubles = Troubles(self)
@@ -74,8 +81,8 @@ class DetectorNode(Node):
 
     def listen(self):
         """Take the frames of `camera/image_raw`; beside a camera in this process `submit` is called instead."""
-        # This one first: the executor takes what is ready in this order, and an image needs its Capture.
-        subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
+        self._captures_come = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
+        self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=self._steady, autostart=False)
         images = subscription(self, Image, "camera/image_raw", self._on_image, IMAGE_DEPTH)
         self._where = f" on {images.topic_name}"
 
@@ -125,17 +132,32 @@ class DetectorNode(Node):
         if len(self._captures) >= CAPTURES_KEPT:
             del self._captures[next(iter(self._captures))]
         self._captures[_key(message.header)] = message
+        if self._held is not None and _key(self._held.header) == _key(message.header):
+            self._go_on()
 
     def _on_image(self, message: Image, info: dict):
         self._count_overwritten(info["publication_sequence_number"])
         try:
             _check_stamp(message.header)
-            frame = replace(message_to_frame(message), **self._taken(message.header))
+            frame = message_to_frame(message)
         except StarposError as error:
             self._arrived()
             self._complain(str(error))
             return
-        self.submit(frame, message.header)
+        if self._held is not None:
+            self._go_on()
+        self._held = Job(frame, message.header)
+        if _key(message.header) in self._captures or not self._captures_come.get_publisher_count():
+            self._go_on()
+        else:
+            self._late.reset()
+
+    def _go_on(self):
+        """With the frame that is held, and what is known of it by now."""
+        self._late.cancel()
+        job, self._held = self._held, None
+        if job is not None:
+            self.submit(replace(job.frame, **self._taken(job.header)), job.header)
 
     def _count_overwritten(self, sequence: int | None):
         """Count the frames that newer ones replaced in the middleware; a lower number is another publisher's."""
