@@ -83,7 +83,8 @@ class Soak:
 
     def _look_at(self, node):
         if "Traceback" in node.output:
-            self.crashes.append(f"a defect in the log of {node.name}: {node.output[-1500:]}")
+            where = max(node.output.index("Traceback") - 500, 0)
+            self.crashes.append(f"a defect in the log of {node.name}: {node.output[where:][:3000]}")
 
     def watch(self):
         """Whether all nodes live; a dead one is a crash, and is started again."""
