@@ -36,11 +36,13 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
     stated = np.median(np.trace(covariance, axis1=1, axis2=2)) / 2
     most = max(stated, float(np.sum(residual**2)))
     extra = np.geomspace(GRID_LEAST * stated, GRID_MOST * most, GRID)
-    xx, xy, yy = (covariance[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-    determinant = (xx + extra) * (yy + extra) - xy * xy
-    x, y = residual.T[:, :, None]
-    d2 = ((yy + extra) * x * x - 2 * xy * x * y + (xx + extra) * y * y) / determinant
-    log_density = -0.5 * (d2 + share * np.log(determinant)).sum(0) - np.log(stated + extra) + np.log(extra)
+    # scaled, that one star of absurd errors, which tells nothing, spoils nothing
+    sigma_x, sigma_y = (np.sqrt(covariance[:, i, i, None] + extra) for i in (0, 1))
+    slant = covariance[:, 0, 1, None] / sigma_x / sigma_y
+    x, y = residual[:, :1] / sigma_x, residual[:, 1:] / sigma_y
+    d2 = (x * x - 2 * slant * x * y + y * y) / (1 - slant**2)
+    log_determinant = 2 * np.log(sigma_x) + 2 * np.log(sigma_y) + np.log1p(-(slant**2))
+    log_density = -0.5 * (d2 + share * log_determinant).sum(0) - np.log(stated + extra) + np.log(extra)
     density = np.exp(log_density - log_density.max())
     return float(density @ extra / density.sum())
 

@@ -12,6 +12,7 @@ EDGE = 2
 ELONGATED = 4
 BLENDED = 8
 MOST_EXPOSURE_S = 3600.0  # tilts of more than one pose would be averaged
+MOST_VARIANCE_PX2 = 1e12  # beyond any frame; squares of it must not overflow
 MOST_STDDEV_S = 1e9  # of a time: more says nothing, and its square must not overflow
 
 
@@ -66,6 +67,8 @@ class Stars:
             )
         object.__setattr__(self, "flags", self.flags.astype(np.uint8))
         c = self.covariance
+        if np.any(c > MOST_VARIANCE_PX2):
+            raise FrameError(f"{place}: a star's error is {np.sqrt(c.max()):.1g} px; leave such stars out.")
         determinant = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] * c[:, 1, 0]
         if not np.all((c[:, 0, 0] > 0) & (c[:, 1, 1] > 0) & (determinant > 0)):
             raise FrameError(

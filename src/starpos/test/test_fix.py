@@ -138,6 +138,18 @@ def test_few_stars_do_not_claim_what_they_cannot_tell(rng):
     assert np.mean(within) == pytest.approx(0.77, abs=0.06)
 
 
+def test_a_star_of_absurd_errors_tells_nothing_and_spoils_nothing(rng):
+    field = random_field(rng, stars=30)
+    xy, places = field.places(STATE, rng)
+    xy = xy + rng.normal(0, 0.05, xy.shape)
+    covariance = np.eye(2)[None].repeat(30, 0) * 0.05**2
+    without = field.solve(xy[1:], places[1:], STATE, covariance_px2=covariance[1:])
+    covariance[0] *= 1e14
+    fix = field.solve(xy, places, STATE, covariance_px2=covariance)
+    assert np.all(np.abs(error_arcsec(fix, field) - error_arcsec(without, field)) < 1e-3)
+    assert np.sqrt(np.diag(fix.covariance)) == pytest.approx(np.sqrt(np.diag(without.covariance)), rel=0.1)
+
+
 def test_too_few_stars(rng):
     field = Field(stars=2)
     xy, places = field.places(STATE, rng)
