@@ -208,9 +208,7 @@ def a_picture(tmp_path):
 
 
 def truncated(tmp_path):
-    return changed(
-        tmp_path, lambda name, data: data[:5000] if name.endswith("mcap") else data
-    ), "not a readable"
+    return changed(tmp_path, lambda name, data: data[:5000] if name.endswith("mcap") else data), "was cut off"
 
 
 def garbage(tmp_path):

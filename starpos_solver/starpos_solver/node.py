@@ -44,6 +44,7 @@ WAITING = 4  # frames that wait for their tilts or for the triangles; older ones
 POLL_S = 0.02
 ANOTHER_TIME_S = 3600.0  # clocks that differ by more are not those of one evening
 J2000_UNIX_S = 946_728_000.0
+CLOCK_STEP_NS = 50_000_000  # a clock that goes back by so much was set
 CLOCK_SIGMAS = 6.0  # beyond the stated error, and AHEAD_S, a stamp in the future is wrong
 
 
@@ -74,6 +75,7 @@ class SolverNode(Node):
         # reads the tables of the Earth's rotation, so that the first frame is not slow
         earth_state(J2000_UNIX_S)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._was_ns = 0  # this node's clock, when something came last
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
         self._solver: Solver | None = None
@@ -179,9 +181,6 @@ class SolverNode(Node):
             # when its time has come the instrument may lean otherwise
             if ahead_s > reports.AHEAD_S:
                 raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
-            if ahead_s:  # both times are known, and of one evening
-                now_s = stamp_to_unix(message.header.stamp) - ahead_s
-                self._tilts.forget_after(now_s + reports.AHEAD_S)
             self._tilts.add(message, self._settings.tilt_stddev_rad)
             self._inputs.came("tilt")
         except StarposError as e:
@@ -213,6 +212,9 @@ class SolverNode(Node):
         the date.
         """
         now_ns = self.get_clock().now().nanoseconds
+        if now_ns < self._was_ns - CLOCK_STEP_NS:
+            self._tilts.forget_after(now_ns * 1e-9)  # so far it was ahead
+        self._was_ns = now_ns
         if unix_s is None or not now_ns:
             return 0.0
         ahead_s = unix_s - now_ns * 1e-9

@@ -12,8 +12,8 @@ from starpos_interfaces.msg import Tilt as TiltMessage
 
 CAPACITY = 6000  # ten minutes at 10 Hz
 UNUSABLE = TiltMessage.OUT_OF_RANGE | TiltMessage.STUCK | TiltMessage.SATURATED
+TOGETHER = 20  # samples of an exposure have no more others between them
 NEAR_S = 1.0  # how far from an exposure a flagged sample still explains why there is no good one
-SET_BACK_S = 1.0  # a sample that is stamped so much before an earlier one tells that their clock was set back
 USUAL_PERIOD_S, JITTER = 0.1, 0.9  # between samples; how much of it the next one may come early
 
 
@@ -21,8 +21,8 @@ class TiltBuffer:
     """The latest samples in any order, bounded; unusable ones are remembered only to say so."""
 
     def __init__(self):
-        self._good: deque[Tilt] = deque(maxlen=CAPACITY)
-        self._latest_unix_s = -np.inf
+        self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with its number as it came
+        self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
 
     def __len__(self) -> int:
@@ -31,7 +31,6 @@ class TiltBuffer:
     def clear(self) -> None:
         self._good.clear()
         self._flagged.clear()
-        self._latest_unix_s = -np.inf
 
     def add(self, message: TiltMessage, unknown_stddev_rad: float) -> None:
         """Keep a sample; TiltError where the message is broken."""
@@ -43,16 +42,15 @@ class TiltBuffer:
         except TiltRangeError:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, TiltMessage.OUT_OF_RANGE))
             raise
-        if sample.utc_unix_s < self._latest_unix_s - SET_BACK_S:
-            self.forget_after(sample.utc_unix_s)
-        self._good.append(sample)
+        self._came += 1
+        self._good.append((self._came, sample))
         self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
 
     def forget_after(self, unix_s: float) -> None:
         """Samples of a clock that was ahead then: when their time comes the instrument may lean otherwise."""
         if self._latest_unix_s > unix_s:
             self._latest_unix_s = unix_s
-            self._good = deque((s for s in self._good if s.utc_unix_s <= unix_s), maxlen=CAPACITY)
+            self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether no further sample of this exposure is to come: one is here that leaves no room for another."""
@@ -63,9 +61,17 @@ class TiltBuffer:
         return times[-1] >= mid_unix_s + span_s / 2 - JITTER * period
 
     def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
-        """The samples about an exposure in order of time, however they came; none counts twice."""
-        reach = span_s / 2 + NEAR_S
-        near = {s.utc_unix_s: s for s in self._good if abs(s.utc_unix_s - mid_unix_s) <= reach}
+        """The samples about an exposure in order of time, however they came; none counts twice.
+
+        They came together.  Of a clock that was set back there are others of this time from long before, when the
+        instrument perhaps leaned otherwise.
+        """
+        reach, near, last = span_s / 2 + NEAR_S, {}, 0
+        for came, sample in self._good:
+            if abs(sample.utc_unix_s - mid_unix_s) <= reach:
+                if came > last + TOGETHER:
+                    near.clear()
+                near[sample.utc_unix_s], last = sample, came
         return [near[t] for t in sorted(near)]
 
     def average(self, mid_unix_s: float, span_s: float) -> Tilt:
@@ -95,6 +101,6 @@ class TiltBuffer:
             )
         if flags:
             raise TiltError("tilt: the inclinometer repeats the same value: check its converter's wiring")
-        nearest = min((abs(s.utc_unix_s - mid_unix_s) for s in self._good), default=None)
+        nearest = min((abs(s.utc_unix_s - mid_unix_s) for _, s in self._good), default=None)
         known = "none has arrived at all" if nearest is None else f"the nearest is {nearest:.1f} s off"
         raise TiltError(f"tilt: no sample near the exposure ({known}): check the inclinometer and the clocks")
