@@ -147,10 +147,12 @@ class DetectorNode(Node):
         if self._held is not None:
             self._go_on()
         self._held = Job(frame, message.header)
-        if _key(message.header) in self._captures or not self._captures_come.get_publisher_count():
-            self._go_on()
-        else:
+        # of the first image the sender may be known already, and not yet that it sends Captures
+        expected = self._last_frame_s is None or self._captures_come.get_publisher_count()
+        if expected and _key(message.header) not in self._captures:
             self._late.reset()
+        else:
+            self._go_on()
 
     def _go_on(self):
         """With the frame that is held, and what is known of it by now."""
