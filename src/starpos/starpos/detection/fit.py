@@ -113,9 +113,9 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
     leverage = ((design @ np.nan_to_num(covariance).astype(np.float32)) * design).sum(2).reshape(used.shape)
     with np.errstate(divide="ignore"):
-        flux_sigma = (
-            normal[:, 2, 2] ** -0.5
-        )  # at known place and colour, of which the star's detection owes nothing
+        # at known place and colour, of which the star's detection owes nothing; a root is rounded alike wherever an array
+        # lies in memory, numpy 1.26's power is not, and the answers of several processes are to be the same
+        flux_sigma = 1 / np.sqrt(normal[:, 2, 2])
     return Fit(
         x,
         y,
