@@ -158,8 +158,15 @@ class DetectorNode(Node):
         """With the frame that is held, and what is known of it by now."""
         self._late.cancel()
         job, self._held = self._held, None
-        if job is not None:
-            self.submit(replace(job.frame, **self._taken(job.header)), job.header)
+        if job is None:
+            return
+        try:
+            frame = replace(job.frame, **self._taken(job.header))
+        except StarposError as error:  # of what no exposure and no clock has
+            self._arrived()
+            self._complain(str(error))
+            return
+        self.submit(frame, job.header)
 
     def _count_overwritten(self, sequence: int | None):
         """Count the frames that newer ones replaced in the middleware; a lower number is another publisher's."""

@@ -174,6 +174,15 @@ def test_exposure_is_the_parameter_where_no_capture_says_it(listener, start, fra
     assert (got.exposure, got.stamp_stddev, got.clock_stddev) == (0.4, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("told", ["exposure", "stamp_stddev", "clock_stddev"])
+def test_a_capture_that_no_frame_can_have_costs_its_frame_only(feed, frame, told):
+    message = feed.message(frame)
+    feed.captures.publish(Capture(header=message.header, **{told: 1e300}))
+    feed.images.publish(message)
+    feed.listener.wait_for_state("detector: Stars", WARN, "1e+300")
+    assert feed.show(frame).stars
+
+
 def test_parameters_apply_at_run_time(feed, frame):
     everything = len(feed.show(frame).stars)
     assert feed.listener.set("detector", max_stars=3).successful
