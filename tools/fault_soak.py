@@ -29,7 +29,7 @@ FAULTS_A_RESTART = 400
 LEGITIMATE = 0.04  # chance of a turn or a drive before a fault
 PATIENCE = 30  # good frames after a fault, of at most a second each
 FEWEST_FOR_MEMORY = 2000  # faults; the first of each kind takes memory for good
-GROWN_MB = 8.0  # of a node: glibc's arenas and the average's state wander by a few
+GROWN_MB = 12.0  # of a node: the allocator's arenas wander by ten, up and down, however long it runs
 
 
 @dataclass
