@@ -9,12 +9,13 @@ Needs Chromium with its driver (apt: chromium, chromium-driver) and selenium (pi
 
 import argparse
 import io
+import os
 import shutil
 import socket
 import sys
 import tempfile
 import time
-from contextlib import chdir, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import demo
@@ -107,7 +108,8 @@ def save(png: bytes, path: Path) -> None:
 @contextmanager
 def own_instrument(seed: int):
     """The demo's instrument and a dashboard in a ROS domain of their own; the page's address."""
-    with own_domain(), tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+    with own_domain(), tempfile.TemporaryDirectory() as scratch:
+        os.chdir(scratch)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]

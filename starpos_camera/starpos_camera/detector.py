@@ -9,7 +9,6 @@ import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -61,8 +60,6 @@ class DetectorNode(Node):
         self._settings = self._detection_settings()
         self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
         self._held: Job | None = None  # the newest frame, while its Capture has not come
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._late: Timer | None = None
         self._frames = self._bad = self._dropped = 0
         self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
         self._troubles = Troubles(self)
@@ -82,7 +79,8 @@ class DetectorNode(Node):
     def listen(self):
         """Take the frames of `camera/image_raw`; beside a camera in this process `submit` is called instead."""
         self._captures_come = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
-        self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=self._steady, autostart=False)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=steady, autostart=False)
         images = subscription(self, Image, "camera/image_raw", self._on_image, IMAGE_DEPTH)
         self._where = f" on {images.topic_name}"
 

@@ -176,6 +176,7 @@ class SolverNode(Node):
         self._work()
 
     def _on_tilt(self, message: Tilt):
+        self._watch_clock()
         try:
             ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
             # when its time has come the instrument may lean otherwise
@@ -190,6 +191,7 @@ class SolverNode(Node):
 
     def _on_stars(self, message: StarArray):
         self._inputs.came("stars")
+        self._watch_clock()
         try:
             stars = message_to_stars(message)
             # who sets it knows better than the camera's host
@@ -205,6 +207,13 @@ class SolverNode(Node):
             self._counts["dropped frames"] += 1
         self._work()
 
+    def _watch_clock(self):
+        """Where this node's clock has gone back it was ahead, and so were the tilts that came by it."""
+        now_ns = self.get_clock().now().nanoseconds
+        if now_ns < self._was_ns - CLOCK_STEP_NS:
+            self._tilts.forget_after(now_ns * 1e-9)
+        self._was_ns = now_ns
+
     def _ahead_s(self, unix_s: float | None) -> float:
         """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet).
 
@@ -212,9 +221,6 @@ class SolverNode(Node):
         the date.
         """
         now_ns = self.get_clock().now().nanoseconds
-        if now_ns < self._was_ns - CLOCK_STEP_NS:
-            self._tilts.forget_after(now_ns * 1e-9)  # so far it was ahead
-        self._was_ns = now_ns
         if unix_s is None or not now_ns:
             return 0.0
         ahead_s = unix_s - now_ns * 1e-9

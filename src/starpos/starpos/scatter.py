@@ -36,26 +36,23 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
     stated = np.median(np.trace(covariance, axis1=1, axis2=2)) / 2
     most = max(stated, float(np.sum(residual**2)))
     extra = np.geomspace(GRID_LEAST * stated, GRID_MOST * most, GRID)
-    # scaled, that one star of absurd errors, which tells nothing, spoils nothing
-    sigma_x, sigma_y = (np.sqrt(covariance[:, i, i, None] + extra) for i in (0, 1))
-    slant = covariance[:, 0, 1, None] / sigma_x / sigma_y
-    x, y = residual[:, :1] / sigma_x, residual[:, 1:] / sigma_y
-    d2 = (x * x - 2 * slant * x * y + y * y) / (1 - slant**2)
-    log_determinant = 2 * np.log(sigma_x) + 2 * np.log(sigma_y) + np.log1p(-(slant**2))
-    log_density = -0.5 * (d2 + share * log_determinant).sum(0) - np.log(stated + extra) + np.log(extra)
+    d2 = distance2(residual, covariance, extra[:, None])
+    log_determinant = np.log(_widened(covariance, extra[:, None])[3])
+    log_density = -0.5 * (d2 + share * log_determinant).sum(1) - np.log(stated + extra) + np.log(extra)
     density = np.exp(log_density - log_density.max())
     return float(density @ extra / density.sum())
 
 
-def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float = 0.0) -> np.ndarray:
-    """Squared residuals (N,) in units of their covariance and an extra isotropic variance (px2)."""
-    (x, y), xx, xy, yy = (
-        residual.T,
-        covariance[:, 0, 0] + extra,
-        covariance[:, 0, 1],
-        covariance[:, 1, 1] + extra,
-    )
-    return (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float | np.ndarray = 0.0) -> np.ndarray:
+    """Squared residuals (N,) in units of their covariance and an extra isotropic variance (px2); (G, N) of (G, 1)."""
+    (x, y), (xx, xy, yy, determinant) = residual.T, _widened(covariance, extra)
+    return (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant
+
+
+def _widened(covariance: np.ndarray, extra: float | np.ndarray) -> tuple[np.ndarray, ...]:
+    """xx, xy, yy and the determinant of covariances (N, 2, 2) with an extra isotropic variance."""
+    xx, xy, yy = covariance[:, 0, 0] + extra, covariance[:, 0, 1], covariance[:, 1, 1] + extra
+    return xx, xy, yy, xx * yy - xy * xy
 
 
 def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callable) -> float:
