@@ -250,6 +250,17 @@ def test_a_reset_in_the_middle_tells_its_cause(board, cause, status):
     assert (board.continuity.restarts, parser.crc_errors, parser.malformed) == (1, 0, 0)
 
 
+@pytest.mark.parametrize("left", [2, 1])
+def test_a_write_to_the_converter_that_a_reset_cut_short_leaves_no_trace(board, left):
+    board.tell("noise 0")
+    board.tell("tilt 20 -20")
+    at_rate(board, 50)
+    board.tell(f"hang {left}")
+    got = samples(board.messages(3000))
+    assert sum(s.status & Status.WATCHDOG != 0 for s in got) == 1 and got[-1].status == 0
+    assert np.abs(angles([s for s in got if not s.status]) - [20, -20]).max() < 0.005
+
+
 def test_the_cause_of_a_reset_is_not_that_of_the_next(board):
     for cause, status in (("hang", Status.FIRST | Status.WATCHDOG), ("reset", Status.FIRST)):
         board.run(BOOT_MS)

@@ -74,6 +74,12 @@ void adc_power_on(struct adc *a)
     a->conversions = conversions;
 }
 
+void adc_interrupt(struct adc *a)
+{
+    if (a->left)
+        a->slipped = true;
+}
+
 static void check_filter(const struct adc *a)
 {
     unsigned sf = a->filter >> 12, lowest[] = {150, 75, 40, 20}; // SKIP, CHP

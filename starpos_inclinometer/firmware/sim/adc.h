@@ -21,11 +21,12 @@ struct adc {
     double pulse;                      // s when RDY falls again after an update nobody read; 0: none
     bool frozen, reference_missing;
     unsigned slips_after; // bytes, a spike on SCLK: the interface takes one more than it is given; 0: none
-    bool slipped;         // until a reset
+    bool slipped;         // or its transfer cut short; until a reset
     unsigned resets, conversions;
 };
 
 void adc_power_on(struct adc *a);
+void adc_interrupt(struct adc *a); // its master forgot the transfer: what it sends next ends that one
 uint8_t adc_transfer(struct adc *a, uint8_t in, double now);
 double adc_next_event(const struct adc *a); // s; 0: none
 void adc_event(struct adc *a, struct sensor *s, double now);

@@ -30,7 +30,7 @@ static const char USAGE[] =
     "  adc            the converter alone is reset, as by a spike\n"
     "  slip BYTES     after so many bytes its interface gets out of step, as by a spike\n"
     "  reset, power   the MCU by its pin; the whole board\n"
-    "  hang           the MCU runs into an endless loop\n"
+    "  hang [BYTES]   the MCU runs into an endless loop; once so many bytes of a write to the converter are to come\n"
     "  state          what the board knows of itself\n";
 
 #define SLICE_S 1e-3
@@ -148,6 +148,8 @@ static bool obey(const char *command)
         mcu_reset(*name == 'p');
     else if (!strcmp(name, "hang") && n == 0)
         mcu_hang();
+    else if (!strcmp(name, "hang") && n == 1)
+        mcu.hang_at = v[0];
     else
         return !strcmp(name, "state") && n == 0;
     return true;

@@ -185,6 +185,7 @@ static void on_reset(struct avr_io_t *io)
     ad7730_selected = false;
     input_length = 0;
     input_running = false;
+    adc_interrupt(&mcu.adc);
     follow_adc();
 }
 
@@ -253,6 +254,10 @@ bool mcu_run(double until)
         int state = avr_run(avr);
         if (state == cpu_Crashed || state == cpu_Done)
             return false;
+        if (mcu.hang_at && mcu.adc.left == mcu.hang_at && !mcu.adc.reading) {
+            mcu.hang_at = 0;
+            mcu_hang();
+        }
     }
     return true;
 }

@@ -18,6 +18,7 @@ struct mcu {
     double reset_at;         // s
     double line_at;          // s of the last '$' sent
     double asleep;           // s altogether
+    unsigned hang_at;        // bytes to come of a write to the converter; 0: not
 };
 
 extern struct mcu mcu;
