@@ -7,9 +7,8 @@ from scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos import triangles
 from starpos.camera import Camera
-from starpos.identification import Pointing, Sky, identify, search, verify
+from starpos.identification import Sky, identify, search
 from starpos.identification.lookup import LOOSE_PX
-from starpos.identification.pose import Field
 
 FIELDS = {
     "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),
@@ -134,65 +133,6 @@ def test_random_points_are_nothing(catalogue, rng):
         for _ in range(2):
             s = random_stars(n, rng)
             assert identify(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky) is None
-
-
-SMALL = Camera.from_focal(
-    300, 225, 375 / 2 / np.tan(np.radians(5.5))
-)  # so few pixels that chance has a chance
-
-
-def exceedances(fields, rng, attempts):
-    """By how much the log-odds of random points exceed what is asked, best of each field, over ln(1e-9) of chance."""
-    best = []
-    for _ in range(fields):
-        n = int(rng.integers(6, 10))
-        field = Field.of(rng.uniform(0, [299, 224], (n, 2)), np.full(n, 0.05), SMALL)
-        over = [
-            match.log_odds - enough
-            for match, enough in attempts(field)
-            if len(match.star) >= search.FEWEST_STARS
-        ]
-        best.append(max(over, default=-np.inf) - np.log(search.FALSE_ACCEPT))
-    return np.array(best)
-
-
-def test_log_odds_rise_over_random_points_no_further_than_chance_allows(catalogue, rng):
-    """Ville: a likelihood ratio exceeds x by chance at most once in x, all hypotheses of a frame taken together."""
-    sky = sky_for(catalogue, SMALL)
-
-    def attempts(field):
-        for hypotheses, error_px, enough in search._attempts(field, sky):
-            if error_px > LOOSE_PX:
-                return
-            yield from ((m, enough) for m in verify.matches(field, sky, hypotheses, error_px, 1e9))
-
-    best = exceedances(80, rng, attempts)
-    for x in (2, 3, 4):
-        allowed = np.exp(-x)
-        assert np.mean(best > x) < allowed + 3 * np.sqrt(allowed / len(best))
-    assert np.mean(best > -2) > 0.1  # or the test would not see anything
-
-
-def test_a_prior_raises_them_no_further(catalogue, rng):
-    sky = sky_for(catalogue, SMALL)
-
-    def attempts(field):
-        for k, proposal in enumerate(Pointing(random_attitude(rng), SMALL.fx).proposals(field, sky)):
-            enough = search._enough(proposal.chosen_from, search.PRIOR_SHARES[min(k, 1)])
-            yield proposal.match(field, 1e9), enough
-
-    best = exceedances(1500, rng, attempts)
-    for x in (2, 4, 6):
-        allowed = np.exp(-x)
-        assert np.mean(best > x) < allowed + 3 * np.sqrt(allowed / len(best))
-    assert best.max() > -6
-
-
-def test_what_is_asked_grows_with_the_hypotheses_and_the_share():
-    assert search._enough(1, 1.0) == pytest.approx(np.log(1e9))
-    assert search._enough(1000, 0.5) == pytest.approx(np.log(1e9) + np.log(2000))
-    priors = search.PRIOR_SHARES[0] + 25 * search.PRIOR_SHARES[1]
-    assert priors + sum(share for _, _, share in search.STAGES) <= 1 + 1e-12
 
 
 def test_a_star_seen_double_does_not_speak_for_itself(catalogue, rng):

@@ -8,12 +8,15 @@ from scipy.spatial import cKDTree
 
 from starpos import rotation
 from starpos.catalogue import Catalogue
+from starpos.identification.evidence import Prior, log_evidence
 from starpos.identification.pose import Field, Pose, directions
 from starpos.identification.sky import Sky
-from starpos.identification.verify import Match
 from starpos.zones import rows_near
 
 FEWEST_STARS = 4  # an identification has
+ENOUGH = np.log(1e9)  # a frame of nothing is taken for some part of the sky once in as many
+TEST_STARS = 50  # the brightest of a frame, which decide
+ROUNDS = 3
 # a star is within GATE_SIGMA of its place, and GATE_PX more
 LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 FAINTEST_FIT = 2000  # stars that take part
@@ -27,7 +30,7 @@ class Identification:
 
     star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): `Sky`'s directions
     into C; blend_px (M,): how far unresolved neighbours may draw each star's image; focal_scale: factor on the camera's
-    focal length; residual_px: rms of one axis; log_odds: of the match against chance; mirrored: the frame's rows run
+    focal length; residual_px: rms of one axis; log_odds: `log_evidence` of it; mirrored: the frame's rows run
     bottom-up, all of this holds for the frame flipped.
     """
 
@@ -70,25 +73,31 @@ class OnFrame:
         return cls(index[on], w[on], drawn[single])
 
 
-def identified(field: Field, sky: Sky, match: Match, stars: OnFrame) -> Identification | None:
-    """All stars of the field matched, one to one, and the pose fitted to them; None where fewer than FEWEST_STARS are."""
-    pose = match.pose
-    xy, sigma = field.xy[int(pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
-    residual = xy[match.star] - pose.project(match.directions)
-    before = np.zeros(0, int)
-    for _ in range(3):
-        middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
-        spread = max(1.4826 * float(middling), LEAST_SPREAD_PX)
-        radius = GATE_SIGMA * np.hypot(spread, sigma) + GATE_PX
-        star, near = _mutual_nearest(xy, pose.project(stars.directions), radius)
-        if len(star) < FEWEST_STARS:
+def identified(
+    field: Field, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior
+) -> Identification | None:
+    """The stars within radius_px (N,) of where a pose has them, fitted, weighed, and carried to the faintest ones.
+
+    None where these are not beyond doubt the stars they were taken for.
+    """
+    xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
+    stars = OnFrame.of(field, sky, near_pose)
+    pair = _mutual_nearest(xy[:TEST_STARS], near_pose.project(stars.directions), radius_px[:TEST_STARS])
+    match = _settled(field, xy[:TEST_STARS], sigma, stars, near_pose, pair)
+    if match is None:
+        return None
+    pose, (star, near), residual = match
+    log_odds = log_evidence(
+        xy[:TEST_STARS], sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
+    )
+    if log_odds < ENOUGH:
+        return None
+    if len(xy) > TEST_STARS:
+        pair = _mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
+        match = _settled(field, xy, sigma, stars, pose, pair)
+        if match is None:
             return None
-        if np.array_equal(near, before):
-            break
-        before = near
-        w = sky.directions(stars.index[near])
-        pose = _of_these(field.focal_px, pose.mirrored, xy[star], w)
-        residual = xy[star] - pose.project(w)
+        pose, (star, near), residual = match
     return Identification(
         star,
         stars.index[near],
@@ -96,9 +105,31 @@ def identified(field: Field, sky: Sky, match: Match, stars: OnFrame) -> Identifi
         pose.attitude,
         pose.focal_px / field.focal_px,
         float(np.sqrt(np.mean(residual * residual))),
-        match.log_odds,
+        log_odds,
         pose.mirrored,
     )
+
+
+def _settled(field: Field, xy, sigma, stars: OnFrame, pose: Pose, pair):
+    """The pose fitted to its own pairs, these, their residuals (M, 2) px; None where they are fewer than FEWEST_STARS."""
+    for _ in range(ROUNDS):
+        star, near = pair
+        if len(star) < FEWEST_STARS:
+            return None
+        w = stars.directions[near]
+        pose = _of_these(field.focal_px, pose.mirrored, xy[star], w)
+        predicted = pose.project(stars.directions)
+        residual = xy[star] - predicted[near]
+        pair = _mutual_nearest(xy, predicted, _gate(residual, sigma[: len(xy)]))
+        if np.array_equal(pair[0], star) and np.array_equal(pair[1], near):
+            break
+    return pose, (star, near), residual
+
+
+def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """How far from its place a star may be (N,) px, where these are the residuals (M, 2) of some."""
+    middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
+    return GATE_SIGMA * np.hypot(max(1.4826 * float(middling), LEAST_SPREAD_PX), sigma) + GATE_PX
 
 
 def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray) -> Pose:

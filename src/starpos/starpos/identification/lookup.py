@@ -7,10 +7,10 @@ from itertools import combinations
 
 import numpy as np
 
+from starpos.identification.evidence import SCALE_TOLERANCE
 from starpos.identification.pose import Field, directions
 from starpos.triangles import TriangleCatalogue, angles, counter_clockwise, opposite_sides
 
-SCALE_TOLERANCE = 0.03  # of the focal length
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
 TRIANGLE_SIGMA = 3.0
 MOST_CANDIDATES = 25_000  # to be expected of one look-up
@@ -40,8 +40,8 @@ class Lookup:
         self.v = directions(field.xy[:1], np.array([field.focal_px]))[0]
         self._done: dict[float, int] = {}
 
-    def candidates(self, stars: int, error_px: float) -> tuple[Candidates, int]:
-        """Those of the `stars` brightest not yet tried at this error, and how many there were to choose from."""
+    def candidates(self, stars: int, error_px: float) -> Candidates:
+        """Those of the `stars` brightest not yet tried at this error."""
         done = self._done.get(error_px, 0)
         triples = _triples(stars)[done:]
         self._done[error_px] = done + len(triples)
@@ -54,13 +54,13 @@ class Lookup:
         star, corner = star[query], self.table.corners[found]
         mirrored = self.table.counter_clockwise[found] != counter_clockwise(self.v[star])
         if not len(star):
-            return Candidates(star, corner, mirrored), 0
+            return Candidates(star, corner, mirrored)
         support = _shared_sides(star, corner, mirrored)
         size = np.abs(np.log(self.table.longest(found) / shape[query, 2]))
         order = np.lexsort((size, -support))
         if error_px > LOOSE_PX:
             order = order[support[order] > 0]
-        return Candidates(star[order], corner[order], mirrored[order]), len(star)
+        return Candidates(star[order], corner[order], mirrored[order])
 
 
 @lru_cache(maxsize=32)

@@ -41,6 +41,11 @@ class Field:
         return len(self.sigma)
 
     @property
+    def area_px2(self) -> float:
+        """Of the frame."""
+        return float(4 * self.half[0] * self.half[1])
+
+    @property
     def radius_rad(self) -> float:
         """Of a cone about the frame's centre that holds the frame."""
         return float(np.arctan(np.hypot(*self.half) / self.focal_px)) * 1.05 + 2e-4
@@ -65,19 +70,28 @@ class Pose:
 
     def fitted(self, xy: np.ndarray, w: np.ndarray) -> "Pose":
         """Least squares for a small rotation and the focal length from pixels xy (N, 2) of directions w (N, 3)."""
-        u = w @ self.attitude.T
-        x, y = (u[:, :2] / u[:, 2:]).T
-        # d(x, y) for a rotation about the camera's axes, and for a relative change of the focal length
-        j = np.empty((2, len(x), 4))
-        j[0, :, 0], j[0, :, 1], j[0, :, 2], j[0, :, 3] = -x * y, 1 + x * x, -y, x
-        j[1, :, 0], j[1, :, 1], j[1, :, 2], j[1, :, 3] = -1 - y * y, x * y, x, y
-        j = j.reshape(-1, 4)
-        residual = xy.T.ravel() / self.focal_px - np.concatenate([x, y])
+        pixel, slope = slopes(self, w)
+        j = slope.reshape(-1, 4)
+        residual = (xy - pixel).ravel()
         try:
             d = np.linalg.solve(j.T @ j, j.T @ residual)
         except np.linalg.LinAlgError:  # all stars in one place
             return self
-        return Pose(rotation.from_vector(d[:3]) @ self.attitude, self.focal_px * (1 + d[3]), self.mirrored)
+        return Pose(
+            rotation.from_vector(d[:3]) @ self.attitude, self.focal_px * (1 + float(d[3])), self.mirrored
+        )
+
+
+def slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) of directions w (N, 3), and how they go (N, 2, 4) with small rotations (rad) of C about its axes and
+    with the logarithm of the focal length."""
+    u = w @ pose.attitude.T
+    x, y = (u[:, :2] / u[:, 2:]).T
+    slope = np.empty((len(w), 2, 4))
+    slope[:, 0, 0], slope[:, 0, 1], slope[:, 0, 2], slope[:, 0, 3] = -x * y, 1 + x * x, -y, x
+    slope[:, 1, 0], slope[:, 1, 1], slope[:, 1, 2], slope[:, 1, 3] = -1 - y * y, x * y, x, y
+    slope *= pose.focal_px
+    return slope[:, :, 3].copy(), slope
 
 
 @dataclass(frozen=True)

@@ -1,46 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where to look first.  A prior only proposes; what it proposes is verified as everything else is."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos import rotation
+from starpos.identification.evidence import SCALE_TOLERANCE, SPREAD, Prior
 from starpos.identification.full import OnFrame
 from starpos.identification.pose import Field, Pose, directions
+from starpos.identification.screen import MATCH_SIGMA
 from starpos.identification.sky import Sky
-from starpos.identification.verify import TEST_STARS, Match, judged, own_stars
 
-ERROR_PX = 1.5  # how far off the stars may be where the prior is right
+ERROR_PX = 5.0  # how far off the stars may be where the prior is right
+STILL_PX = 6.0  # what has not moved has not moved by more, anywhere in the frame
 BRIGHTEST = 15  # stars of the frame that vote for a shift
 REACH = 0.05  # of the frame's width: how far the stars may have moved
 AGREE_PX = 3.0  # votes for the same shift
 MOST = 4  # proposals of a kind
 RING_STARS = 8  # of the frame that vote for an azimuth
 J2000_RAD = 2.5e-4  # aberration and most proper motions, which the beacons lack
+STANDS, WAS_MOVED = np.log(0.5), np.log(0.5)  # of the probability
 
-
-@dataclass(frozen=True)
-class Proposal:
-    """A pose, the catalogue's stars on the frame at it or near it, which of the n = min(N, TEST_STARS) brightest stars it
-    was made from, own (n,), and among how many it was chosen."""
-
-    pose: Pose
-    stars: OnFrame
-    own: np.ndarray
-    chosen_from: int
-
-    def match(self, field: Field, enough: float) -> Match:
-        """Fitted to the stars that agree, unless its log-odds are `enough` without."""
-        w = self.stars.directions
-        raw = judged(field, self.pose, w, self.own, ERROR_PX, enough)
-        if raw.log_odds > enough or len(raw.star) < 2:
-            return raw
-        pose = self.pose.fitted(field.xy[0, raw.star], raw.directions)
-        own = self.own.copy()
-        own[raw.star[:2]] = True  # two stars pay for the four parameters of the fit
-        return judged(field, pose, w, own, ERROR_PX, enough)
+Attempt = tuple[
+    Pose, np.ndarray, Prior
+]  # a pose, how far off stars may be (N,) px, and the poses that could be
 
 
 @dataclass(frozen=True)
@@ -54,21 +40,35 @@ class Pointing:
         if not (np.isfinite(self.attitude).all() and 0 < self.focal_px < np.inf):
             raise ValueError("a Pointing needs a finite attitude and a positive focal length")
 
-    def proposals(self, field: Field, sky: Sky) -> Iterator[Proposal]:
+    def attempts(self, field: Field, sky: Sky, log_share: float) -> Iterator[Attempt]:
         """That nothing has moved; then the shifts that most stars agree on."""
         pose = Pose(self.attitude, self.focal_px, False)
-        stars = OnFrame.of(field, sky, pose)
-        xy = field.xy[0, : min(len(field), TEST_STARS)]
-        yield Proposal(pose, stars, np.zeros(len(xy), bool), 1)
-        shift = xy[:BRIGHTEST, None] - pose.project(stars.directions)
-        star, near = np.nonzero(np.square(shift).sum(-1) < (2 * REACH * field.half[0]) ** 2)
-        shift = shift[star, near]
+        radius_px = np.hypot(MATCH_SIGMA * field.sigma, ERROR_PX)
+        yield pose, radius_px, self._known(field, STILL_PX, log_share + STANDS)
+        reach_px = 2 * REACH * field.half[0]
+        prior = self._known(field, reach_px + STILL_PX, log_share + WAS_MOVED)
+        xy = field.xy[0, :BRIGHTEST]
+        shift = xy[:, None] - pose.project(OnFrame.of(field, sky, pose).directions)
+        shift = shift[np.square(shift).sum(-1) < reach_px**2]
         for k in _most_voted(np.square(shift[:, None] - shift).sum(-1) < AGREE_PX**2):
             # a shift along x is a turn about the camera's y axis, one along y about its x axis
             x, y = shift[k] / self.focal_px
-            moved = replace(pose, attitude=rotation.from_vector([-y, x, 0.0]) @ self.attitude)
-            own = own_stars(xy[None], star[None, k : k + 1], field.sigma[: len(xy)])[0]
-            yield Proposal(moved, stars, own, len(shift))
+            turned = rotation.from_vector([-y, x, 0.0]) @ self.attitude
+            yield replace(pose, attitude=turned), radius_px, prior
+
+    def _known(self, field: Field, reach_px: float, log_share: float) -> Prior:
+        """Poses that shift the frame by reach_px at most, and turn and stretch it by STILL_PX at its corners."""
+        shift, turn = reach_px / self.focal_px, STILL_PX / np.hypot(*field.half)
+        most = np.array([shift, shift, turn, turn])
+
+        log_density = log_share - float(np.log(2 * most).sum())
+
+        def density(pose: Pose) -> float:
+            moved = rotation.to_small_vector(pose.attitude @ self.attitude.T)
+            off = np.append(moved, np.log(pose.focal_px / self.focal_px))
+            return log_density if (np.abs(off) < most).all() and not pose.mirrored else -math.inf
+
+        return Prior(density, most)
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Plumb:
         if not np.isfinite([*self.zenith_sky, *self.zenith_camera, self.tolerance_rad]).all():
             raise ValueError("a Plumb needs finite directions and a finite tolerance")
 
-    def proposals(self, field: Field, sky: Sky) -> Iterator[Proposal]:
+    def attempts(self, field: Field, sky: Sky, log_share: float) -> Iterator[Attempt]:
         """`Pointing`s to the azimuths at which most stars are as far from the zenith as the catalogue's."""
         camera, world = _frame_about(self.zenith_camera), _frame_about(self.zenith_sky)
         seen = directions(field.xy[:1, :RING_STARS], np.array([field.focal_px]))[0] @ camera.T
@@ -104,11 +104,25 @@ class Plumb:
         for k in np.argsort(-votes, kind="stable")[: 10 * MOST].tolist():
             if len(pick) < MOST and all(abs(turn[k] - turn[j]) > window for j in pick):
                 pick.append(k)
+        prior = self._known(field, log_share)
         for k in pick:
             middle = np.median(turn[k : k + votes[k]])
             attitude = camera.T @ rotation.about_axis(2, middle) @ world
-            for p in Pointing(attitude, field.focal_px).proposals(field, sky):
-                yield replace(p, chosen_from=p.chosen_from * len(turn))
+            for pose, radius_px, _ in Pointing(attitude, field.focal_px).attempts(field, sky, log_share):
+                yield pose, radius_px, prior
+
+    def _known(self, field: Field, log_share: float) -> Prior:
+        """Poses that have the zenith near where it should be, at any azimuth."""
+        reach = self.tolerance_rad + J2000_RAD + 2 * REACH * field.half[0] / field.focal_px
+
+        poses = np.pi * reach**2 * 2 * np.pi * 2 * SCALE_TOLERANCE
+        log_density = log_share - float(np.log(poses))
+
+        def density(pose: Pose) -> float:
+            off = np.linalg.norm(pose.attitude @ self.zenith_sky - self.zenith_camera)
+            return log_density if off < reach and not pose.mirrored else -math.inf
+
+        return Prior(density, SPREAD)
 
 
 def _frame_about(pole: np.ndarray) -> np.ndarray:

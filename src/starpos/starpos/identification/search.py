@@ -1,36 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search: priors first, then lost in space, from few bright stars to more, from good centroids to poor ones."""
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from starpos.camera import Camera
-from starpos.identification.full import FEWEST_STARS, Identification, OnFrame, identified
+from starpos.identification.evidence import anywhere
+from starpos.identification.full import FEWEST_STARS, TEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
-from starpos.identification.pose import Field, Poses
-from starpos.identification.prior import Plumb, Pointing
+from starpos.identification.pose import Field, Pose, Poses
+from starpos.identification.prior import Attempt, Plumb, Pointing
+from starpos.identification.screen import MATCH_SIGMA, promising
 from starpos.identification.sky import Sky
-from starpos.identification.verify import TEST_STARS, Hypotheses, Match, matches, own_stars
 
-FALSE_ACCEPT = 1e-9  # probability that a frame of nothing is taken for some part of the sky
-PRIOR_SHARES = 0.05, 0.05 / 25  # of that: for a camera that stands, for each other proposal
-# (brightest stars, their error in px, share of FALSE_ACCEPT); the second kind is for lenses that distort
-STAGES = (
-    (5, 0.3, 0.7),
-    (7, 0.3, 0.1),
-    (10, 0.3, 0.04),
-    (14, 0.3, 0.02),
-    (20, 0.3, 0.02),
-    (9, 2.5, 0.01),
-    (8, 6.0, 0.01),
-)
-MAX_VERIFIED = 25  # candidates a stage
-EDGE_PX, WIDEST_MARGIN = (
-    2.0,
-    0.25,
-)  # how far stars may lie beyond the frame as it is, and (share of it) as it becomes
+# (brightest stars, their error in px); the last kinds are for lenses that distort
+STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
+LOG_HALF = np.log(0.5)
+MOST_LOOKED_AT = 25  # candidates a stage
+# how far stars may lie beyond the frame as it is, and (share of it) as it becomes
+EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
 
 def identify(
@@ -48,19 +37,9 @@ def identify(
     if len(xy) < FEWEST_STARS:
         return None
     field = Field.of(xy, sigma_px, camera)
-    for k, proposal in enumerate(p for given in priors for p in given.proposals(field, sky)):
-        enough = _enough(proposal.chosen_from, PRIOR_SHARES[min(k, 1)])
-        match = proposal.match(field, enough)
-        if _sound(match, enough) and (
-            found := identified(field, sky, match, OnFrame.of(field, sky, match.pose))
-        ):
+    for pose, radius_px, prior in _attempts(field, sky, priors):
+        if found := identified(field, sky, pose, radius_px, prior):
             return found
-    for hypotheses, error_px, enough in _attempts(field, sky):
-        for match in matches(field, sky, hypotheses, error_px, enough):
-            if _sound(match, enough) and (
-                found := identified(field, sky, match, OnFrame.of(field, sky, match.pose))
-            ):
-                return found
     return None
 
 
@@ -84,27 +63,32 @@ def identify_directions(
     return identify(xy + margin, sigma_px, ideal, sky, priors)
 
 
-def _enough(hypotheses: int, share: float) -> float:
-    """Log-odds that the best of so many hypotheses must have: wrong ones reach them with share * FALSE_ACCEPT (Ville)."""
-    return math.log(max(hypotheses, 1) / (share * FALSE_ACCEPT))
+def _attempts(field: Field, sky: Sky, priors) -> Iterator[Attempt]:
+    """What to try, in this order.  Half of the probability is the priors' where there are any."""
+    for prior in priors:
+        yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
+    lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
+    for pose, radius_px in _lost_in_space(field, sky):
+        yield pose, radius_px, lost
 
 
-def _sound(match: Match, enough: float) -> bool:
-    return match.log_odds > enough and len(match.star) >= FEWEST_STARS
-
-
-def _attempts(field: Field, sky: Sky) -> Iterator[tuple[Hypotheses, float, float]]:
-    """What to try, in this order: hypotheses, the stars' error in px, and the log-odds that are enough."""
+def _lost_in_space(field: Field, sky: Sky) -> Iterator[tuple[Pose, np.ndarray]]:
     lookup = Lookup(field, sky.triangles)
-    for stars, error_px, share in STAGES:
-        candidates, count = lookup.candidates(min(stars, len(field)), error_px)
-        # mostly the first one is right, and the others together cost little more
-        for k in (slice(0, 1), slice(1, MAX_VERIFIED)):
-            if len(some := candidates[k]):
-                yield _of_triangles(field, sky, some, error_px), error_px, _enough(count, share)
+    for stars, error_px in STAGES:
+        candidates = lookup.candidates(min(stars, len(field)), error_px)
+        # mostly the first one is right
+        if len(candidates):
+            poses, radius_px = _of_triangles(field, sky, candidates[:1], error_px)
+            yield poses[0], radius_px[0]
+        if len(candidates) > 1:
+            others = candidates[1:MOST_LOOKED_AT]
+            poses, radius_px = _of_triangles(field, sky, others, error_px)
+            for k in promising(field, sky, poses, others.star, radius_px / MATCH_SIGMA):
+                yield poses[k], radius_px[k]
 
 
-def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> Hypotheses:
+def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
+    """The poses that K triangles make, and how far off the field's brightest stars may be (K, n) px."""
     xy = field.xy[c.mirrored.astype(int), : min(len(field), TEST_STARS)]
     each = np.arange(len(c))[:, None]
     corners = xy[each, c.star]
@@ -115,4 +99,4 @@ def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> Hyp
     size2 = np.maximum(np.square(corners - middle).sum((1, 2)) / 3, 1.0)[:, None]
     away2 = np.square(xy - middle).sum(2)
     sigma = np.hypot(field.sigma[: xy.shape[1]], error_px)
-    return Hypotheses(poses, own_stars(xy, c.star, sigma), sigma * np.sqrt(1 + away2 / size2))
+    return poses, MATCH_SIGMA * sigma * np.sqrt(1 + away2 / size2)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame's stars say for a pose against chance: the evidence that the frame shows this part of the sky.
+
+By chance they are random points.  If the frame shows the sky, each next detection, from the brightest down, is either a
+false star, as often as those before it (Laplace's rule of succession), or the j-th brightest of the catalogue's stars
+not yet seen, with probability 1 / ((j + 1) (j + 2)), at its place to its error.  The ratio of the two probabilities,
+averaged over all poses that could be, has a mean of 1 under chance: it exceeds x at most once in x frames of random
+points, at whatever detection one stops (Ville's inequality) and however a pose was come by.  What the surroundings of one
+pose contribute to it, by Laplace's method, is less than all of it.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.identification.pose import Pose, slopes
+
+# The centroids' errors besides their own, px, and how often: none; a catalogue that is off; a lens nobody knows
+ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0.1])
+SCALE_TOLERANCE = 0.03  # of the focal length
+SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)  # how far off its logarithm may be, and how often
+MIRRORED = 0.1  # of all frames
+SPREAD = np.array([np.pi, np.pi, np.pi, SCALE_TOLERANCE])
+DOUBLE_PX = 3.0  # detections this close may be one star, and then say nothing new
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the pose: log_density of one, per rad3 of rotation and unit of the focal length's logarithm, -inf
+    where it cannot be; spread (4,): what a frame that leaves more open leaves, rad about C's axes and of that logarithm.
+    """
+
+    log_density: Callable[[Pose], float]
+    spread: np.ndarray
+
+
+def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
+    """Lost in space with a focal length of about focal_px; rotations fill 8 pi2."""
+
+    def log_density(pose: Pose) -> float:
+        scale = abs(math.log(pose.focal_px / focal_px))
+        density = sum(share / (2 * within) for within, share in SCALES if scale < within)
+        parity = MIRRORED if pose.mirrored else 1 - MIRRORED
+        return log_share + math.log(parity * density / (8 * math.pi**2)) if density else -math.inf
+
+    return Prior(log_density, SPREAD)
+
+
+def log_evidence(
+    xy: np.ndarray,
+    sigma_px: np.ndarray,
+    area_px2: float,
+    pose: Pose,
+    prior: Prior,
+    star: np.ndarray,
+    rank: np.ndarray,
+    w: np.ndarray,
+) -> float:
+    """Logarithm of the evidence for a pose that was fitted to matched stars.
+
+    xy (N, 2), sigma_px (N,): the brightest detections, brightest first, on a frame of area_px2.  star (M,): which of
+    them, ascending, are stars of the catalogue; rank (M,) of these in brightness on the frame; w (M, 3) their directions.
+    """
+    predicted, slope = slopes(pose, w)
+    distance2 = np.square(xy[star] - predicted).sum(1)
+    n = np.arange(len(xy))
+    hit = np.zeros(len(xy), int)
+    hit[star] = 1
+    odds = np.tile((n - hit.cumsum() + hit + 1) / (n + 3), (len(ERRORS_PX), 1))
+    passed = rank - np.tril(rank[:, None] > rank).sum(1)
+    right = (np.arange(len(star)) + 2) / (star + 3)
+    variance = sigma_px[star] ** 2 + ERRORS_PX[:, None] ** 2
+    density = np.exp(-0.5 * distance2 / variance) / (2 * np.pi * variance)
+    odds[:, star] += right * area_px2 / ((passed + 1) * (passed + 2)) * density
+    odds[:, _doubles(xy)] = 1.0
+    information = np.einsum("nki,nkj->ij", slope, slope) / variance.min(1)[:, None, None]
+    information = information + np.diag(1 / prior.spread**2)
+    volume = 0.5 * (4 * np.log(2 * np.pi) - np.linalg.slogdet(information)[1])
+    best = np.log(odds).cumsum(1).max(1) + volume + LOG_SHARES
+    return float(best.max() + prior.log_density(pose))
+
+
+def _doubles(xy: np.ndarray) -> np.ndarray:
+    """Which detections (N,) lie on a brighter one."""
+    apart2 = np.square(xy[:, 0, None] - xy[:, 0]) + np.square(xy[:, 1, None] - xy[:, 1])
+    return np.tril(apart2 < DOUBLE_PX**2, -1).any(1)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which of many poses are worth a fit: how many bright stars of the frame are where bright ones of the catalogue are."""
+
+import numpy as np
+
+from starpos.identification.pose import Field, Poses
+from starpos.identification.sky import Sky
+from starpos.zones import rows_near
+
+MATCH_SIGMA = 3.5  # a star is within so many of its error
+LOG_FALSE = np.log(0.35)  # of the detections that may be no catalogue star
+WORTH_A_FIT = 4.0  # log-odds
+MOST_STARS = 440  # of the catalogue, the brightest on the frame
+FAR = 1e7  # px, where no star is
+
+
+def promising(field: Field, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: np.ndarray) -> list[int]:
+    """Rows of the K poses that are worth a fit, best first.
+
+    They were made from the field's stars star (K, 3), and put the n = min(N, TEST_STARS) brightest to sigma_px (K, n).
+    """
+    predicted, count = _expected(field, sky, poses)
+    xy = field.xy[poses.mirrored.astype(int), : sigma_px.shape[1]]
+    apart2 = np.square(xy[:, :, None, 0] - predicted[:, None, :, 0])
+    apart2 += np.square(xy[:, :, None, 1] - predicted[:, None, :, 1])
+    nearest = apart2.argmin(2)
+    each, n = np.arange(len(xy))[:, None], np.arange(xy.shape[1])
+    # one catalogue star answers one detection: the one nearest to it
+    mutual = apart2.argmin(1)[each, nearest] == n
+    variance = sigma_px * sigma_px
+    distance2 = apart2[each, n, nearest] / variance
+    by_chance = 2 * np.pi * variance * np.maximum(count, 1)[:, None] / field.area_px2
+    odds = np.where(mutual & (distance2 < MATCH_SIGMA**2), -0.5 * distance2 - np.log(by_chance), LOG_FALSE)
+    # what a pose was made from does not speak for it
+    odds[each, star] = 0.0
+    # from the brightest down to any
+    worth = odds.cumsum(1).max(1)
+    return [k for k in np.argsort(-worth, kind="stable").tolist() if worth[k] > WORTH_A_FIT]
+
+
+def _expected(field: Field, sky: Sky, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Bright catalogue stars on K frames: pixels (K, S, 2), FAR beyond each frame's count (K,)."""
+    axis = np.append(field.middle / field.focal_px, 1.0)
+    centre = np.einsum("i,kij->kj", axis / np.sqrt(axis @ axis), poses.attitude)
+    frame, row = rows_near(sky.triangles.cell_start, centre, field.radius_rad)
+    u = np.einsum("mij,mj->mi", poses.attitude[frame], sky.bright(row))
+    pixel = u[:, :2] * (poses.focal_px[frame] / np.maximum(u[:, 2], 1e-6))[:, None]
+    on = np.flatnonzero(field.holds(pixel))
+    on = on[np.lexsort((sky.triangles.rank[row[on]], frame[on]))]
+    frame = frame[on]
+    count = np.bincount(frame, minlength=len(poses))
+    place = np.arange(len(on)) - (np.cumsum(count) - count)[frame]
+    keep = place < MOST_STARS
+    on, frame, place, count = on[keep], frame[keep], place[keep], np.minimum(count, MOST_STARS)
+    pixels = np.full((len(poses), max(1, int(count.max(initial=0))), 2), FAR)
+    pixels[frame, place] = pixel[on]
+    return pixels, count
