@@ -4,6 +4,7 @@
 Pixel (0, 0) is the centre of the top-left pixel; C has x right, y down, z out along the optical axis.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ class Camera:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if self.width < 1 or self.height < 1:
             raise InstrumentError(f"camera size {self.width} x {self.height} px: both must be at least 1")
-        if not np.all(np.isfinite(numbers)):
+        if not all(map(math.isfinite, numbers)):
             raise InstrumentError(
                 "camera intrinsics hold a number that is not finite: calibrate the camera again"
             )
@@ -67,12 +68,12 @@ class Camera:
 
         Raises InstrumentError where the distortion cannot be inverted.
         """
-        target = np.stack(
-            [(np.asarray(x, float) - self.cx) / self.fx, (np.asarray(y, float) - self.cy) / self.fy], -1
-        )
-        plane = self._undistort(target) if any(self.distortion) else target
-        v = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], -1)
-        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+        x, y = (np.asarray(x, float) - self.cx) / self.fx, (np.asarray(y, float) - self.cy) / self.fy
+        v = np.ones((*x.shape, 3))
+        v[..., 0], v[..., 1] = x, y
+        if any(self.distortion):
+            v[..., :2] = self._undistort(v[..., :2])
+        return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
     def project(self, v) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind the camera."""

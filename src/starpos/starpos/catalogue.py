@@ -77,7 +77,8 @@ class Catalogue:
         """
         ra, dec = self.ra_mas[index] * MAS, self.dec_mas[index] * MAS
         cr, sr, cd, sd = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
-        v = np.stack([cd * cr, cd * sr, sd], -1)
+        v = np.empty((*ra.shape, 3))
+        v[..., 0], v[..., 1], v[..., 2] = cd * cr, cd * sr, sd
         if year == EPOCH:
             return v
         east = (
@@ -102,7 +103,7 @@ class Catalogue:
 
     def cone(self, centre, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Indices of the stars within radius_rad of the unit vector `centre` at J2000, brightest first."""
-        _, index = rows_near(self.cell_start, np.asarray(centre)[None], radius_rad)
+        index = rows_near(self.cell_start, np.asarray(centre), radius_rad)
         if np.isfinite(limit_mag):
             index = index[self.vmag_centi[index] < limit_mag * 100]
         index = index[self.directions(index) @ centre >= np.cos(radius_rad)]

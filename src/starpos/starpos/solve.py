@@ -282,7 +282,7 @@ def _attitude(found: ident.Identification, sky: ident.Sky, camera: Camera) -> At
     """The pointing of the frame's centre; for a mirrored frame, of the frame turned the right way up."""
     seen = camera.scaled(found.focal_scale)
     x, y = camera.centre_px
-    centre, above = (sky.unaberrated(v) for v in seen.directions([x, x], [y, y - 1.0]) @ found.attitude)
+    centre, above = sky.unaberrated(seen.directions([x, x], [y, y - 1.0]) @ found.attitude)
     ra, dec = erfa.c2s(centre)
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])

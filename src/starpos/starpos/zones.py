@@ -4,6 +4,7 @@
 A table in declination zones, each sorted by right ascension, has every cell in one run of rows.
 """
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -19,30 +20,27 @@ def cell_starts(zone_start: np.ndarray, ra_deg: np.ndarray) -> np.ndarray:
     return np.append(np.concatenate(starts), zone_start[-1]).astype(np.int32)
 
 
-def rows_near(cell_start: np.ndarray, centre: np.ndarray, radius_rad: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows in the cells that cones about the unit vectors centre (Q, 3) touch: (cone (M,), row (M,))."""
-    x, y, z = centre.T
-    flat = np.sqrt(x * x + y * y)
-    ra, dec = np.degrees(np.arctan2(y, x)), np.arctan2(z, flat)
-    reach = np.sin(radius_rad) / np.maximum(flat, 1e-12)
-    pole_inside = np.abs(dec) + radius_rad > np.pi / 2 - 1e-9
-    half = np.where(pole_inside, 180.0, np.degrees(np.arcsin(np.minimum(reach, 1.0))))
-    low = np.maximum(np.degrees(dec - radius_rad) + 90, 0).astype(int)
-    high = np.minimum(np.degrees(dec + radius_rad) + 90, ZONES - 1).astype(int)
-    first = np.floor(ra - half).astype(int)
-    width = np.minimum(np.floor(ra + half).astype(int) - first + 1, CELLS)
-    cone, zone = ranges(low, high - low + 1)
-    begin = (first % CELLS)[cone]
-    beyond = begin + width[cone] - CELLS  # a run that passes 360 deg goes on at 0
-    zone *= CELLS
-    begins, ends = zone + begin, zone + np.minimum(beyond, 0) + CELLS
-    if (wraps := beyond > 0).any():
-        cone = np.concatenate([cone, cone[wraps]])
-        begins = np.concatenate([begins, zone[wraps]])
-        ends = np.concatenate([ends, (zone + beyond)[wraps]])
-    start = cell_start[begins]
-    run, rows = ranges(start, cell_start[ends] - start)
-    return cone[run], rows
+def rows_near(cell_start: np.ndarray, centre: np.ndarray, radius_rad: float) -> np.ndarray:
+    """Rows (M,) in the cells that a cone about centre (3,), of any length, touches."""
+    x, y, z = centre.tolist()
+    flat = math.hypot(x, y)
+    ra, dec = math.degrees(math.atan2(y, x)), math.atan2(z, flat)
+    half = 180.0  # of the cone in right ascension: all where a pole is inside
+    if abs(dec) + radius_rad < math.pi / 2 - 1e-9:
+        half = math.degrees(math.asin(min(math.sin(radius_rad) / math.cos(dec), 1.0)))
+    low = max(int(math.degrees(dec - radius_rad) + 90), 0)
+    high = min(int(math.degrees(dec + radius_rad) + 90), ZONES - 1)
+    first = math.floor(ra - half)
+    width = min(math.floor(ra + half) - first + 1, CELLS)
+    first %= CELLS
+    # in each zone, and where a run passes 360 deg once more from 0 on
+    runs = [(first, min(first + width, CELLS))] + (
+        [(0, first + width - CELLS)] if first + width > CELLS else []
+    )
+    runs = [
+        (zone * CELLS + begin, zone * CELLS + end) for zone in range(low, high + 1) for begin, end in runs
+    ]
+    return np.concatenate([np.arange(cell_start[begin], cell_start[end]) for begin, end in runs])
 
 
 def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

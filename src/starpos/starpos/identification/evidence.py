@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.identification.pairs import close_pairs
 from starpos.identification.pose import Pose, slopes
 
 # The centroids' errors besides their own, px, and how often: none; a catalogue that is off; a lens nobody knows
@@ -23,17 +24,23 @@ SCALE_TOLERANCE = 0.03  # of the focal length
 SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)  # how far off its logarithm may be, and how often
 MIRRORED = 0.1  # of all frames
 SPREAD = np.array([np.pi, np.pi, np.pi, SCALE_TOLERANCE])
+TEST_STARS = 50  # the brightest of a frame, which decide
+EARLIER = np.tri(TEST_STARS, k=-1, dtype=bool)
 DOUBLE_PX = 3.0  # detections this close may be one star, and then say nothing new
 
 
 @dataclass(frozen=True)
 class Prior:
     """What is known of the pose: log_density of one, per rad3 of rotation and unit of the focal length's logarithm, -inf
-    where it cannot be; spread (4,): what a frame that leaves more open leaves, rad about C's axes and of that logarithm.
+    where it cannot be; spread (4,): what a frame that tells less leaves open, rad about C's axes and of that logarithm.
     """
 
     log_density: Callable[[Pose], float]
     spread: np.ndarray
+
+    @property
+    def information(self) -> np.ndarray:
+        return np.diag(1 / self.spread**2)
 
 
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
@@ -68,21 +75,16 @@ def log_evidence(
     n = np.arange(len(xy))
     hit = np.zeros(len(xy), int)
     hit[star] = 1
-    odds = np.tile((n - hit.cumsum() + hit + 1) / (n + 3), (len(ERRORS_PX), 1))
-    passed = rank - np.tril(rank[:, None] > rank).sum(1)
+    odds = np.empty((len(ERRORS_PX), len(xy)))
+    odds[:] = (n - hit.cumsum() + hit + 1) / (n + 3)
+    passed = rank - (EARLIER[: len(star), : len(star)] & (rank[:, None] > rank)).sum(1)
     right = (np.arange(len(star)) + 2) / (star + 3)
     variance = sigma_px[star] ** 2 + ERRORS_PX[:, None] ** 2
     density = np.exp(-0.5 * distance2 / variance) / (2 * np.pi * variance)
     odds[:, star] += right * area_px2 / ((passed + 1) * (passed + 2)) * density
-    odds[:, _doubles(xy)] = 1.0
-    information = np.einsum("nki,nkj->ij", slope, slope) / variance.min(1)[:, None, None]
-    information = information + np.diag(1 / prior.spread**2)
+    odds[:, close_pairs(xy, DOUBLE_PX)[1]] = 1.0
+    slope = slope.reshape(-1, 4)
+    information = slope.T @ slope / variance.min(1)[:, None, None] + prior.information
     volume = 0.5 * (4 * np.log(2 * np.pi) - np.linalg.slogdet(information)[1])
     best = np.log(odds).cumsum(1).max(1) + volume + LOG_SHARES
     return float(best.max() + prior.log_density(pose))
-
-
-def _doubles(xy: np.ndarray) -> np.ndarray:
-    """Which detections (N,) lie on a brighter one."""
-    apart2 = np.square(xy[:, 0, None] - xy[:, 0]) + np.square(xy[:, 1, None] - xy[:, 1])
-    return np.tril(apart2 < DOUBLE_PX**2, -1).any(1)

@@ -4,23 +4,21 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from starpos import rotation
 from starpos.catalogue import Catalogue
-from starpos.identification.evidence import Prior, log_evidence
+from starpos.identification.evidence import TEST_STARS, Prior, log_evidence
+from starpos.identification.pairs import close_pairs, mutual_nearest
 from starpos.identification.pose import Field, Pose, directions
 from starpos.identification.sky import Sky
 from starpos.zones import rows_near
 
 FEWEST_STARS = 4  # an identification has
 ENOUGH = np.log(1e9)  # a frame of nothing is taken for some part of the sky once in as many
-TEST_STARS = 50  # the brightest of a frame, which decide
 ROUNDS = 3
 # a star is within GATE_SIGMA of its place, and GATE_PX more
 LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 FAINTEST_FIT = 2000  # stars that take part
-SMALL_TABLE = 20_000  # detections times catalogue stars
 BLEND_PX = 2.5  # closer stars make one image
 
 
@@ -58,7 +56,7 @@ class OnFrame:
         """As many as the field's stars may be."""
         catalogue, stars = sky.catalogue, min(len(field), FAINTEST_FIT)
         axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
-        _, index = rows_near(catalogue.cell_start, (axis / np.sqrt(axis @ axis))[None], field.radius_rad)
+        index = rows_near(catalogue.cell_start, axis, field.radius_rad)
         light = catalogue.vmag_centi[index]
         most = 12 * stars + 300  # three times too many, as the cells reach beyond the frame
         if len(index) > most:
@@ -68,7 +66,7 @@ class OnFrame:
         w = sky.directions(index)
         pixel = pose.project(w)
         on = np.flatnonzero(field.holds(pixel))[: 3 * stars + 50]
-        single, drawn = _resolved(catalogue, index[on], pixel[on], w[on] * field.focal_px)
+        single, drawn = _resolved(catalogue, index[on], pixel[on], w[on], field.focal_px)
         on = on[single]
         return cls(index[on], w[on], drawn[single])
 
@@ -82,7 +80,7 @@ def identified(
     """
     xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
     stars = OnFrame.of(field, sky, near_pose)
-    pair = _mutual_nearest(xy[:TEST_STARS], near_pose.project(stars.directions), radius_px[:TEST_STARS])
+    pair = mutual_nearest(xy[:TEST_STARS], near_pose.project(stars.directions), radius_px[:TEST_STARS])
     match = _settled(field, xy[:TEST_STARS], sigma, stars, near_pose, pair)
     if match is None:
         return None
@@ -93,7 +91,7 @@ def identified(
     if log_odds < ENOUGH:
         return None
     if len(xy) > TEST_STARS:
-        pair = _mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
+        pair = mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
         match = _settled(field, xy, sigma, stars, pose, pair)
         if match is None:
             return None
@@ -120,7 +118,7 @@ def _settled(field: Field, xy, sigma, stars: OnFrame, pose: Pose, pair):
         pose = _of_these(field.focal_px, pose.mirrored, xy[star], w)
         predicted = pose.project(stars.directions)
         residual = xy[star] - predicted[near]
-        pair = _mutual_nearest(xy, predicted, _gate(residual, sigma[: len(xy)]))
+        pair = mutual_nearest(xy, predicted, _gate(residual, sigma[: len(xy)]))
         if np.array_equal(pair[0], star) and np.array_equal(pair[1], near):
             break
     return pose, (star, near), residual
@@ -135,34 +133,17 @@ def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray) -> Pose:
     """The pose of matched stars from them alone: to the last bit the same, from wherever the search came to them."""
     v = directions(xy[None], np.array([focal_px]))[0]
-    pose = Pose(rotation.best_rotation(w, v), focal_px, mirrored)
-    for _ in range(2):
-        pose = pose.fitted(xy, w)
-    return pose
+    return Pose(rotation.best_rotation(w, v), focal_px, mirrored).fitted(xy, w, steps=2)
 
 
-def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, place: np.ndarray):
+def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float):
     """Which stars (brightest first) do not melt into a brighter one (N,), and how far these draw it (N,) px."""
     single, drawn = np.ones(len(index), bool), np.zeros(len(index))
-    pair = cKDTree(pixel).query_pairs(BLEND_PX, output_type="ndarray")
-    if len(pair):
-        brighter, fainter = pair.T
+    brighter, fainter = close_pairs(pixel, BLEND_PX)
+    if len(fainter):
         ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
         # from the sky and rounded, so that it is the same at every pose
-        apart = np.round(np.linalg.norm(place[fainter] - place[brighter], axis=1), 6)
+        apart = np.round(focal_px * np.linalg.norm(w[fainter] - w[brighter], axis=1), 6)
         np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
         single[fainter] = False
     return single, drawn
-
-
-def _mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
-    if len(xy) * len(predicted) < SMALL_TABLE:  # all distances at once are quicker than two trees
-        apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
-        nearest, back = apart2.argmin(1), apart2.argmin(0)
-        distance = np.sqrt(apart2[np.arange(len(xy)), nearest])
-    else:
-        distance, nearest = cKDTree(predicted).query(xy)
-        back = cKDTree(xy).query(predicted)[1]
-    good = (distance < radius) & (back[nearest] == np.arange(len(xy)))
-    return np.flatnonzero(good), nearest[good]

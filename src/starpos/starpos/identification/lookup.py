@@ -78,8 +78,8 @@ def _shapes(v: np.ndarray, triples: np.ndarray, error: np.ndarray):
     """
     side = opposite_sides(v[triples])
     angle = angles(side)
-    order = np.argsort(-angle, axis=1, kind="stable")
-    triples, angle, side = (np.take_along_axis(x, order, 1) for x in (triples, angle, side))
+    order = np.arange(len(triples))[:, None], np.argsort(-angle, axis=1, kind="stable")
+    triples, angle, side = triples[order], angle[order], side[order]
     a, b, c = np.maximum(side.T, 1e-9)
     error = TRIANGLE_SIGMA * error
     largest = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
@@ -102,5 +102,5 @@ def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) ->
     mixed ^= mixed >> np.uint64(29)
     mixed *= np.uint64(0xBF58476D1CE4E5B9)
     key = mixed + mixed[:, [1, 2, 0]] + mirrored.astype(np.uint64)[:, None]
-    _, inverse, count = np.unique(key.ravel(), return_inverse=True, return_counts=True)
-    return (count[inverse].reshape(key.shape) - 1).sum(1)
+    ordered = np.sort(key, axis=None)
+    return (np.searchsorted(ordered, key, "right") - np.searchsorted(ordered, key) - 1).sum(1)

@@ -7,7 +7,8 @@ import numpy as np
 
 from starpos import rotation
 from starpos.camera import Camera
-from starpos.triangles import opposite_sides
+
+SMALL_STEP = 3e-5  # rad
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ class Field:
 
     def holds(self, pixel: np.ndarray) -> np.ndarray:
         """Which of pixels (N, 2) are on the frame (N,)."""
-        return (np.abs(pixel - self.middle) < self.half + 2).all(-1)
+        on = np.abs(pixel - self.middle) < self.half + 2
+        return on[..., 0] & on[..., 1]
 
 
 @dataclass(frozen=True)
@@ -68,17 +70,21 @@ class Pose:
         u = w @ self.attitude.T
         return u[:, :2] * (self.focal_px / np.maximum(u[:, 2:], 1e-6))
 
-    def fitted(self, xy: np.ndarray, w: np.ndarray) -> "Pose":
+    def fitted(self, xy: np.ndarray, w: np.ndarray, steps: int = 1) -> "Pose":
         """Least squares for a small rotation and the focal length from pixels xy (N, 2) of directions w (N, 3)."""
         pixel, slope = slopes(self, w)
         j = slope.reshape(-1, 4)
         residual = (xy - pixel).ravel()
         try:
-            d = np.linalg.solve(j.T @ j, j.T @ residual)
+            *turn, scale = np.linalg.solve(j.T @ j, j.T @ residual).tolist()
         except np.linalg.LinAlgError:  # all stars in one place
             return self
-        return Pose(
-            rotation.from_vector(d[:3]) @ self.attitude, self.focal_px * (1 + float(d[3])), self.mirrored
+        pose = Pose(rotation.from_vector(turn) @ self.attitude, self.focal_px * (1 + scale), self.mirrored)
+        # its error is the square of the step
+        return (
+            pose
+            if steps == 1 or max(map(abs, (*turn, scale))) < SMALL_STEP
+            else pose.fitted(xy, w, steps - 1)
         )
 
 
@@ -128,4 +134,6 @@ def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
 
 
 def _perimeter(v: np.ndarray) -> np.ndarray:
-    return opposite_sides(v).sum(-1)
+    """Of triangles (K, 3, 3), along the chords."""
+    side = v - v[:, [1, 2, 0]]
+    return np.sqrt(np.einsum("kni,kni->kn", side, side)).sum(1)

@@ -41,8 +41,8 @@ def promising(field: Field, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: 
 def _expected(field: Field, sky: Sky, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Bright catalogue stars on K frames: pixels (K, S, 2), FAR beyond each frame's count (K,)."""
     axis = np.append(field.middle / field.focal_px, 1.0)
-    centre = np.einsum("i,kij->kj", axis / np.sqrt(axis @ axis), poses.attitude)
-    frame, row = rows_near(sky.triangles.cell_start, centre, field.radius_rad)
+    rows = [rows_near(sky.triangles.cell_start, axis @ a, field.radius_rad) for a in poses.attitude]
+    frame, row = np.repeat(np.arange(len(rows)), [len(r) for r in rows]), np.concatenate(rows)
     u = np.einsum("mij,mj->mi", poses.attitude[frame], sky.bright(row))
     pixel = u[:, :2] * (poses.focal_px[frame] / np.maximum(u[:, 2], 1e-6))[:, None]
     on = np.flatnonzero(field.holds(pixel))

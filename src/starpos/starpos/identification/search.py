@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search: priors first, then lost in space, from few bright stars to more, from good centroids to poor ones."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from starpos.camera import Camera
-from starpos.identification.evidence import anywhere
-from starpos.identification.full import FEWEST_STARS, TEST_STARS, Identification, identified
+from starpos.identification.evidence import TEST_STARS, anywhere
+from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
 from starpos.identification.pose import Field, Pose, Poses
 from starpos.identification.prior import Attempt, Plumb, Pointing
@@ -53,13 +54,13 @@ def identify_directions(
     """`identify` from unit vectors (N, 3) in C, refraction taken off, as any `camera` gave them."""
     # of square pixels, which is what identify fits
     squeeze = camera.fx / camera.fy
-    size = np.array([camera.width, max(1, round(camera.height * squeeze))])
-    middle = np.array([camera.cx, camera.cy * squeeze])
-    xy = Camera(*size.tolist(), camera.fx, camera.fx, *middle.tolist()).project(directions)
+    width, height = camera.width, max(1, round(camera.height * squeeze))
+    cx, cy = camera.cx, camera.cy * squeeze
+    xy = Camera(width, height, camera.fx, camera.fx, cx, cy).project(directions)
     # what a lens has drawn in from the sides lies beyond them without its distortion, and so do the catalogue's stars
-    beyond = np.maximum(-xy, xy - (size - 1)).max(initial=0.0)
-    margin = int(np.ceil(np.clip(beyond - EDGE_PX, 0.0, WIDEST_MARGIN * size.max())))
-    ideal = Camera(*(size + 2 * margin).tolist(), camera.fx, camera.fx, *(middle + margin).tolist())
+    beyond = float(np.maximum(-xy, xy - (width - 1, height - 1)).max(initial=0.0))
+    margin = math.ceil(min(max(beyond - EDGE_PX, 0.0), WIDEST_MARGIN * max(width, height)))
+    ideal = Camera(width + 2 * margin, height + 2 * margin, camera.fx, camera.fx, cx + margin, cy + margin)
     return identify(xy + margin, sigma_px, ideal, sky, priors)
 
 

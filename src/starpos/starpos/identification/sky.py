@@ -28,6 +28,6 @@ class Sky:
         return self.directions(self.triangles.star[row])
 
     def unaberrated(self, v: np.ndarray) -> np.ndarray:
-        """ICRS direction (3,) of one seen at v (3,)."""
+        """ICRS directions (n, 3) of those seen at v (n, 3)."""
         v = v - np.asarray(self.velocity)
-        return v / np.linalg.norm(v)
+        return v / np.linalg.norm(v, axis=1, keepdims=True)

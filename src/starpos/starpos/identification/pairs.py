@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a frame that lie close to each other."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+SMALL_TABLE = 20_000  # points times others
+
+
+def close_pairs(xy: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (M,), (M,) of the points xy (N, 2) that are closer than reach_px, the smaller row of each pair first."""
+    order = np.argsort(xy[:, 0], kind="stable")
+    x, y = xy[order].T
+    one, other = [], []
+    # side by side in x, then every second one, ... : few of a frame's stars have a neighbour at all
+    for k in range(1, len(x)):
+        near = np.flatnonzero(x[k:] - x[:-k] < reach_px)
+        if not len(near):
+            break
+        near = near[np.square(x[near + k] - x[near]) + np.square(y[near + k] - y[near]) < reach_px**2]
+        one.append(order[near])
+        other.append(order[near + k])
+    if not one:
+        return np.zeros(0, int), np.zeros(0, int)
+    one, other = np.concatenate(one), np.concatenate(other)
+    return np.minimum(one, other), np.maximum(one, other)
+
+
+def mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
+    if len(xy) * len(predicted) < SMALL_TABLE:  # all distances at once are quicker than two trees
+        apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
+        nearest, back = apart2.argmin(1), apart2.argmin(0)
+        distance = np.sqrt(apart2[np.arange(len(xy)), nearest])
+    else:
+        distance, nearest = cKDTree(predicted).query(xy)
+        back = cKDTree(xy).query(predicted)[1]
+    good = (distance < radius) & (back[nearest] == np.arange(len(xy)))
+    return np.flatnonzero(good), nearest[good]
