@@ -2,8 +2,8 @@
 """Which catalogue star is which: from a prior, or lost in space from a frame's brightest stars.
 
 Triangles of the brightest stars are looked up by their shape; candidates that share a side support each other (the
-paper's search); each is then held against the whole field by log-odds, so that a match is accepted by its probability
-and never by a count, and fitted by least squares to the faintest stars seen.
+paper's search); the pose of each is fitted to the brightest stars that agree and weighed by its evidence, so that a match
+is accepted by its probability and never by a count, and then carried to the faintest stars seen.
 """
 
 from starpos.identification.full import Identification
