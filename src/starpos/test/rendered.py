@@ -25,10 +25,11 @@ def star(size, x, y, fwhm, trail=(0.0, 0.0)):
 
 
 def field(size, stars, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gains=None):
-    """Noiseless electrons (float64) of stars (N, 3): x, y, electrons; gains (N + 1, 2, 2): each star's mosaic and
-    last the sky's."""
+    """Noiseless electrons (float64) of stars (N, 3): x, y, electrons; fwhm (N,) and trail (N, 2) of each, or of all;
+    gains (N + 1, 2, 2): each star's mosaic and last the sky's."""
     image = np.zeros(size)
-    reach = int(4 * fwhm + np.hypot(*trail)) + 3
+    fwhm, trail = np.broadcast_to(fwhm, len(stars)), np.broadcast_to(trail, (len(stars), 2))
+    reach = int(np.max(4 * fwhm + np.hypot(*trail.T), initial=0)) + 3
 
     def through(gain, light, row=0, column=0):
         rows, columns = np.indices(light.shape)
@@ -38,7 +39,7 @@ def field(size, stars, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gains=None):
         r0, c0 = max(0, int(y) - reach), max(0, int(x) - reach)
         r1, c1 = min(size[0], int(y) + reach + 1), min(size[1], int(x) + reach + 1)
         if r1 > r0 and c1 > c0:
-            light = electrons * star((r1 - r0, c1 - c0), x - c0, y - r0, fwhm, trail)
+            light = electrons * star((r1 - r0, c1 - c0), x - c0, y - r0, fwhm[i], trail[i])
             image[r0:r1, c0:c1] += through(None if gains is None else gains[i], light, r0, c0)
     return image + through(None if gains is None else gains[-1], np.full(size, float(sky)))
 

@@ -30,7 +30,7 @@ def with_companions(stamps, spike, fit, psf, response, cut_at):
         stamps.take(odd), _rows(fit, odd), psf, response
     )
     freedom = np.maximum(used.sum((1, 2)) - 6, 1)
-    apart = np.hypot(*(psf.axes @ np.stack([x[1] - x[0], y[1] - y[0]])))
+    apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
     away = np.maximum(np.abs(x - stamps.x[odd]), np.abs(y - stamps.y[odd]))
     with np.errstate(invalid="ignore"):
         real = (flux > FAINTEST * sigma).all(0) & np.isfinite(chi2) & (apart > CLOSEST)
@@ -50,7 +50,7 @@ def with_companions(stamps, spike, fit, psf, response, cut_at):
     stamps = _with_rows(stamps, odd, replace(pair, signal=pair.signal - models[1]))
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
     light = (
-        psf.evaluate(*second_stamps.offsets(x[0], y[0]))[0]
+        psf.at(x[0], y[0]).evaluate(*second_stamps.offsets(x[0], y[0]))[0]
         * response.gain.astype(np.float32)[second_stamps.phase]
     )
     light *= flux[0].astype(np.float32)[:, None, None]
@@ -82,7 +82,7 @@ def _fit_pairs(stamps, fit, psf, response):
 
     Gauss-Newton on all six numbers; the companion starts where the most is left.
     """
-    n = len(fit.x)
+    n, psf = len(fit.x), psf.at(fit.x, fit.y)
     gain = response.gain.astype(np.float32)[stamps.phase]
     dx, dy = stamps.offsets(fit.x, fit.y)
     left = ndimage.gaussian_filter(stamps.good * fit.residual, (0, 0.8, 0.8))

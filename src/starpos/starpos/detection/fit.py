@@ -61,7 +61,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     nothing to the mosaic's phase nor to the star's colour. The weights come from the model, not from the pixels,
     whose noise would otherwise pull the fit.
     """
-    x, y = x.copy(), y.copy()
+    x, y, local = x.copy(), y.copy(), psf.at(x, y)
     n, phases = len(x), len(response.gain)
     gain = response.gain.astype(np.float32)[stamps.phase]
     inverse_noise2 = stamps.good / stamps.noise**2
@@ -73,10 +73,10 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     for round_ in range(rounds):
         last = round_ == rounds - 1
         dx, dy = stamps.offsets(x, y)
-        value, by_x, by_y = psf.evaluate(dx, dy)
-        local = gain * (1 + colour.astype(np.float32)[each, stamps.phase]) if extra else gain
-        inside = psf.within(dx, dy, FIT_WIDTHS)
-        unit = value * local
+        value, by_x, by_y = local.evaluate(dx, dy)
+        own = gain * (1 + colour.astype(np.float32)[each, stamps.phase]) if extra else gain
+        inside = local.within(dx, dy, FIT_WIDTHS)
+        unit = value * own
         if not np.isfinite(flux).all():
             weight = inverse_noise2 * inside
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,7 +86,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         variance = response.variance(stamps.noise, amount * unit)
         used = stamps.good & inside & ~outlier
         root = np.sqrt(used / variance)
-        columns = [amount * by_x * local, amount * by_y * local, unit]
+        columns = [amount * by_x * own, amount * by_y * own, unit]
         columns += [amount * value * gain * (stamps.phase == p) for p in range(extra)]
         design = np.stack([(c * root).reshape(n, -1) for c in columns], 2)
         residual = stamps.signal - amount * unit

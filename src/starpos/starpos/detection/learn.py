@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection.fit import FIT_WIDTHS, Response, fit_stars
-from starpos.detection.psf import MAX_ORDER, Psf, gaussian, refine
-from starpos.detection.shape import frame_shape, moments, relative_widths, window_for
+from starpos.detection.fit import Response, fit_stars
+from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
+from starpos.detection.refine import all_terms, even_terms, refine, widened
+from starpos.detection.shape import frame_shape, moments, own_shape, relative_widths, window_for
 from starpos.detection.stamps import cut
 
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
@@ -17,11 +18,12 @@ TEACHERS = 250
 TEACHING_PIXELS = 12000  # of wide stars fewer are enough
 # a star does not teach if the PSF leaves more of its squared light than this, three times what others do, and noise
 UNLIKE = 0.005
-ROUNDS = 2  # of fits and refinements
+ROUNDS, ORDER = 2, 6  # of fits and refinements; of the terms
 # px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more of a pixel's light
 RING_FWHM, POOR = 5.0, 0.05
 RING_ROUNDS, RING_ORDER = 6, 14  # so many more rounds then, and terms of that order
 MAX_REACH = 20
+LOUDEST = 100  # SNR: the widths of a brighter star tell no more of the field
 SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
 SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
 
@@ -55,15 +57,18 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         ring = round_ >= ROUNDS
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
             break  # the response was learnt once more: with the last PSF, of the stars that are like it
-        enough = int(np.log2(len(x)) / 1.2)  # 2 from 6 stars, 3 from 13, 4 from 28
-        order = min(RING_ORDER, 4 * enough) if ring else min(MAX_ORDER, 2 * enough)
-        if order > 0:
-            psf = _shape_up(stamps, psf, x, y, fit.flux[sound], response, order)
+        # pairs are still among the stars of the first round, and look like coma
+        terms = (
+            all_terms(psf, ORDER, len(x))
+            if round_ == ROUNDS - 1
+            else even_terms(psf, RING_ORDER if ring else ORDER)
+        )
+        psf = _shape_up(stamps, psf, fit, sound, response, terms)
     return Lesson(psf, response, reach_of(psf))
 
 
 def _teachers(plane, background, x, y, height, saturation):
-    """The Gaussian most like the bright stars alone in their surroundings, these stars' Stamps, and x, y (N,) of each."""
+    """The Gaussians most like the bright stars alone in their surroundings, their Stamps, and x, y (N,) of each."""
     bright = np.flatnonzero(height > BRIGHT)
     if len(bright) == 0:
         bright = np.arange(min(len(x), TEACHERS))
@@ -74,21 +79,28 @@ def _teachers(plane, background, x, y, height, saturation):
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     if shape is None:
         return gaussian(np.eye(2) * DEFAULT_SIGMA**2), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
-    psf = gaussian(shape)
+    psf = gaussian(shape, stamps.x, stamps.y)
     stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
     smooth, blur = grey(stamps, background)
     x, y = centroid(smooth, shape)
     window = window_for(shape)
-    _, _, seen = moments(smooth, x, y, window)
-    widths = relative_widths(seen, shape + blur * np.eye(2), window)
+    mass, _, seen = moments(smooth, x, y, window)
+    ratio = np.nan_to_num(psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T)
+    extremes = np.linalg.eigvalsh(ratio)
+    near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
+    weight = np.clip(mass / np.median(stamps.noise, axis=(1, 2)), 1, LOUDEST) ** 2
+    psf = widened(psf, x[near], y[near], ratio[near], weight[near])
+    widths = relative_widths(seen, psf.at(x, y).shape + blur * np.eye(2), window)
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
 
 
 def reach_of(psf) -> int:
-    """px from the centre at which a stamp may end: 3.5 widths along the longer axis."""
-    return int(np.clip(np.ceil(3.5 * np.sqrt(np.linalg.eigvalsh(psf.shape)[1])) + 1, 4, MAX_REACH))
+    """px from the centre at which a stamp may end: 3.5 widths along the longer axis, where that is longest."""
+    x, y = np.linspace(*psf.box, 5).T
+    widest = np.linalg.eigvalsh(psf.at(*(v.ravel() for v in np.meshgrid(x, y))).shape).max()
+    return int(np.clip(np.ceil(3.5 * np.sqrt(widest)) + 1, 4, MAX_REACH))
 
 
 def grey(stamps, background):
@@ -104,10 +116,10 @@ def centroid(stamps, shape, rounds=3):
     """x, y (N,) px: the windowed centroids of stars of covariance shape, never further than 2 px from the peak."""
     x, y = stamps.x.astype(float), stamps.y.astype(float)
     window = window_for(shape)
-    gain = (np.eye(2) + shape @ np.linalg.inv(window)).T  # of a displacement the window shows only a part
+    gain = np.eye(2) + shape @ np.linalg.inv(window)  # of a displacement the window shows only a part
     for _ in range(rounds):
         _, step, _ = moments(stamps, x, y, window)
-        step = np.clip(np.nan_to_num(step @ gain), -1, 1)
+        step = np.clip(np.nan_to_num((gain @ step[..., None])[..., 0]), -1, 1)
         x = np.clip(x + step[:, 0], stamps.x - 2, stamps.x + 2)
         y = np.clip(y + step[:, 1], stamps.y - 2, stamps.y + 2)
     return x, y
@@ -146,7 +158,7 @@ def _respond(stamps, psf, x, y, fit, sound, before):
     used = fit.used[sound]
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
-        gain, spread = _gains(stamps, psf.evaluate(*stamps.offsets(x, y))[0], before)
+        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.offsets(x, y))[0], before)
     noise2 = (stamps.noise**2)[used]
     light, square = np.maximum(fit.model[sound][used], 0), fit.residual[sound][used] ** 2
     square = square / np.maximum(1 - fit.leverage[sound][used], 0.1)
@@ -155,6 +167,8 @@ def _respond(stamps, psf, x, y, fit, sound, before):
         variance = noise2 + photon * light + misfit2 * light**2
         keep = square < 25 * variance if photon + misfit2 > 0 else slice(None)
         photon, misfit2 = _two_terms(light[keep], (square - noise2)[keep], variance[keep])
+    # few stars tell too little as often as too much, and too small errors do the more harm
+    photon += float(np.sqrt(2 / max(((light / variance) ** 2).sum(), 1e-12)))
     return Response(gain, spread, photon, float(np.sqrt(misfit2)))
 
 
@@ -193,13 +207,13 @@ def _gains(stamps, value, before):
     return gain, float(np.clip(np.sqrt(spread2), 0.01, 0.5))
 
 
-def _shape_up(stamps, psf, x, y, flux, response, order):
-    """One refinement of the PSF by these stars."""
-    dx, dy = np.broadcast_arrays(*stamps.offsets(x, y))
-    gain = response.gain.astype(np.float32)[stamps.phase]
-    scale = gain * flux.astype(np.float32)[:, None, None]
-    value = psf.evaluate(dx, dy)[0]
+def _shape_up(stamps, psf, fit, sound, response, terms):
+    """One refinement of the PSF by the stars in stamps, the sound ones of a fit."""
+    x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
+    scale = response.gain.astype(np.float32)[stamps.phase] * flux[:, None, None]
+    dx, dy = stamps.offsets(x, y)
+    light = scale * psf.at(x, y).evaluate(dx, dy)[0]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
-    variance = response.variance(stamps.noise, scale * value) + (0.02 * scale * value) ** 2
-    use = stamps.good & psf.within(dx, dy, FIT_WIDTHS)
-    return refine(psf, dx[use], dy[use], (stamps.signal[use] / scale[use]), (scale**2 / variance)[use], order)
+    variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
+    weight = fit.used[sound] * scale**2 / variance
+    return refine(psf, x, y, dx, dy, stamps.signal / scale, weight, terms)

@@ -19,7 +19,7 @@ ABOUT = (
     "width", "height", "mid_unix_s", "exposure_s", "source", "focal_px", "stamp_stddev_s", "clock_stddev_s",
 )
 # fmt: on
-CHUNK_PIXELS = 200_000  # of stars fitted at once: a few tens of megabytes
+CHUNK_PIXELS = 60_000  # of stars fitted at once: a few tens of megabytes
 PEAKS = 10_000  # looked at; at least twice as many as stars are wanted, as hot pixels are peaks too
 
 

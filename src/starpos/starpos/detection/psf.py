@@ -2,112 +2,154 @@
 """The frame's effective point spread function: what a pixel sees of a star of unit flux at an offset from it.
 
 As Anderson & King (2000, PASP 112, 1360) it is a smooth function of the offset that holds optics, seeing, the
-trail and the pixel's own square, learnt from the frame's stars; here as Gauss-Hermite series (Refregier 2003,
-MNRAS 338, 35) along the principal axes of the mean star: u along, v across the trail, in units of its widths.
-Only even terms are kept, so the centre is the centre of symmetry whatever the fit makes of the rest.
-
-One PSF serves the whole field. Coma whose tail reaches 1 px at the corners, of stars of FWHM 2.4 px, costs 1 to 3 % of
-the Cramer-Rao bound; a star of 3000 and one of 60000 electrons then differ there by 0.02 px (what both shift belongs
-to the camera's distortion). That is too little for a PSF that varies; but what it fails to describe passes for noise,
-and the errors then say twice too much.
+trail and the pixel's own square, learnt from the frame's stars and, where that describes them better, different from
+place to place; here as Gauss-Hermite series (Refregier 2003, MNRAS 338, 35) along the principal axes of the mean star:
+u along, v across the trail, in units of its widths. The centre is the centroid of all light, since the series has no
+term of first order.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-MAX_ORDER = 6
+MONOMIALS = 6  # of second order in the field's coordinates
+NARROW, BROAD = 0.25, 6.0  # limits of a place's squared widths over the mean ones
 
 
 @dataclass(frozen=True, eq=False)
-class Psf:
-    """axes (2, 2): rows turn an offset (dx, dy) px into (u, v); series (I, J): coefficient of h_i(u) h_j(v),
-    Hermite polynomials."""
+class LocalPsf:
+    """The PSF where N stars are; N = 1 serves any number of them.
+
+    axes    (N, 2, 2): rows turn an offset (dx, dy) px into (u, v)
+    series  (N, I, J): coefficient of h_i(u) h_j(v), Hermite polynomials
+    """
 
     axes: np.ndarray
     series: np.ndarray
 
     @property
     def shape(self):
-        """Covariance (2, 2) px2 of the Gaussian the series corrects."""
+        """(N, 2, 2) px2: covariances of the Gaussians the series correct."""
+        inverse = np.linalg.inv(self.axes)
+        return inverse @ inverse.transpose(0, 2, 1)
+
+    def within(self, dx, dy, widths):
+        """Whether pixels dx, dy px off the stars' centres lie within so many widths of them."""
+        u, v = self._scaled(dx, dy)
+        return u * u + v * v < widths**2
+
+    def evaluate(self, dx, dy):
+        """value, d/dx0 and d/dy0 (N, S, S): the PSF at pixels dx, dy off the stars' centres, and how moving them acts."""
+        u, v = self._scaled(dx, dy)
+        place, u, v = u.shape, u.reshape(len(u), -1), v.reshape(len(v), -1)
+        _, i, j = self.series.shape
+        fu, fv = _hermites(u, i), _hermites(v, j)
+        gauss = self._gauss(u, v)
+        # -d/du of h_i exp(-u^2 / 2) is sqrt(i + 1) h_i+1 exp(-u^2 / 2)
+        series = self.series.astype(np.float32)
+        by_u, by_v = (np.sqrt(np.arange(1, n + 1, dtype=np.float32)) for n in (i, j))
+        across = series @ fv[:, :-1]
+        value = np.einsum("nip,nip->np", fu[:, :-1], across) * gauss
+        across *= by_u[:, None]
+        du = np.einsum("nip,nip->np", fu[:, 1:], across) * gauss
+        across = (series * by_v) @ fv[:, 1:]
+        dv = np.einsum("nip,nip->np", fu[:, :-1], across) * gauss
+        a = self.axes.astype(np.float32)[..., None]
+        by_x, by_y = (a[:, 0, k] * du + a[:, 1, k] * dv for k in (0, 1))
+        return value.reshape(place), by_x.reshape(place), by_y.reshape(place)
+
+    def terms(self, dx, dy, orders):
+        """(N, T, P): each term i, j of `orders` (T, 2) alone at P = S S pixels."""
+        u, v = (w.reshape(len(w), -1) for w in self._scaled(dx, dy))
+        i, j = np.transpose(orders)
+        terms = _hermites(u, max(1, i.max()))[:, i]
+        terms *= _hermites(v, max(1, j.max()))[:, j]
+        terms *= self._gauss(u, v)[:, None]
+        return terms
+
+    def _scaled(self, dx, dy):
+        a = self.axes.astype(np.float32)[..., None, None]
+        return a[:, 0, 0] * dx + a[:, 0, 1] * dy, a[:, 1, 0] * dx + a[:, 1, 1] * dy
+
+    def _gauss(self, u, v):
+        norm = np.abs(np.linalg.det(self.axes)).astype(np.float32)[:, None] / np.float32(2 * np.pi)
+        return np.exp(-0.5 * (u * u + v * v)) * norm
+
+
+@dataclass(frozen=True, eq=False)
+class Psf:
+    """The PSF of a frame of size (width, height) px: `at` gives it where stars are.
+
+    axes    (2, 2): those of the mean star, as a LocalPsf has them
+    widths  (K, 2, 2): squared widths along these axes, as coefficients of the field's K monomials; K is 6, or 1: the
+            same everywhere
+    series  (K, I, J): the coefficients of the series, likewise
+    box     (2, 2): the lowest x, y and the highest, px, of the stars it was learnt from; beyond, it is as at its edge
+    """
+
+    axes: np.ndarray
+    widths: np.ndarray
+    series: np.ndarray
+    box: np.ndarray
+
+    @property
+    def shape(self):
+        """Covariance (2, 2) px2 of the mean star."""
         inverse = np.linalg.inv(self.axes)
         return inverse @ inverse.T
 
     @property
     def fwhm_px(self) -> float:
-        """Geometric mean over the two axes of that Gaussian's full width at half maximum."""
+        """Geometric mean over the two axes of the mean star's full width at half maximum."""
         return float(np.sqrt(8 * np.log(2)) * abs(np.linalg.det(self.axes)) ** -0.5)
 
-    def within(self, dx, dy, widths):
-        """Whether pixels dx, dy px off a star's centre lie within so many widths of it."""
-        u, v = (a[0] * dx + a[1] * dy for a in self.axes.astype(np.float32))
-        return u * u + v * v < widths**2
+    def at(self, x, y) -> LocalPsf:
+        """The PSF at the points x, y (N,) px."""
+        axes, series = self.axes[None], self.series[:1]
+        if len(self.widths) > 1:
+            axes = power(np.tensordot(self.monomials(x, y), self.widths, 1), -0.5) @ self.axes
+        if len(self.series) > 1:
+            series = np.tensordot(self.monomials(x, y), self.series, 1)
+        return LocalPsf(axes, series)
 
-    def evaluate(self, dx, dy):
-        """value, d/dx0 and d/dy0 (N, S, S): the PSF at pixels dx, dy off a star's centre, and how moving it acts."""
-        u, v = (a[0] * dx + a[1] * dy for a in self.axes.astype(np.float32))
-        fu, fv = (_hermites(w, n) for w, n in zip((u, v), self.series.shape, strict=True))
-        norm = np.float32(abs(np.linalg.det(self.axes)) / (2 * np.pi))
-        gauss = np.exp(-0.5 * (u * u + v * v)) * norm
-        # -d/du of h_i exp(-u^2 / 2) is sqrt(i + 1) h_i+1 exp(-u^2 / 2)
-        series = self.series.astype(np.float32)
-        by_u, by_v = (np.sqrt(np.arange(1, n + 1, dtype=np.float32)) for n in series.shape)
-        flat = fv.reshape(len(fv), -1)
-        # einsum: a product by BLAS wakes its threads, which spin on for longer than it takes
-        across = np.einsum("ij,jk->ik", series, flat[:-2]).reshape(-1, *u.shape)
-        value = np.einsum("i...,i...->...", fu[:-2], across)
-        du = np.einsum("i,i...,i...->...", by_u, fu[1:-1], across)
-        across = np.einsum("ij,jk->ik", series * by_v, flat[1:-1]).reshape(-1, *u.shape)
-        dv = np.einsum("i...,i...->...", fu[:-2], across)
-        (ax, ay), (bx, by) = self.axes.astype(np.float32)
-        du, dv = du * gauss, dv * gauss
-        return value * gauss, ax * du + bx * dv, ay * du + by * dv
+    def monomials(self, x, y):
+        """(N, 6): of the field's coordinates, each from -1 to 1, and of zero mean over the box but for the first."""
+        low, high = self.box
+        place = 2 * (np.stack([x, y], -1) - low) / np.maximum(high - low, 1) - 1
+        p, q = np.nan_to_num(np.clip(place, -1, 1)).T  # a star whose fit failed is nowhere
+        return np.stack([np.ones_like(p), p, q, p * p - 1 / 3, p * q, q * q - 1 / 3], -1)
+
+    def with_widths(self, widths) -> "Psf":
+        """With other squared widths (6, 2, 2) along these axes, made those of the mean star's axes."""
+        root = power(widths[:1], -0.5)[0]
+        return replace(self, axes=root @ self.axes, widths=root @ widths @ root)
 
 
-def gaussian(shape) -> Psf:
-    """The Psf of an elliptical Gaussian of covariance shape (2, 2) px2; its first axis is the long one."""
+def gaussian(shape, x=(0.0,), y=(0.0,)) -> Psf:
+    """The Psf of an elliptical Gaussian of covariance shape (2, 2) px2, learnt from stars at x, y (N,) px.
+
+    Its first axis is the long one.
+    """
     values, vectors = np.linalg.eigh(shape)
     axes = (vectors / np.sqrt(values)).T[::-1]
-    return Psf(axes, np.ones((1, 1)))
+    box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]])
+    return Psf(axes, np.eye(2)[None], np.ones((1, 1, 1)), box)
 
 
-def refine(psf, dx, dy, brightness, weight, order) -> Psf:
-    """The Psf whose even series fits stars best, by weighted linear least squares.
-
-    dx, dy      (M,) px: offsets of M pixels from their stars' centres
-    brightness  (M,) values of those pixels over their stars' fluxes
-    weight      (M,) inverse variances of brightness
-    order       of the terms across the trail; along it more, up to twice as many, as the star is longer
-    """
-    u, v = psf.axes.astype(np.float32) @ np.stack([dx, dy])
-    gauss = np.exp(-0.5 * (u * u + v * v)) * np.float32(abs(np.linalg.det(psf.axes)) / (2 * np.pi))
-    long, short = 1 / np.linalg.norm(psf.axes, axis=1)
-    stretch = float(np.clip(long / short, 1, 2))
-    along = int(order * stretch) // 2 * 2
-    fu, fv = _hermites(u, along), _hermites(v, order)
-    terms = [
-        (i, j)
-        for i in range(along + 1)
-        for j in range(order + 1)
-        if (i + j) % 2 == 0 and i / stretch + j <= order
-    ]
-    design = np.stack([fu[i] * fv[j] * gauss for i, j in terms])
-    weighted = design * weight.astype(np.float32)
-    normal = np.einsum("ik,jk->ij", weighted, design).astype(np.float64)
-    # a weak pull of the corrections to zero keeps thin data sound
-    pull = np.array([0.0] + [1.0] * (len(terms) - 1)) * np.trace(normal) / len(terms) * 1e-4
-    found = np.linalg.solve(normal + np.diag(pull), np.einsum("ik,k->i", weighted, brightness))
-    series = np.zeros((along + 1, order + 1))
-    series[tuple(np.transpose(terms))] = found
-    if not np.all(np.isfinite(series)) or series[0, 0] <= 0:
-        return psf
-    return Psf(psf.axes, series / series[0, 0])  # unit flux: the other terms integrate to zero
+def power(widths, exponent):
+    """Symmetric powers of squared widths (N, 2, 2), these kept within what a field can do."""
+    values, vectors = np.linalg.eigh(widths)
+    values = np.clip(values, NARROW, BROAD) ** exponent
+    return (vectors * values[:, None]) @ vectors.transpose(0, 2, 1)
 
 
 def _hermites(u, order):
-    """h_0(u) .. h_order+1(u): the probabilists' Hermite polynomials over sqrt(n!), which keeps them of order 1."""
-    values = np.empty((order + 2, *u.shape), u.dtype)
-    values[0], values[1] = 1, u
-    for n in range(1, order + 1):
-        values[n + 1] = (u * values[n] - np.float32(n**0.5) * values[n - 1]) * np.float32((n + 1) ** -0.5)
+    """(N, order + 1, P): h_0(u) .. h_order(u) of u (N, P), the probabilists' Hermite polynomials over sqrt(n!), which
+    keeps them of order 1; order >= 1."""
+    values = np.empty((len(u), order + 1, u.shape[1]), u.dtype)
+    values[:, 0], values[:, 1] = 1, u
+    for n in range(1, order):
+        values[:, n + 1] = (u * values[:, n] - np.float32(n**0.5) * values[:, n - 1]) * np.float32(
+            (n + 1) ** -0.5
+        )
     return values

@@ -12,21 +12,22 @@ NARROWEST_WINDOW = 1.2  # px2: under narrower ones a sum over pixels is no integ
 
 
 def at_least(shape, floor):
-    """The covariance shape (2, 2) px2 with no principal axis below floor px2."""
+    """The covariance shape (..., 2, 2) px2 with no principal axis below floor px2."""
     values, vectors = np.linalg.eigh(shape)
-    return vectors @ np.diag(np.maximum(values, floor)) @ vectors.T
+    return (vectors * np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
 
 
 def moments(stamps, x, y, window):
-    """One look through the window (2, 2) px2 at the points x, y (N,).
+    """One look through the window (2, 2) px2, or one each (N, 2, 2), at the points x, y (N,).
 
     Returns mass (N,), the mean offset (N, 2) px from x, y and the covariance (N, 2, 2) px2 of the windowed image;
     NaN where there is nothing. Pixels off the frame or saturated hold what they hold: without them the moments
     would lean away from the edge.
     """
     dx, dy = stamps.offsets(x, y)
-    inverse = np.linalg.inv(window)
-    exponent = inverse[0, 0] * dx * dx + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy * dy
+    inverse = np.linalg.inv(window)[..., None, None].astype(np.float32)
+    xx, xy, yy = (inverse[..., i, j, :, :] for i, j in ((0, 0), (0, 1), (1, 1)))
+    exponent = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
     weighted = np.exp(-0.5 * exponent) * stamps.signal
     rows, columns = weighted.sum(2), weighted.sum(1)  # the separable sums, over (N, S) from here on
     dx, dy = dx[:, 0, :], dy[:, :, 0]
@@ -40,7 +41,7 @@ def moments(stamps, x, y, window):
 
 
 def window_for(shape):
-    """The window (2, 2) px2 that suits stars of covariance shape: the same, unless too narrow for sums."""
+    """The window (..., 2, 2) px2 that suits stars of covariance shape: the same, unless too narrow for sums."""
     return at_least(shape, NARROWEST_WINDOW)
 
 
@@ -74,8 +75,17 @@ def frame_shape(stamps, blur=0.0, rounds=12):
     return at_least(shape - blur * np.eye(2), NARROWEST)
 
 
+def own_shape(seen, window):
+    """Covariances (N, 2, 2) px2 of stars from those of their windowed images (N, 2, 2); NaN where there are none."""
+    sound = np.isfinite(seen).all((1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(seen))) > 1e-6)
+    narrower = np.linalg.inv(np.where(sound[:, None, None], seen, np.eye(2))) - np.linalg.inv(window)
+    sound &= np.abs(np.linalg.det(narrower)) > 1e-9
+    own = np.linalg.inv(np.where(sound[:, None, None], narrower, np.eye(2)))
+    return np.where(sound[:, None, None], own, np.nan)
+
+
 def relative_widths(seen, shape, window):
-    """(N, 2): the smaller and the larger squared width of windowed images over that of a star of `shape`.
+    """(N, 2): the smaller and the larger squared width of windowed images over that of stars of `shape` (..., 2, 2).
 
     1 for a star like the frame's, towards 0 across a hot pixel; along a streak it reaches 2 if window = shape.
     NaN counts as 0.
@@ -83,4 +93,4 @@ def relative_widths(seen, shape, window):
     expected = np.linalg.inv(np.linalg.inv(shape) + np.linalg.inv(window))
     root = np.linalg.inv(np.linalg.cholesky(expected))
     with np.errstate(invalid="ignore"):
-        return np.linalg.eigvalsh(np.nan_to_num(root @ seen @ root.T))
+        return np.linalg.eigvalsh(np.nan_to_num(root @ seen @ np.swapaxes(root, -1, -2)))

@@ -30,11 +30,12 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         return replace(stamps, signal=signal, good=stamps.good & ~spike), spike
 
     stamps, spike = cut_at(x, y)
-    shape = psf.shape
+    shape = psf.at(x, y).shape
     x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
     stamps, spike, fit = with_companions(stamps, spike, fit, psf, lesson.response, cut_at)
     smooth, blur = grey(_own_light(stamps, fit, spike), background)
+    shape = psf.at(stamps.x, stamps.y).shape
     window = window_for(shape)
     _, _, seen = moments(smooth, fit.x, fit.y, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
@@ -79,11 +80,12 @@ def _levelled(stamps):
 
 def _spikes(stamps, lesson):
     """Which pixels (N, S, S) tower over their neighbours as no star does, whatever they lie on, and those's mean."""
-    grid = np.arange(-1, 2, dtype=np.float32)
-    star = lesson.psf.evaluate(grid[None, None, :], grid[None, :, None])[0][0]
+    grid = np.tile(np.arange(-1, 2, dtype=np.float32), (len(stamps.x), 1))
+    star = lesson.psf.at(stamps.x, stamps.y).evaluate(grid[:, None, :], grid[:, :, None])[0]
     four = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
+    top, beside = star[:, 1, 1], (star * four).sum((1, 2))
     # 1 at least: a ring has a dark middle
-    sharpest = max(1.0, star[1, 1] / max((star * four).sum(), 1e-3 * star[1, 1]))
+    sharpest = np.maximum(1.0, top / np.maximum(beside, 1e-3 * np.abs(top)))[:, None, None].astype(np.float32)
     grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
     around = ndimage.convolve(grey, four[None], mode="nearest")
     spike = (grey > SPIKE * sharpest * (around + stamps.noise)) & (stamps.signal > OUTLIER * stamps.noise)
@@ -102,7 +104,7 @@ def _own_light(stamps, fit, spike):
 
 def _core(stamps, fit, psf, widths):
     """(N, S, S) bool: the pixels within so many widths of the star's centre."""
-    return psf.within(*stamps.offsets(fit.x, fit.y), widths)
+    return psf.at(fit.x, fit.y).within(*stamps.offsets(fit.x, fit.y), widths)
 
 
 def _is_dot(stamps, fit, response):
