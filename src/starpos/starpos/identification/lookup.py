@@ -102,5 +102,5 @@ def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) ->
     mixed ^= mixed >> np.uint64(29)
     mixed *= np.uint64(0xBF58476D1CE4E5B9)
     key = mixed + mixed[:, [1, 2, 0]] + mirrored.astype(np.uint64)[:, None]
-    ordered = np.sort(key, axis=None)
-    return (np.searchsorted(ordered, key, "right") - np.searchsorted(ordered, key) - 1).sum(1)
+    _, inverse, count = np.unique(key.ravel(), return_inverse=True, return_counts=True)
+    return (count[inverse].reshape(key.shape) - 1).sum(1)
