@@ -70,6 +70,8 @@ def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
     """uint8 or uint16 (h, w) of any real values by the rule of starpos.reading.read_frame; FrameError of others."""
     if values.dtype.kind not in "uif":
         raise FrameError(f"{place}: its pixels are {values.dtype}; give numbers.")
+    if values.size == 0:
+        raise FrameError(f"{place}: it has no pixels; its shape is {values.shape}.")
     if values.dtype.kind == "u" and values.dtype.itemsize <= 2:
         return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
     if values.dtype.kind == "f":

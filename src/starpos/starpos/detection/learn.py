@@ -193,7 +193,7 @@ def _gains(stamps, value, before):
     weight = (stamps.good / before.variance(stamps.noise, stamps.signal))[..., None] * phases
     information = (weight * (value * value)[..., None]).sum((1, 2))
     own = (weight * (value * stamps.signal)[..., None]).sum((1, 2)) / np.maximum(information, 1e-12)
-    mean = np.maximum(own.mean(1, keepdims=True), 1e-12)
+    mean = np.maximum(own.mean(1, keepdims=True), 1e-3)  # DN: far below any star
     own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
     gain, spread2 = np.median(own, 0), 0.0
     for _ in range(4):
