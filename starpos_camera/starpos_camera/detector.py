@@ -230,6 +230,7 @@ class DetectorNode(Node):
                 "background (DN)": last.detection.background,
                 "noise (DN)": last.detection.noise,
                 "fwhm (px)": last.detection.fwhm_px,
+                "chi2": last.detection.typical_chi2,
                 "cpu_ms": last.cpu_ms,
                 "seconds": last.seconds,
             }

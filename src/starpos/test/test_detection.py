@@ -205,6 +205,20 @@ def test_eight_bits_are_enough():
     assert np.all(rms(np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]) < 1.2 * bound(10000))
 
 
+def test_chi_square_tells_the_star_that_is_not_like_the_others():
+    rng = np.random.default_rng(16)
+    stars = grid((400, 400), 40, 15000, rng)
+    fwhm = np.where(np.arange(len(stars)) == 0, 3.2, 2.4)  # the first is a nebula
+    detection = detect(Frame(noisy(field((400, 400), stars, fwhm), rng)))
+    index = match(detection.stars, stars[1:])
+    assert len(detection.chi2) == len(detection.stars) and np.all(index >= 0)
+    assert np.mean(detection.chi2[index]) == pytest.approx(1, abs=0.06)
+    assert detection.typical_chi2 == pytest.approx(1, abs=0.06)
+    odd = np.setdiff1d(np.arange(len(detection.stars)), index)
+    assert np.all(detection.chi2[odd] > 1.6)
+    assert len(detect(Frame(np.zeros((80, 80), np.uint16))).chi2) == 0
+
+
 def test_time_size_and_source_reach_the_stars_brightest_first():
     rng = np.random.default_rng(13)
     stars = grid((200, 300), 50, lambda n: np.geomspace(2000, 50000, n), rng)

@@ -39,7 +39,7 @@ def _tell(path: str, answer, as_json: bool) -> None:
     else:
         print(
             f"{path}: {len(stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
-            f"FWHM {found.fwhm_px:.2f} px, {cpu_ms:.0f} ms",
+            f"FWHM {found.fwhm_px:.2f} px, chi2 {found.typical_chi2:.2f}, {cpu_ms:.0f} ms",
             flush=True,
         )
 

@@ -59,12 +59,21 @@ class DetectionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The stars of a frame and what else it told: background and noise (DN, medians over the frame), FWHM (px)."""
+    """The stars of a frame and what else it told: background and noise (DN, medians over the frame), FWHM (px).
+
+    chi2  (N,) of each star's fit, per degree of freedom: about 1 where it is as the frame's PSF and noise say
+    """
 
     stars: Stars
     background: float
     noise: float
     fwhm_px: float
+    chi2: np.ndarray
+
+    @property
+    def typical_chi2(self) -> float:
+        """The median of chi2; NaN without stars."""
+        return float(np.median(self.chi2)) if len(self.chi2) else float("nan")
 
 
 def detect(frame, settings=DetectionSettings()) -> Detection:
@@ -72,13 +81,13 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     plane, mosaic = plane_of(frame)
     about = {name: getattr(frame, name) for name in ABOUT}
     if min(plane.shape) < 2:
-        return Detection(no_stars(**about), float(np.median(plane)), 0.0, float("nan"))
+        return _starless(about, float(np.median(plane)), 0.0)
     background = measure_background(plane, settings.mesh_px, mosaic)
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
     peaks = find_peaks(plane, background, settings.threshold, max(PEAKS, 2 * settings.max_stars))
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
-        return Detection(no_stars(**about), level, noise, float("nan"))
+        return _starless(about, level, noise)
     background = replace(background, correlation=peaks.correlation)
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
@@ -88,8 +97,13 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     columns = {name: column[: settings.max_stars] for name, column in resolve(columns, lesson.psf).items()}
+    chi2 = columns.pop("chi2")
     stars = Stars(**columns, **about)
-    return Detection(stars, level, noise, lesson.psf.fwhm_px if len(stars) else float("nan"))
+    return Detection(stars, level, noise, lesson.psf.fwhm_px if len(stars) else float("nan"), chi2)
+
+
+def _starless(about, level, noise):
+    return Detection(no_stars(**about), level, noise, float("nan"), np.zeros(0))
 
 
 def _saturation(plane, x, y, settings):

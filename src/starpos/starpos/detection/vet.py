@@ -20,7 +20,7 @@ LOUD = 3  # times the quietest pixel's noise
 
 
 def measure(plane, background, x, y, lesson, saturation, min_snr):
-    """Columns x, y, flux, snr, covariance, flags of the stars among the peaks x, y (N,) int, in no order."""
+    """Columns x, y, flux, snr, covariance, flags, chi2 of the stars among the peaks x, y (N,) int, in no order."""
     psf = lesson.psf
 
     def cut_at(x, y):
@@ -57,6 +57,7 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
     columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
+    columns["chi2"] = fit.chi2
     return {name: column[sound] for name, column in columns.items()}
 
 
