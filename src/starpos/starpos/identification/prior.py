@@ -24,9 +24,8 @@ RING_STARS = 8  # of the frame that vote for an azimuth
 J2000_RAD = 2.5e-4  # aberration and most proper motions, which the beacons lack
 STANDS, WAS_MOVED = np.log(0.5), np.log(0.5)  # of the probability
 
-Attempt = tuple[
-    Pose, np.ndarray, Prior
-]  # a pose, how far off stars may be (N,) px, and the poses that could be
+# A pose, how far off stars may be (N,) px, and the poses that could be
+Attempt = tuple[Pose, np.ndarray, Prior]
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,6 @@ class Pointing:
         """Poses that shift the frame by reach_px at most, and turn and stretch it by STILL_PX at its corners."""
         shift, turn = reach_px / self.focal_px, STILL_PX / np.hypot(*field.half)
         most = np.array([shift, shift, turn, turn])
-
         log_density = log_share - float(np.log(2 * most).sum())
 
         def density(pose: Pose) -> float:
