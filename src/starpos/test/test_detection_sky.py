@@ -83,6 +83,32 @@ def test_a_dark_roof_makes_no_star_and_hides_none_above_it(sky, rng):
     assert len(found) == len(set(index[index >= 0]))
 
 
+@pytest.mark.parametrize("brightness", [10, 200, 1500, 6000])
+def test_a_tree_costs_what_it_covers_and_most_of_what_its_leaves_add_is_flagged(brightness, rng):
+    stars = grid(SIZE, 40, ELECTRONS, rng)
+    along = np.linspace(0, 1, 500)[:, None]
+    x, y, angle = rng.uniform(0, SIZE[1], 60), rng.uniform(320, SIZE[0], 60), rng.uniform(0, np.pi, 60)
+    length = rng.uniform(50, 250, 60)
+    column, row = x + along * length * np.cos(angle), y - 0.7 * along * length * np.sin(angle)
+    inside = (column >= 0) & (column < SIZE[1]) & (row >= 300) & (row < SIZE[0])
+    twigs = np.zeros(SIZE)
+    twigs[row[inside].astype(int), column[inside].astype(int)] = 3
+    twigs = np.clip(ndimage.gaussian_filter(twigs, 1.6), 0, 1)
+    leaves = brightness * np.clip(1 + 0.4 * ndimage.gaussian_filter(rng.normal(0, 3, SIZE), 2), 0, None)
+    found = found_in(field(SIZE, stars, sky=60) * (1 - twigs) + twigs * leaves, rng)
+    near = ndimage.gaussian_filter(twigs, 9)[stars[:, 1].astype(int), stars[:, 0].astype(int)] > 0.02
+    clear = stars[~near]
+    clear = clear[match(found, clear) >= 0]
+    assert len(clear) > 0.98 * np.count_nonzero(~near)  # a twig's end may lie on one
+    error, pull = errors(found, clear)
+    assert rms(error) < 1.1 * rms(bound(ELECTRONS, sky=60))
+    assert 0.85 < rms(pull) < 1.1
+    index = match(found, stars, within=3)
+    false = np.setdiff1d(np.arange(len(found)), index)
+    assert np.count_nonzero(found.flags[false] == 0) < 0.6 * len(false) or len(false) < 8
+    assert np.mean(found.flags[match(found, clear)] > 0) < 0.05
+
+
 def test_dead_rows_and_columns_cost_only_the_stars_on_them(stars, rng):
     pixels = noisy(field(SIZE, stars), rng)
     rows, columns = np.arange(30, SIZE[0], 97), np.array([130, 131, 333])

@@ -7,11 +7,15 @@ import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
-from starpos.detection.stamps import surroundings
+from starpos.detection.stamps import are_dots, surroundings
 
 STRIP = 64  # rows: small enough to stay in the processor's cache
 CROWD = 14  # px: the widest defocused star
 LEADERS = 100  # peaks that tell whether the frame's stars are rings
+SINGLE, CLEAR = (
+    0.15,
+    20.0,
+)  # share of peaks that would not be single if they were; sigma: where a ring has no single one
 
 
 @dataclass(frozen=True)
@@ -50,27 +54,46 @@ def find_peaks(plane, background, threshold, limit) -> Peaks:
 
     The light of a telescope out of focus, with an obstruction in its middle, is a ring, on which several peaks crowd:
     where most bright ones do, the frame is smoothed more widely, if that leaves them alone and makes them stand out
-    more. A streak or a tree stays a crowd; the two stars of a pair stand out less.
+    more. A streak or a tree stays a crowd, or has stars beside it; the two stars of a pair stand out less.
     """
     sharp = _peaks_of(plane, background, SHARP, threshold, limit)
-    if not _crowded(sharp):
+    leaders = _leaders(plane, background, sharp)
+    if not _crowded(sharp, leaders):
         return sharp
     wide = _peaks_of(plane, background, WIDE, threshold, limit)
-    if len(wide.x) == 0 or _crowded(wide):
+    wide_leaders = _leaders(plane, background, wide)
+    if len(wide_leaders) == 0 or _crowded(wide, wide_leaders):
         return sharp
-    better = np.median(wide.height[:LEADERS]) > np.median(sharp.height[:LEADERS])
+    if np.count_nonzero(_single(plane, background, sharp)) > SINGLE * len(wide.x):
+        return sharp
+    better = np.median(wide.height[wide_leaders]) > np.median(sharp.height[leaders])
     return wide if better else sharp
 
 
-def _crowded(peaks):
-    """Whether most of the brightest peaks have one like them within CROWD px."""
+def _leaders(plane, background, peaks):
+    """Indices of the brightest that are no hot pixels."""
+    first = np.arange(min(len(peaks.x), 10 * LEADERS))
+    return first[~are_dots(plane, background, peaks.x[first], peaks.y[first])][:LEADERS]
+
+
+def _crowded(peaks, leaders):
+    """Whether most of the leaders have one like them within CROWD px."""
     points = np.stack([peaks.x, peaks.y], 1)
-    leaders = points[:LEADERS]
     if len(leaders) < 2:
         return False
-    alike = points[peaks.height > 0.5 * peaks.height[len(leaders) - 1]]
-    nearest = spatial.cKDTree(alike).query(leaders, 2)[0][:, 1]
+    alike = peaks.height > 0.5 * peaks.height[leaders[-1]]
+    nearest = spatial.cKDTree(points[alike]).query(points[leaders], 2)[0][:, 1]
     return bool(np.median(nearest) < CROWD)
+
+
+def _single(plane, background, peaks):
+    """Which peaks (N,) are bright, wider than a pixel, and have none of half their height within CROWD px."""
+    points = np.stack([peaks.x, peaks.y], 1)
+    pairs = spatial.cKDTree(points).query_pairs(CROWD, output_type="ndarray")
+    single = peaks.height > CLEAR
+    for a, b in (pairs.T, pairs.T[::-1]):
+        single[a[peaks.height[b] > 0.5 * peaks.height[a]]] = False
+    return single & ~are_dots(plane, background, peaks.x, peaks.y)
 
 
 def _peaks_of(plane, background, kernel, threshold, limit):

@@ -10,7 +10,7 @@ from starpos.detection.fit import Response, fit_stars
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import all_terms, even_terms, refine, widened
 from starpos.detection.shape import frame_shape, moments, own_shape, relative_widths, window_for
-from starpos.detection.stamps import cut
+from starpos.detection.stamps import are_dots, cut
 
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
 BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
@@ -73,7 +73,7 @@ def _teachers(plane, background, x, y, height, saturation):
     if len(bright) == 0:
         bright = np.arange(min(len(x), TEACHERS))
     bright = bright[_isolated(x, y, height, bright)]
-    bright = bright[~_is_dot(cut(plane, background, x[bright], y[bright], 1, saturation))][:TEACHERS]
+    bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(~stamps.full.any((1, 2)))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
@@ -133,13 +133,6 @@ def _isolated(x, y, height, index):
     for a, b in (pairs.T, pairs.T[::-1]):
         crowded[a[height[b] > 0.02 * height[a]]] = True
     return ~crowded[index]
-
-
-def _is_dot(stamps):
-    """Hot pixels in stamps of 3 x 3: less light in the neighbours together than in half the brightest pixel."""
-    core = stamps.signal.reshape(-1, 9)
-    peak = core.max(1)
-    return core.sum(1) - peak < 0.5 * peak
 
 
 def _strangeness(stamps, fit):

@@ -62,6 +62,13 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     return Stamps(x, y, pixels - level, noise, on & ~full, full, phase)
 
 
+def are_dots(plane, background, x, y):
+    """Whether the pixels x, y (N,) int are hot: less light in their neighbours together than in half of the brightest."""
+    core = cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9)
+    peak = core.max(1)
+    return core.sum(1) - peak < 0.5 * peak
+
+
 def surroundings(plane, background, x, y, reach):
     """What `uneven` says of the squares reach px around the pixels x, y (N,) int."""
     side, end = np.arange(-reach, reach), np.full(2 * reach, reach)

@@ -16,6 +16,7 @@ from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
 SPECK = 3  # pixels
 SPIKE = 3  # times sharper than a star
 RESOLVED = 3.0  # widths, 1.3 FWHM: nearer ones are measured, but each leans on the other
+STRANGE = 3.0  # chi-square of what no star alone makes: twigs, nebulae, stars under something
 LOUD = 3  # times the quietest pixel's noise
 
 
@@ -54,6 +55,7 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
         edge = (~stamps.good & ~stamps.full & ~spike & _core(stamps, fit, psf, 3)).any((1, 2))
         foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux
+        foreign |= _misfit(fit) > STRANGE
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
     columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
