@@ -68,7 +68,7 @@ def scene(rng, stars=12):
     xy = rng.uniform([-150, -112], [150, 112], (stars, 2))
     w = directions(xy[None], np.array([made.focal_px]))[0] @ made.attitude
     xy = xy + rng.normal(0, SIGMA_PX, xy.shape)
-    return made.fitted(xy, w).fitted(xy, w), w, xy
+    return made.fitted(xy, w, np.full(stars, SIGMA_PX)), w, xy
 
 
 def evidence(pose, w, xy, star=None, rank=None, prior=None):

@@ -19,6 +19,7 @@ ROUNDS = 3
 # a star is within GATE_SIGMA of its place, and GATE_PX more
 LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 FAINTEST_FIT = 2000  # stars that take part
+FLOOR_PX = 0.05  # what a centroid's own error does not tell: the catalogue, the lens
 BLEND_PX = 2.5  # closer stars make one image
 
 
@@ -28,8 +29,8 @@ class Identification:
 
     star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): `Sky`'s directions
     into C; blend_px (M,): how far unresolved neighbours may draw each star's image; focal_scale: factor on the camera's
-    focal length; residual_px: rms of one axis; log_odds: `log_evidence` of it; mirrored: the frame's rows run
-    bottom-up, all of this holds for the frame flipped.
+    focal length; residual_px: rms of one axis, bright stars counting more as they do in the fit; log_odds:
+    `log_evidence` of it; mirrored: the frame's rows run bottom-up, all of this holds for the frame flipped.
     """
 
     star: np.ndarray
@@ -102,7 +103,7 @@ def identified(
         stars.blend_px[near],
         pose.attitude,
         pose.focal_px / field.focal_px,
-        float(np.sqrt(np.mean(residual * residual))),
+        _rms(residual, np.hypot(sigma[star], FLOOR_PX)),
         log_odds,
         pose.mirrored,
     )
@@ -115,7 +116,7 @@ def _settled(field: Field, xy, sigma, stars: OnFrame, pose: Pose, pair):
         if len(star) < FEWEST_STARS:
             return None
         w = stars.directions[near]
-        pose = _of_these(field.focal_px, pose.mirrored, xy[star], w)
+        pose = _of_these(field.focal_px, pose.mirrored, xy[star], w, np.hypot(sigma[star], FLOOR_PX))
         predicted = pose.project(stars.directions)
         residual = xy[star] - predicted[near]
         pair = mutual_nearest(xy, predicted, _gate(residual, sigma[: len(xy)]))
@@ -130,10 +131,16 @@ def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return GATE_SIGMA * np.hypot(max(1.4826 * float(middling), LEAST_SPREAD_PX), sigma) + GATE_PX
 
 
-def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray) -> Pose:
+def _rms(residual: np.ndarray, sigma_px: np.ndarray) -> float:
+    """Of one axis of residuals (M, 2), each weighted as in the fit."""
+    weight = 1 / np.square(sigma_px)
+    return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
+
+
+def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> Pose:
     """The pose of matched stars from them alone: to the last bit the same, from wherever the search came to them."""
     v = directions(xy[None], np.array([focal_px]))[0]
-    return Pose(rotation.best_rotation(w, v), focal_px, mirrored).fitted(xy, w, steps=2)
+    return Pose(rotation.best_rotation(w, v), focal_px, mirrored).fitted(xy, w, sigma_px)
 
 
 def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float):

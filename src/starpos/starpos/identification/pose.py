@@ -8,7 +8,7 @@ import numpy as np
 from starpos import rotation
 from starpos.camera import Camera
 
-SMALL_STEP = 3e-5  # rad
+STEPS, SMALL_STEP = 2, 3e-5  # of a fit; rad
 
 
 @dataclass(frozen=True)
@@ -70,22 +70,23 @@ class Pose:
         u = w @ self.attitude.T
         return u[:, :2] * (self.focal_px / np.maximum(u[:, 2:], 1e-6))
 
-    def fitted(self, xy: np.ndarray, w: np.ndarray, steps: int = 1) -> "Pose":
-        """Least squares for a small rotation and the focal length from pixels xy (N, 2) of directions w (N, 3)."""
-        pixel, slope = slopes(self, w)
-        j = slope.reshape(-1, 4)
-        residual = (xy - pixel).ravel()
-        try:
-            *turn, scale = np.linalg.solve(j.T @ j, j.T @ residual).tolist()
-        except np.linalg.LinAlgError:  # all stars in one place
-            return self
-        pose = Pose(rotation.from_vector(turn) @ self.attitude, self.focal_px * (1 + scale), self.mirrored)
-        # its error is the square of the step
-        return (
-            pose
-            if steps == 1 or max(map(abs, (*turn, scale))) < SMALL_STEP
-            else pose.fitted(xy, w, steps - 1)
-        )
+    def fitted(self, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> "Pose":
+        """Least squares for a small rotation and the focal length: pixels xy (N, 2), good to sigma_px (N,), of directions
+        w (N, 3)."""
+        pose, weight = self, 1 / sigma_px[:, None]
+        for _ in range(STEPS):
+            pixel, slope = slopes(pose, w)
+            j = (slope * weight[:, None]).reshape(-1, 4)
+            residual = ((xy - pixel) * weight).ravel()
+            try:
+                *turn, scale = np.linalg.solve(j.T @ j, j.T @ residual).tolist()
+            except np.linalg.LinAlgError:  # all stars in one place
+                break
+            turned = rotation.from_vector(turn) @ pose.attitude
+            pose = Pose(turned, pose.focal_px * (1 + scale), pose.mirrored)
+            if max(map(abs, (*turn, scale))) < SMALL_STEP:  # whose square is what is left
+                break
+        return pose
 
 
 def slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
