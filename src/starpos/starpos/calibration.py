@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammainccinv
 
 from starpos import rotation
 from starpos.budget import ALWAYS, ErrorTerm, heading_of
@@ -166,6 +165,8 @@ def _unknown(plumb: Plumb, sound: list[Solution]) -> Calibration:
 
 def _most_scatter(frames: int) -> float:
     """Chi-square a degree of freedom that sound frames may have; few may have more."""
+    from scipy.special import gammainccinv  # slow to import
+
     freedom = max(2 * frames - 5, 1)
     return max(MOST_SCATTER, 2 * float(gammainccinv(freedom / 2, 1e-9)) / freedom)
 

@@ -76,8 +76,9 @@ def best_rotation(source: np.ndarray, target: np.ndarray, weight: np.ndarray | N
 
 
 def to_quaternion(r: np.ndarray) -> np.ndarray:
-    """Unit quaternion (x, y, z, w) of a rotation matrix, w >= 0."""
-    from scipy.spatial.transform import Rotation
-
-    q = Rotation.from_matrix(r).as_quat()
+    """Unit quaternion (x, y, z, w) of a rotation matrix, w >= 0 (Bar-Itzhack 2000, J. Guid. Control Dyn. 23, 1085)."""
+    twist = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    trace = np.trace(r)
+    k = np.block([[r + r.T - trace * np.eye(3), twist[:, None]], [twist, trace]])
+    q = np.linalg.eigh(k)[1][:, 3]
     return q if q[3] >= 0 else -q

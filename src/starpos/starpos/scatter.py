@@ -7,6 +7,8 @@ import numpy as np
 
 OUTLIER_SIGMA = 5.0
 GRID, GRID_LEAST, GRID_MOST = 128, 1e-3, 1e2  # of variances, in units of the stated and of all residuals
+# of the search for one: parts of the largest, points of a grid, grids; to 1e-3
+LEAST_EXTRA, COARSE, ROUNDS = 1e-12, 24, 4
 MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
 
 
@@ -20,9 +22,9 @@ def judged(
     """
     # by the median, else an outlier among a dozen stars would widen the gate enough to pass itself
     typical = _extra_variance(
-        residual[keep], covariance[keep], lambda d2: np.median(d2) / MEDIAN_OF_CHI2 - share
+        residual[keep], covariance[keep], lambda d2: np.median(d2, axis=-1) / MEDIAN_OF_CHI2 - share
     )
-    extra = _extra_variance(residual[keep], covariance[keep], lambda d2: d2.mean() / 2 - share)
+    extra = _extra_variance(residual[keep], covariance[keep], lambda d2: d2.mean(-1) / 2 - share)
     return extra, distance2(residual, covariance, typical) < OUTLIER_SIGMA**2
 
 
@@ -56,14 +58,18 @@ def _widened(covariance: np.ndarray, extra: float | np.ndarray) -> tuple[np.ndar
 
 
 def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callable) -> float:
-    """The isotropic variance (px2) at which excess(squared distances) is 0; 0 where it never is above."""
+    """The isotropic variance (px2) at which excess(squared distances (..., N)) is 0; 0 where it never is above.
 
-    def above(extra):
-        return excess(distance2(residual, covariance, extra))
-
-    if above(0.0) <= 0:
+    By grids, each between two points of the one before: scipy.optimize takes longer to import than a node to start.
+    """
+    if excess(distance2(residual, covariance)) <= 0:
         return 0.0
-    high = 8 * np.sum(residual**2) + 1e-12
-    from scipy.optimize import brentq  # slow to import: only where stars are fitted
-
-    return float(brentq(above, 0.0, high, xtol=1e-12, rtol=1e-3)) if above(high) < 0 else float(high)
+    high = 8 * float(np.sum(residual**2)) + 1e-12
+    low = LEAST_EXTRA * high
+    for _ in range(ROUNDS):
+        extra = np.geomspace(low, high, COARSE)
+        below = np.flatnonzero(excess(distance2(residual, covariance, extra[:, None])) < 0)
+        if not len(below):
+            return high
+        low, high = extra[max(below[0] - 1, 0)], extra[below[0]]
+    return float(np.sqrt(low * high))

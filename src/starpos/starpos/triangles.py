@@ -20,7 +20,6 @@ from math import comb
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from starpos.catalogue import Catalogue
 from starpos.progress import Progress, quiet
@@ -141,6 +140,8 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
 
     A circle takes its own brightest stars, however bright its neighbours are, so that every part of the sky has enough.
     """
+    from scipy.spatial import cKDTree  # slow to import, and mostly the cache has all
+
     by_light = np.argsort(catalogue.vmag_centi, kind="stable")
     smallest_circle = min(radius for radius, _, _ in CIRCLES) * half_diagonal
     circles = 4 / smallest_circle**2  # that make up a sphere
@@ -173,6 +174,8 @@ def _apart(v: np.ndarray, nearest: float) -> np.ndarray:
 
     Close groups, which make no triangles among themselves, would take the places of a circle.
     """
+    from scipy.spatial import cKDTree
+
     pair = cKDTree(v).query_pairs(2 * np.sin(nearest / 2), output_type="ndarray")
     alone = np.ones(len(v), bool)
     alone[pair.max(1, initial=0)] = False
@@ -188,8 +191,8 @@ def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
     return [(radius, spacing, n) for (radius, spacing, _), n in zip(CIRCLES, taken, strict=True)]
 
 
-def _triples_of_circles(tree: cKDTree, radius: float, spacing: float, most: int) -> np.ndarray:
-    """Keys of all triples among the `most` first rows of the tree in each circle; a key is (a n + b) n + c, a < b < c."""
+def _triples_of_circles(tree, radius: float, spacing: float, most: int) -> np.ndarray:
+    """Keys of all triples among the `most` first rows of the cKDTree in each circle: (a n + b) n + c, a < b < c."""
     centres = _spread(_circles(radius, spacing))
     n, chord = tree.n, 2 * np.sin(radius / 2)
     found = []

@@ -2,7 +2,6 @@
 """Points of a frame that lie close to each other."""
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 SMALL_TABLE = 20_000  # points times others
 
@@ -33,6 +32,8 @@ def mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
         nearest, back = apart2.argmin(1), apart2.argmin(0)
         distance = np.sqrt(apart2[np.arange(len(xy)), nearest])
     else:
+        from scipy.spatial import cKDTree  # slow to import, and seldom needed
+
         distance, nearest = cKDTree(predicted).query(xy)
         back = cKDTree(xy).query(predicted)[1]
     good = (distance < radius) & (back[nearest] == np.arange(len(xy)))
