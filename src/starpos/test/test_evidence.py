@@ -3,13 +3,13 @@
 
 import numpy as np
 import pytest
-from test_identification import random_attitude, sky_for
+from test_identification import random_attitude, seen, sky_for
 
 from starpos import rotation
 from starpos.camera import Camera
-from starpos.identification import Plumb, Pointing, full, identify
+from starpos.identification import Plumb, Pointing, full, identify, identify_directions, search
 from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, Prior, anywhere, log_evidence
-from starpos.identification.pose import Pose, directions, slopes
+from starpos.identification.pose import Field, Pose, directions, slopes
 from starpos.montecarlo import Conditions, draw
 
 # so few pixels that chance has a chance
@@ -115,10 +115,24 @@ def test_a_false_star_costs_and_a_crowd_of_them_costs_little_more(rng):
 
 
 def test_a_detection_upon_another_says_nothing(rng):
+    """Neither as a false star nor as the neighbour that the catalogue has there."""
     pose, w, xy = scene(rng, 6)
     beside = xy[0] + DOUBLE_PX * np.array([0.6, 0.0])
-    doubled = evidence(pose, w, np.insert(xy, 1, beside, 0), star=np.r_[0, 2:7])
-    assert evidence(pose, w, xy) - 3 < doubled < evidence(pose, w, xy)
+    alone, seen = evidence(pose, w, xy), np.insert(xy, 1, beside, 0)
+    assert alone - 3 < evidence(pose, w, seen, star=np.r_[0, 2:7]) < alone
+    neighbour = directions(beside[None, None], np.array([pose.focal_px]))[0] @ pose.attitude
+    assert alone - 3 < evidence(pose, np.insert(w, 1, neighbour, 0), seen) < alone + 3
+
+
+def test_the_priors_share_half_of_the_probability(catalogue, rng):
+    sky, attitude = sky_for(catalogue, SMALL), random_attitude(rng)
+    field = Field.of(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL)
+    priors = Pointing(attitude, SMALL.fx), Plumb(attitude[2], np.eye(3)[2], 1e-3)
+    expected = Pose(attitude, SMALL.fx, False)
+    tried = {id(prior): prior for _, _, prior in search._attempts(field, sky, priors)}
+    *led, lost = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
+    assert sorted(led) == pytest.approx([1 / 8, 1 / 8, 1 / 4])
+    assert lost < 1 / 2
 
 
 def test_a_pose_that_the_prior_excludes_is_worth_nothing(rng):
@@ -128,6 +142,67 @@ def test_a_pose_that_the_prior_excludes_is_worth_nothing(rng):
     assert evidence(pose, w, xy, prior=anywhere(2000.0 * 1.05)) == -np.inf
     nominal, off = (evidence(pose, w, xy, prior=anywhere(f)) for f in (2000.0, 2000.0 * 1.02))
     assert off < nominal < off + 4
+
+
+def integral(prior, made, zenith, reach_rad, rng):
+    """Of a prior over the poses that have zenith (3,) within reach_rad of where `made` has it, in any roll about it."""
+    total, poses = 0.0, 6000
+    across = np.cross(zenith, made.attitude[np.argmin(np.abs(made.attitude @ zenith))])
+    across /= np.linalg.norm(across)
+    for k, (height, azimuth, roll) in enumerate(rng.random((poses, 3))):
+        off = 2 * np.arcsin(np.sqrt(height) * np.sin(reach_rad / 2))
+        tip = rotation.from_vector(off * rotation.from_vector(2 * np.pi * azimuth * zenith) @ across)
+        attitude = made.attitude @ tip @ rotation.from_vector(2 * np.pi * roll * zenith)
+        total += np.exp(
+            prior.log_density(Pose(attitude, made.focal_px * np.exp(0.2 * (k + 0.5) / poses - 0.1), False))
+        )
+    return total / poses * 4 * np.pi * np.sin(reach_rad / 2) ** 2 * 2 * np.pi * 0.2
+
+
+def test_a_prior_is_a_probability(rng):
+    """The density of each over all poses makes its share, and its widths leave room for no more."""
+    field = Field.of(np.zeros((0, 2)), np.zeros(0), SMALL)
+    made = Pose(random_attitude(rng), SMALL.fx, False)
+    zenith = random_attitude(rng)[2]
+    plumb = Plumb(zenith, made.attitude @ zenith, 0.01)._known(field, 0.0)
+    pointing = Pointing(made.attitude, SMALL.fx)._known(field, 300.0, 0.0)
+    lost = anywhere(SMALL.fx)
+    assert integral(plumb, made, zenith, 0.03, rng) == pytest.approx(1, abs=0.15)
+    assert integral(lost, made, zenith, np.pi, rng) == pytest.approx(0.9, abs=0.05)
+    box = 1.5 * pointing.width
+    inside = [
+        pointing.log_density(
+            Pose(rotation.from_vector(d[:3]) @ made.attitude, SMALL.fx * np.exp(d[3]), False)
+        )
+        for d in (rng.random((4000, 4)) - 0.5) * box
+    ]
+    assert np.mean(np.exp(inside)) * box.prod() == pytest.approx(1, abs=0.15)
+    for prior in (plumb, pointing, lost):
+        assert np.exp(prior.log_density(made)) * prior.width.prod() <= 1.1
+
+
+def test_errors_of_nothing_are_no_certainty(catalogue, rng):
+    sky = sky_for(catalogue, SMALL)
+    for sigma_px in (0.0, 1e-200):
+        for _ in range(5):
+            assert identify(rng.uniform(0, [299, 224], (20, 2)), np.full(20, sigma_px), SMALL, sky) is None
+        xy, _ = seen(sky, SMALL, random_attitude(rng), 8.0, rng, sigma=0.02)
+        assert identify(xy, np.full(len(xy), sigma_px), SMALL, sky) is not None
+
+
+def test_what_is_no_number_is_not_accepted(catalogue, rng, monkeypatch):
+    monkeypatch.setattr(full, "log_evidence", lambda *_: np.nan)
+    sky = sky_for(catalogue, SMALL)
+    assert identify(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL, sky) is None
+
+
+def test_what_lies_beyond_the_frame_does_not_make_chance_rarer(catalogue, rng, monkeypatch):
+    seen = set()
+    monkeypatch.setattr(full, "log_evidence", lambda xy, sigma, area_px2, *_: seen.add(area_px2) or -np.inf)
+    xy = rng.uniform(0, [299, 224], (20, 2))
+    xy[3] = -40.0, 100.0  # as a lens that draws in does
+    identify_directions(SMALL.directions(*xy.T), np.full(20, SIGMA_PX), SMALL, sky_for(catalogue, SMALL))
+    assert seen == {AREA_PX2}
 
 
 def test_more_evidence_than_the_prior_leaves_room_for_is_not_claimed(rng):

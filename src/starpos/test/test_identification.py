@@ -7,7 +7,7 @@ from scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos import triangles
 from starpos.camera import Camera
-from starpos.identification import Sky, identify, search
+from starpos.identification import Sky, identify, identify_directions, search
 from starpos.identification.lookup import LOOSE_PX
 
 FIELDS = {
@@ -176,6 +176,21 @@ def test_aberration_of_the_date(catalogue, rng):
     bent = sky.catalogue.directions(np.array([5]), 2026.8)[0]
     np.testing.assert_allclose(sky.unaberrated(sky.directions(np.array([5])))[0], bent, atol=1e-8)
     assert np.linalg.norm(sky.unaberrated(v[None])) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_refused(value, catalogue, rng):
+    camera, _ = FIELDS["15 deg"]
+    sky, xy, sigma = sky_for(catalogue, camera), rng.uniform(0, 600, (12, 2)), np.full(12, 0.05)
+    for broken in (xy, sigma):
+        kept, broken[3] = broken[3].copy(), value
+        with pytest.raises(ValueError, match="finite"):
+            identify(xy, sigma, camera, sky)
+        broken[3] = kept
+    v = camera.directions(*xy.T)
+    v[3] = value
+    with pytest.raises(ValueError, match="finite"), np.errstate(invalid="ignore"):
+        identify_directions(v, sigma, camera, sky)
 
 
 DEGENERATE = {

@@ -64,7 +64,17 @@ def test_a_prior_gives_the_same_answer_as_none(field):
 
 
 @pytest.mark.parametrize(
-    "kind", ["elsewhere", "beside", "rolled", "behind", "another zenith", "no star there"]
+    "kind",
+    [
+        "elsewhere",
+        "beside",
+        "rolled",
+        "behind",
+        "a speck of sky",
+        "a drop",
+        "another zenith",
+        "no star there",
+    ],
 )
 def test_a_wrong_prior_falls_back_to_the_whole_sky(field, rng, kind):
     sky, camera, attitude, xy, sigma, index = field
@@ -73,10 +83,35 @@ def test_a_wrong_prior_falls_back_to_the_whole_sky(field, rng, kind):
         "beside": Pointing(turned(attitude, rng, 0.05), camera.fx),
         "rolled": Pointing(rotation.about_axis(2, 0.3) @ attitude, camera.fx),
         "behind": Pointing(np.diag([1.0, -1.0, -1.0]) @ attitude, camera.fx),
+        "a speck of sky": Pointing(attitude, 1e300),
+        "a drop": Pointing(attitude, 1e-300),
         "another zenith": Plumb(random_attitude(rng)[2], np.array([0.0, 0.6, 0.8]), 90 * ARCSEC),
         "no star there": Plumb(random_attitude(rng)[2], np.array([0.0, 0.0, 1.0]), 1e-9),
     }[kind]
     check(identify(xy, sigma, camera, sky, [wrong, wrong]), attitude, index, camera, sky)
+
+
+def test_what_is_no_rotation_is_no_prior():
+    one = np.eye(3)
+    for wrong in (0 * one, -one, np.nan * one, 1e200 * one, np.ones((3, 3)) / 3**0.5):
+        with pytest.raises(ValueError, match="rotation"):
+            Pointing(wrong, 1000.0)
+
+
+@pytest.mark.parametrize("focal_px", [0.0, -1.0, np.nan, np.inf])
+def test_what_is_no_focal_length_is_no_prior(focal_px):
+    with pytest.raises(ValueError, match="focal length"):
+        Pointing(np.eye(3), focal_px)
+
+
+def test_what_is_no_zenith_is_no_prior():
+    up, down = np.eye(3)[2], -np.eye(3)[2]
+    for zeniths in ((0 * up, up), (up, 2 * up), (np.nan * up, up), (up, 1e200 * up)):
+        with pytest.raises(ValueError, match="unit vectors"):
+            Plumb(*zeniths, 1e-3)
+    for tolerance_rad in (-1e-3, 0.2, np.nan, np.inf):
+        with pytest.raises(ValueError, match="tolerance"):
+            Plumb(up, down, tolerance_rad)
 
 
 def test_with_a_prior_four_stars_are_enough(field):

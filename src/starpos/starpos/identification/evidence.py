@@ -23,7 +23,8 @@ ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0
 SCALE_TOLERANCE = 0.03  # of the focal length
 SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)  # how far off its logarithm may be, and how often
 MIRRORED = 0.1  # of all frames
-SPREAD = np.array([np.pi, np.pi, np.pi, SCALE_TOLERANCE])
+# of all rotations, about each axis; of the likeliest focal lengths
+WIDTH = np.append(np.full(3, np.cbrt(8 * np.pi**2)), 2 * SCALES[0][0])
 TEST_STARS = 50  # the brightest of a frame, which decide
 EARLIER = np.tri(TEST_STARS, k=-1, dtype=bool)
 DOUBLE_PX = 3.0  # detections this close may be one star, and then say nothing new
@@ -32,15 +33,16 @@ DOUBLE_PX = 3.0  # detections this close may be one star, and then say nothing n
 @dataclass(frozen=True)
 class Prior:
     """What is known of the pose: log_density of one, per rad3 of rotation and unit of the focal length's logarithm, -inf
-    where it cannot be; spread (4,): what a frame that tells less leaves open, rad about C's axes and of that logarithm.
+    where it cannot be; width (4,): of where it can, rad about C's axes and of that logarithm, so that a frame that tells
+    less is given no more poses than there are.
     """
 
     log_density: Callable[[Pose], float]
-    spread: np.ndarray
+    width: np.ndarray
 
     @property
     def information(self) -> np.ndarray:
-        return np.diag(1 / self.spread**2)
+        return np.diag(2 * np.pi / self.width**2)
 
 
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
@@ -52,7 +54,7 @@ def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
         parity = MIRRORED if pose.mirrored else 1 - MIRRORED
         return log_share + math.log(parity * density / (8 * math.pi**2)) if density else -math.inf
 
-    return Prior(log_density, SPREAD)
+    return Prior(log_density, WIDTH)
 
 
 def log_evidence(

@@ -53,9 +53,9 @@ class OnFrame:
     blend_px: np.ndarray
 
     @classmethod
-    def of(cls, field: Field, sky: Sky, pose: Pose) -> "OnFrame":
-        """As many as the field's stars may be."""
-        catalogue, stars = sky.catalogue, min(len(field), FAINTEST_FIT)
+    def of(cls, field: Field, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
+        """As many as the brightest of the field's detections may be."""
+        catalogue, stars = sky.catalogue, min(len(field), most_detections)
         axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
         index = rows_near(catalogue.cell_start, axis, field.radius_rad)
         light = catalogue.vmag_centi[index]
@@ -80,7 +80,7 @@ def identified(
     None where these are not beyond doubt the stars they were taken for.
     """
     xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
-    stars = OnFrame.of(field, sky, near_pose)
+    stars = OnFrame.of(field, sky, near_pose, TEST_STARS)
     pair = mutual_nearest(xy[:TEST_STARS], near_pose.project(stars.directions), radius_px[:TEST_STARS])
     match = _settled(field, xy[:TEST_STARS], sigma, stars, near_pose, pair)
     if match is None:
@@ -89,9 +89,10 @@ def identified(
     log_odds = log_evidence(
         xy[:TEST_STARS], sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
     )
-    if log_odds < ENOUGH:
+    if not log_odds >= ENOUGH:  # nor where it is no number
         return None
     if len(xy) > TEST_STARS:
+        stars = OnFrame.of(field, sky, pose, FAINTEST_FIT)
         pair = mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
         match = _settled(field, xy, sigma, stars, pose, pair)
         if match is None:

@@ -27,6 +27,8 @@ def close_pairs(xy: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray
 
 def mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
+    if not (len(xy) and len(predicted)):
+        return np.zeros(0, int), np.zeros(0, int)
     if len(xy) * len(predicted) < SMALL_TABLE:  # all distances at once are quicker than two trees
         apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
         nearest, back = apart2.argmin(1), apart2.argmin(0)

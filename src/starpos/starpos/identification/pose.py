@@ -9,6 +9,7 @@ from starpos import rotation
 from starpos.camera import Camera
 
 STEPS, SMALL_STEP = 2, 3e-5  # of a fit; rad
+LEAST_SIGMA_PX = 1e-3  # no centroid is better, whatever is said
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,8 @@ class Field:
     """A frame's stars, brightest first.
 
     xy (2, N, 2): px from the principal point, as they are and with the frame's rows flipped; sigma (N,): their errors;
-    middle (2,): the frame's centre; half (2,): half its size; focal_px: as the camera is believed to be.
+    middle (2,): the frame's centre; half (2,): half its size; focal_px: as the camera is believed to be; area_px2: of
+    where detections are by chance, never too large.
     """
 
     xy: np.ndarray
@@ -24,26 +26,33 @@ class Field:
     middle: np.ndarray
     half: np.ndarray
     focal_px: float
+    area_px2: float
 
     @classmethod
-    def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera) -> "Field":
-        """From pixels (N, 2) of an ideal camera."""
+    def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera, margin_px: int = 0) -> "Field":
+        """From pixels (N, 2) of an ideal camera, whose frame has margins that few detections lie on.
+
+        ValueError where a pixel or an error is no finite number.
+        """
+        if not (np.isfinite(xy).all() and np.isfinite(sigma).all()):
+            raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
         principal = np.array([camera.cx, camera.cy])
         flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
         return cls(
             np.stack([xy, flipped]) - principal,
-            sigma,
+            np.maximum(sigma, LEAST_SIGMA_PX),
             np.array(camera.centre_px) - principal,
             np.array([camera.width, camera.height]) / 2,
             camera.fx,
+            float((camera.width - 2 * margin_px) * (camera.height - 2 * margin_px)),
         )
 
     def __len__(self) -> int:
         return len(self.sigma)
 
     @property
-    def area_px2(self) -> float:
-        """Of the frame."""
+    def whole_px2(self) -> float:
+        """Of the frame, and of its margins."""
         return float(4 * self.half[0] * self.half[1])
 
     @property
@@ -82,9 +91,12 @@ class Pose:
                 *turn, scale = np.linalg.solve(j.T @ j, j.T @ residual).tolist()
             except np.linalg.LinAlgError:  # all stars in one place
                 break
+            step = max(map(abs, (*turn, scale)))
+            if not step < 1:  # nor where it is no number
+                break
             turned = rotation.from_vector(turn) @ pose.attitude
             pose = Pose(turned, pose.focal_px * (1 + scale), pose.mirrored)
-            if max(map(abs, (*turn, scale))) < SMALL_STEP:  # whose square is what is left
+            if step < SMALL_STEP:  # whose square is what is left
                 break
         return pose
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.identification.evidence import SCALE_TOLERANCE, SPREAD, Prior
+from starpos.identification.evidence import SCALE_TOLERANCE, TEST_STARS, Prior
 from starpos.identification.full import OnFrame
 from starpos.identification.pose import Field, Pose, directions
 from starpos.identification.screen import MATCH_SIGMA
@@ -21,6 +21,8 @@ REACH = 0.05  # of the frame's width: how far the stars may have moved
 AGREE_PX = 3.0  # votes for the same shift
 MOST = 4  # proposals of a kind
 RING_STARS = 8  # of the frame that vote for an azimuth
+WIDEST_RAD = 0.1  # a zenith known worse says nothing of where to look
+EXACT = 1e-6  # to which rotations and unit vectors are such
 J2000_RAD = 2.5e-4  # aberration and most proper motions, which the beacons lack
 STANDS, WAS_MOVED = np.log(0.5), np.log(0.5)  # of the probability
 
@@ -36,8 +38,11 @@ class Pointing:
     focal_px: float
 
     def __post_init__(self):
-        if not (np.isfinite(self.attitude).all() and 0 < self.focal_px < np.inf):
-            raise ValueError("a Pointing needs a finite attitude and a positive focal length")
+        a = self.attitude
+        if not (_unit(a) and np.abs(a @ a.T - np.eye(3)).max() < EXACT and np.linalg.det(a) > 0):
+            raise ValueError("a Pointing's attitude must be a rotation (3, 3)")
+        if not 0 < self.focal_px < np.inf:
+            raise ValueError("a Pointing's focal length must be positive and finite")
 
     def attempts(self, field: Field, sky: Sky, log_share: float) -> Iterator[Attempt]:
         """That nothing has moved; then the shifts that most stars agree on."""
@@ -47,7 +52,7 @@ class Pointing:
         reach_px = 2 * REACH * field.half[0]
         prior = self._known(field, reach_px + STILL_PX, log_share + WAS_MOVED)
         xy = field.xy[0, :BRIGHTEST]
-        shift = xy[:, None] - pose.project(OnFrame.of(field, sky, pose).directions)
+        shift = xy[:, None] - pose.project(OnFrame.of(field, sky, pose, TEST_STARS).directions)
         shift = shift[np.square(shift).sum(-1) < reach_px**2]
         for k in _most_voted(np.square(shift[:, None] - shift).sum(-1) < AGREE_PX**2):
             # a shift along x is a turn about the camera's y axis, one along y about its x axis
@@ -66,7 +71,7 @@ class Pointing:
             off = np.append(moved, np.log(pose.focal_px / self.focal_px))
             return log_density if (np.abs(off) < most).all() and not pose.mirrored else -math.inf
 
-        return Prior(density, most)
+        return Prior(density, 2 * most)
 
 
 @dataclass(frozen=True)
@@ -79,8 +84,10 @@ class Plumb:
     tolerance_rad: float
 
     def __post_init__(self):
-        if not np.isfinite([*self.zenith_sky, *self.zenith_camera, self.tolerance_rad]).all():
-            raise ValueError("a Plumb needs finite directions and a finite tolerance")
+        if not (_unit(self.zenith_sky) and _unit(self.zenith_camera)):
+            raise ValueError("a Plumb's zeniths must be unit vectors (3,)")
+        if not 0 <= self.tolerance_rad <= WIDEST_RAD:
+            raise ValueError(f"a Plumb's tolerance must be from 0 to {WIDEST_RAD:g} rad")
 
     def attempts(self, field: Field, sky: Sky, log_share: float) -> Iterator[Attempt]:
         """`Pointing`s to the azimuths at which most stars are as far from the zenith as the catalogue's."""
@@ -112,15 +119,21 @@ class Plumb:
     def _known(self, field: Field, log_share: float) -> Prior:
         """Poses that have the zenith near where it should be, at any azimuth."""
         reach = self.tolerance_rad + J2000_RAD + 2 * REACH * field.half[0] / field.focal_px
-
-        poses = np.pi * reach**2 * 2 * np.pi * 2 * SCALE_TOLERANCE
-        log_density = log_share - float(np.log(poses))
+        rotations = np.pi * reach**2 * 2 * np.pi
+        log_density = log_share - float(np.log(rotations * 2 * SCALE_TOLERANCE))
 
         def density(pose: Pose) -> float:
             off = np.linalg.norm(pose.attitude @ self.zenith_sky - self.zenith_camera)
-            return log_density if off < reach and not pose.mirrored else -math.inf
+            scale = abs(np.log(pose.focal_px / field.focal_px))
+            possible = off < reach and scale < SCALE_TOLERANCE and not pose.mirrored
+            return log_density if possible else -math.inf
 
-        return Prior(density, SPREAD)
+        return Prior(density, np.append(np.full(3, np.cbrt(rotations)), 2 * SCALE_TOLERANCE))
+
+
+def _unit(v: np.ndarray) -> bool:
+    """Whether v (..., 3) are unit vectors."""
+    return bool((np.abs(v) < 2).all() and (np.abs(np.square(v).sum(-1) - 1) < EXACT).all())
 
 
 def _frame_about(pole: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ def promising(field: Field, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: 
     mutual = apart2.argmin(1)[each, nearest] == n
     variance = sigma_px * sigma_px
     distance2 = apart2[each, n, nearest] / variance
-    by_chance = 2 * np.pi * variance * np.maximum(count, 1)[:, None] / field.area_px2
+    by_chance = 2 * np.pi * variance * np.maximum(count, 1)[:, None] / field.whole_px2
     odds = np.where(mutual & (distance2 < MATCH_SIGMA**2), -0.5 * distance2 - np.log(by_chance), LOG_FALSE)
     # what a pose was made from does not speak for it
     odds[each, star] = 0.0

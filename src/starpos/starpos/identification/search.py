@@ -33,15 +33,9 @@ def identify(
     """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction taken off).
 
     sigma_px (N,): their errors, one axis.  The focal length may be off by SCALE_TOLERANCE.  Priors only say where to look
-    first.  None: no part of the sky is these stars beyond doubt.
+    first.  None: no part of the sky is these stars beyond doubt.  ValueError where a pixel or an error is no number.
     """
-    if len(xy) < FEWEST_STARS:
-        return None
-    field = Field.of(xy, sigma_px, camera)
-    for pose, radius_px, prior in _attempts(field, sky, priors):
-        if found := identified(field, sky, pose, radius_px, prior):
-            return found
-    return None
+    return _identify(Field.of(xy, sigma_px, camera), sky, priors)
 
 
 def identify_directions(
@@ -59,9 +53,19 @@ def identify_directions(
     xy = Camera(width, height, camera.fx, camera.fx, cx, cy).project(directions)
     # what a lens has drawn in from the sides lies beyond them without its distortion, and so do the catalogue's stars
     beyond = float(np.maximum(-xy, xy - (width - 1, height - 1)).max(initial=0.0))
-    margin = math.ceil(min(max(beyond - EDGE_PX, 0.0), WIDEST_MARGIN * max(width, height)))
+    widest = WIDEST_MARGIN * max(width, height)
+    margin = math.ceil(min(beyond - EDGE_PX, widest)) if beyond > EDGE_PX else 0
     ideal = Camera(width + 2 * margin, height + 2 * margin, camera.fx, camera.fx, cx + margin, cy + margin)
-    return identify(xy + margin, sigma_px, ideal, sky, priors)
+    return _identify(Field.of(xy + margin, sigma_px, ideal, margin), sky, priors)
+
+
+def _identify(field: Field, sky: Sky, priors) -> Identification | None:
+    if len(field) < FEWEST_STARS:
+        return None
+    for pose, radius_px, prior in _attempts(field, sky, priors):
+        if found := identified(field, sky, pose, radius_px, prior):
+            return found
+    return None
 
 
 def _attempts(field: Field, sky: Sky, priors) -> Iterator[Attempt]:
