@@ -3,7 +3,7 @@
 
 import numpy as np
 
-SMALL_TABLE = 20_000  # points times others
+SMALL_TABLE = 100_000  # points times others
 
 
 def close_pairs(xy: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
