@@ -4,10 +4,10 @@
 By chance they are random points anywhere on the frame.  If the frame shows the sky, each next detection, from the
 brightest down, is either a false star, as often as those before it (a rule of succession, from two right and one wrong),
 or the j-th brightest of the catalogue's stars not yet seen, with probability 1 / ((j + 1) (j + 2)), at its place to its
-error.  The ratio of the two probabilities, averaged over all poses that could be, has a mean of 1 under chance: it exceeds
-x at most once in x frames of random points, at whatever detection one stops (Ville's inequality) and however a pose was
-come by.  What the surroundings of one pose contribute to it is less than all of it; Laplace's method takes it to a factor
-of some, which the poses left out exceed by far: of random points the ratio exceeds 1 in one frame of a hundred.
+error.  The ratio of the two probabilities, averaged over all poses that could be, has a mean of 1 under chance: it
+exceeds x at most once in x frames of random points, at whatever detection one stops (Ville's inequality) and however a
+pose was come by.  What the surroundings of one pose contribute to it is less than all of it; Laplace's method takes it to
+a factor of some, which the poses left out exceed by far: of random points the ratio exceeds 1 in one frame of a hundred.
 """
 
 import math
