@@ -10,7 +10,9 @@ from starpos.detection.psf import MONOMIALS, Psf, power
 PLACES = 12  # stars at least that may tell the field's corners apart
 SIGNIFICANT = 4.0  # F of widths that go with the field against the same everywhere
 LIKELY = 0.3  # 1 sigma of a coefficient of which no star tells
-WORTH = 2.0  # by how much each further coefficient must lower chi-square: Akaike's
+# By how much each further coefficient must lower chi-square: Akaike's price, and twice that for those which move all
+# stars of a frame, or of a part of it, by as much as they err
+WORTH, DEAR = 2.0, 4.0
 COMA = 3  # order of the odd terms
 FIELD_ORDER = 4  # of the even terms that may go with the field
 
@@ -46,10 +48,12 @@ class Terms:
 
     orders      (T, 2): (i, j) of each, without the (0, 0) that all have
     candidates  (C, T, K) bool: coefficients of the terms in the field's monomials, each set tried besides the best before
+    price       (T, K): what each coefficient must be worth
     """
 
     orders: np.ndarray
     candidates: np.ndarray
+    price: np.ndarray
 
 
 def even_terms(psf, highest) -> Terms:
@@ -57,7 +61,9 @@ def even_terms(psf, highest) -> Terms:
     grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
     orders = np.array([term for term in grid if 0 < _rank(psf, *term) <= highest])
     steps = np.arange(2, highest + 1, 2)
-    return Terms(orders, (_rank(psf, *orders.T) <= steps[:, None])[..., None])
+    return Terms(
+        orders, (_rank(psf, *orders.T) <= steps[:, None])[..., None], np.full((len(orders), 1), WORTH)
+    )
 
 
 def all_terms(psf, highest, count) -> Terms:
@@ -71,7 +77,7 @@ def all_terms(psf, highest, count) -> Terms:
     shape = (_rank(psf, *orders.T) <= FIELD_ORDER) & ~width & ~coma
     everywhere = [terms[:, None] & first for terms in (*steps, coma)]
     field = [terms[:, None] & ~first for terms in (width, coma, shape)] if len(first) > 1 else []
-    return Terms(orders, np.array(everywhere + field))
+    return Terms(orders, np.array(everywhere + field), np.where(coma[:, None] | ~first, DEAR, WORTH))
 
 
 def _rank(psf, i, j):
@@ -87,14 +93,15 @@ def refine(psf, x, y, dx, dy, brightness, weight, terms) -> Psf:
     dx, dy      (N, S, S) px, broadcastable: offsets of S x S pixels from their stars' centres
     brightness  (N, S, S): those pixels over their stars' fluxes
     weight      (N, S, S): inverse variances of brightness; 0: not used
-    terms       Terms, of which as many are taken as Akaike's criterion finds worth their number
+    terms       Terms, of which as many are taken as are worth their price
     """
     normal, right = _marginal(psf.at(x, y), dx, dy, brightness, weight, terms.orders)
     count, places = terms.candidates.shape[1:]
     field = psf.monomials(x, y)[:, :places]
     normal = np.einsum("nab,nk,nl->akbl", normal, field, field, optimize=True).reshape(count * places, -1)
     right = np.einsum("na,nk->ak", right, field).ravel()
-    found = _chosen(normal + np.eye(len(right)) / LIKELY**2, right, terms.candidates.reshape(-1, len(right)))
+    candidates = terms.candidates.reshape(-1, len(right))
+    found = _chosen(normal + np.eye(len(right)) / LIKELY**2, right, candidates, terms.price.ravel())
     if not np.all(np.isfinite(found)):
         return psf
     found = found.reshape(count, places)
@@ -126,13 +133,13 @@ def _marginal(local, dx, dy, brightness, weight, orders):
     return normal, right[:, :count] - np.einsum("ntk,nk->nt", share, right[:, count:])
 
 
-def _chosen(normal, right, candidates):
-    """The coefficients with which chi-square and Akaike's price are lowest; 0 where not worth it."""
+def _chosen(normal, right, candidates, price):
+    """The coefficients with which chi-square and their price are lowest; 0 where not worth it."""
     found, taken, most = np.zeros(len(right)), np.zeros(len(right), bool), 0.0
     for candidate in candidates:
         index = np.flatnonzero(taken | candidate)
         solution = np.linalg.solve(normal[np.ix_(index, index)], right[index])
-        gain = right[index] @ solution - WORTH * len(index)
+        gain = right[index] @ solution - price[index].sum()
         if gain > most:
             most, taken = gain, taken | candidate
             found = np.zeros(len(right))
