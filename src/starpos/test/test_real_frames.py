@@ -14,7 +14,7 @@ from starpos.solve import Solver, Status
 
 # Where ours, of 87, 63, 103 and 7 stars, is above theirs, of 19, 8, 10 and 3 stars after a fit of six parameters
 LARGER_RMS_PX = {"2019-07-29T204726_Alt40_Azi-135_Try1.tiff": 0.130, "2019-07-29T204726_Alt40_Azi-45_Try1.tiff": 0.125,
-                 "2019-07-29T204726_Alt60_Azi-135_Try1.tiff": 0.140, "img0.png": 0.18}  # fmt: skip
+                 "2019-07-29T204726_Alt60_Azi-135_Try1.tiff": 0.140, "img0.png": 0.20}  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=["openstartracker", "tetra3", "panoptes"])
