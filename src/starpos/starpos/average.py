@@ -101,7 +101,7 @@ class _Track:
     def add(self, f: Fix, pose: Fix) -> "_Track | None":
         """With one more fix of a pose; None where it is too far off."""
         running, sigmas = self.running.add(f, pose)
-        if sigmas > GATE_SIGMA:
+        if sigmas > GATE_SIGMA or not running.straight_from(self.running):
             return None
         n = self.frames + 1
         mean = self.mean_unix_s + (f.utc_unix_s - self.mean_unix_s) / n

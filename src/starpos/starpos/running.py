@@ -18,6 +18,8 @@ from starpos.rotation import full_turn, half_turn
 
 UNIT = np.array([1.0, 1.0, 1e-6])  # m and rad, brought to like sizes
 HUBER_SIGMA = 4.0  # a fix further off pulls no harder
+MOST_BENT = 0.2  # of the claim: by how much a step of the place may leave the plane
+STEEPEST = 30.0  # tangent of the latitude from which on parallels count as bent no more
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,19 @@ class Running:
         sources = kept @ now.sources @ kept.T + brought @ noise @ brought.T
         sources = (sources + sources.swapaxes(1, 2)) / 2
         return replace(now, state=state, sources=sources, known=np.ones(3, bool)), sigmas
+
+    def straight_from(self, before: "Running") -> bool:
+        """Whether the way from an earlier place to this one is as straight as this one's claim takes it for.
+
+        A clock's error goes along the parallel, which leaves the plane with the square of the way: 20 m in 16 km.
+        """
+        if not before.known[:2].all():
+            return True
+        step = self.state[:2] - before.state[:2]
+        latitude, _ = before.plane.place(before.state[:2])
+        bent = step @ step / (2 * before.plane.radii[1]) * (1 + min(abs(np.tan(latitude)), STEEPEST))
+        least = np.linalg.eigvalsh(self.sources.sum(0)[:2, :2])[0]
+        return bool(bent <= MOST_BENT * np.sqrt(max(least, 0.0)))
 
     def _at(self, f: Fix) -> tuple["Running", np.ndarray]:
         """The shared errors as they are at the time of a fix; and which of its terms are all its own (T,)."""

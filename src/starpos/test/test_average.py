@@ -321,6 +321,24 @@ def test_a_robot_that_turns_on_the_spot_has_not_moved(rng):
     assert np.all(np.abs(moved_m(a, field)) < 4 * sigmas(a)[:2])
 
 
+def test_a_clock_that_was_far_off_bends_no_average(rng):
+    """16 km along the parallel leave the tangent plane by 20 m: frames of the right clock begin anew."""
+    field, averager, worst = Field(latitude=55.0), Averager(), 0.0
+    for k in range(8):
+        known = k >= 3
+        now = replace(
+            field, utc=UTC + k, azimuth=150.0 if known else 40.0
+        )  # touched, or the stamp has slipped
+        xy, places = now.places(earth_state(now.utc), rng)
+        tilt = replace(now.tilt(np.eye(2) * (0.16 * ARCSEC) ** 2), utc_unix_s=now.utc + 60 * (not known))
+        state = earth_state(tilt.utc_unix_s)
+        averager.add(now.solve(xy, places, state, tilt=tilt, clock_stddev_s=0.01 if known else 60.0))
+        a = averager.average
+        off = moved_m(a, field)[:2]
+        worst = max(worst, float(np.sqrt(off @ np.linalg.solve(a.covariance[:2, :2], off))))
+    assert worst < 4 and a.covariance[0, 0] < 10**2
+
+
 def test_memory_does_not_grow(rng):
     averager, two = Averager(), fixes(Field(), rng, [40.0] * 2)
     sizes = []
