@@ -77,3 +77,15 @@ def match(found, stars, within=2.0):
         return np.full(len(stars), -1)
     apart = np.hypot(stars[:, None, 0] - found.x, stars[:, None, 1] - found.y)
     return np.where(apart.min(1) < within, apart.argmin(1), -1)
+
+
+def errors(found, stars):
+    """Errors (N, 2) px of stars that must all be found, and these over their sigmas."""
+    index = match(found, stars)
+    assert np.all(index >= 0)
+    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
+    return error, error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from rendered import bound, field, grid, match, noisy
+from rendered import bound, errors, field, grid, match, noisy, rms
 
 from starpos.detection import detect
 from starpos.frame import Frame
@@ -20,18 +20,6 @@ def stars(rng):
 def outwards(stars):
     """(N, 2): from the centre, of length 1 in a corner."""
     return (stars[:, :2] - [SIZE[1] / 2, SIZE[0] / 2]) / (np.hypot(*SIZE) / 2)
-
-
-def errors(found, stars):
-    """Errors (N, 2) px of stars that must all be found, and these over their sigmas."""
-    index = match(found, stars)
-    assert np.all(index >= 0)
-    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
-    return error, error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))
-
-
-def rms(values):
-    return np.sqrt(np.mean(np.square(values)))
 
 
 OPTICS = {

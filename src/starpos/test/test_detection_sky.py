@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from rendered import bound, field, grid, match, noisy
+from rendered import bound, errors, field, grid, match, noisy, rms
 from scipy import ndimage
 
 from starpos.detection import detect
@@ -21,18 +21,6 @@ def stars(rng):
 
 def found_in(light, rng, **more):
     return detect(Frame(noisy(light, rng, **more))).stars
-
-
-def errors(found, stars):
-    """Errors (N, 2) px of stars that must all be found, and these over their sigmas."""
-    index = match(found, stars)
-    assert np.all(index >= 0)
-    error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]
-    return error, error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))
-
-
-def rms(values):
-    return np.sqrt(np.mean(np.square(values)))
 
 
 def test_vignetting_shifts_no_star(stars, rng):
