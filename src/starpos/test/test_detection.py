@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from rendered import BIAS, bound, field, grid, match, noisy, rms
+from rendered import BIAS, bound, field, grid, match, noisy
 from scipy import ndimage
 
 from starpos.detection import DetectionSettings, detect
@@ -28,6 +28,10 @@ def errors(size, frames, electrons, seed, pattern="", gains=None, **shape):
         error.append(d)
         pull.append(d / np.sqrt(np.einsum("nii->ni", found.covariance[hit])))
     return np.concatenate(error), np.concatenate(pull), missed, invented
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values), axis=0))
 
 
 @pytest.mark.parametrize("electrons", [1500, 8000, 80000])
