@@ -16,6 +16,18 @@ OUTCOMES = {
     '<error message="broken"/>': 1,
 }
 
+SIGNALLED = """
+import os, signal, threading
+rest = threading.Event()
+thread = threading.Thread(target=rest.wait, daemon=True)
+thread.start()  # before the signals are asked for, as numpy's are
+from indi_sky import signals
+told = signals()
+for number in (signal.SIGIO, signal.SIGTERM):
+    signal.pthread_kill(thread.ident, number)
+    print(os.read(told, 1)[0], end=" " if number == signal.SIGIO else "\\n")
+"""
+
 
 def run(tool, *arguments, cwd=None):
     """The exit status and all that it says."""
@@ -62,3 +74,10 @@ def test_a_fault_whose_test_did_not_run_is_not_passed(tmp_path, monkeypatch, out
     )
     rows, failed = rows_of(report)
     assert failed == bad and len(rows) == 1 and (rows[0][1] == "back after 1 s") == (not bad)
+
+
+def test_a_signal_that_another_thread_of_the_sky_gets_does_not_end_it():
+    numbers = subprocess.run(
+        [sys.executable, "-c", SIGNALLED], cwd=TOOLS, capture_output=True, text=True, check=False
+    )
+    assert (numbers.returncode, numbers.stdout) == (0, "29 15\n"), numbers.stderr

@@ -61,6 +61,19 @@ class Picture:
         fcntl.fcntl(self._file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
 
 
+def signals() -> int:
+    """A pipe's end from which each SIGIO and each of ENDS is read as a byte, its number.
+
+    A signal may come to any thread, to those that numpy has started too, which heed no mask of the main thread's.
+    """
+    told, tell = os.pipe()
+    os.set_blocking(tell, False)
+    signal.set_wakeup_fd(tell)
+    for number in {signal.SIGIO, *ENDS}:
+        signal.signal(number, lambda *_: None)
+    return told
+
+
 def set_up(port: str, folder: Path):
     """Have the simulator take its frames from the folder."""
     for setting in (
@@ -84,11 +97,11 @@ def main() -> int:
     expose(scene, catalogue, time.time(), exposure_s, rng)  # what takes long the first time
     picture = Picture(folder / "sky.fits", scene.camera.width, scene.camera.height)
     set_up(port, folder)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGIO, *ENDS})
+    told = signals()
     picture.lease()
     print("ready", flush=True)
     begun = 0.0
-    while signal.sigwaitinfo({signal.SIGIO, *ENDS}).si_signo == signal.SIGIO:
+    while os.read(told, 1)[0] == signal.SIGIO:
         now = time.time()
         if now > begun + exposure_s:  # else the same exposure looks once more
             begun = now

@@ -102,7 +102,10 @@ class Processes:
     def dead(self) -> str | None:
         """A sentence about a process that has ended, if any has."""
         name = next((name for name, p in self.running.items() if p.poll() is not None), None)
-        return name and f"{name} has stopped: see {self.folder / name}.log"
+        if name is None:
+            return None
+        said = (self.folder / f"{name}.log").read_text(errors="replace").splitlines() or ["nothing"]
+        return f"{name} has stopped with status {self.running[name].returncode}; it said last: {said[-1]}"
 
     def peak_mb(self) -> dict[str, int]:
         """Peak resident memory of each, 10^6 bytes."""
