@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every package says of itself: read by the tool that colcon and rosdep read it with, the same in all its places."""
 
+import ast
 import re
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,29 @@ from catkin_pkg.package import parse_package
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = sorted(p.parent for folder in (ROOT, ROOT / "src") for p in folder.glob("*/package.xml"))
+PYTHON = [f for f in FOLDERS if (f / "setup.py").is_file()]
+KEYS = {  # rosdep's, of modules that are no ROS package
+    "astropy": "python3-astropy",
+    "astropy_iers_data": "python3-astropy",
+    "cv2": "python3-opencv",
+    "erfa": "python3-astropy",
+    "matplotlib": "python3-matplotlib",
+    "numpy": "python3-numpy",
+    "pytest": "python3-pytest",
+    "scipy": "python3-scipy",
+    "serial": "python3-serial",
+    "tornado": "python3-tornado",
+    "yaml": "python3-yaml",
+}
+# Only PyPI has them, or brings them with these, and the code says so where one is absent; a module of ours that
+# cannot do without is one of them
+OPTIONAL = {
+    "alpaca", "alpaca_simulators", "dask", "distributed", "exifread", "gphoto2", "indipyclient", "lz4", "rawpy",
+    "requests", "rosbags", "selenium", "starpos_camera.sources.alpaca_http", "urllib3",
+}  # fmt: skip
+HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/*.py")}  # modules beside the tests
+HELPERS |= {"late_starpos"}  # a test writes it
+FOR_TESTS = {"starpos_common.testing", "starpos_common.linters"}  # the shared part of the packages' tests
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -25,11 +51,69 @@ def test_all_have_one_version():
     assert len({parse_package(folder).version for folder in FOLDERS}) == 1
 
 
-@pytest.mark.parametrize(
-    "folder", [f for f in FOLDERS if (f / "setup.py").is_file()], ids=lambda folder: folder.name
-)
+@pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
 def test_setup_py_says_what_the_manifest_says(folder):
     package, setup = parse_package(folder), (folder / "setup.py").read_text()
     for key, value in (("version", package.version), ("license", package.licenses[0])):
         assert re.findall(rf'\b{key}="(.*?)"', setup) == [value]
     assert package.maintainers[0].email in setup
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
+    """The modules that a file names, dotted, and whether at its top; what `from` takes out of one may be one too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.col_offset == 0) for alias in node.names)
+        if isinstance(node, ast.ImportFrom):
+            yield from ((f"{node.module}.{alias.name}", node.col_offset == 0) for alias in node.names)
+
+
+def is_any(module: str, names: set[str]) -> bool:
+    """Whether it is one of them or in one."""
+    return any(f"{module}.".startswith(f"{name}.") for name in names)
+
+
+class Code:
+    """A package's Python files and what they import; {dotted name: {imported: at the top}}."""
+
+    def __init__(self, folder: Path):
+        self.run, self.test = {}, {}
+        for path in (f for part in (folder.name, "launch", "test") for f in folder.glob(f"{part}/**/*.py")):
+            name = ".".join(path.relative_to(folder).with_suffix("").parts)
+            kind = self.test if name.startswith("test.") or name in FOR_TESTS else self.run
+            kind[name] = dict(sorted(imports(ast.parse(path.read_text()))))
+
+
+def keys_of(files: dict[str, dict[str, bool]], own: str) -> set[str]:
+    """What package.xml must name for files, wherever in them they import it."""
+    modules = {module for modules in files.values() for module in modules if not is_any(module, OPTIONAL)}
+    names = {module.partition(".")[0] for module in modules} - {own} - HELPERS - sys.stdlib_module_names
+    return {KEYS.get(name, name) for name in names}
+
+
+def names(dependencies) -> set[str]:
+    return {dependency.name for dependency in dependencies}
+
+
+@pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
+def test_the_manifest_names_what_the_code_imports_and_no_more(folder):
+    assert keys_of(Code(folder).run, folder.name) == names(parse_package(folder).exec_depends)
+
+
+@pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
+def test_the_manifest_names_what_the_tests_import(folder):
+    """Also what the shared part of the packages' tests needs: a test_depend holds for its own package only."""
+    package, common, code = parse_package(folder), ROOT / "starpos_common", Code(folder)
+    wanted = keys_of(code.test, folder.name)
+    if any(is_any(module, FOR_TESTS) for modules in code.test.values() for module in modules):
+        shared = {name: modules for name, modules in Code(common).test.items() if name in FOR_TESTS}
+        wanted |= keys_of(shared, common.name) - names(parse_package(common).exec_depends)
+    assert wanted <= names(package.exec_depends + package.test_depends)
+
+
+@pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
+def test_what_only_pypi_has_is_imported_where_it_is_needed_only(folder):
+    """A module's first lines are run also where it is absent."""
+    for name, modules in Code(folder).run.items():
+        at_top = {module for module, top in modules.items() if top and is_any(module, OPTIONAL)}
+        assert not at_top or name in OPTIONAL, f"{name} imports {at_top} at its top"
