@@ -32,6 +32,7 @@ class Status:
 class Diagnostics:
     """Publishes one DiagnosticStatus `node: Task` for every task, at 1 Hz of real time.
 
+    In a namespace it is `/namespace/node: Task`, as of diagnostic_updater with use_fqn: the topic is everybody's.
     Real time, because a health report must not stop with a paused simulation or flood a fast replay; the
     stamp is the node's own time. `hardware_id` may be changed at any time.
     """
@@ -39,6 +40,7 @@ class Diagnostics:
     def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Status]], hardware_id: str = "none"):
         self.hardware_id = hardware_id
         self._node = node
+        self._name = node.get_name() if node.get_namespace() == "/" else node.get_fully_qualified_name()
         self._tasks = dict(tasks)
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -59,7 +61,7 @@ class Diagnostics:
             status = Status(Level.ERROR, f"this diagnostic failed: {type(error).__name__}: {error}")
         return DiagnosticStatus(
             level=bytes([status.level]),
-            name=f"{self._node.get_name()}: {name}",
+            name=f"{self._name}: {name}",
             message=status.message,
             hardware_id=self.hardware_id,
             values=[KeyValue(key=key, value=_text(value)) for key, value in status.values.items()],

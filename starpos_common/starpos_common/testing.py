@@ -102,11 +102,11 @@ class Listener:
 class Process:
     """The function `executable` of a module as a program of its own."""
 
-    def __init__(self, module: str, executable: str, parameters):
+    def __init__(self, module: str, executable: str, parameters, namespace: str = "/"):
         program = f"import sys; from {module} import {executable}; sys.exit({executable}())"
         options = [word for p in parameters for word in ("-p", p)]
         self._process = subprocess.Popen(
-            [sys.executable, "-c", program, "--ros-args", *options],
+            [sys.executable, "-c", program, "--ros-args", "-r", f"__ns:={namespace}", *options],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

@@ -16,7 +16,7 @@ def node():
     take_domain()
     context = rclpy.Context()
     rclpy.init(context=context)
-    node = rclpy.create_node("sensor", context=context, namespace="left")
+    node = rclpy.create_node("sensor", context=context)
     yield node
     node.destroy_node()
     rclpy.shutdown(context=context)
@@ -56,3 +56,21 @@ def test_every_task_is_published_each_second_even_in_paused_simulated_time(node)
     while len(received) == before:
         assert time.monotonic() < end
         executor.spin_once(timeout_sec=0.5)
+
+
+def test_the_same_node_of_two_instruments_has_two_names(node):
+    received = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
+    executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    twins = [rclpy.create_node("solver", context=node.context, namespace=ns) for ns in ("a", "/b/c", "")]
+    for twin in twins:
+        Diagnostics(twin, {"Solution": lambda: Status(Level.OK, "")})
+        executor.add_node(twin)
+    wanted = {"/a/solver: Solution", "/b/c/solver: Solution", "solver: Solution"}
+    end = time.monotonic() + 20
+    while {message.status[0].name for message in received} != wanted:
+        assert time.monotonic() < end, received
+        executor.spin_once(timeout_sec=0.5)
+    for twin in twins:
+        twin.destroy_node()

@@ -138,6 +138,26 @@ def test_only_lights_of_the_nodes_asked_for():
     assert [x["name"] for x in told(b)["lights"]] == ["solver: A"]
 
 
+@pytest.mark.parametrize(
+    "lights, seen",
+    [
+        ({"solver"}, ["solver: A"]),
+        ({"/a/solver"}, ["solver: A"]),
+        ({"solver", "/b/solver", "/solver"}, ["/b/solver: B", "/solver: C", "solver: A"]),
+        ({}, ["/b/solver: B", "/solver: C", "solver: A"]),
+    ],
+)
+def test_the_lights_of_another_instrument_are_not_taken_for_its_own(lights, seen):
+    b = Board(10, frozenset(lights), namespace="/a")
+    b.hear_diagnostics(
+        said.diagnostics(("/a/solver: A", 0, ""), ("/b/solver: B", 2, ""), ("solver: C", 2, ""))
+    )
+    assert [x["name"] for x in told(b)["lights"]] == seen
+    alone = Board(10, frozenset({"solver"}))
+    alone.hear_diagnostics(said.diagnostics(("/a/solver: A", 2, ""), ("solver: C", 0, "")))
+    assert [x["name"] for x in told(alone)["lights"]] == ["solver: C"]
+
+
 def test_a_node_that_has_said_nothing_has_a_light_too_or_all_seems_green_without_it():
     clock = Clock()
     b = Board(10, frozenset({"camera", "solver"}), clock)

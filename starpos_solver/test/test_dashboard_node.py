@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node itself: how it starts, what it refuses, what hostile topics do to it, how it ends."""
 
+import json
 import signal
 import socket
 import sys
@@ -16,7 +17,7 @@ from sensor_msgs.msg import Image, NavSatFix
 from starpos.errors import StarposError
 from starpos_common.testing import Listener, Process, lacks, take_domain
 
-OK = 0
+OK, WARN = 0, 1
 
 
 @pytest.fixture
@@ -33,8 +34,8 @@ def start():
         lacks("tornado", "pip install")
     processes = []
 
-    def start(*parameters):
-        processes.append(Process("starpos_solver.dashboard.main", "dashboard", parameters))
+    def start(*parameters, executable="dashboard", module="starpos_solver.dashboard.main", namespace="/"):
+        processes.append(Process(module, executable, parameters, namespace))
         return processes[-1]
 
     yield start
@@ -42,9 +43,9 @@ def start():
         process.kill()
 
 
-def address_of(listener) -> tuple[str, int]:
-    listener.wait_for_state("dashboard: Page", OK, "shown at http://")
-    host, _, port = listener.states["dashboard: Page"].message.rpartition("/")[2].rpartition(":")
+def address_of(listener, page="dashboard: Page") -> tuple[str, int]:
+    listener.wait_for_state(page, OK, "shown at http://")
+    host, _, port = listener.states[page].message.rpartition("/")[2].rpartition(":")
     return host, int(port)
 
 
@@ -100,6 +101,26 @@ def test_it_ends_at_once_with_pages_open_and_hung(start, listener, signals):
 def words(listener) -> list[str]:
     state = listener.states.get("dashboard: Page")
     return [word for v in state.values[:1] for word in (v.key, v.value)] if state else []
+
+
+def test_the_solver_of_another_instrument_on_the_graph_is_not_its_own(start, listener):
+    start("port:=0", "lights:=solver", namespace="/a")
+    host, port = address_of(listener, "/a/dashboard: Page")
+
+    def names_shown(url=f"http://{host}:{port}/events"):
+        with urllib.request.urlopen(url, timeout=10) as page:
+            state = next(line for line in page if b'"lights"' in line)
+        return {light["name"] for light in json.loads(state.removeprefix(b"data: "))["lights"]}
+
+    start(executable="solver", module="starpos_solver.main", namespace="/b")
+    listener.wait(lambda: "/b/solver: Solution" in listener.states)
+    assert listener.set("a/dashboard", lights="/b/solver").successful
+    listener.wait(lambda: "/b/solver: Solution" in names_shown())  # it hears the other one
+    assert listener.set("a/dashboard", lights="solver").successful
+    listener.wait_for_state("/b/solver: Solution", WARN)
+    assert names_shown() == {"solver"}  # silent
+    start(executable="solver", module="starpos_solver.main", namespace="/a")
+    listener.wait(lambda: "solver: Solution" in names_shown())
 
 
 def test_hostile_messages_are_taken_in_its_stride(start, listener):

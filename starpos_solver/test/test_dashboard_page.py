@@ -154,6 +154,22 @@ def test_no_fix_looks_like_no_fix_and_nan_is_no_number(page):
     assert "NaN" not in everything and "undefined" not in everything and "null" not in everything.lower()
 
 
+def test_why_there_is_no_fix_is_never_another_instruments_reason(page, listener):
+    own, other = "waiting for the first frame", "the other one is under clouds"
+    lights = (("/b/solver: Solution", 1, other), ("solver: Solution", 1, own))
+    page.instrument.works(
+        fix=said.fix(math.nan), solver__solution=None, **{"/diagnostics": said.diagnostics(*lights)}
+    )
+    assert listener.set("dashboard", lights="").successful
+    try:
+        page.shows(status_word="No fix", status_sentence=own)
+        page.instrument.says["/diagnostics"] = said.diagnostics(lights[0])
+        page.shows(status_word="No fix", status_sentence="no fix")
+        page.until(lambda: other in [lamp[2] for lamp in page.run(LAMPS)])
+    finally:
+        assert listener.set("dashboard", lights="camera, detector, inclinometer, solver").successful
+
+
 def test_an_old_stamp_is_an_old_fix(page, listener):
     page.instrument.works()
     fix = page.instrument.says.pop("fix")

@@ -20,12 +20,19 @@ STATUSES = 256  # of one message that are looked at
 class Board:
     """Messages in, one JSON text out; all of it bounded. `changed`: something came since the last `told`.
 
-    nodes: whose diagnostics are lights; all where there are none.
+    nodes: whose diagnostics are lights, by their names in `namespace`, or whole ones; all where there are none.
     """
 
-    def __init__(self, track: int, nodes: frozenset[str], clock: Callable[[], float] = time.monotonic):
+    def __init__(
+        self,
+        track: int,
+        nodes: frozenset[str],
+        clock: Callable[[], float] = time.monotonic,
+        namespace: str = "/",
+    ):
         self.changed = False
-        self._nodes = nodes
+        self._namespace = namespace
+        self._nodes = self._seen(nodes)
         self._clock, self._since = clock, clock()
         self._heard: dict[str, tuple[float, dict]] = {}  # (when, what)
         self._lights: dict[str, tuple[float, dict]] = {}
@@ -64,9 +71,10 @@ class Board:
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
         """Those of the nodes that are to have lights."""
         for status in message.status[:STATUSES]:
-            if self._nodes and _node_of(status.name) not in self._nodes:
+            name = readings.seen_from(self._namespace, status.name)
+            if self._nodes and _node_of(name) not in self._nodes:
                 continue
-            told = readings.light(status)
+            told = readings.light(status, name)
             self._lights.pop(told["name"], None)  # the newest is the last
             self._lights[told["name"]] = self._clock(), told
             if len(self._lights) > LIGHTS:
@@ -83,9 +91,12 @@ class Board:
 
     def only_lights_of(self, nodes: frozenset[str]) -> None:
         """Of these nodes, from now on; of all where there are none."""
-        self._nodes, self._since = nodes, self._clock()
+        self._nodes, self._since = self._seen(nodes), self._clock()
         if nodes:
-            self._lights = {n: light for n, light in self._lights.items() if _node_of(n) in nodes}
+            self._lights = {n: light for n, light in self._lights.items() if _node_of(n) in self._nodes}
+
+    def _seen(self, nodes: frozenset[str]) -> frozenset[str]:
+        return frozenset(readings.seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
 
     def _keep(self, name: str, told: dict | None):
         self.changed = True

@@ -29,7 +29,9 @@ class DashboardNode(Node):
     def __init__(self):
         super().__init__("dashboard")
         self._values = declare(self, PARAMETERS, apply=self._apply)
-        self._board = Board(self._values["track"], names(self._values["lights"]))
+        self._board = Board(
+            self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
+        )
         address = self._values["address"]
         self._server = Server(
             listen(address, self._values["port"]),

@@ -58,8 +58,8 @@ PARAMETERS = (
     Parameter(
         "lights",
         "camera, detector, inclinometer, solver",
-        "Nodes whose diagnostics are shown, separated by commas, and named where they say nothing; '' shows those of "
-        "every node there is.",
+        "Nodes whose diagnostics are shown, separated by commas, and named where they say nothing: those of the "
+        "dashboard's own namespace, or by whole names such as /b/solver; '' shows those of every node there is.",
     ),
 )
 

@@ -119,11 +119,17 @@ def solution(message: Solution) -> dict:
     }
 
 
-def light(status: DiagnosticStatus) -> dict:
-    """One diagnostic; a level that is none of the four is an error."""
+def seen_from(namespace: str, name: str) -> str:
+    """A diagnostic's name as it is in a namespace: `solver: Solution` of its own, else whole: `/b/solver: Solution`."""
+    whole = name if name.startswith("/") else f"/{name}"
+    return whole.removeprefix(namespace.rstrip("/") + "/")
+
+
+def light(status: DiagnosticStatus, name: str) -> dict:
+    """One diagnostic, under a name; a level that is none of the four is an error."""
     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
     return {
-        "name": text(status.name, NAME_LETTERS),
+        "name": text(name, NAME_LETTERS),
         "level": level if 0 <= level <= STALE else ERROR,
         "sentence": text(status.message),
     }

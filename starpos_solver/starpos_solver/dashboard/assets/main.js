@@ -12,6 +12,7 @@ import * as text from "/text.js";
 const TICK_MS = 500;
 const AHEAD_S = 1; // a stamp further in the future is told
 const MOST_TRACK = 10000;
+const OWN_SOLUTION = /^[^/]+: Solution$/; // another instrument's name has its namespace
 
 let state = { lights: [], old_after: { slow: 15, fast: 5 } };
 let received = performance.now();
@@ -66,7 +67,7 @@ function render() {
 
 function verdict(fix, old) {
   const said = state.solution && !state.solution.good && !isOld(state.solution) ? state.solution.sentence : "";
-  const solver = state.lights.find((l) => l.name.endsWith(": Solution") && heardAgo(l) < state.old_after.fast);
+  const solver = state.lights.find((l) => OWN_SOLUTION.test(l.name) && heardAgo(l) < state.old_after.fast);
   const why = said || (solver && solver.level > 0 ? solver.sentence : "");
   if (full) return ["lost", "No place", `${full} pages are open already, as many as the parameter clients allows`];
   if (!link.alive) return ["lost", "No connection", "the dashboard node is silent: what is shown is of the past"];
