@@ -93,8 +93,9 @@ PARAMETERS = (
     Parameter(
         "altitude",
         NAN,
-        "Altitude put into fix, which the stars cannot tell; unset leaves NaN, and some consumers "
-        "drop such a fix.",
+        "Height above the WGS 84 ellipsoid, put into fix: the height above sea level of a map plus the geoid's "
+        "undulation there (-107 to 86 m), by which it is wrong without. The stars cannot tell it; unset leaves NaN, and "
+        "some consumers drop such a fix.",
         "m",
         -1000.0,
         100000.0,

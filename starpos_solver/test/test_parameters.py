@@ -87,6 +87,11 @@ def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):
         known_instrument(str(tmp_path / "missing.yaml"))
 
 
+def test_the_altitude_says_which_one_it_is():
+    [altitude] = (p for p in PARAMETERS if p.name == "altitude")
+    assert "above the WGS 84 ellipsoid" in altitude.description
+
+
 def test_the_deflection_defaults_to_knowing_nothing():
     assert vertical_of(values(), None).stddev_arcsec > 1
     assert not math.isnan(vertical_of(values(), None).xi_arcsec)
