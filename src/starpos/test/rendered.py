@@ -44,6 +44,13 @@ def field(size, stars, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gains=None):
     return image + through(None if gains is None else gains[-1], np.full(size, float(sky)))
 
 
+def coloured(count, rng):
+    """Gains (count + 1, 2, 2) of an RGGB mosaic for stars of any colour, and for the sky."""
+    red, blue = rng.uniform(0.3, 1.0, (2, count))
+    own = np.stack([np.stack([red, np.ones(count)], 1), np.stack([np.ones(count), blue], 1)], 1)
+    return np.concatenate([own, [[[0.5, 1.0], [1.0, 0.6]]]])
+
+
 def noisy(image, rng, top=65535, dtype=np.uint16):
     """What a camera writes of these electrons."""
     counts = rng.poisson(image) + rng.normal(0, READ_NOISE, image.shape) + BIAS

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from rendered import BIAS, bound, field, grid, match, noisy
+from rendered import BIAS, bound, coloured, field, grid, match, noisy
 from scipy import ndimage
 
 from starpos.detection import DetectionSettings, detect
@@ -111,13 +111,6 @@ def test_error_does_not_depend_on_where_in_a_pixel_a_star_falls(fwhm):
 
 @pytest.mark.parametrize("pattern", ["rggb", ""])
 def test_a_mosaic_declared_or_not_shifts_no_star_whatever_its_colour(pattern):
-    sky = np.array([[0.5, 1.0], [1.0, 0.6]])
-
-    def coloured(count, rng):
-        red, blue = rng.uniform(0.3, 1.0, (2, count))
-        own = np.stack([np.stack([red, np.ones(count)], 1), np.stack([np.ones(count), blue], 1)], 1)
-        return np.concatenate([own, sky[None]])
-
     error, pull, missed, invented = errors(
         (520, 520), 3, 20000, seed=4, pattern=pattern, gains=coloured, trail=TRAIL
     )

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from rendered import bound, errors, field, grid, match, noisy, rms
+from rendered import bound, coloured, errors, field, grid, match, noisy, rms
 from scipy import ndimage
 
 from starpos.detection import detect
@@ -119,20 +119,25 @@ def test_stars_far_over_the_full_well_are_found_where_they_are(rng):
     assert np.all(np.abs(error[full]) < 0.1)
 
 
+@pytest.mark.parametrize("pattern", ["", "rggb"])
 @pytest.mark.parametrize("ratio", [1.0, 0.3])
-@pytest.mark.parametrize("fwhms", [1.6, 2.0, 2.7])
-def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, rng):
+@pytest.mark.parametrize("fwhms", [0.8, 1.0, 1.25, 1.3, 1.4, 1.6, 2.0, 2.7])
+def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, pattern, rng):
     stars = grid(SIZE, 50, 20000, rng)
-    first = stars[::6]
+    first = stars[::3]
     angle = rng.uniform(0, 2 * np.pi, len(first))
     second = first + fwhms * 2.4 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     second[:, 2] = 20000 * ratio
-    found = found_in(field(SIZE, np.concatenate([stars, second])), rng)
-    assert len(found) == len(stars) + len(second)
+    both = np.concatenate([stars, second])
+    gains, mean = (coloured(len(both), rng), np.array([[0.65, 1], [1, 0.65]])) if pattern else (None, None)
+    found = detect(Frame(noisy(field(SIZE, both, gains=gains), rng), pattern)).stars
+    assert len(found) == len(both)
     for some in (first, second):
         error, pull = errors(found, some)
-        assert rms(error) < 1.4 * rms(bound(some[0, 2]))
-        assert 0.7 < rms(pull) < 1.3
+        assert rms(error) < (1.4 if fwhms > 1.5 else 2.4) * rms(bound(some[0, 2], gain=mean))
+        assert 0.75 < rms(pull) < 1.25
+        if fwhms > 1.5:  # resolved
+            assert np.count_nonzero(found.flags[match(found, some)]) < 0.2 * len(some)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.3])

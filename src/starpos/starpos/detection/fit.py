@@ -24,6 +24,32 @@ class Response:
     dn_per_photon: float
     misfit: float
 
+    @property
+    def own_gains(self) -> int:
+        """How many gains a star has of its own: P, or none without a mosaic."""
+        return len(self.gain) if len(self.gain) > 1 else 0
+
+    def of_stars(self, colour, phase):
+        """(N, S, S) float32: gains of pixels of these phases for stars whose own are 1 + colour (N, P) times the mean."""
+        own = (self.gain * (1 + colour)).astype(np.float32)
+        return own[np.arange(len(own))[:, None, None], phase]
+
+    def columns(self, shape, amount, own, phase):
+        """How pixels (N, S, S) change with a star's x, y, flux and own gains: a list.
+
+        shape, amount, own: what LocalPsf.evaluate tells of them; the star's flux and its gains there.
+        """
+        value, by_x, by_y = shape
+        gain = self.gain.astype(np.float32)
+        by_gain = [amount * value * np.where(phase == p, gain[p], 0) for p in range(self.own_gains)]
+        return [amount * by_x * own, amount * by_y * own, value * own, *by_gain]
+
+    def hold(self, normal, right, colour):
+        """Adds to normal equations of these columns, in place, how near the mean stars' own gains are."""
+        for p in range(self.own_gains):
+            normal[:, 3 + p, 3 + p] += self.colour_spread**-2
+            right[:, 3 + p] -= colour[:, p] * self.colour_spread**-2
+
     def variance(self, noise, light):
         """DN2 of pixels with the sky's noise (DN) and light DN of a star on them."""
         light = np.maximum(light, 0)
@@ -62,21 +88,18 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     whose noise would otherwise pull the fit.
     """
     x, y, local = x.copy(), y.copy(), psf.at(x, y)
-    n, phases = len(x), len(response.gain)
-    gain = response.gain.astype(np.float32)[stamps.phase]
+    n = len(x)
     inverse_noise2 = stamps.good / stamps.noise**2
-    extra = 0 if phases == 1 else phases
-    colour = np.zeros((n, phases))  # each star's gains over the frame's, minus 1
+    colour = np.zeros((n, len(response.gain)))  # each star's gains over the frame's, minus 1
+    own = response.of_stars(colour, stamps.phase)
     flux = np.full(n, np.nan)
-    each = np.arange(n)[:, None, None]
     outlier = np.zeros(stamps.signal.shape, bool)
     for round_ in range(rounds):
         last = round_ == rounds - 1
         dx, dy = stamps.offsets(x, y)
-        value, by_x, by_y = local.evaluate(dx, dy)
-        own = gain * (1 + colour.astype(np.float32)[each, stamps.phase]) if extra else gain
+        shape = local.evaluate(dx, dy)
         inside = local.within(dx, dy, FIT_WIDTHS)
-        unit = value * own
+        unit = shape[0] * own
         if not np.isfinite(flux).all():
             weight = inverse_noise2 * inside
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,15 +109,12 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         variance = response.variance(stamps.noise, amount * unit)
         used = stamps.good & inside & ~outlier
         root = np.sqrt(used / variance)
-        columns = [amount * by_x * own, amount * by_y * own, unit]
-        columns += [amount * value * gain * (stamps.phase == p) for p in range(extra)]
+        columns = response.columns(shape, amount, own, stamps.phase)
         design = np.stack([(c * root).reshape(n, -1) for c in columns], 2)
         residual = stamps.signal - amount * unit
         normal = (design.transpose(0, 2, 1) @ design).astype(np.float64)
         right = (design.transpose(0, 2, 1) @ (residual * root).reshape(n, -1, 1))[..., 0].astype(np.float64)
-        for p in range(extra):
-            normal[:, 3 + p, 3 + p] += response.colour_spread**-2
-            right[:, 3 + p] -= colour[:, p] * response.colour_spread**-2
+        response.hold(normal, right, colour)
         covariance = inverse(normal)
         if last:
             break
@@ -107,8 +127,9 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         x += np.clip(step[:, 0], -1, 1)
         y += np.clip(step[:, 1], -1, 1)
         flux += step[:, 2]
-        if extra:
+        if response.own_gains:
             colour = np.clip(colour + step[:, 3:], -0.9, 3.0)
+            own = response.of_stars(colour, stamps.phase)
     freedom = np.maximum(used.sum((1, 2)) - 3, 1)
     chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
     leverage = ((design @ np.nan_to_num(covariance).astype(np.float32)) * design).sum(2).reshape(used.shape)
