@@ -21,17 +21,27 @@ def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
 
 @pytest.mark.parametrize(
     ("values", "words"),
-    [  # rclpy itself refuses what a native range or the type excludes, with its own words
+    [
         ({"refraction__pressure": -5.0}, "refraction.pressure must be a number from 0 to 120000 Pa"),
         ({"refraction__pressure": math.inf}, "refraction.pressure must be a number from 0 to 120000 Pa"),
         ({"misalignment": [1.0, 2.0]}, "misalignment must be 3 values"),
         ({"calibration_url": "/nowhere/instrument.yaml"}, "/nowhere/instrument.yaml"),
         ({"deflection__geoid": "/nowhere/egm.gtx"}, "/nowhere/egm.gtx GTX GeoTIFF"),
-        ({"refraction__humidity": 1.5}, "refraction.humidity 0 1"),
-        ({"min_stars": 2}, "min_stars 4 1000"),
-        ({"clock_stddev": 0.5, "min_stars": 0}, "min_stars 4 1000"),
-        ({"deflection__xi": 200.0}, "deflection.xi -120 120"),
-        ({"refraction__temperature": "warm"}, "DOUBLE STRING"),
+        ({"refraction__humidity": 1.5}, "refraction.humidity must be a number from 0 to 1; 1.5 was given."),
+        ({"min_stars": 2}, "min_stars must be a whole number from 4 to 1000; 2 was given."),
+        (
+            {"clock_stddev": 0.5, "min_stars": 0},
+            "min_stars must be a whole number from 4 to 1000; 0 was given.",
+        ),
+        (
+            {"deflection__xi": 200.0},
+            "deflection.xi must be a number from -120 to 120 arcsec; 200.0 was given.",
+        ),
+        ({"refraction__temperature": "warm"}, "refraction.temperature must be a number 'warm' was given."),
+        (
+            {"misalignment_stddev": -1},
+            "misalignment_stddev must be a number from 0 to 36000 arcsec; -1 was given.",
+        ),
     ],
 )
 def test_what_is_refused_comes_back_with_its_constraint(graph, solver, values, words):

@@ -101,7 +101,7 @@ class Parameter:
 
     def _error(self, value) -> ParameterError:
         shown = value.tolist() if hasattr(value, "tolist") else value
-        return ParameterError(f"parameter {self.name} must be {self.constraint}; {shown!r} was given.")
+        return ParameterError(f"parameter {self.name} must be {self.constraint}; {shown!r:.200} was given.")
 
     def descriptor(self) -> ParameterDescriptor:
         """Its descriptor. With a NaN default it leaves out the native range, which would refuse NaN."""
@@ -172,14 +172,14 @@ def declare(
     if complaint:
         raise ParameterError(complaint)
 
-    def widen(changes: list[RosParameter]) -> list[RosParameter]:
-        return [_widened(table[c.name], c) if c.name in table else c for c in changes]
+    def prepare(changes: list[RosParameter]) -> list[RosParameter]:
+        return [_prepared(node, table[c.name], c) if c.name in table else c for c in changes]
 
     def validate(changes: list[RosParameter]) -> SetParametersResult:
-        try:
-            wanted = {c.name: table[c.name].convert(c.value) for c in changes if c.name in table}
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+        for change in changes:
+            if isinstance(change, _Refused):
+                return SetParametersResult(successful=False, reason=change.reason)
+        wanted = {c.name: table[c.name].convert(c.value) for c in changes if c.name in table}
         try:
             reason = check({**values, **wanted}, frozenset(wanted)) if check and wanted else None
         except Exception as error:  # a defect costs this change, not the night
@@ -191,7 +191,7 @@ def declare(
         if names:
             apply(names)
 
-    node.add_pre_set_parameters_callback(widen)
+    node.add_pre_set_parameters_callback(prepare)
     node.add_on_set_parameters_callback(validate)
     if apply:
         node.add_post_set_parameters_callback(applied)
@@ -220,13 +220,24 @@ def _given(node: Node) -> Mapping[str, Any]:
     return node._parameter_overrides  # rclpy has no public way to what was given
 
 
-def _widened(parameter: Parameter, change: RosParameter) -> RosParameter:
+class _Refused(RosParameter):
+    """Stands for a change that is not allowed, with the present value, until the sentence can be answered.
+
+    Between the callbacks rclpy checks types and ranges by itself, in words that name neither the unit nor, where the type
+    is wrong, the parameter.
+    """
+
+    def __init__(self, present: RosParameter, reason: str):
+        super().__init__(present.name, present.type_, present.value)
+        self.reason = reason
+
+
+def _prepared(node: Node, parameter: Parameter, change: RosParameter) -> RosParameter:
     """Whole numbers as floats where floats are meant, so that `ros2 param set ... 5` works."""
     try:
-        value = parameter.ros_value(parameter.convert(change.value))
-    except ParameterError:
-        return change
-    return RosParameter(change.name, value=value)
+        return RosParameter(change.name, value=parameter.ros_value(parameter.convert(change.value)))
+    except ParameterError as error:
+        return _Refused(node.get_parameter(change.name), str(error))
 
 
 def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
