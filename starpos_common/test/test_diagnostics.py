@@ -69,7 +69,7 @@ def test_the_same_node_of_two_instruments_has_two_names(node):
         executor.add_node(twin)
     wanted = {"/a/solver: Solution", "/b/c/solver: Solution", "solver: Solution"}
     end = time.monotonic() + 20
-    while {message.status[0].name for message in received} != wanted:
+    while not wanted <= {message.status[0].name for message in received}:
         assert time.monotonic() < end, received
         executor.spin_once(timeout_sec=0.5)
     for twin in twins:
