@@ -37,6 +37,8 @@ def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
             {"deflection__xi": 200.0},
             "deflection.xi must be a number from -120 to 120 arcsec; 200.0 was given.",
         ),
+        ({"frame_id": ""}, "frame_id must be a frame's name, not empty, '' was given."),
+        ({"frame_id": "a b"}, "frame_id must be a frame's name, without blanks 'a b' was given."),
         ({"refraction__temperature": "warm"}, "refraction.temperature must be a number 'warm' was given."),
         (
             {"misalignment_stddev": -1},

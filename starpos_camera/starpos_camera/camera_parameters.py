@@ -4,7 +4,7 @@
 import math
 
 from starpos_camera.sources.registry import SOURCES
-from starpos_common.parameters import Parameter
+from starpos_common.parameters import FRAME_NAME, Parameter
 
 COMMON = (
     Parameter(
@@ -19,6 +19,7 @@ COMMON = (
         "starpos_camera_optical_frame",
         "Frame of the images: x right, y down, z out along the optical axis.",
         read_only=True,
+        form=FRAME_NAME,
     ),
     Parameter(
         "cadence",

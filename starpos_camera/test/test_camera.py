@@ -219,6 +219,7 @@ def test_a_calibration_that_cannot_be_written_holds_for_the_session(start, liste
     [
         ((), "files.path must name a folder"),
         (("source:=webcam",), "source must be one of files, simulated"),
+        (("frame_id:='a b'",), "frame_id must be a frame's name, not empty, without blanks"),
         (("source:=simulated", "exposure:=6"), "must not be longer than `cadence`"),
         (("source:=simulated", "simulated.latitude:=91"), "from -90 to 90 deg"),
         (("source:=simulated", "calibration_url:=http://x/y.yaml"), "file:///"),

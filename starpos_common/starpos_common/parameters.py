@@ -20,6 +20,20 @@ class ParameterError(StarposError):
 
 
 @dataclass(frozen=True)
+class Form:
+    """What a text must look like. `constraint` is the rest of the sentence 'NAME must be ...'."""
+
+    constraint: str
+    fits: Callable[[str], bool]
+
+
+FRAME_NAME = Form(
+    "a frame's name, not empty, without blanks, control characters or a leading /",
+    lambda text: text.isprintable() and " " not in text and text[:1] not in ("", "/"),
+)
+
+
+@dataclass(frozen=True)
 class Parameter:
     """One parameter of a node.
 
@@ -29,6 +43,7 @@ class Parameter:
     unit         '' for a bare number or a text
     minimum, maximum   inclusive, of numbers (of each number of a tuple); None: unbounded
     choices      the allowed values; () for any
+    form         of a text; None for any
     read_only    cannot be changed while the node runs
     """
 
@@ -40,6 +55,7 @@ class Parameter:
     maximum: float | None = None
     choices: tuple = ()
     read_only: bool = False
+    form: Form | None = None
 
     @property
     def items(self) -> tuple:
@@ -58,6 +74,8 @@ class Parameter:
         unit = f" {self.unit}" if self.unit else ""
         if self.choices:
             text = "one of " + ", ".join(map(str, self.choices))
+        elif self.form:
+            text = self.form.constraint
         elif self.minimum is not None and self.maximum is not None:
             text += f" from {self.minimum:g} to {self.maximum:g}{unit}"
         elif self.minimum is not None:
@@ -88,6 +106,8 @@ class Parameter:
         if kind is float and type(item) is int:
             item = float(item)
         if type(item) is not kind or (self.choices and item not in self.choices):
+            raise self._error(whole)
+        if self.form and not self.form.fits(item):
             raise self._error(whole)
         if kind is float and not math.isfinite(item):
             if math.isnan(item) and self.may_be_nan:

@@ -8,7 +8,14 @@ import rclpy
 import yaml
 from rclpy.parameter import Parameter as RosParameter
 
-from starpos_common.parameters import Parameter, ParameterError, declare, to_yaml, warn_of_unknown
+from starpos_common.parameters import (
+    FRAME_NAME,
+    Parameter,
+    ParameterError,
+    declare,
+    to_yaml,
+    warn_of_unknown,
+)
 from starpos_common.testing import take_domain
 
 TABLE = (
@@ -20,6 +27,7 @@ TABLE = (
     Parameter("offsets", (2.5, 2.5), "Of x and y.", "V", 0.0, 5.0),
     Parameter("source", "files", "Where frames come from.", choices=("files", "simulated")),
     Parameter("loop", False, "Begin anew at the end."),
+    Parameter("frame_id", "starpos_link", "Frame of the fix.", form=FRAME_NAME),
     Parameter("port", "/dev/x", 'The "port".', read_only=True),
 )
 
@@ -48,6 +56,11 @@ REFUSED = (
     ("source:=moon", "source must be one of files, simulated; 'moon' was given."),
     ("source:=3", "source must be one of files, simulated; 3 was given."),
     ("loop:=1", "loop must be true or false; 1 was given."),
+    (
+        "frame_id:=/map",
+        "frame_id must be a frame's name, not empty, without blanks, control characters or a leading /; "
+        "'/map' was given.",
+    ),
 )
 
 
@@ -168,6 +181,20 @@ def test_a_change_is_refused_in_the_sentence_of_the_start(make, override, senten
     assert not result.successful and result.reason == f"parameter {sentence}"
     assert str(before) == str((node.get_parameter(name).value, node.describe_parameter(name)))
     assert applied == []
+
+
+@pytest.mark.parametrize(
+    "name", ["", " ", "/", "/map", "a b", "a\n", "\tmap", "a\x00", "a\x7f", "a\u00a0b", "a\u202eb"]
+)
+def test_no_frame_has_such_a_name(name):
+    frame_id = next(p for p in TABLE if p.name == "frame_id")
+    with pytest.raises(ParameterError, match="without blanks, control characters or a leading /"):
+        frame_id.convert(name)
+
+
+@pytest.mark.parametrize("name", ["map", "rover/starpos_link", "a-b.c:d", "Zürich"])
+def test_such_names_frames_have(name):
+    assert next(p for p in TABLE if p.name == "frame_id").convert(name) == name
 
 
 def test_a_parameter_cannot_be_taken_away(make):

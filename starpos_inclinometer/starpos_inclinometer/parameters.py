@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from starpos_common.parameters import Parameter
+from starpos_common.parameters import FRAME_NAME, Parameter
 from starpos_inclinometer import protocol, sensor
 from starpos_inclinometer.ascii_line import UNITS, pattern_error
 
@@ -44,6 +44,7 @@ PARAMETERS = (
         "starpos_inclinometer_frame",
         "Frame of the tilts: S, the sensor's X', Y', Z'; of source imu, the IMU's own axes.",
         read_only=True,
+        form=FRAME_NAME,
     ),
     Parameter(
         "rate",

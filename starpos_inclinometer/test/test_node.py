@@ -142,6 +142,7 @@ def test_frozen_converter_and_steep_tilt_are_flagged_and_reported(bench, start, 
         ("source:=gnss", "source must be one of serial, imu, ascii"),
         ("offset_volts:=[2.5]", "offset_volts must be 2 values"),
         ("port:=7", "port must be a text"),
+        ("frame_id:=''", "frame_id must be a frame's name, not empty"),
         ("port:=''", "port must name the serial port, such as /dev/serial/by-id/...; it is empty"),
     ],
 )

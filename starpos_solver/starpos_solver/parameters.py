@@ -13,14 +13,16 @@ from starpos.geoid import Geoid
 from starpos.instrument import Calibration, Instrument
 from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
-from starpos_common.parameters import Parameter
+from starpos_common.parameters import FRAME_NAME, Parameter
 from starpos_common.paths import path_of
 
 NAN = math.nan
 SAME_FOCAL = 0.05  # of the focal length, by which that of one camera may change
 
 PARAMETERS = (
-    Parameter("frame_id", "starpos_link", "Frame of fix and heading: x forward, y left, z up."),
+    Parameter(
+        "frame_id", "starpos_link", "Frame of fix and heading: x forward, y left, z up.", form=FRAME_NAME
+    ),
     Parameter(
         "calibration_url",
         "",
