@@ -10,9 +10,9 @@ from starpos.stars import ELONGATED
 SIZE = (700, 900)
 
 
-def trail(start, end, electrons_per_px, width=1.3):
-    """Electrons of a satellite's trail on SIZE: a Gaussian across, sharp at its ends."""
-    y, x = np.indices(SIZE)
+def trail(start, end, electrons_per_px, width=1.3, size=SIZE):
+    """Electrons of a satellite's trail: a Gaussian across, sharp at its ends."""
+    y, x = np.ogrid[: size[0], : size[1]]
     way = np.subtract(end, start)
     length = np.hypot(*way)
     along = ((x - start[0]) * way[0] + (y - start[1]) * way[1]) / length
@@ -43,6 +43,28 @@ def test_a_trail_makes_no_star_and_costs_none_beside_it(start, end, electrons, r
     error = np.stack([found.x[index], found.y[index]], 1)[far] - stars[far, :2]
     assert np.sqrt(np.mean(error**2)) < 1.15 * np.sqrt(np.mean(bound(9000) ** 2))
     assert np.all((found.flags[index[far]] & ELONGATED) == 0)
+
+
+@pytest.mark.parametrize("electrons", [150, 500, 2000])
+@pytest.mark.parametrize("count", [1, 3, 8, 25])
+def test_a_trail_is_no_ring_however_few_the_stars(count, electrons, rng):
+    start, end = (-50, 40), (950, 780)
+    stars = grid(SIZE, 50, 9000, rng)
+    near = trail(start, end, 1.0, 9)[stars[:, 1].astype(int), stars[:, 0].astype(int)]
+    stars = rng.permutation(stars[near < 1e-4])[:count]
+    found = detect(Frame(noisy(field(SIZE, stars) + trail(start, end, electrons), rng))).stars
+    assert np.all(match(found, stars) >= 0)
+    assert len(found) == count
+
+
+def test_a_long_trail_on_a_large_frame_hides_no_star(rng):
+    size, start, end = (3744, 5616), (-20, 750), (5636, 3000)
+    stars = grid(size, 700, 9000, rng)
+    light = field(size, stars) + trail(start, end, 300, size=size)
+    found = detect(Frame(noisy(light, rng))).stars
+    index = match(found, stars)
+    assert np.mean(index >= 0) > 0.9  # one or two lie under it
+    assert len(found) == np.count_nonzero(index >= 0)
 
 
 def test_stars_under_a_trail_are_measured_as_well_as_they_say(rng):

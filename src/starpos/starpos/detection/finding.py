@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where something starlike stands out of the noise: a smoothed frame's peaks. One pass, strip by strip."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,10 +12,8 @@ from starpos.detection.stamps import are_dots, surroundings
 STRIP = 64  # rows: small enough to stay in the processor's cache
 CROWD = 14  # px: the widest defocused star
 LEADERS = 100  # peaks that tell whether the frame's stars are rings
-SINGLE, CLEAR = (
-    0.15,
-    20.0,
-)  # share of peaks that would not be single if they were; sigma: where a ring has no single one
+NEAREST = 24  # sharp peaks that tell what a wide one is
+OPPOSITE = -0.95  # cosine between the two sides to which a line goes on
 
 
 @dataclass(frozen=True)
@@ -53,47 +51,53 @@ def find_peaks(plane, background, threshold, limit) -> Peaks:
     """At most `limit` Peaks that stand out by `threshold` sigma.
 
     The light of a telescope out of focus, with an obstruction in its middle, is a ring, on which several peaks crowd:
-    where most bright ones do, the frame is smoothed more widely, if that leaves them alone and makes them stand out
-    more. A streak or a tree stays a crowd, or has stars beside it; the two stars of a pair stand out less.
+    where most bright ones do, the frame is smoothed more widely, if most of what then stands out are rings. A streak
+    or a twig is a crowd too, but goes on to both sides; the two stars of a pair stand out less.
     """
     sharp = _peaks_of(plane, background, SHARP, threshold, limit)
-    leaders = _leaders(plane, background, sharp)
-    if not _crowded(sharp, leaders):
+    bright = _no_dots(plane, background, sharp)
+    if not _crowded(bright):
         return sharp
     wide = _peaks_of(plane, background, WIDE, threshold, limit)
-    wide_leaders = _leaders(plane, background, wide)
-    if len(wide_leaders) == 0 or _crowded(wide, wide_leaders):
-        return sharp
-    if np.count_nonzero(_single(plane, background, sharp)) > SINGLE * len(wide.x):
-        return sharp
-    better = np.median(wide.height[wide_leaders]) > np.median(sharp.height[leaders])
-    return wide if better else sharp
+    return wide if _are_rings(plane.shape, bright, _no_dots(plane, background, wide)) else sharp
 
 
-def _leaders(plane, background, peaks):
-    """Indices of the brightest that are no hot pixels."""
-    first = np.arange(min(len(peaks.x), 10 * LEADERS))
-    return first[~are_dots(plane, background, peaks.x[first], peaks.y[first])][:LEADERS]
+def _no_dots(plane, background, peaks):
+    """The Peaks that are no hot pixels."""
+    keep = ~are_dots(plane, background, peaks.x, peaks.y)
+    return replace(peaks, x=peaks.x[keep], y=peaks.y[keep], height=peaks.height[keep])
 
 
-def _crowded(peaks, leaders):
-    """Whether most of the leaders have one like them within CROWD px."""
+def _crowded(peaks):
+    """Whether most of the brightest have one like them within CROWD px."""
     points = np.stack([peaks.x, peaks.y], 1)
-    if len(leaders) < 2:
+    if len(points) < 2:
         return False
-    alike = peaks.height > 0.5 * peaks.height[leaders[-1]]
-    nearest = spatial.cKDTree(points[alike]).query(points[leaders], 2)[0][:, 1]
+    leaders = points[:LEADERS]
+    alike = points[peaks.height > 0.5 * peaks.height[len(leaders) - 1]]
+    nearest = spatial.cKDTree(alike).query(leaders, 2)[0][:, 1]
     return bool(np.median(nearest) < CROWD)
 
 
-def _single(plane, background, peaks):
-    """Which peaks (N,) are bright, wider than a pixel, and have none of half their height within CROWD px."""
-    points = np.stack([peaks.x, peaks.y], 1)
-    pairs = spatial.cKDTree(points).query_pairs(CROWD, output_type="ndarray")
-    single = peaks.height > CLEAR
-    for a, b in (pairs.T, pairs.T[::-1]):
-        single[a[peaks.height[b] > 0.5 * peaks.height[a]]] = False
-    return single & ~are_dots(plane, background, peaks.x, peaks.y)
+def _are_rings(size, sharp, wide):
+    """Whether most of the brightest wide peaks, but those on a line, stand for several sharp ones lower than they.
+
+    A line ends at the edge of the frame, size (height, width) px, so nothing there tells.
+    """
+    points, centres = (np.stack([peaks.x, peaks.y], 1) for peaks in (sharp, wide))
+    apart, near = spatial.cKDTree(points).query(centres, NEAREST, distance_upper_bound=2 * CROWD)
+    height = np.append(sharp.height, 0)[near]
+    inside = apart < 0.7 * CROWD
+    highest = height.max(1, where=inside, initial=0)
+    alike = height > 0.25 * highest[:, None]
+    ring = (highest < wide.height) & (np.count_nonzero(inside & alike, axis=1) > 1)
+    beyond = alike & ~inside & np.isfinite(apart)
+    way = (np.append(points, [[0, 0]], 0)[near] - centres[:, None]) / np.maximum(apart, 1)[..., None]
+    way *= beyond[..., None]
+    on_line = np.einsum("nik,njk->nij", way, way).min((1, 2), initial=0) < OPPOSITE
+    at_edge = np.minimum(centres, np.array(size[::-1]) - 1 - centres).min(1) < 2 * CROWD
+    rings = ring[~on_line & ~at_edge][:LEADERS]
+    return np.count_nonzero(rings) > 0.5 * len(rings)
 
 
 def _peaks_of(plane, background, kernel, threshold, limit):

@@ -69,9 +69,12 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
 
 def _teachers(plane, background, x, y, height, saturation):
     """The Gaussians most like the bright stars alone in their surroundings, their Stamps, and x, y (N,) of each."""
-    bright = np.flatnonzero(height > BRIGHT)
+    clear = np.ones(len(x), bool)
+    for streak in background.streaks:
+        clear &= streak.at(y, x)[0] == 0
+    bright = np.flatnonzero(clear & (height > BRIGHT))
     if len(bright) == 0:
-        bright = np.arange(min(len(x), TEACHERS))
+        bright = np.flatnonzero(clear)[:TEACHERS]
     bright = bright[_isolated(x, y, height, bright)]
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
