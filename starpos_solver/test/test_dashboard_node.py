@@ -64,6 +64,13 @@ def test_a_parameter_out_of_range_is_one_line_and_status_1(start, parameter):
     assert status == 1 and len(output.splitlines()) == 1 and "must be" in output
 
 
+@pytest.mark.parametrize("address", ["''", "' '", "'127.0.0.1 '"])
+def test_no_address_is_not_every_address(start, address):
+    status, output = start("port:=0", f"address:={address}").end()
+    (line,) = output.splitlines()
+    assert status == 1 and "parameter address must be an address of this machine" in line
+
+
 def test_without_tornado_it_says_how_to_install_it(monkeypatch):
     from starpos_solver.dashboard.main import make_nodes
 

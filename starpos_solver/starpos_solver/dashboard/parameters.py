@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dashboard's parameters."""
 
-from starpos_common.parameters import Parameter
+from starpos_common.parameters import Form, Parameter
+
+# An empty one would be every network of this machine, without a word of it.
+ADDRESS = Form(
+    "an address of this machine, such as 127.0.0.1, without blanks", lambda text: text.split() == [text]
+)
 
 PARAMETERS = (
     Parameter(
@@ -10,6 +15,7 @@ PARAMETERS = (
         "Address the page is served on; 0.0.0.0 or :: is every network of this machine, and whoever reaches it reads "
         "where the instrument is, without a password.",
         read_only=True,
+        form=ADDRESS,
     ),
     Parameter(
         "port",
