@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from starpos.detection import detect
 from starpos.frame import Frame
-from starpos.stars import SATURATED
+from starpos.stars import BLENDED, SATURATED
 
 SIZE = (600, 900)
 ELECTRONS = 12000
@@ -138,6 +138,17 @@ def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, pattern, rng):
         assert 0.75 < rms(pull) < 1.25
         if fwhms > 1.5:  # resolved
             assert np.count_nonzero(found.flags[match(found, some)]) < 0.2 * len(some)
+
+
+def test_three_stars_in_a_row_do_not_vanish_and_their_image_is_flagged(rng):
+    stars = grid(SIZE, 50, 20000, rng)
+    middle = stars[::3]
+    angle = rng.uniform(0, 2 * np.pi, len(middle))
+    way = 1.3 * 2.4 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    found = found_in(field(SIZE, np.concatenate([stars, middle - way, middle + way])), rng)
+    index = match(found, middle, within=4)
+    assert np.all(index >= 0)
+    assert np.all(found.flags[index] & BLENDED)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.3])

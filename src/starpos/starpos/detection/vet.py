@@ -17,11 +17,14 @@ SPECK = 3  # pixels
 SPIKE = 3  # times sharper than a star
 RESOLVED = 3.0  # widths, 1.3 FWHM: nearer ones are measured, but each leans on the other
 STRANGE = 3.0  # chi-square of what no star alone makes: twigs, nebulae, stars under something
+WIDE = 1.7  # times the squared width of a star: no one star
+# times that, across; and SNR: such wide ones may be stars in a row, and stay, flagged
+NARROW, CERTAIN = 1.2, 60
 LOUD = 3  # times the quietest pixel's noise
 
 
 def measure(plane, background, x, y, lesson, saturation, min_snr):
-    """Columns x, y, flux, snr, covariance, flags, chi2 of the stars among the peaks x, y (N,) int, in no order."""
+    """Columns x, y, flux, snr, covariance, flags, chi2, wide of the stars among the peaks x, y (N,) int, in no order."""
     psf = lesson.psf
 
     def cut_at(x, y):
@@ -52,14 +55,16 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
         slack = 3 / matched
         full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
-        sound &= full | ((widths[:, 0] > 0.45 - slack) & (widths[:, 1] < 1.7))
+        wide = (widths[:, 1] > WIDE) & ~full
+        sound &= full | (widths[:, 0] > 0.45 - slack)
+        sound &= ~wide | ((widths[:, 0] < NARROW) & (matched > CERTAIN))
         edge = (~stamps.good & ~stamps.full & ~spike & _core(stamps, fit, psf, 3)).any((1, 2))
         foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux
-        foreign |= _misfit(fit) > STRANGE
+        foreign |= (_misfit(fit) > STRANGE) | wide
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
     columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
-    columns["chi2"] = fit.chi2
+    columns |= {"chi2": fit.chi2, "wide": wide}
     return {name: column[sound] for name, column in columns.items()}
 
 
@@ -131,9 +136,13 @@ def _is_dot(stamps, fit, response):
 
 
 def resolve(columns, psf):
-    """Sort by flux, keep one of each set of fits that ran into the same star, and flag neighbours as BLENDED."""
+    """Sort by flux, keep one of each set of fits that ran into the same star, and flag neighbours as BLENDED.
+
+    A wide image stays, flagged, where nothing better was measured.
+    """
     order = np.argsort(-columns["flux"], kind="stable")
     columns = {name: column[order] for name, column in columns.items()}
+    wide = columns.pop("wide")
     n = len(order)
     if n == 0:
         return columns
@@ -143,7 +152,9 @@ def resolve(columns, psf):
     apart = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
     ratio = columns["flux"][pairs[:, 1]] / columns["flux"][pairs[:, 0]]
     keep = np.ones(n, bool)
-    keep[pairs[(apart < 1.5) | (ratio < 0.01), 1]] = False
+    for one, other in (pairs.T, pairs.T[::-1]):
+        keep[one[wide[one] & ~wide[other] & (apart < RESOLVED)]] = False
+    keep[pairs[keep[pairs[:, 0]] & ((apart < 1.5) | (ratio < 0.01)), 1]] = False
     near = keep[pairs].all(1) & (apart < RESOLVED)
     flags = columns["flags"].copy()
     flags[pairs[near, 1]] |= BLENDED
