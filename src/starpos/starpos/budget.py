@@ -22,8 +22,8 @@ class ErrorTerm:
     """One source of error: factor (6, m) of the covariance variance * factor @ factor.T.
 
     Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  shared: None
-    where the error is new in every frame; else keys, and frames whose terms have one in common have the same m errors:
-    ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a second, for an error that wanders.
+    where the error is new in every frame; else the keys of what it is the mean of, and the m errors of frames that have
+    some in common have their `correlation`: ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a second, for an error that wanders.
     posed: the factor is the same as long as nobody touches the camera; that it differs is noise.
     """
 
@@ -43,6 +43,11 @@ class ErrorTerm:
     def common(self) -> bool:
         """Whether it keeps its sign from frame to frame."""
         return self.shared == ALWAYS
+
+
+def correlation(a: tuple, b: tuple) -> float:
+    """Of two means of equally good readings, by the keys of these."""
+    return len(set(a) & set(b)) / (len(a) * len(b)) ** 0.5 if a and b else 0.0
 
 
 @dataclass(frozen=True)

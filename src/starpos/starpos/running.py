@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.budget import ErrorTerm, symmetric_root
+from starpos.budget import ErrorTerm, correlation, symmetric_root
 from starpos.earth import curvature_radii_m
 from starpos.fix import Fix
 from starpos.rotation import full_turn, half_turn
@@ -189,14 +189,12 @@ class Running:
         for k, t in enumerate(f.terms):
             if own[k]:
                 continue
-            at = self.columns[k]
-            unit = np.eye(at.stop - at.start)
-            if set(keys[k]) & set(t.shared):
-                sources[k, at, at] += unit * t.walk_s * abs(f.utc_unix_s - self.utc_unix_s)
-            else:  # another error of the kind, not met before
-                state[at] = 0.0
-                sources[:, at, :] = sources[:, :, at] = 0.0
-                sources[k, at, at] = unit * t.variance
+            at, alike = self.columns[k], correlation(keys[k], t.shared)
+            state[at] *= alike
+            sources[:, at, :] *= alike
+            sources[:, :, at] *= alike
+            walked = t.walk_s * abs(f.utc_unix_s - self.utc_unix_s) if alike else 0.0
+            sources[k, at, at] += np.eye(at.stop - at.start) * (t.variance * (1 - alike**2) + walked)
             keys[k] = t.shared
         later = max(self.utc_unix_s, f.utc_unix_s)
         return replace(self, state=state, sources=sources, keys=tuple(keys), utc_unix_s=later), own
