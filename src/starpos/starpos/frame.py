@@ -9,6 +9,7 @@ from starpos.errors import FrameError
 from starpos.stars import check_focal, check_size, check_times
 
 MAX_PIXELS = 200_000_000  # a header may claim anything; this much fits a small robot's memory
+LOUDEST = 30_000  # times the noise above the sky or below it: further off is no light, as no sensor reaches that far
 PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 
 
@@ -80,16 +81,30 @@ def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
             raise FrameError(f"{place}: more than 1 % of its pixels are NaN or infinite; mask fewer of them.")
         if not finite.all():
             values = np.where(finite, values, np.median(values[finite]))
-    low, high = float(values.min()), float(values.max())
+    if not np.isfinite(float(values.max()) - float(values.min())):
+        raise FrameError(
+            f"{place}: its pixels span {values.min():g} to {values.max():g}; rescale them to 16 bits."
+        )
+    low, high = _limits(values)
     span = high - low
     narrow = values.dtype.kind == "f" and 0 < span < 4096
-    if not np.isfinite(span):
-        raise FrameError(f"{place}: its pixels span {low:g} to {high:g}; rescale them to 16 bits.")
     if low >= 0 and high <= 65535 and not narrow:
         offset, scale = 0.0, 1.0
     else:
         offset, scale = low, (65535 / span if narrow or span > 65535 else 1.0)
     out = np.empty(values.shape, np.uint16)
     for row in range(0, len(values), 256):  # strips: a float64 copy of a whole frame is 170 MB
-        out[row : row + 256] = np.rint((values[row : row + 256].astype(np.float64) - offset) * scale)
+        strip = np.clip(values[row : row + 256].astype(np.float64), low, high)
+        out[row : row + 256] = np.rint((strip - offset) * scale)
     return out
+
+
+def _limits(values) -> tuple[float, float]:
+    """The least and the largest value, as far as LOUDEST allows: a pixel divided by a dead one would take all 16 bits."""
+    low, high = float(values.min()), float(values.max())
+    some = np.atleast_2d(values)[:: max(1, len(values) // 256)].astype(np.float64)
+    noise = np.median(np.abs(np.diff(some, axis=1))) if some.shape[1] > 1 else 0.0
+    if noise == 0:
+        return low, high
+    sky = float(np.median(some))
+    return max(low, sky - LOUDEST * noise), min(high, sky + LOUDEST * noise)

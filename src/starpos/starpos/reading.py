@@ -36,7 +36,8 @@ def read_frame(path, clock: CameraClock | None = None) -> Frame | Stars:
     in TIMESYS), EXPTIME or EXPOSURE its length in s; BAYERPAT (XBAYROFF, YBAYROFF) the mosaic; FOCALLEN
     (mm) and XPIXSZ (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits stay,
     rounded; others are shifted to begin at 0, and scaled to fill 16 bits where their range is wider than that
-    or, of floats, narrower than 4096. A few NaN or infinite pixels become the median.
+    or, of floats, narrower than 4096. A few NaN or infinite pixels become the median, and what lies further from
+    it than any light (frame.LOUDEST) is clipped.
     TIFF, PNG, JPEG: 8 or 16 bits, grey or colour. 16-bit colour is scaled down to bgr8.
     Camera raw: the mosaic as the sensor gave it, through rawpy.
     Of these the exposure is EXIF's, where exifread is installed; the time too, but only with a clock.

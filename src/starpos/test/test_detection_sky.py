@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Skies and sensors that are not clean: what is in the way costs only what it covers."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from rendered import bound, coloured, errors, field, grid, match, noisy, rms
 from scipy import ndimage
 
 from starpos.detection import detect
-from starpos.frame import Frame
+from starpos.detection.background import measure_background
+from starpos.detection.finding import find_peaks
+from starpos.frame import Frame, to_unsigned
 from starpos.stars import BLENDED, SATURATED
 
 SIZE = (600, 900)
@@ -163,3 +167,50 @@ def test_many_pairs_teach_no_false_errors(ratio, rng):
         error, pull = errors(found, some)
         assert rms(error) < 1.2 * rms(bound(some[0, 2], trail=trail))
         assert 0.85 < rms(pull) < 1.15
+
+
+def peaks_of(pixels):
+    return find_peaks(pixels, measure_background(pixels, 64, None), 5.0, 10_000)
+
+
+def test_hot_pixels_cost_no_fit_each_and_hardly_a_star(rng):
+    stars = grid(SIZE, 60, ELECTRONS, rng)
+    light = noisy(field(SIZE, stars), rng).astype(int)
+    hot = rng.random(SIZE) < 0.004
+    light[hot] += rng.integers(100, 20_000, hot.sum())
+    pixels = light.clip(0, 65535).astype(np.uint16)
+    found = detect(Frame(pixels)).stars
+    assert np.mean(match(found, stars) >= 0) > 0.98  # a hot pixel in the midst of one may cost it
+    assert len(peaks_of(pixels).x) < len(stars) + 0.4 * hot.sum()  # pairs of hot pixels stay to be looked at
+
+
+def test_a_disc_that_saturates_is_few_peaks_and_hides_no_star_a_cell_of_the_background_away(rng):
+    stars = grid(SIZE, 50, ELECTRONS, rng)
+    y, x = np.indices(SIZE)
+    disc = np.hypot(x - 450, y - 300) < 150
+    stars = stars[np.hypot(stars[:, 0] - 450, stars[:, 1] - 300) > 150 + 64]
+    pixels = noisy(np.where(disc, 1e6, field(SIZE, stars)), rng)
+    assert len(peaks_of(pixels).x) < len(stars) + 50
+    assert np.all(match(detect(Frame(pixels)).stars, stars) >= 0)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1 / 65535], ids=["DN", "share"])
+@pytest.mark.parametrize("value", [1e5, 1e7, 1e30, -1e6])
+def test_a_pixel_beyond_all_light_costs_no_other_its_precision(unit, value, stars, rng):
+    pixels = noisy(field(SIZE, stars), rng).astype(np.float64) * unit
+    pixels[10, 10] = value
+    error, _ = errors(detect(Frame(to_unsigned(pixels, "the frame"))).stars, stars)
+    assert rms(error) < 1.1 * rms(bound(ELECTRONS))
+
+
+def test_memory_is_less_than_two_and_a_half_frames(rng):
+    size = (1155, 1732)
+    frame = Frame(noisy(field(size, grid(size, 80, ELECTRONS, rng)), rng))
+    detect(Frame(frame.pixels[:200, :200].copy()))  # what the first call loads
+    tracemalloc.start()
+    try:
+        detect(frame)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2.5 * frame.pixels.nbytes

@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
-from starpos.detection.stamps import are_dots, surroundings
+from starpos.detection.stamps import are_alone, are_dots, surroundings
 
 STRIP = 64  # rows: small enough to stay in the processor's cache
+CHUNK = 4096  # peaks looked at at once
 CROWD = 14  # px: the widest defocused star
 LEADERS = 100  # peaks that tell whether the frame's stars are rings
 NEAREST = 24  # sharp peaks that tell what a wide one is
@@ -125,7 +126,11 @@ def _peaks_of(plane, background, kernel, threshold, limit):
         above &= smooth == cv2.dilate(smooth, neighbours)
         place = np.flatnonzero(above[offset : offset + bottom - top])  # faster than nonzero in two dimensions
         y, x = np.divmod(place, plane.shape[1])
-        found.append(np.stack([x, y + top, smooth[y + offset, x]]))
+        value = smooth[y + offset, x]
+        if np.any(np.diff(place) == 1):  # a saturated disc is a plateau of as many peaks as pixels
+            _, part = cv2.connectedComponents(above[offset : offset + bottom - top].astype(np.uint8))
+            x, y, value = _merged(x, y, value, part[y, x] - 1)
+        found.append(np.stack([x, y + top, value]))
     if not found:
         return Peaks(np.zeros(0, int), np.zeros(0, int), np.zeros(0), correlation)
     x, y, value = np.concatenate(found, 1)
@@ -133,7 +138,13 @@ def _peaks_of(plane, background, kernel, threshold, limit):
     height = (value - local) / sigma
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
     x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
-    raised, uneven = surroundings(plane, background, x, y, round(6.7 * kernel.sigma))
+    starlike = ~are_alone(plane, background, x, y)
+    x, y, height = x[starlike], y[starlike], height[starlike]
+    near = [
+        surroundings(plane, background, x[c], y[c], round(6.7 * kernel.sigma))
+        for c in (slice(i, i + CHUNK) for i in range(0, len(x), CHUNK))
+    ]
+    raised, uneven = np.concatenate(near, 1) if near else np.zeros((2, 0))
     height = (height - raised / (kernel.norm * correlation)) / uneven
     keep = np.flatnonzero(height > _above_tail(height, threshold))
     keep = keep[np.argsort(-height[keep], kind="stable")]
@@ -204,11 +215,14 @@ def _join_plateaus(x, y, height, flat):
     pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(flat + 0.5, output_type="ndarray")
     if len(pairs) == 0:
         return x.astype(int), y.astype(int), height
-    n = len(x)
-    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (n, n))
-    groups, group = sparse.csgraph.connected_components(graph, directed=False)
-    count = np.bincount(group, minlength=groups)
-    x, y = (np.rint(np.bincount(group, v, groups) / count).astype(int) for v in (x, y))
-    height = np.bincount(group, height, groups) / count
+    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (len(x), len(x)))
+    x, y, height = _merged(x, y, height, sparse.csgraph.connected_components(graph, directed=False)[1])
     order = np.argsort(-height, kind="stable")
     return x[order], y[order], height[order]
+
+
+def _merged(x, y, value, group):
+    """The middle of each group of peaks (N,), numbered from 0, and its mean value."""
+    count = np.bincount(group)
+    x, y = (np.rint(np.bincount(group, v) / count).astype(int) for v in (x, y))
+    return x, y, np.bincount(group, value) / count

@@ -19,7 +19,7 @@ ABOUT = (
     "width", "height", "mid_unix_s", "exposure_s", "source", "focal_px", "stamp_stddev_s", "clock_stddev_s",
 )
 # fmt: on
-CHUNK_PIXELS = 60_000  # of stars fitted at once: a few tens of megabytes
+CHUNK_PIXELS = 12_000, 60_000  # of stars fitted at once, of a small frame and of a large one: 1 and 5 MB
 PEAKS = 10_000  # looked at; at least twice as many as stars are wanted, as hot pixels are peaks too
 
 
@@ -92,7 +92,7 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
-    chunk = max(1, CHUNK_PIXELS // (2 * lesson.reach + 1) ** 2)
+    chunk = max(1, int(np.clip(plane.size // 64, *CHUNK_PIXELS)) // (2 * lesson.reach + 1) ** 2)
     chunks = [slice(i, i + chunk) for i in range(0, len(x), chunk)]
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

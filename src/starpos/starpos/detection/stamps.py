@@ -12,6 +12,9 @@ UNEVEN = (
     1.6  # times it: what about 50 pixels must show, four times the errors, to count for more than the mesh
 )
 
+# of a hot pixel's light, and of their noise: what the 24 pixels around it have less of, together
+ALONE, NOTHING = 0.25, 3.0
+
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
@@ -62,11 +65,23 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     return Stamps(x, y, pixels - level, noise, on & ~full, full, phase)
 
 
-def are_dots(plane, background, x, y):
-    """Whether the pixels x, y (N,) int are hot: less light in their neighbours together than in half of the brightest."""
-    core = cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9)
-    peak = core.max(1)
-    return core.sum(1) - peak < 0.5 * peak
+def are_dots(plane, background, x, y, doubt=0):
+    """Whether the pixels x, y (N,) int are hot: less light in their neighbours together than in half of the brightest.
+
+    Those that are not by less than `doubt` sigma count as hot.
+    """
+    core = cut(plane, background, x, y, 1, np.inf)
+    peak = core.signal.max((1, 2))
+    noise = np.sqrt((core.noise**2).sum((1, 2)))
+    return core.signal.sum((1, 2)) - peak < 0.5 * peak + doubt * noise
+
+
+def are_alone(plane, background, x, y):
+    """Whether the pixels x, y (N,) int are hot beyond doubt: next to no light around them, no star beside them either."""
+    around = cut(plane, background, x, y, 2, np.inf)
+    peak = around.signal.max((1, 2))
+    beside = around.signal.sum((1, 2)) - peak
+    return beside < np.minimum(ALONE * peak, NOTHING * np.sqrt((around.noise**2).sum((1, 2))))
 
 
 def surroundings(plane, background, x, y, reach):
