@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -134,15 +135,28 @@ def run():
     def run(name, *arguments):
         command = [sys.executable, "-c", LAUNCH, str(FOLDER / f"{name}.launch.py"), *arguments]
         processes.append(
-            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            subprocess.Popen(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                start_new_session=True,  # a process group of its own, with its nodes
+            )
         )
         return processes[-1]
 
     yield run
     for process in processes:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def ctrl_c(process) -> None:
+    """What a terminal does: SIGINT to launch and to all it has started, which end cleanly."""
+    os.killpg(process.pid, signal.SIGINT)
+    out, _ = process.communicate(timeout=WAIT_S)
+    assert "Traceback" not in out and "has died" not in out, out
 
 
 def test_the_demo_gives_its_place_in_a_namespace_and_ends_cleanly(run):
@@ -156,28 +170,29 @@ def test_the_demo_gives_its_place_in_a_namespace_and_ends_cleanly(run):
     fix = fixes[-1]
     sigma_deg = (fix.position_covariance[0] + fix.position_covariance[4]) ** 0.5 / 111e3
     assert abs(fix.latitude + 30) < 5 * sigma_deg and abs(fix.longitude - 100) < 6 * sigma_deg
-    process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=30)
-    assert "Traceback" not in out and "has died" not in out
+    ctrl_c(process)
 
 
 def test_a_process_that_is_killed_is_started_again_where_that_is_asked_for(run):
     process = run("starpos", "respawn:=true", "camera:=simulated", "port:=/nowhere")
-    patience = threading.Timer(WAIT_S, process.kill)
+    patience = threading.Timer(WAIT_S, os.killpg, (process.pid, signal.SIGKILL))
     patience.start()
 
     def pid_of_next_inclinometer() -> int:
+        """Once it speaks: launch says its pid before it can end it."""
+        pid = 0
         for line in process.stdout:
             if match := re.search(r"\[inclinometer-\d+\]: process started with pid \[(\d+)\]", line):
-                return int(match[1])
+                pid = int(match[1])
+            elif pid and re.match(r"\[inclinometer-\d+\] .*/nowhere", line):
+                return pid
         raise AssertionError(f"not started within {WAIT_S} s")
 
     first = pid_of_next_inclinometer()
     os.kill(first, signal.SIGKILL)
     assert pid_of_next_inclinometer() != first
     patience.cancel()
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=WAIT_S)
+    ctrl_c(process)
 
 
 @pytest.mark.skipif(not NIGHT.is_dir(), reason="no bag beside the package")
