@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tools/ make of arguments that are none, and of tests that did not run."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -74,6 +75,18 @@ def test_a_fault_whose_test_did_not_run_is_not_passed(tmp_path, monkeypatch, out
     )
     rows, failed = rows_of(report)
     assert failed == bad and len(rows) == 1 and (rows[0][1] == "back after 1 s") == (not bad)
+
+
+def test_no_profile_is_none_and_no_empty_path_to_one(monkeypatch):
+    """Fast DDS prints an error for an empty path."""
+    monkeypatch.syspath_prepend(str(TOOLS))
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/home/robot/mine.xml")
+    import latency
+
+    latency.choose("")
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in os.environ
+    latency.choose("quick.xml")
+    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] == "quick.xml"
 
 
 def test_a_signal_that_another_thread_of_the_sky_gets_does_not_end_it():

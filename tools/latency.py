@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
 QUICK_START = ROOT / "starpos_solver" / "config" / "quick_start.xml"
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 START_S, SOLVER_S, FRAME_S, STARS_S = 3.0, 1.0, 0.6, 0.02  # targets, median
 FILES = 8  # frames of 42 MB on disk, played round and round
 CADENCE_S = 1.0
@@ -229,6 +230,14 @@ def peak_mb(pid: int) -> float:
     return next(int(line.split()[1]) * 1.024e-3 for line in lines if line.startswith("VmHWM"))
 
 
+def choose(profile: str) -> None:
+    """The Fast DDS profiles of all nodes; '' is none, also where the shell has some."""
+    if profile:
+        os.environ[PROFILES] = profile
+    else:
+        os.environ.pop(PROFILES, None)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -242,7 +251,7 @@ def main() -> int:
     options = parser.parse_args()
     only, rows = options.only.split(","), []
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = options.profile
+    choose(options.profile)
     from domain_coordinator import domain_id
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
