@@ -56,17 +56,14 @@ def test_the_track_has_a_dot_for_every_fix_before(page):
     for k in range(4):
         page.instrument.works(fix=said.fix(48.1373 + 1e-4 * k))
         page.shows(decimal=f"{48.1373 + 1e-4 * k:.4f}° 11.575°")
-    dots = page.run("return document.querySelector('.dots').getAttribute('d')")
-    assert len(set(dots.split("M")[1:])) >= 3 and "NaN" not in dots
+    dots = "return document.querySelector('.dots').getAttribute('d')"
+    page.until(lambda: len(set(page.run(dots).split("M")[1:])) >= 3)  # the map is drawn after the texts
+    assert "NaN" not in page.run(dots)
 
 
 def test_a_fix_without_a_known_error_has_no_ellipse(page):
     page.instrument.works(fix=said.fix(48.1373, 11.5755, (nan := math.nan, nan, nan)))
     page.shows(sigma_east="± —", status_sentence="how far it may be off is not known")
-    drawn = [
-        page.run(f"return document.querySelector('#ellipse-newest .{q}').getAttribute('d')")
-        for q in ("inner", "outer")
-    ]
-    assert drawn == ["", ""] and page.run(
-        "return document.querySelector('#ellipse-newest .mark').checkVisibility()"
-    )
+    drawn = "return ['inner', 'outer'].map((q) => document.querySelector(`#ellipse-newest .${q}`).getAttribute('d'))"
+    page.until(lambda: page.run(drawn) == ["", ""])
+    assert page.run("return document.querySelector('#ellipse-newest .mark').checkVisibility()")
