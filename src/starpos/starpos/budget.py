@@ -22,9 +22,9 @@ class ErrorTerm:
     """One source of error: factor (6, m) of the covariance variance * factor @ factor.T.
 
     Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  shared: None
-    where the error is new in every frame; else the keys of what it is the mean of, and the m errors of frames that have
-    some in common have their `correlation`: ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a second, for an error that wanders.
-    posed: the factor is the same as long as nobody touches the camera; that it differs is noise.
+    where the error is new in every frame; else the keys of what it is the mean of, and the m errors of two frames have
+    the `correlation` of their keys: ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a
+    second, for an error that wanders.  posed: the factor is the same as long as nobody touches the camera; that it differs is noise.
     """
 
     name: str
