@@ -24,7 +24,8 @@ class ErrorTerm:
     Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  shared: None
     where the error is new in every frame; else the keys of what it is the mean of, and the m errors of two frames have
     the `correlation` of their keys: ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a
-    second, for an error that wanders.  posed: the factor is the same as long as nobody touches the camera; that it differs is noise.
+    second, for an error that wanders.  posed: the factor is the same as long as nobody touches the camera; that it
+    differs is noise.
     """
 
     name: str
