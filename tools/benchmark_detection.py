@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time and memory of detection against the frame's size and against the number of stars: two tables.
+"""CPU time and memory of detection against the frame's size, the number of stars and the share of hot pixels.
 
 `benchmark_detection.py [--repeat N]`.  sep with windowed positions answers the same frames where it can be imported
 (`pip install sep`).  Memory is what the process grows by at its peak, over the frame's own bytes (Linux only).
@@ -27,12 +27,15 @@ SIZES = {
     21: (5616, 3744),
     60: (9488, 6324),
 }  # Mpx: columns, rows
-STARS_PER_MPX, STAR_COUNTS = 15, (10, 100, 1000, 5000)
+STARS_PER_MPX, STAR_COUNTS, HOT = 15, (10, 100, 1000, 5000), (0.0001, 0.001, 0.003)
 SKY, SIGMA, TRAIL = 600, 1.02, np.array([2.6, -2.2])  # DN; px; px: half a second of the sky
 
 
-def exposure(size, count, rng):
-    """A 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, faint ones commonest."""
+def exposure(size, count, rng, hot=0.0):
+    """A 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, faint ones commonest.
+
+    hot: the share of pixels that are hot, by 100 DN and more, 2000 on average.
+    """
     columns, rows = size
     pixels = rng.normal(SKY, 7.0, (rows, columns)).astype(np.float32)
     grid, steps = np.arange(-14, 15), (np.arange(12) + 0.5) / 12 - 0.5
@@ -42,6 +45,8 @@ def exposure(size, count, rng):
         star = np.exp(-0.5 * (v / SIGMA) ** 2).T @ np.exp(-0.5 * (u / SIGMA) ** 2)
         stamp = np.s_[int(y) - 14 : int(y) + 15, int(x) - 14 : int(x) + 15]
         pixels[stamp] += rng.poisson(star * (flux / star.sum()))
+    which = np.flatnonzero(rng.random(pixels.size) < hot)
+    pixels.flat[which] += 100 + rng.exponential(2000, len(which))
     return np.clip(np.rint(pixels), 0, 65535).astype(np.uint16)
 
 
@@ -66,7 +71,8 @@ def memory_kb(name):
 
 def measured(work, path, repeat):
     """Stars found, CPU ms (the quickest of `repeat`), and the peak of memory over the frame's bytes."""
-    work(exposure(SIZES[0.5], 100, np.random.default_rng(1)))  # what the first call loads is no frame's work
+    # what the first call loads is no frame's work; a small one leaves no memory to those that follow
+    work(exposure((200, 200), 5, np.random.default_rng(1)))
     pixels = np.load(path)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
     before, times = memory_kb("VmRSS"), []
@@ -87,19 +93,20 @@ def main():
     if importlib.util.find_spec("sep"):
         programs["sep"] = with_sep
     print(
-        f"{'Mpx':>6} {'stars':>6}"
+        f"{'Mpx':>6} {'stars':>6} {'hot':>6}"
         + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs)
     )
     rng = np.random.default_rng(1)
-    cases = [(mpx, round(STARS_PER_MPX * mpx)) for mpx in SIZES] + [(21, count) for count in STAR_COUNTS]
+    cases = [(mpx, round(STARS_PER_MPX * mpx), 0.0) for mpx in SIZES] + [(21, n, 0.0) for n in STAR_COUNTS]
+    cases += [(21, 315, hot) for hot in HOT]
     with (
         tempfile.TemporaryDirectory() as folder,
         multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool,
     ):
         path = Path(folder) / "frame.npy"
-        for mpx, count in cases:
-            np.save(path, exposure(SIZES[mpx], count, rng))
-            line = f"{mpx:6g} {count:6d}"
+        for mpx, count, hot in cases:
+            np.save(path, exposure(SIZES[mpx], count, rng, hot))
+            line = f"{mpx:6g} {count:6d} {hot:6g}"
             for work in programs.values():
                 found, ms, memory = pool.apply(measured, (work, path, repeat))
                 line += f" | {found:14d} {ms:7.1f} {ms / mpx:6.1f} {memory:6.2f}"
