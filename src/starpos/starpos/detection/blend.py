@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 from scipy import ndimage
 
-from starpos.detection.fit import FIT_WIDTHS, Fit, fit_stars, inverse
+from starpos.detection.fit import FIT_WIDTHS, Fit, fit_stars, gains_at, inverse
 from starpos.detection.stamps import Stamps
 
 SURPRISING = 4.0  # sigma of chi-square: from here on one star is not enough
@@ -27,7 +27,7 @@ def with_companions(stamps, spike, fit, psf, response, cut_at):
     if len(odd) == 0:
         return stamps, spike, fit
     before = (stamps.good * fit.residual**2 / response.variance(stamps.noise, fit.model))[odd]
-    x, y, flux, colour, sigma, covariance, models, used, chi2 = _fit_pairs(
+    x, y, flux, gains, sigma, covariance, models, used, chi2 = _fit_pairs(
         stamps.take(odd), _rows(fit, odd), psf, response
     )
     freedom = np.maximum(used.sum((1, 2)) - 6, 1)
@@ -41,25 +41,25 @@ def with_companions(stamps, spike, fit, psf, response, cut_at):
     if not real.any():
         return stamps, spike, fit
     odd, used, whole = odd[real], used[real], away[1, real] < stamps.reach - 1
-    x, y, flux, colour, sigma, covariance, models = (
-        a[:, real] for a in (x, y, flux, colour, sigma, covariance, models)
+    x, y, flux, gains, sigma, covariance, models = (
+        a[:, real] for a in (x, y, flux, gains, sigma, covariance, models)
     )
     pair = stamps.take(odd)
     first = replace(
-        _rows(fit, odd), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0],
+        _rows(fit, odd), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
         chi2=(chi2 / freedom)[real], residual=pair.signal - models.sum(0), model=models[0], used=used,
         outlier=np.zeros_like(used),
     )  # fmt: skip
     stamps = _with_rows(stamps, odd, replace(pair, signal=pair.signal - models[1]))
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
     light = psf.at(x[0], y[0]).evaluate(*second_stamps.offsets(x[0], y[0]))[0]
-    light *= response.of_stars(colour[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
+    light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
     noise = np.sqrt(response.variance(second_stamps.noise, light))
     second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
     second = fit_stars(second_stamps, psf, x[1], y[1], response, rounds=3)
     # where the first one's stamp held it whole, the fit of both at once knows best
     together = {"x": x[1], "y": y[1], "flux": flux[1], "flux_sigma": sigma[1], "covariance": covariance[1]}
-    together["chi2"] = first.chi2
+    together |= {"gains": gains[1], "chi2": first.chi2}
     for name, value in together.items():
         own = getattr(second, name)
         together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
@@ -78,7 +78,7 @@ def _surprising(stamps, fit):
 
 
 def _fit_pairs(stamps, fit, psf, response):
-    """x, y, flux (2, N), colour (2, N, P), sigma of flux (2, N), covariance (2, N, 2, 2), models (2, N, S, S), used
+    """x, y, flux (2, N), gains (2, N, P), sigma of flux (2, N), covariance (2, N, 2, 2), models (2, N, S, S), used
     (N, S, S) and chi2 (N,) of pairs.
 
     Gauss-Newton on all their numbers; the companion starts where the most is left.
@@ -90,7 +90,8 @@ def _fit_pairs(stamps, fit, psf, response):
     for round_ in range(ROUNDS + 1):
         places = [stamps.offsets(x[k], y[k]) for k in (0, 1)]
         shapes = [psf.evaluate(*place) for place in places]
-        own = [response.of_stars(colour[k], stamps.phase) for k in (0, 1)]
+        gains = response.gain * (1 + colour)
+        own = [gains_at(gains[k], stamps.phase) for k in (0, 1)]
         inside = psf.within(*places[0], FIT_WIDTHS) | psf.within(*places[1], FIT_WIDTHS)
         used = stamps.good & inside
         if flux is None:
@@ -125,7 +126,7 @@ def _fit_pairs(stamps, fit, psf, response):
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(np.stack([known[:, 2, 2], known[:, 5, 5]]))
     covariance = np.stack([covariance[:, s, s][:, :2, :2] for s in each])
-    return x, y, flux, colour, sigma, covariance, models, used, (residual**2).sum((1, 2))
+    return x, y, flux, gains, sigma, covariance, models, used, (residual**2).sum((1, 2))
 
 
 def _brightest_left(stamps, fit, psf):

@@ -29,11 +29,6 @@ class Response:
         """How many gains a star has of its own: P, or none without a mosaic."""
         return len(self.gain) if len(self.gain) > 1 else 0
 
-    def of_stars(self, colour, phase):
-        """(N, S, S) float32: gains of pixels of these phases for stars whose own are 1 + colour (N, P) times the mean."""
-        own = (self.gain * (1 + colour)).astype(np.float32)
-        return own[np.arange(len(own))[:, None, None], phase]
-
     def columns(self, shape, amount, own, phase):
         """How pixels (N, S, S) change with a star's x, y, flux and own gains: a list.
 
@@ -60,6 +55,7 @@ class Response:
 class Fit:
     """N fitted stars: x, y px; flux DN and its sigma; covariance (N, 2, 2) px2 of x, y; chi2 per degree of freedom.
 
+    gains (N, P): what each phase of the mosaic passes of each star's light;
     residual, model (N, S, S): signal minus model, and the model, DN; used (N, S, S): which pixels took part;
     outlier (N, S, S): which did not, much too bright for this star;
     leverage (N, S, S): how much of its own noise each pixel explains, 0..1, so a residual's variance is 1 - leverage
@@ -71,6 +67,7 @@ class Fit:
     flux: np.ndarray
     flux_sigma: np.ndarray
     covariance: np.ndarray
+    gains: np.ndarray
     chi2: np.ndarray
     residual: np.ndarray
     model: np.ndarray
@@ -91,7 +88,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     n = len(x)
     inverse_noise2 = stamps.good / stamps.noise**2
     colour = np.zeros((n, len(response.gain)))  # each star's gains over the frame's, minus 1
-    own = response.of_stars(colour, stamps.phase)
+    own = gains_at(response.gain * (1 + colour), stamps.phase)
     flux = np.full(n, np.nan)
     outlier = np.zeros(stamps.signal.shape, bool)
     for round_ in range(rounds):
@@ -129,7 +126,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         flux += step[:, 2]
         if response.own_gains:
             colour = np.clip(colour + step[:, 3:], -0.9, 3.0)
-            own = response.of_stars(colour, stamps.phase)
+            own = gains_at(response.gain * (1 + colour), stamps.phase)
     freedom = np.maximum(used.sum((1, 2)) - 3, 1)
     chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
     leverage = ((design @ np.nan_to_num(covariance).astype(np.float32)) * design).sum(2).reshape(used.shape)
@@ -143,6 +140,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         flux,
         flux_sigma,
         covariance[:, :2, :2],
+        response.gain * (1 + colour),
         chi2,
         residual,
         amount * unit,
@@ -150,6 +148,11 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         outlier & stamps.good & inside,
         leverage,
     )
+
+
+def gains_at(gains, phase):
+    """(N, S, S) float32: of stars' gains (N, P) those of pixels of these phases."""
+    return gains.astype(np.float32)[np.arange(len(gains))[:, None, None], phase]
 
 
 def inverse(normal):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection.fit import Response, fit_stars
+from starpos.detection.fit import Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import all_terms, even_terms, refine, widened
 from starpos.detection.shape import frame_shape, moments, own_shape, relative_widths, window_for
@@ -19,6 +19,8 @@ TEACHING_PIXELS = 12000  # of wide stars fewer are enough
 # a star does not teach if the PSF leaves more of its squared light than this, three times what others do, and noise
 UNLIKE = 0.005
 ROUNDS, ORDER = 2, 6  # of fits and refinements; of the terms
+# px: on a mosaic the colours of narrower stars look like their shape; at least so many tell them apart in more rounds
+FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 # px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more of a pixel's light
 RING_FWHM, POOR = 5.0, 0.05
 RING_ROUNDS, RING_ORDER = 6, 14  # so many more rounds then, and terms of that order
@@ -41,7 +43,9 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
     """What the peaks x, y (N,) of that height, highest first, teach; defaults where they teach nothing."""
     response = Response(np.ones(len(background.level)), 0.3, 0.0, 0.0)
     psf, stamps, x, y = _teachers(plane, background, x, y, height, saturation)
-    for round_ in range(ROUNDS + RING_ROUNDS):
+    fine = background.is_mosaic and psf.fwhm_px < FINE_FWHM and len(x) >= FINE_STARS
+    rounds = ROUNDS + FINE_ROUNDS * fine
+    for round_ in range(rounds + RING_ROUNDS):
         if len(x) == 0:
             break
         fit = fit_stars(stamps, psf, x, y, response, rounds=3)
@@ -54,13 +58,13 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         sound &= strange < 3 * max(0, np.quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = _respond(stamps, psf, x, y, fit, sound, response)
-        ring = round_ >= ROUNDS
+        ring = round_ >= rounds
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
             break  # the response was learnt once more: with the last PSF, of the stars that are like it
         # pairs are still among the stars of the first round, and look like coma
         terms = (
             all_terms(psf, ORDER, len(x))
-            if round_ == ROUNDS - 1
+            if round_ == rounds - 1
             else even_terms(psf, RING_ORDER if ring else ORDER)
         )
         psf = _shape_up(stamps, psf, fit, sound, response, terms)
@@ -206,10 +210,10 @@ def _gains(stamps, value, before):
 def _shape_up(stamps, psf, fit, sound, response, terms):
     """One refinement of the PSF by the stars in stamps, the sound ones of a fit."""
     x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
-    scale = response.gain.astype(np.float32)[stamps.phase] * flux[:, None, None]
+    scale = gains_at(fit.gains[sound], stamps.phase) * flux[:, None, None]
     dx, dy = stamps.offsets(x, y)
     light = scale * psf.at(x, y).evaluate(dx, dy)[0]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
     variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
     weight = fit.used[sound] * scale**2 / variance
-    return refine(psf, x, y, dx, dy, stamps.signal / scale, weight, terms)
+    return refine(psf, x, y, dx, dy, stamps.signal / scale, weight, stamps.phase, terms)

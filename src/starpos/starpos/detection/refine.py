@@ -86,16 +86,17 @@ def _rank(psf, i, j):
     return i / float(np.clip(long / short, 1, 2)) + j
 
 
-def refine(psf, x, y, dx, dy, brightness, weight, terms) -> Psf:
-    """The Psf whose series fits N stars best, by weighted linear least squares; their positions and fluxes may follow.
+def refine(psf, x, y, dx, dy, brightness, weight, phase, terms) -> Psf:
+    """The Psf whose series fits N stars best, by weighted linear least squares; their positions and gains may follow.
 
     x, y        (N,) px: the stars' places
     dx, dy      (N, S, S) px, broadcastable: offsets of S x S pixels from their stars' centres
-    brightness  (N, S, S): those pixels over their stars' fluxes
+    brightness  (N, S, S): those pixels over their stars' fluxes and gains
     weight      (N, S, S): inverse variances of brightness; 0: not used
+    phase       (N, S, S): which of the mosaic's gains is theirs
     terms       Terms, of which as many are taken as are worth their price
     """
-    normal, right = _marginal(psf.at(x, y), dx, dy, brightness, weight, terms.orders)
+    normal, right = _marginal(psf.at(x, y), dx, dy, brightness, weight, phase, terms.orders)
     count, places = terms.candidates.shape[1:]
     field = psf.monomials(x, y)[:, :places]
     normal = np.einsum("nab,nk,nl->akbl", normal, field, field, optimize=True).reshape(count * places, -1)
@@ -115,19 +116,20 @@ def refine(psf, x, y, dx, dy, brightness, weight, terms) -> Psf:
     return replace(psf, series=series)
 
 
-def _marginal(local, dx, dy, brightness, weight, orders):
-    """(N, T, T) and (N, T): the normal equations of each star for the terms, whatever its position and flux are."""
+def _marginal(local, dx, dy, brightness, weight, phase, orders):
+    """(N, T, T) and (N, T): the normal equations of each star for the terms, whatever its position and gains are."""
     n, count = len(brightness), len(orders)
     weight = weight.reshape(n, 1, -1)
     value, by_x, by_y = (a.reshape(n, 1, -1) for a in local.evaluate(dx, dy))
     mean = local.terms(dx, dy, np.zeros((1, 2), int))
-    design = np.concatenate([local.terms(dx, dy, orders), value, by_x, by_y], axis=1)
+    gains = value * (phase.reshape(n, 1, -1) == np.arange(phase.max() + 1)[:, None])
+    design = np.concatenate([local.terms(dx, dy, orders), gains, by_x, by_y], axis=1)
     weighted = design * weight
     normal = (weighted @ design.transpose(0, 2, 1)).astype(np.float64)
     left = brightness.reshape(n, 1, -1) - mean
     right = np.einsum("ntp,np->nt", weighted, left[:, 0]).astype(np.float64)
     free = normal[:, count:, count:]
-    free = free + np.eye(3) * (1e-9 * np.trace(free, axis1=1, axis2=2)[:, None, None] + 1e-30)
+    free = free + np.eye(free.shape[1]) * (1e-9 * np.trace(free, axis1=1, axis2=2)[:, None, None] + 1e-30)
     share = normal[:, :count, count:] @ np.linalg.inv(free)
     normal = normal[:, :count, :count] - share @ normal[:, count:, :count]
     return normal, right[:, :count] - np.einsum("ntk,nk->nt", share, right[:, count:])
