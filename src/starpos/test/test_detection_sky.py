@@ -75,9 +75,8 @@ def test_a_dark_roof_makes_no_star_and_hides_none_above_it(sky, rng):
     assert len(found) == len(set(index[index >= 0]))
 
 
-@pytest.mark.parametrize("brightness", [10, 200, 1500, 6000])
-def test_a_tree_costs_what_it_covers_and_most_of_what_its_leaves_add_is_flagged(brightness, rng):
-    stars = grid(SIZE, 40, ELECTRONS, rng)
+def tree(rng):
+    """The share (0..1) of each pixel that twigs cover, below row 300 of SIZE."""
     along = np.linspace(0, 1, 500)[:, None]
     x, y, angle = rng.uniform(0, SIZE[1], 60), rng.uniform(320, SIZE[0], 60), rng.uniform(0, np.pi, 60)
     length = rng.uniform(50, 250, 60)
@@ -85,7 +84,13 @@ def test_a_tree_costs_what_it_covers_and_most_of_what_its_leaves_add_is_flagged(
     inside = (column >= 0) & (column < SIZE[1]) & (row >= 300) & (row < SIZE[0])
     twigs = np.zeros(SIZE)
     twigs[row[inside].astype(int), column[inside].astype(int)] = 3
-    twigs = np.clip(ndimage.gaussian_filter(twigs, 1.6), 0, 1)
+    return np.clip(ndimage.gaussian_filter(twigs, 1.6), 0, 1)
+
+
+@pytest.mark.parametrize("brightness", [10, 200, 1500, 6000])
+def test_a_tree_costs_what_it_covers_and_most_of_what_its_leaves_add_is_flagged(brightness, rng):
+    stars = grid(SIZE, 40, ELECTRONS, rng)
+    twigs = tree(rng)
     leaves = brightness * np.clip(1 + 0.4 * ndimage.gaussian_filter(rng.normal(0, 3, SIZE), 2), 0, None)
     found = found_in(field(SIZE, stars, sky=60) * (1 - twigs) + twigs * leaves, rng)
     near = ndimage.gaussian_filter(twigs, 9)[stars[:, 1].astype(int), stars[:, 0].astype(int)] > 0.02
@@ -99,6 +104,18 @@ def test_a_tree_costs_what_it_covers_and_most_of_what_its_leaves_add_is_flagged(
     false = np.setdiff1d(np.arange(len(found)), index)
     assert np.count_nonzero(found.flags[false] == 0) < 0.6 * len(false) or len(false) < 8
     assert np.mean(found.flags[match(found, clear)] > 0) < 0.05
+
+
+@pytest.mark.parametrize("count", [5, 8, 15, 25, 40])
+def test_twigs_that_outnumber_the_stars_teach_nothing(count, rng):
+    stars = grid(SIZE, 24, ELECTRONS, rng)
+    stars = rng.permutation(stars[stars[:, 1] < 290])[:count]
+    twigs = tree(rng)
+    leaves = 200 * np.clip(1 + ndimage.gaussian_filter(rng.normal(0, 1.2, SIZE), 2), 0, None)
+    light = field(SIZE, stars, sky=60) * (1 - twigs) + twigs * leaves
+    error, pull = errors(found_in(light, rng), stars)
+    assert rms(error) < 1.3 * rms(bound(ELECTRONS, sky=60))
+    assert rms(pull) < 1.3
 
 
 def test_dead_rows_and_columns_cost_only_the_stars_on_them(stars, rng):

@@ -9,7 +9,14 @@ from scipy import ndimage, spatial
 from starpos.detection.fit import Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import all_terms, even_terms, refine, widened
-from starpos.detection.shape import frame_shape, moments, own_shape, relative_widths, window_for
+from starpos.detection.shape import (
+    NARROWEST,
+    frame_shape,
+    moments,
+    own_shape,
+    relative_widths,
+    window_for,
+)
 from starpos.detection.stamps import are_dots, cut
 
 DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
@@ -18,6 +25,7 @@ TEACHERS = 250
 TEACHING_PIXELS = 12000  # of wide stars fewer are enough
 # a star does not teach if the PSF leaves more of its squared light than this, three times what others do, and noise
 UNLIKE = 0.005
+ALIKE, LIKENESS = 5, 0.6  # so many stars are more alike than twigs by chance; log of width, and ellipticity
 ROUNDS, ORDER = 2, 6  # of fits and refinements; of the terms
 # px: on a mosaic the colours of narrower stars look like their shape; at least so many tell them apart in more rounds
 FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
@@ -83,6 +91,8 @@ def _teachers(plane, background, x, y, height, saturation):
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(~stamps.full.any((1, 2)))
+    if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):  # fainter ones' shapes are noise
+        stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     if shape is None:
         return gaussian(np.eye(2) * DEFAULT_SIGMA**2), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
@@ -101,6 +111,26 @@ def _teachers(plane, background, x, y, height, saturation):
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
+
+
+def _most_alike(stamps):
+    """Which stamps (N,) bool are somewhat alike, as stars are and twigs are not: most, or those around the most alike."""
+    shape, widest = np.eye(2) * (stamps.reach / 4) ** 2, (stamps.reach / 2) ** 2
+    for _ in range(3):
+        window = window_for(shape)
+        own = own_shape(moments(stamps, *centroid(stamps, shape, rounds=2), window)[2], window)
+        values, vectors = np.linalg.eigh(np.nan_to_num(own))
+        values = np.where(values > 0, np.clip(values, NARROWEST, widest), widest)
+        shape = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
+    xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)], 1)
+    alike = np.linalg.norm(look - np.median(look, axis=0), axis=1) < LIKENESS
+    alike &= values[:, 0] > NARROWEST
+    sound = (values[:, 0] > NARROWEST) & (values[:, 1] < widest)
+    if np.count_nonzero(alike) > 0.5 * len(alike) or np.count_nonzero(sound) < ALIKE:
+        return np.ones(len(alike), bool)
+    densest = np.argmin(spatial.cKDTree(look[sound]).query(look[sound], ALIKE)[0][:, -1])
+    return sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
 
 
 def reach_of(psf) -> int:

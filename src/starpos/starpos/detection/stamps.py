@@ -65,15 +65,11 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     return Stamps(x, y, pixels - level, noise, on & ~full, full, phase)
 
 
-def are_dots(plane, background, x, y, doubt=0):
-    """Whether the pixels x, y (N,) int are hot: less light in their neighbours together than in half of the brightest.
-
-    Those that are not by less than `doubt` sigma count as hot.
-    """
-    core = cut(plane, background, x, y, 1, np.inf)
-    peak = core.signal.max((1, 2))
-    noise = np.sqrt((core.noise**2).sum((1, 2)))
-    return core.signal.sum((1, 2)) - peak < 0.5 * peak + doubt * noise
+def are_dots(plane, background, x, y):
+    """Whether the pixels x, y (N,) int are hot: less light in their neighbours together than in half of the brightest."""
+    core = cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9)
+    peak = core.max(1)
+    return core.sum(1) - peak < 0.5 * peak
 
 
 def are_alone(plane, background, x, y):
