@@ -13,6 +13,7 @@ ELONGATED = 4
 BLENDED = 8
 MOST_EXPOSURE_S = 3600.0  # tilts of more than one pose would be averaged
 MOST_VARIANCE_PX2 = 1e12  # beyond any frame; squares of it must not overflow
+SYMMETRIC = 1e-6  # of the variances: by how much a covariance's two halves may differ
 MOST_STDDEV_S = 1e9  # of a time: more says nothing, and its square must not overflow
 
 
@@ -69,10 +70,11 @@ class Stars:
         c = self.covariance
         if np.any(c > MOST_VARIANCE_PX2):
             raise FrameError(f"{place}: a star's error is {np.sqrt(c.max()):.1g} px; leave such stars out.")
-        determinant = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] * c[:, 1, 0]
-        if not np.all((c[:, 0, 0] > 0) & (c[:, 1, 1] > 0) & (determinant > 0)):
+        variances = c[:, 0, 0] * c[:, 1, 1]
+        definite = (c[:, 0, 0] > 0) & (c[:, 1, 1] > 0) & (variances > c[:, 0, 1] ** 2)
+        if not np.all(definite & ((c[:, 0, 1] - c[:, 1, 0]) ** 2 <= SYMMETRIC**2 * variances)):
             raise FrameError(
-                f"{place}: a star's covariance is not positive definite; measure its centroid again."
+                f"{place}: a star's covariance is not symmetric and positive definite; measure its centroid again."
             )
         if np.any(np.diff(self.flux) > 0):
             raise FrameError(f"{place}: the stars are not sorted; give them brightest first.")

@@ -41,6 +41,7 @@ def test_taking_some_stars_keeps_the_frame_they_belong_to():
         ({"flux": [1.0]}, "shape"),
         ({"flux": [100, 900]}, "brightest first"),
         ({"covariance": np.zeros((2, 2, 2))}, "positive definite"),
+        ({"covariance": np.stack([np.eye(2), [[1.0, -2.0], [0.1, 1.0]]])}, "symmetric"),
         ({"covariance": np.stack([np.eye(2), np.eye(2) * 1e300])}, "error is 1e\\+150 px"),
         ({"covariance": np.ones((2, 2))}, "shape"),
         ({"snr": ["bright", "faint"]}, "not numbers"),
