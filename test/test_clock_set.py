@@ -50,3 +50,25 @@ def test_its_tilts_are_not_those_of_a_frame_whose_stars_come_first(graph, clock)
         graph.tilt.publish(tilt)
     solution, _, _ = graph.result(shot.stamp)
     assert (solution.tilt.x, solution.tilt.y) == pytest.approx(turned.tilt, abs=1e-4)
+
+
+def test_a_frame_of_another_time_gets_no_fix_from_the_tilts_of_that_time(graph, clock):
+    """Its stars have overtaken its own tilts, and then the instrument leaned otherwise."""
+    rng, scene = np.random.default_rng(4), scene_at()
+    turned = replace(scene, altitude_deg=scene.altitude_deg + 3.0)
+
+    def exposed(start_s, scene):
+        clock(START_S + start_s + EXPOSURE_S + LATENCY_S)
+        return shot_of(scene, START_S + start_s, rng)
+
+    for start_s, leaning in ((0.0, scene), (0.8, scene), (40.0, turned), (40.8, turned)):
+        solution, _, _ = graph.answer(exposed(start_s, leaning))
+        assert solution.status == Solution.OK, solution.status_text
+    shot = exposed(41.6, turned)
+    shot.stars.header.stamp = unix_to_stamp(stamp_to_unix(shot.stars.header.stamp) - 40.78)
+    graph.stars.publish(shot.stars)
+    solution, fix, _ = graph.result(shot.stamp)
+    assert solution.status == Solution.NO_TILT and "of another time" in solution.status_text
+    assert fix.status.status < 0
+    solution, _, _ = graph.answer(exposed(42.4, turned))
+    assert solution.status == Solution.OK, solution.status_text

@@ -270,6 +270,8 @@ class SolverNode(Node):
         if self._doubt.seconds <= stated_s:
             return frame, answer
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self._doubt.seconds), doubted=True)
+        if self._doubt.leans_otherwise:
+            return frame, Answer.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
         return frame, self._answer_to(frame, answer.standing)
 
     def _solver_now(self) -> Solver:

@@ -14,6 +14,11 @@ EQUATOR_M_PER_S = 465.1
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
+OTHER_TILTS = (
+    "by its stars the camera stands as it stood, by the tilts of its stamp it leans otherwise: they are of another time; "
+    + ONE_CLOCK
+)
+
 
 def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
     """The newest frame's."""

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stamps of a camera at rest that contradict each other widen the time, and those that agree do not."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixes import fix_at
+from fixes import fix_at, north_of
 
 from starpos import rotation
-from starpos.earth import ROTATION_RAD_S
+from starpos.earth import ROTATION_RAD_S, zenith_of
 from starpos_solver.clock_doubt import ClockDoubt
 
 STATED_S = 0.01
@@ -18,7 +19,8 @@ def stamped(off_s: float, azimuth_deg=40.0, **at):
     """The fix of a frame whose stamp is off by so much: the Earth has turned under it."""
     fix = fix_at(0.0, azimuth_deg, **at)
     turn = rotation.about_axis(2, ROTATION_RAD_S * off_s)
-    return replace(fix, camera_to_itrs=turn @ fix.camera_to_itrs)
+    east, north, _ = turn @ zenith_of(fix.latitude, fix.longitude)
+    return replace(fix, camera_to_itrs=turn @ fix.camera_to_itrs, longitude=math.atan2(north, east))
 
 
 def doubts_of(*fixes, stated_s=STATED_S) -> list[float]:
@@ -78,3 +80,17 @@ def test_cleared_nothing_is_held_against_the_next():
     doubt.clear()
     doubt.add(stamped(3.0), STATED_S)
     assert doubt.seconds == 0.0
+
+
+@pytest.mark.parametrize(
+    ("off_s", "metres", "otherwise"),
+    [(40.0, 0, False), (40.0, 500, False), (40.0, 3000, True), (0.0, 3000, False)],
+)
+def test_one_that_is_off_and_leans_otherwise_has_the_tilts_of_another_time(off_s, metres, otherwise):
+    """A fix errs by 100 m; what comes right in time is the inclinometer's, and for the average to judge."""
+    doubt = ClockDoubt()
+    doubt.add(stamped(0.0), STATED_S)
+    doubt.add(north_of(stamped(off_s), metres), STATED_S)
+    assert doubt.leans_otherwise is otherwise
+    doubt.add(stamped(0.0), STATED_S)
+    assert not doubt.leans_otherwise

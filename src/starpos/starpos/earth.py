@@ -204,6 +204,12 @@ def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
     return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
 
 
+def zenith_of(latitude: float, longitude: float) -> np.ndarray:
+    """Unit vector (3,) in ITRS that is up at a latitude and longitude (rad)."""
+    c = np.cos(latitude)
+    return np.array([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)])
+
+
 def curvature_radii_m(latitude: float) -> tuple[float, float]:
     """Radii of curvature of WGS 84 (prime vertical, meridian) in m at a latitude in rad."""
     w2 = 1 - ECCENTRICITY2 * np.sin(latitude) ** 2

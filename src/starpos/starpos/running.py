@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.budget import ErrorTerm, correlation, symmetric_root
-from starpos.earth import curvature_radii_m
+from starpos.earth import curvature_radii_m, zenith_of
 from starpos.fix import Fix
 from starpos.rotation import full_turn, half_turn
 
@@ -34,7 +34,9 @@ class Plane:
     @classmethod
     def at(cls, f: Fix) -> "Plane":
         axes = _axes(f.latitude, f.longitude)
-        return cls(_zenith(f.latitude, f.longitude), axes, np.array(curvature_radii_m(f.latitude)), f.heading)
+        return cls(
+            zenith_of(f.latitude, f.longitude), axes, np.array(curvature_radii_m(f.latitude)), f.heading
+        )
 
     def convergence(self, latitude: float, longitude: float) -> float:
         """Azimuth of a place's own north against this plane's."""
@@ -42,7 +44,7 @@ class Plane:
 
     def across(self, latitude: float, longitude: float) -> np.ndarray:
         """East, north in m (2,) of a place."""
-        return self.axes @ (_zenith(latitude, longitude) - self.zenith) * self.radii
+        return self.axes @ (zenith_of(latitude, longitude) - self.zenith) * self.radii
 
     def seen(self, f: Fix) -> np.ndarray:
         """East, north, heading (3,) of a fix against the plane's own, in UNIT."""
@@ -224,11 +226,6 @@ class Running:
         values, vectors = np.linalg.eigh(beyond)
         values = np.maximum(values, 1e-3 * np.trace(part.sources.sum(0)[:2, :2]))
         return float(np.sqrt(np.sum((apart @ vectors) ** 2 / values)))
-
-
-def _zenith(latitude: float, longitude: float) -> np.ndarray:
-    c = np.cos(latitude)
-    return np.array([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)])
 
 
 def _axes(latitude: float, longitude: float) -> np.ndarray:
