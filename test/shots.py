@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 
-from starpos.atmosphere import Atmosphere
 from starpos.catalogue import load as load_catalogue
+from starpos.earth.refraction import Atmosphere
 from starpos.inclinometer import Tilt
 from starpos.simulate import Scene, detected, expose, read_tilt, render, scene_of
 from starpos.stars import no_stars

@@ -31,7 +31,7 @@ NODES = {
 @pytest.fixture(scope="module")
 def instrument(graph, tmp_path_factory):
     """All four nodes and an emulated inclinometer; a function that starts one of them."""
-    from starpos.atmosphere import Atmosphere
+    from starpos.earth.refraction import Atmosphere
     from starpos.simulate import scene_of
 
     folder, count = tmp_path_factory.mktemp("instrument"), iter(range(1000))

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from starpos import camera_yaml, geoid_file, instrument_file
+from starpos import camera_yaml, instrument_file
+from starpos.earth import geoid_file
 from starpos.errors import StarposError
 from starpos.inclinometer import read_tilt_csv
 from starpos.reading import read_frame

@@ -26,7 +26,7 @@ from shots import (
 )
 
 from starpos import instrument_file
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
 from starpos.inclinometer import InclinometerErrors
 from starpos.instrument import Calibration, Instrument
 from starpos.sky import Site

@@ -9,8 +9,8 @@ import argparse
 
 import numpy as np
 
-from starpos import geoid
-from starpos.vertical import Deflection
+from starpos.earth import geoid
+from starpos.earth.vertical import Deflection
 
 PLACES = {
     "Netherlands": (52.2, 5.5),

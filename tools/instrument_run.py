@@ -44,7 +44,7 @@ class Place:
         )
 
     def scene(self):
-        from starpos.atmosphere import Atmosphere
+        from starpos.earth.refraction import Atmosphere
         from starpos.simulate import scene_of
 
         air = Atmosphere(self.pressure, self.temperature, self.humidity)
@@ -194,7 +194,7 @@ def stamp_of(message) -> tuple[int, int]:
 
 def _error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
     """East and north of the truth."""
-    from starpos.earth import curvature_radii_m
+    from starpos.earth.orientation import curvature_radii_m
 
     phi = math.radians(place.latitude)
     prime_vertical, meridian = curvature_radii_m(phi)

@@ -6,7 +6,7 @@ from enum import Enum, auto
 import numpy as np
 
 from starpos.average import MOVED_FIXES, Average, Averager
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
 from starpos.fix import Fix
 from starpos.plumb import EARTH_RADIUS_M
 from starpos.pose import slip_s

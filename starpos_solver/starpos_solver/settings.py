@@ -8,12 +8,12 @@ from rclpy.node import Node
 
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
+from starpos.earth.geoid import Geoid
+from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
-from starpos.geoid import Geoid
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Calibration, Instrument
 from starpos.solve import Solver
-from starpos.vertical import Vertical
 from starpos_common.parameters import declare
 from starpos_solver import parameters
 

@@ -9,7 +9,7 @@ import pytest
 from fixes import fix_at, north_of
 
 from starpos import rotation
-from starpos.earth import ROTATION_RAD_S, zenith_of
+from starpos.earth.orientation import ROTATION_RAD_S, zenith_of
 from starpos_solver.clock_doubt import ClockDoubt
 
 STATED_S = 0.01

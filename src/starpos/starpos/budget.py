@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.earth import ROTATION_RAD_S, EarthState, curvature_radii_m
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState, curvature_radii_m
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.mounting import Mounting
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.budget import ALWAYS, ErrorTerm, heading_of
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.inclinometer import Tilt, a2_matrix

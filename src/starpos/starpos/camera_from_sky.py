@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import triangles
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
-from starpos.earth import earth_motion
+from starpos.earth.orientation import earth_motion
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.identification import Identification, Pointing, Sky, identify_directions
 from starpos.intrinsics import (

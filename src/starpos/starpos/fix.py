@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.atmosphere import Atmosphere, Refraction
 from starpos.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
 from starpos.camera import Camera
-from starpos.earth import EarthState, station_velocity
+from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.mounting import Mounting

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.camera import Camera
-from starpos.earth import DAY_S
+from starpos.earth.orientation import DAY_S
 from starpos.errors import InstrumentError
 from starpos.inclinometer import LIMIT_RAD, InclinometerErrors
 from starpos.mounting import Mounting

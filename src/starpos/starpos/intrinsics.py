@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from starpos import rotation
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.scatter import distance2, judged
 

@@ -12,12 +12,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.atmosphere import Atmosphere
 from starpos.average import Average, average
 from starpos.calibration import calibrate_at
 from starpos.camera import Camera
 from starpos.catalogue import EPOCH, MAS, Catalogue
-from starpos.earth import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
+from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
 from starpos.inclinometer import InclinometerErrors, TiltLog
 from starpos.instrument import Calibration, Instrument
@@ -27,7 +28,6 @@ from starpos.sky import Site, camera_to_enu
 from starpos.solve import Solver
 from starpos.stars import Stars
 from starpos.turning import turn
-from starpos.vertical import Deflection, geodetic
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
 EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0

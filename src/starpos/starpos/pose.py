@@ -8,7 +8,7 @@ as no hand turns it, one of the stamps is wrong.
 import numpy as np
 
 from starpos import rotation
-from starpos.earth import ROTATION_RAD_S
+from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.fix import Fix
 
 SIGMAS = 6.0  # that errors may reach

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.budget import ErrorTerm, correlation, symmetric_root
-from starpos.earth import curvature_radii_m, zenith_of
+from starpos.earth.orientation import curvature_radii_m, zenith_of
 from starpos.fix import Fix
 from starpos.rotation import full_turn, half_turn
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import erf
 
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
-from starpos.earth import earth_state
+from starpos.earth.orientation import earth_state
+from starpos.earth.refraction import Atmosphere
 from starpos.frame import Frame
 from starpos.instrument import Calibration, Instrument
 from starpos.sky import Site, camera_to_enu

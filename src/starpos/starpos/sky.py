@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos import rotation
-from starpos.atmosphere import Atmosphere
 from starpos.catalogue import Catalogue
-from starpos.earth import EarthState, station_velocity
+from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.refraction import Atmosphere
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ import numpy as np
 
 from starpos import identification as ident
 from starpos import triangles
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
-from starpos.earth import EarthState, earth_motion, earth_state
+from starpos.earth.orientation import EarthState, earth_motion, earth_state
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix import Fix, MatchedStars, solve_fix
 from starpos.inclinometer import Tilt, a2_matrix

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth import EarthState
+from starpos.earth.orientation import EarthState
 from starpos.identification import Identification, Plumb, Pointing
 
 PLUMB_TOLERANCE_RAD = np.radians(90 / 3600)  # 2.8 km of travel, or as much error of the tilt

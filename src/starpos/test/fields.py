@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
-from starpos.earth import EarthState, earth_state, station_velocity
+from starpos.earth.orientation import EarthState, earth_state, station_velocity
+from starpos.earth.refraction import Atmosphere
 from starpos.fix import Fix, MatchedStars, Mounting, solve_fix
 from starpos.inclinometer import Tilt
 from starpos.instrument import TOP_OF_FRAME

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from starpos.atmosphere import Atmosphere
+from starpos.earth.refraction import Atmosphere
 from starpos.inclinometer import Tilt
 from starpos.simulate import Optics, Scene, detected, expose, read_tilt, scene_of
 from starpos.solve import Solver

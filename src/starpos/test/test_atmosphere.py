@@ -3,7 +3,7 @@ import erfa
 import numpy as np
 import pytest
 
-from starpos.atmosphere import Atmosphere, Refraction
+from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import InstrumentError
 
 ARCSEC = np.radians(1 / 3600)

@@ -9,7 +9,7 @@ from fields import ARCSEC, UTC, Field, random_field, turn
 from starpos import rotation
 from starpos.average import Averager, average
 from starpos.budget import ALWAYS, ErrorTerm, correlation
-from starpos.earth import curvature_radii_m, earth_state
+from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt
 from starpos.running import UNIT, Plane

@@ -11,7 +11,7 @@ from fields import ARCSEC, UTC, Field
 
 from starpos import rotation
 from starpos.average import Averager, average
-from starpos.earth import curvature_radii_m, earth_state
+from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.inclinometer import Tilt
 

@@ -8,7 +8,7 @@ import pytest
 from fields import ARCSEC, UTC, Field
 
 from starpos import rotation
-from starpos.earth import earth_state
+from starpos.earth.orientation import earth_state
 from starpos.fix import Mounting
 from starpos.inclinometer import EXACT, InclinometerErrors, Tilt
 

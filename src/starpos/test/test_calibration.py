@@ -10,7 +10,7 @@ from sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.average import average
 from starpos.calibration import VALID_DAYS, calibrate_at
-from starpos.earth import DAY_S, curvature_radii_m
+from starpos.earth.orientation import DAY_S, curvature_radii_m
 from starpos.errors import FixError
 from starpos.inclinometer import InclinometerErrors
 from starpos.instrument import Calibration

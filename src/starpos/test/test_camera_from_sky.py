@@ -9,10 +9,10 @@ import pytest
 from lenses import AIR, FIELDS, ideal, k1_of, night, prediction_errors, random_camera, values
 from scenes import random_stars, with_false_stars
 
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.camera_from_sky import calibrate
 from starpos.detection import detect
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.intrinsics import rms
 from starpos.reading import read_frame

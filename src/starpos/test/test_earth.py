@@ -10,8 +10,7 @@ import erfa
 import numpy as np
 import pytest
 
-from starpos.atmosphere import Atmosphere
-from starpos.earth import (
+from starpos.earth.orientation import (
     EXTRAPOLATION_DAYS,
     EXTRAPOLATION_SIGMA_S,
     POLE_SIGMA_RAD,
@@ -23,6 +22,7 @@ from starpos.earth import (
     station_velocity,
     utc_text,
 )
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import TimeError
 from starpos.sky import Site
 

@@ -6,11 +6,11 @@ import numpy as np
 from astropy.utils import iers
 from astropy_iers_data import IERS_A_FILE
 
-from starpos import earth
+from starpos.earth import orientation
 
 
 def test_it_is_what_astropy_reads():
-    theirs, ours = iers.IERS_A.open(IERS_A_FILE), earth._table()
+    theirs, ours = iers.IERS_A.open(IERS_A_FILE), orientation._table()
 
     def column(name, unit):
         return np.ma.filled(theirs[name], np.nan).to_value(unit)[: len(ours.mjd)]
@@ -27,7 +27,7 @@ def test_it_is_what_astropy_reads():
 
 
 def test_its_leap_seconds_are_those_of_erfa():
-    table = earth._table()
+    table = orientation._table()
     for year, seconds in ((1973, 12), (1999, 32), (2017, 37), (2025, 37)):
         _, days = erfa.cal2jd(year, 6, 1)
         assert table.tai_minus_utc[int(days - table.mjd[0])] == seconds

@@ -8,9 +8,9 @@ import pytest
 from fields import ARCSEC, PAPER, UTC, Field, random_field, turn
 
 from starpos import rotation
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
-from starpos.earth import curvature_radii_m, earth_state
+from starpos.earth.orientation import curvature_radii_m, earth_state
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.fix import Mounting
 from starpos.inclinometer import Tilt

@@ -8,7 +8,7 @@ import pytest
 from fields import ARCSEC, Field
 
 from starpos import rotation
-from starpos.earth import ROTATION_RAD_S, earth_state
+from starpos.earth.orientation import ROTATION_RAD_S, earth_state
 from starpos.pose import slip_s
 
 

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from starpos.atmosphere import Atmosphere
 from starpos.average import average
+from starpos.earth.refraction import Atmosphere
 from starpos.inclinometer import read_tilt_csv
 from starpos.instrument import Instrument, focal_px_of
 from starpos.reading import read_frame

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
 
-from starpos.atmosphere import Atmosphere
 from starpos.cli import main
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Deflection
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
 from starpos.report import folder, measures
 from starpos.report.working import Workshop, worked
-from starpos.vertical import Deflection
 
 pytest.importorskip("matplotlib")
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from reports import simulate
 
-from starpos.atmosphere import Atmosphere
 from starpos.budget import ALWAYS, ErrorTerm
 from starpos.camera import Camera
-from starpos.earth import curvature_radii_m, earth_state
+from starpos.earth.orientation import curvature_radii_m, earth_state
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Deflection
 from starpos.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument import Instrument
 from starpos.report import folder, measures, sky_figure
@@ -18,7 +19,6 @@ from starpos.report.night import Night, Place, Shot, Truth
 from starpos.report.working import Workshop, worked
 from starpos.sky import Site, camera_to_enu
 from starpos.solve import Status
-from starpos.vertical import Deflection
 
 ARCSEC = np.radians(1 / 3600)
 FOCAL_PX = 29.67e3 / 6.4

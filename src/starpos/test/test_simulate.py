@@ -9,7 +9,7 @@ import pytest
 from scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 from scipy.spatial import cKDTree
 
-from starpos.earth import earth_state
+from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.inclinometer import a2_matrix, read_tilt_csv
 from starpos.night import write_night

@@ -24,7 +24,7 @@ from scenes import (
 from starpos.average import average
 from starpos.camera import Camera
 from starpos.cli.common import tell_extrapolation
-from starpos.earth import curvature_radii_m, earth_state, station_velocity
+from starpos.earth.orientation import curvature_radii_m, earth_state, station_velocity
 from starpos.errors import TiltError
 from starpos.inclinometer import EXACT, Tilt, TiltLog
 from starpos.instrument import Calibration, Instrument

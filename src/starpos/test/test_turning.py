@@ -9,7 +9,7 @@ from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
 from starpos.average import average
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Calibration, Instrument
 from starpos.sky import camera_to_enu

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
+from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import InstrumentError
-from starpos.vertical import Deflection, geodetic
 
 ARCSEC = np.radians(1 / 3600)
 NONE = np.zeros((3, 3))

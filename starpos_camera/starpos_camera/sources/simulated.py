@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from starpos.atmosphere import Atmosphere
+from starpos.earth.refraction import Atmosphere
 from starpos.instrument import focal_px_of
 from starpos_camera.sources import Exposure, Settings
 from starpos_common.parameters import Parameter

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from starpos import camera_yaml, catalogue
-from starpos.atmosphere import Atmosphere
 from starpos.camera import Camera
 from starpos.camera_from_sky import FromSky
 from starpos.camera_from_sky import calibrate as camera_from_sky
 from starpos.cli import calibrate_site, common
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.inclinometer import TiltLog, a2_matrix, read_tilt_csv
 from starpos.instrument import Instrument

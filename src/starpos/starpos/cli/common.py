@@ -9,15 +9,16 @@ import time
 
 import numpy as np
 
-from starpos import geoid, instrument, instrument_file
-from starpos.atmosphere import Atmosphere
+from starpos import instrument, instrument_file
 from starpos.camera import Camera
+from starpos.earth import geoid
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frame import Frame
 from starpos.reading import read_frame
 from starpos.stars import Stars
-from starpos.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 
 GIVEN_STDDEV_ARCSEC = 1.0  # of a deflection given by hand without its error
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos import catalogue
-from starpos.atmosphere import Atmosphere
 from starpos.cli.common import stars_of
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
 from starpos.exif import CameraClock
 from starpos.frame import Frame

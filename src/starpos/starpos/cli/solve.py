@@ -12,6 +12,7 @@ from starpos.average import Average, average
 from starpos.cli import common, jobs
 from starpos.cli.archive import Night, nights_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
+from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix import Fix
 from starpos.inclinometer import TiltLog
@@ -19,7 +20,6 @@ from starpos.solve import Solution, Solver, Status
 from starpos.stars import Stars
 from starpos.turning import turn
 from starpos.utc import utc_text
-from starpos.vertical import Vertical, geodetic
 
 NO_FIX = 1
 WORTH_SAVING_ARCSEC = 600.0

@@ -10,13 +10,13 @@ import numpy as np
 
 from starpos import bags
 from starpos.camera import Camera
+from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError
 from starpos.inclinometer import TiltLog
 from starpos.progress import Progress
 from starpos.report.folder import truth_in
 from starpos.report.messages import camera_of, deflection_of, shot_of, tilt_row
 from starpos.report.night import Shot, Truth
-from starpos.vertical import Deflection
 
 SUFFIXES = (".mcap", ".db3")
 PACKAGE = "starpos_interfaces"

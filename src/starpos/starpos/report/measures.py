@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
 from starpos.report.night import Night, Place, Truth
 
 ARCSEC = np.radians(1 / 3600)

@@ -5,7 +5,8 @@ import numpy as np
 
 from starpos.budget import ALWAYS, ErrorTerm
 from starpos.camera import Camera
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
+from starpos.earth.vertical import ARCSEC, Deflection
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.inclinometer import LIMIT_RAD
 from starpos.report.folder import Exposure
@@ -14,7 +15,6 @@ from starpos.rotation import full_turn
 from starpos.solve import Attitude, Status
 from starpos.stars import Stars
 from starpos.utc import utc_text
-from starpos.vertical import ARCSEC, Deflection
 
 UNUSABLE = 1 | 2 | 4  # of Tilt.flags: out of range, stuck, saturated
 STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT, Status.TILT_OUT_OF_RANGE,

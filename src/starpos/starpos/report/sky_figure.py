@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from starpos.catalogue import Catalogue
-from starpos.earth import EarthState, earth_state, station_velocity
+from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.report.frame_figures import pointed
 from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE

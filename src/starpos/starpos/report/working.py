@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.atmosphere import Atmosphere
 from starpos.average import average
 from starpos.budget import heading_of, place_of
 from starpos.catalogue import Catalogue
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
 from starpos.fix import Fix
 from starpos.inclinometer import a2_matrix
@@ -23,7 +24,6 @@ from starpos.solve import Solution, Solver, Status
 from starpos.stars import Stars
 from starpos.turning import turn
 from starpos.utc import utc_text
-from starpos.vertical import Vertical
 
 STILL_SIGMA = 8.0  # readings further than this from their mean say that the camera was moved
 

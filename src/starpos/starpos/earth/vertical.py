@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from starpos.earth import curvature_radii_m
+from starpos.earth.orientation import curvature_radii_m
 from starpos.errors import InstrumentError
 from starpos.rotation import full_turn
 

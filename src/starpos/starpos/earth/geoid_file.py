@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos.earth.geotiff import read_geotiff
 from starpos.errors import GeoidError
-from starpos.geotiff import read_geotiff
 
 GTX_HEADER = struct.Struct(">4d2i")  # south, west, step in latitude, in longitude (deg), rows, columns
 GTX_NODATA = np.float32(-88.8888)
