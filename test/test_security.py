@@ -10,8 +10,8 @@ import pytest
 from starpos import camera_yaml, instrument_file
 from starpos.earth import geoid_file
 from starpos.errors import StarposError
+from starpos.frames.reading import read_frame
 from starpos.inclinometer import read_tilt_csv
-from starpos.reading import read_frame
 from starpos_common.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 

@@ -18,7 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # CPU time is compared, not cleve
 import numpy as np
 
 from starpos.detection import detect
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 
 SIZES = {
     0.5: (866, 577),

@@ -81,7 +81,7 @@ def start(processes: Processes, place: Place, seed: int, port: Path):
 def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray, path: Path) -> bool:
     """Draw the fixes and the frame that was kept; False where none was, or its stars were not heard."""
     from starpos import picture
-    from starpos.annotate import Identified, annotate
+    from starpos.frames.annotate import Identified, annotate
     from starpos_common.messages import message_to_frame, message_to_stars
 
     frame, place = watcher.pictured, watcher.place

@@ -11,9 +11,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from starpos.annotate import Identified, annotate
-from starpos.frame import Frame
-from starpos.stars import Stars
+from starpos.frames.annotate import Identified, annotate
+from starpos.frames.frame import Frame
+from starpos.frames.stars import Stars
 from starpos_camera.worker import Worker
 from starpos_common.messages import frame_to_message
 from starpos_common.topics import publisher, subscription

@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 from starpos.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import NothingYet, Settings, Source, SourceEnded

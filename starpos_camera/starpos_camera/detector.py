@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
 from starpos_camera.worker import Worker

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from test_detector import Feed
 
-from starpos.annotate import DETECTED, IDENTIFIED
+from starpos.frames.annotate import DETECTED, IDENTIFIED
 from starpos_camera.detector import DetectorNode
 from starpos_common.messages import message_to_frame
 from starpos_interfaces.msg import Solution, StarArray

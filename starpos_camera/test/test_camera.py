@@ -21,7 +21,7 @@ from starpos import camera_yaml
 from starpos.camera import Camera
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
-from starpos.reading import read_frame
+from starpos.frames.reading import read_frame
 from starpos.simulate import expose
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_common.testing import lacks

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 from starpos_camera.sources import CaptureError, Exposure
 from starpos_camera.stamping import in_one_time
 from starpos_common.messages import stamp_to_unix

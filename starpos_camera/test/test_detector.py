@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 
 from starpos.detection import detect
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 from starpos_common.messages import frame_to_message, message_to_stars
 from starpos_interfaces.msg import Capture, StarArray
 

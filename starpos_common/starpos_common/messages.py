@@ -12,9 +12,9 @@ from std_msgs.msg import Header
 
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
+from starpos.frames.stars import Stars
 from starpos.inclinometer import SCA100T_NOISE_RAD, Tilt
-from starpos.stars import Stars
 from starpos_interfaces.msg import Star, StarArray
 from starpos_interfaces.msg import Tilt as TiltMessage
 

@@ -11,9 +11,9 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
+from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.inclinometer import Tilt
-from starpos.stars import EDGE, Stars, no_stars
 from starpos_common import messages
 from starpos_interfaces.msg import StarArray
 

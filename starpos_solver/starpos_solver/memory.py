@@ -9,9 +9,9 @@ import numpy as np
 
 from starpos.errors import TiltError
 from starpos.fix import Fix
+from starpos.frames.stars import Stars
 from starpos.inclinometer import Tilt, TiltLog
 from starpos.pose import slip_s
-from starpos.stars import Stars
 
 MOST_POSES = 36
 MOST_TILTS = 64  # of a pose, the newest

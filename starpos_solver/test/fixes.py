@@ -9,9 +9,9 @@ import numpy as np
 from starpos import rotation
 from starpos.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix import Fix
+from starpos.frames.stars import Stars
 from starpos.inclinometer import Tilt
 from starpos.sky import Site, camera_to_enu
-from starpos.stars import Stars
 from starpos_solver.memory import Seen
 
 T0 = 1_793_642_400.0

@@ -11,13 +11,13 @@ from starpos.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.earth.orientation import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix import Fix
+from starpos.frames.stars import Stars
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import ARCSEC, MOST_C, Calibration, Instrument
 from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky import Site
 from starpos.solve import Solution, Solver
-from starpos.stars import Stars
 
 ROUNDS = 4
 SETTLED_RAD = np.radians(0.02 / 3600)

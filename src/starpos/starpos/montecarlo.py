@@ -15,7 +15,7 @@ import numpy as np
 from starpos.camera import Camera
 from starpos.catalogue import Catalogue
 from starpos.errors import CatalogueError
-from starpos.stars import Stars
+from starpos.frames.stars import Stars
 
 TOLERANCE_ARCSEC = 20.0  # of the frame's centre, or a pixel where that is more
 FALSE_STEP_MAG = 0.1  # a false star outshines the next one by this

@@ -20,13 +20,13 @@ from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, 
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
+from starpos.frames.stars import Stars
 from starpos.inclinometer import InclinometerErrors, TiltLog
 from starpos.instrument import Calibration, Instrument
 from starpos.rotation import half_turn
 from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
 from starpos.sky import Site, camera_to_enu
 from starpos.solve import Solver
-from starpos.stars import Stars
 from starpos.turning import turn
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's

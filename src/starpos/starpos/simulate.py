@@ -14,10 +14,10 @@ from starpos.camera import Camera
 from starpos.catalogue import Catalogue
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
+from starpos.frames.stars import Stars
 from starpos.instrument import Calibration, Instrument
 from starpos.sky import Site, camera_to_enu
-from starpos.stars import Stars
 
 FWHM_PER_SIGMA = 2.354820045
 STAMP_SIGMAS = 5.0

@@ -17,13 +17,13 @@ from starpos.earth.orientation import EarthState, earth_motion, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix import Fix, MatchedStars, solve_fix
+from starpos.frames.reading import why_no_time
+from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Instrument
 from starpos.progress import Progress, quiet
-from starpos.reading import why_no_time
 from starpos.rotation import full_turn
 from starpos.standing import Standing
-from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 
 J2000 = 2000.0
 UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED

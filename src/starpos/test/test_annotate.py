@@ -5,10 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from starpos import annotate as module
-from starpos.annotate import DETECTED, FLAGGED, IDENTIFIED, Identified, annotate, shrink
-from starpos.frame import Frame
-from starpos.stars import SATURATED, Stars, no_stars
+from starpos.frames import annotate as module
+from starpos.frames.annotate import DETECTED, FLAGGED, IDENTIFIED, Identified, annotate, shrink
+from starpos.frames.frame import Frame
+from starpos.frames.stars import SATURATED, Stars, no_stars
 
 SIZE = (641, 483)
 

@@ -14,9 +14,9 @@ from starpos.camera_from_sky import calibrate
 from starpos.detection import detect
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.intrinsics import rms
-from starpos.reading import read_frame
-from starpos.stars import SATURATED, Stars, no_stars
 
 
 def flipped(stars: Stars) -> Stars:

@@ -9,7 +9,7 @@ import pytest
 import raws
 
 from starpos.cli import main
-from starpos.reading import read_frame
+from starpos.frames.reading import read_frame
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")

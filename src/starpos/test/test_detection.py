@@ -6,8 +6,8 @@ from scipy import ndimage
 
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError
-from starpos.frame import Frame
-from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos.frames.frame import Frame
+from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
 TRAIL = (2.6, -2.2)  # px: half a second of the sky
 

@@ -7,7 +7,7 @@ from rendered import field, grid, noisy
 
 from starpos.detection import detect
 from starpos.errors import FrameError
-from starpos.frame import PATTERNS, Frame, to_unsigned
+from starpos.frames.frame import PATTERNS, Frame, to_unsigned
 
 TYPES = [
     "u1",

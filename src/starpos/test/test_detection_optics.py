@@ -6,7 +6,7 @@ import pytest
 from rendered import bound, errors, field, grid, match, noisy, rms
 
 from starpos.detection import detect
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 
 SIZE, TRAIL = (900, 1300), (2.6, -2.2)
 FAINT, BRIGHT = 3000.0, 60000.0

@@ -6,7 +6,7 @@ from rendered import field, grid, match
 
 from starpos.detection import detect
 from starpos.detection.plane import plane_of
-from starpos.frame import PATTERNS, Frame
+from starpos.frames.frame import PATTERNS, Frame
 
 OF_MOSAIC = {
     "rggb": "BayerBG",

@@ -11,8 +11,8 @@ from scipy import ndimage
 from starpos.detection import detect
 from starpos.detection.background import measure_background
 from starpos.detection.finding import find_peaks
-from starpos.frame import Frame, to_unsigned
-from starpos.stars import BLENDED, SATURATED
+from starpos.frames.frame import Frame, to_unsigned
+from starpos.frames.stars import BLENDED, SATURATED
 
 SIZE = (600, 900)
 ELECTRONS = 12000

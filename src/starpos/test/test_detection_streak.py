@@ -4,8 +4,8 @@ import pytest
 from rendered import bound, field, grid, match, noisy
 
 from starpos.detection import detect
-from starpos.frame import Frame
-from starpos.stars import ELONGATED
+from starpos.frames.frame import Frame
+from starpos.frames.stars import ELONGATED
 
 SIZE = (700, 900)
 

@@ -12,9 +12,9 @@ import pytest
 import raws
 
 from starpos.errors import FrameError, TimeError
-from starpos.exif import CameraClock
-from starpos.frame import Frame
-from starpos.reading import decode_frame, read_frame
+from starpos.frames.exif import CameraClock
+from starpos.frames.frame import Frame
+from starpos.frames.reading import decode_frame, read_frame
 
 MOSAIC = raws.mosaic()
 SHOWN_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()  # raws.START, were it UTC

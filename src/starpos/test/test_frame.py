@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 
 
 def test_depths_and_colours_a_camera_gives_are_accepted():

@@ -12,9 +12,9 @@ import pytest
 from astropy.io import fits
 
 from starpos.errors import LETTERS, FrameError, one_line
-from starpos.fits_frame import decode_fits
-from starpos.frame import Frame
-from starpos.reading import read_frame
+from starpos.frames.fits import decode_fits
+from starpos.frames.frame import Frame
+from starpos.frames.reading import read_frame
 
 PIXELS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
 NIGHT = {"DATE-OBS": "2026-11-02T18:00:00.125", "EXPTIME": 0.5}

@@ -16,8 +16,8 @@ pytest.importorskip("rosbags")
 from bags import Recorder, typestore
 from rosbags.rosbag2 import StoragePlugin
 
+from starpos.frames.reading import read_frame
 from starpos.inclinometer import read_tilt_csv
-from starpos.reading import read_frame
 
 RECORDED = Path(__file__).resolve().parents[3] / "test" / "data" / "night"
 FOCAL_PX = 29.67e3 / 6.4

@@ -10,11 +10,11 @@ from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 from starpos import rotation
 from starpos.average import average
 from starpos.earth.orientation import curvature_radii_m
+from starpos.frames.stars import no_stars
 from starpos.inclinometer import Tilt, a2_matrix
 from starpos.instrument import Calibration, Instrument
 from starpos.sky import camera_to_enu
 from starpos.solve import Solver, Status
-from starpos.stars import no_stars
 from starpos.turning import turn
 
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from starpos.camera import Camera
 from starpos.errors import StarposError
-from starpos.frame import Frame
+from starpos.frames.frame import Frame
 from starpos_common.parameters import Parameter
 
 

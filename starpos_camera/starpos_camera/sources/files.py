@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from starpos.errors import FrameError
-from starpos.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
-from starpos.frame import Frame
-from starpos.reading import FITS, JPEG, PICTURE, RAW, read_frame
+from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
+from starpos.frames.frame import Frame
+from starpos.frames.reading import FITS, JPEG, PICTURE, RAW, read_frame
 from starpos_camera.sources import CaptureError, Exposure, NothingYet, Settings, SourceEnded, missing
 from starpos_camera.sources.watched_folder import WatchedFolder
 from starpos_common.parameters import Parameter

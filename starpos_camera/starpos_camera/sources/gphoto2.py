@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import PurePosixPath
 
 from starpos.errors import FrameError
-from starpos.reading import RAW, decode_frame
+from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.gphoto2_camera import TOLERANCE, Gphoto2Camera, sentence
 from starpos_camera.sources.timing import middle_of_commanded

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from starpos.errors import StarposError, one_line
-from starpos.fits_frame import decode_fits
-from starpos.frame import MAX_PIXELS
+from starpos.frames.fits import decode_fits
+from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
 from starpos_camera.sources.indi_server import Blob, Server

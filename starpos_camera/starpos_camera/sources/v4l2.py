@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from starpos.frame import MAX_PIXELS, Frame
+from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources import CaptureError, Exposure, Settings
 from starpos_camera.sources.opencv_video import quiet
 from starpos_interfaces.msg import Capture

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frame import MAX_PIXELS, Frame
+from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources import CaptureError, Exposure, Settings, SourceEnded
 from starpos_camera.sources.opencv_video import quiet
 from starpos_camera.sources.timing import read_utc

@@ -15,11 +15,11 @@ from starpos.camera_from_sky import calibrate as camera_from_sky
 from starpos.cli import calibrate_site, common
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
+from starpos.frames.reading import why_no_time
+from starpos.frames.stars import Stars
 from starpos.inclinometer import TiltLog, a2_matrix, read_tilt_csv
 from starpos.instrument import Instrument
 from starpos.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
-from starpos.reading import why_no_time
-from starpos.stars import Stars
 
 NOTHING = 1  # exit status
 CAMERA_NAME = "camera"  # the node's

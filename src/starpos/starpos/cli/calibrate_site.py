@@ -11,11 +11,11 @@ from starpos.calibration import Calibrated, calibrate_at
 from starpos.cli import common
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError
+from starpos.frames.stars import Stars
 from starpos.inclinometer import TiltLog
 from starpos.instrument import Instrument
 from starpos.sky import Site
 from starpos.solve import Solver
-from starpos.stars import Stars
 
 UNKNOWN_DEG = 60.0  # an angle with such an error is any
 

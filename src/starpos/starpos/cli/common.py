@@ -15,10 +15,10 @@ from starpos.earth import geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError
-from starpos.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
-from starpos.frame import Frame
-from starpos.reading import read_frame
-from starpos.stars import Stars
+from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
+from starpos.frames.frame import Frame
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import Stars
 
 GIVEN_STDDEV_ARCSEC = 1.0  # of a deflection given by hand without its error
 

@@ -4,7 +4,7 @@
 from starpos.cli import common, jobs
 from starpos.cli.frame_work import Detecting, Reader
 from starpos.errors import FrameError
-from starpos.stars import Stars
+from starpos.frames.stars import Stars
 
 
 def define(parser) -> None:

@@ -16,13 +16,13 @@ from starpos import catalogue
 from starpos.cli.common import stars_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
-from starpos.exif import CameraClock
-from starpos.frame import Frame
+from starpos.frames.exif import CameraClock
+from starpos.frames.frame import Frame
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import Stars
 from starpos.inclinometer import TiltLog, read_tilt_csv
 from starpos.instrument import Instrument
-from starpos.reading import read_frame
 from starpos.solve import Solution, Solver
-from starpos.stars import Stars
 
 if TYPE_CHECKING:
     from starpos.detection import Detection

@@ -9,9 +9,9 @@ from pathlib import Path
 from starpos import catalogue
 from starpos.cli import common
 from starpos.errors import FrameError, InstrumentError
+from starpos.frames.stars import Stars, no_stars
 from starpos.instrument import Instrument
 from starpos.report.night import Night
-from starpos.stars import Stars, no_stars
 from starpos.utc import utc_text
 
 NO_FIX = 1

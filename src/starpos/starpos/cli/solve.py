@@ -15,9 +15,9 @@ from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix import Fix
+from starpos.frames.stars import Stars
 from starpos.inclinometer import TiltLog
 from starpos.solve import Solution, Solver, Status
-from starpos.stars import Stars
 from starpos.turning import turn
 from starpos.utc import utc_text
 

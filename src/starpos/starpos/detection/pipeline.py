@@ -12,7 +12,7 @@ from starpos.detection.plane import plane_of
 from starpos.detection.streak import find_streaks
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
-from starpos.stars import Stars, no_stars
+from starpos.frames.stars import Stars, no_stars
 
 # fmt: off
 ABOUT = (

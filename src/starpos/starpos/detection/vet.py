@@ -11,7 +11,7 @@ from starpos.detection.fit import OUTLIER, fit_stars
 from starpos.detection.learn import centroid, grey
 from starpos.detection.shape import moments, relative_widths, window_for
 from starpos.detection.stamps import cut, uneven
-from starpos.stars import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
 SPECK = 3  # pixels
 SPIKE = 3  # times sharper than a star

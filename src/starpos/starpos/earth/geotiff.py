@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import GeoidError
-from starpos.picture_frame import decode_picture
+from starpos.frames.pictures import decode_picture
 
 WIDTH, HEIGHT, SAMPLES = 256, 257, 277
 PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735

@@ -10,10 +10,10 @@ import numpy as np
 
 from starpos.detection import detect
 from starpos.errors import FrameError, TiltError
+from starpos.frames.reading import FITS, read_frame
+from starpos.frames.stars import Stars
 from starpos.inclinometer import Tilt, read_tilt_csv
-from starpos.reading import FITS, read_frame
 from starpos.report.night import Truth
-from starpos.stars import Stars
 
 TILTS, TRUTH = "tilt.csv", "truth.json"
 TRUTH_LIMIT = 1 << 26

@@ -14,6 +14,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
 from starpos.fix import Fix
+from starpos.frames.stars import Stars
 from starpos.inclinometer import a2_matrix
 from starpos.instrument import Instrument
 from starpos.progress import Progress, quiet
@@ -21,7 +22,6 @@ from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import turn as wrapped
 from starpos.report.night import NO_TILT, Night, Place, Shot
 from starpos.solve import Solution, Solver, Status
-from starpos.stars import Stars
 from starpos.turning import turn
 from starpos.utc import utc_text
 

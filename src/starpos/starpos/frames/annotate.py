@@ -8,8 +8,8 @@ from datetime import datetime, timezone
 import cv2
 import numpy as np
 
-from starpos.frame import Frame
-from starpos.stars import Stars
+from starpos.frames.frame import Frame
+from starpos.frames.stars import Stars
 
 SHOWN_PX = 1600  # of a frame's longer side, at most
 WHITE_PERCENTILE, WHITE_SIGMAS = 99.95, 30.0  # white is the higher of the two

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import FrameError, one_line
-from starpos.exif import CameraClock
-from starpos.fits_frame import read_fits
-from starpos.frame import Frame
-from starpos.frame_header import focal_px, times
-from starpos.picture_frame import JPEG as JPEG_START
-from starpos.picture_frame import PNG as PNG_START
-from starpos.picture_frame import picture_frame
-from starpos.raw_frame import raw_frame
-from starpos.stars import Stars
+from starpos.frames.exif import CameraClock
+from starpos.frames.fits import read_fits
+from starpos.frames.frame import Frame
+from starpos.frames.header import focal_px, times
+from starpos.frames.pictures import JPEG as JPEG_START
+from starpos.frames.pictures import PNG as PNG_START
+from starpos.frames.pictures import picture_frame
+from starpos.frames.raw import raw_frame
+from starpos.frames.stars import Stars
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff")

@@ -6,9 +6,9 @@ import struct
 
 import numpy as np
 
-from starpos import exif
 from starpos.errors import FrameError, one_line
-from starpos.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
+from starpos.frames import exif
+from starpos.frames.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
 
 # TIFF 6.0: where the data of an image lie and how long they are, in strips or tiles; and the IFDs below one
 STRIPS, TILES, BELOW = (273, 279), (324, 325), 330

@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 
 from starpos.errors import FrameError, one_line
-from starpos.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
-from starpos.frame_header import KEYS, focal_px, times
+from starpos.frames.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
+from starpos.frames.header import KEYS, focal_px, times
 
 FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.stars import check_focal, check_size, check_times
+from starpos.frames.stars import check_focal, check_size, check_times
 
 MAX_PIXELS = 200_000_000  # a header may claim anything; this much fits a small robot's memory
 LOUDEST = 30_000  # times the noise above the sky or below it: further off is no light, as no sensor reaches that far

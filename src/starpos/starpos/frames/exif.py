@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from starpos.errors import FrameError, TimeError
-from starpos.frame_header import MAX_EXPOSURE_S
+from starpos.frames.header import MAX_EXPOSURE_S
 
 UNTENDED_STDDEV_S = 60.0  # Canon and Nikon allow their clocks a minute a month
 ZONES_H = 14.0  # UTC-12 to UTC+14 are in use

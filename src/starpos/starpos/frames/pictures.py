@@ -6,9 +6,9 @@ import zlib
 
 import numpy as np
 
-from starpos import exif
 from starpos.errors import FrameError
-from starpos.frame import MAX_PIXELS, Frame, to_unsigned
+from starpos.frames import exif
+from starpos.frames.frame import MAX_PIXELS, Frame, to_unsigned
 
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8\xff"
