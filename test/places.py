@@ -7,7 +7,7 @@ import numpy as np
 from graph import stamp_of
 from shots import scene_at, shoot
 
-from starpos.instrument import Calibration
+from starpos.instrument.instrument import Calibration
 from starpos.sky import Site
 
 METRES = 6.371e6  # a sphere will do

@@ -11,9 +11,9 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from shots import FULL_FOCAL_PX, LATITUDE_DEG, LONGITUDE_DEG, PRESSURE_PA, scene_at, shoot
 from std_srvs.srv import Trigger
 
-from starpos import instrument_file
-from starpos.inclinometer import InclinometerErrors
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.srv import SelfCalibrate
 

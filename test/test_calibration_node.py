@@ -14,8 +14,8 @@ from sensor_msgs.msg import NavSatFix
 from shots import FULL_FOCAL_PX, LATITUDE_DEG, LONGITUDE_DEG, PRESSURE_PA, SOLVER, START_S, scene_at, shoot
 from std_srvs.srv import Trigger
 
-from starpos import instrument_file
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate
 

@@ -9,9 +9,9 @@ import pytest
 from sensor_msgs.srv import SetCameraInfo
 from shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
-from starpos import camera_yaml, instrument_file
-from starpos.camera import Camera
-from starpos.instrument import Instrument
+from starpos.instrument import camera_file, instrument_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 from starpos_common.messages import camera_to_message
 from starpos_interfaces.srv import SaveCalibration
 
@@ -30,7 +30,7 @@ cameras = [Camera.from_focal(100, 80, focal) for focal in (1000.0, 2000.0)]
 files = {
     "instrument.yaml": (lambda p, c: instrument_file.write(p, Instrument(c.fx, c)),
                         lambda p: instrument_file.read(p).focal_px),
-    "camera.yaml": (lambda p, c: camera_yaml.write(p, c, "camera"), lambda p: camera_yaml.read(p).fx),
+    "camera.yaml": (lambda p, c: camera_file.write(p, c, "camera"), lambda p: camera_file.read(p).fx),
 }
 for name, (write, read) in files.items():
     path, found = folder / name, []
@@ -96,7 +96,7 @@ def _is_solved(graph) -> bool:
 def test_a_camera_killed_while_it_saves_starts_again_with_a_whole_file(graph, run, tmp_path, round_):
     path = tmp_path / "camera.yaml"
     cameras = [Camera.from_focal(*FULL, FULL_FOCAL_PX * k) for k in (1.0, 1.01)]
-    camera_yaml.write(path, cameras[0], "camera")
+    camera_file.write(path, cameras[0], "camera")
     parameters = ("source:=simulated", "cadence:=100.0", f"calibration_url:={path}")
     process = run("starpos_camera", "camera", *parameters)
     client = graph.node.create_client(SetCameraInfo, "camera/set_camera_info")
@@ -111,7 +111,7 @@ def test_a_camera_killed_while_it_saves_starts_again_with_a_whole_file(graph, ru
     process.signal(signal.SIGKILL)
     process.wait()
     graph.node.destroy_client(client)
-    assert camera_yaml.read(path) in cameras
+    assert camera_file.read(path) in cameras
     again = run("starpos_camera", "camera", *parameters)
     graph.wait(lambda: graph.state("camera: Capture", "").level is not None)
     values = {v.key: v.value for v in graph.state("camera: Capture", "").values}

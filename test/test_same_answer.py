@@ -9,7 +9,7 @@ import subprocess
 import pytest
 from shots import focal_of
 
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.msg import Tilt as TiltMessage

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from starpos import camera_yaml, instrument_file
 from starpos.earth import geoid_file
 from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
-from starpos.inclinometer import read_tilt_csv
+from starpos.instrument import camera_file, instrument_file
+from starpos.instrument.inclinometer import read_tilt_csv
 from starpos_common.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 
@@ -155,7 +155,7 @@ def test_the_search_covers_the_product_and_would_find(monkeypatch):
         ("frame.cr2", b"II*\0", 1 << 40, read_frame),
         ("tilt.csv", b"utc_unix_s,theta_x_deg,theta_y_deg\n", 1 << 40, read_tilt_csv),
         ("instrument.yaml", b"starpos_instrument: 1\n", 1 << 40, instrument_file.read),
-        ("camera.yaml", b"image_width: 1\n", 1 << 40, camera_yaml.read),
+        ("camera.yaml", b"image_width: 1\n", 1 << 40, camera_file.read),
         ("geoid.tif", b"II*\0", 1 << 40, geoid_file.read_grid),
         ("geoid.gtx", b"\x40" * 40, 1 << 40, geoid_file.read_grid),
     ],

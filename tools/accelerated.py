@@ -25,10 +25,10 @@ from shots import (
     shot_of,
 )
 
-from starpos import instrument_file
 from starpos.earth.orientation import curvature_radii_m
-from starpos.inclinometer import InclinometerErrors
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky import Site
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Solution

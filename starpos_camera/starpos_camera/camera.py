@@ -15,11 +15,11 @@ from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
-from starpos import camera_yaml
-from starpos.camera import Camera
 from starpos.errors import InstrumentError, StarposError
 from starpos.frames.frame import Frame
-from starpos.instrument import focal_px_of
+from starpos.instrument import camera_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import NothingYet, Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
@@ -80,7 +80,7 @@ class CameraNode(Node):
         if self._values["calibration_url"]:
             self._calibration_path = path_of(self._values["calibration_url"])
             if os.path.exists(self._calibration_path):  # Path.exists raises where a name is too long
-                self._calibration = camera_yaml.read(self._calibration_path)
+                self._calibration = camera_file.read(self._calibration_path)
             else:
                 self.get_logger().warning(
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
@@ -269,7 +269,7 @@ class CameraNode(Node):
 
     def _keep(self, camera: Camera):
         try:
-            camera_yaml.write(self._calibration_path, camera, self.get_name())
+            camera_file.write(self._calibration_path, camera, self.get_name())
         except InstrumentError as error:
             raise InstrumentError(f"{error}; the calibration holds for this session only.") from None
 

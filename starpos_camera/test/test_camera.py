@@ -17,11 +17,11 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 
-from starpos import camera_yaml
-from starpos.camera import Camera
 from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
 from starpos.frames.reading import read_frame
+from starpos.instrument import camera_file
+from starpos.instrument.camera import Camera
 from starpos.simulate import expose
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_common.testing import lacks
@@ -186,7 +186,7 @@ def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, list
     answer = listener.call(SetCameraInfo, "camera/set_camera_info", request)
     assert answer.success and str(path) in answer.status_message
     listener.wait(lambda: message_to_camera(infos[-1]) == camera)
-    assert camera_yaml.read(path) == camera
+    assert camera_file.read(path) == camera
     assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
     status, out = node.end(signal.SIGINT)
     assert status == 0 and "there is no calibration yet" in out

@@ -10,11 +10,11 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
-from starpos.inclinometer import SCA100T_NOISE_RAD, Tilt
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 from starpos_interfaces.msg import Star, StarArray
 from starpos_interfaces.msg import Tilt as TiltMessage
 

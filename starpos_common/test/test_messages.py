@@ -9,11 +9,11 @@ import pytest
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, Image
 
-from starpos.camera import Camera
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import EDGE, Stars, no_stars
-from starpos.inclinometer import Tilt
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt
 from starpos_common import messages
 from starpos_interfaces.msg import StarArray
 

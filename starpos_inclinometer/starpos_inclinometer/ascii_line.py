@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from typing import Any
 
-from starpos.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
+from starpos.instrument.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
 from starpos_inclinometer.clock import ArrivalFilter
 from starpos_inclinometer.continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.host_clock import HostClock, Moment

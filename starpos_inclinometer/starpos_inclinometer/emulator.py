@@ -18,7 +18,7 @@ import tty
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
-from starpos.inclinometer import sca100t_volts
+from starpos.instrument.inclinometer import sca100t_volts
 from starpos_inclinometer import protocol, sensor
 
 FIRMWARE = 0x0100

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from starpos.inclinometer import LIMIT_RAD
+from starpos.instrument.inclinometer import LIMIT_RAD
 from starpos_common.topics import subscription
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.noise import NoiseTracker, noise_text

@@ -7,7 +7,12 @@ Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (An
 import math
 from dataclasses import dataclass
 
-from starpos.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD, SCA100T_OFFSET_V, SCA100T_SENSITIVITY_V_PER_G
+from starpos.instrument.inclinometer import (
+    LIMIT_RAD,
+    SCA100T_NOISE_RAD,
+    SCA100T_OFFSET_V,
+    SCA100T_SENSITIVITY_V_PER_G,
+)
 from starpos_inclinometer.noise import NoiseTracker
 from starpos_inclinometer.protocol import Sample, Status
 from starpos_inclinometer.source import GAP, OUT_OF_RANGE, SATURATED, STUCK

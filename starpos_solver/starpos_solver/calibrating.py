@@ -17,7 +17,7 @@ from starpos.average import Average, Averager, average
 from starpos.calibration import Calibrated, calibrate_at
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix import Fix
-from starpos.instrument import Calibration
+from starpos.instrument.instrument import Calibration
 from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.sky import Site
 from starpos.solve import Solver

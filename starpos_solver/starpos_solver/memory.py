@@ -10,7 +10,7 @@ import numpy as np
 from starpos.errors import TiltError
 from starpos.fix import Fix
 from starpos.frames.stars import Stars
-from starpos.inclinometer import Tilt, TiltLog
+from starpos.instrument.inclinometer import Tilt, TiltLog
 from starpos.pose import slip_s
 
 MOST_POSES = 36

@@ -5,14 +5,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from starpos import instrument, instrument_file
-from starpos.camera import Camera
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument import instrument, instrument_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.plumb import UNKNOWN_ARCSEC
 from starpos_common.parameters import FRAME_NAME, Parameter
 from starpos_common.paths import path_of

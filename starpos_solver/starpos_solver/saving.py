@@ -3,9 +3,9 @@
 
 from pathlib import Path
 
-from starpos import instrument_file
 from starpos.errors import InstrumentError
-from starpos.instrument import Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Instrument
 from starpos_common.paths import path_of
 
 

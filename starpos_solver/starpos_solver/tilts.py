@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
-from starpos.inclinometer import Tilt, TiltLog
+from starpos.instrument.inclinometer import Tilt, TiltLog
 from starpos_common.messages import message_to_tilt, stamp_to_unix
 from starpos_interfaces.msg import Tilt as TiltMessage
 

@@ -10,7 +10,7 @@ from starpos import rotation
 from starpos.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix import Fix
 from starpos.frames.stars import Stars
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos.sky import Site, camera_to_enu
 from starpos_solver.memory import Seen
 

@@ -7,9 +7,9 @@ import struct
 import numpy as np
 import pytest
 
-from starpos.camera import Camera
 from starpos.errors import GeoidError, InstrumentError
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos_solver.parameters import (
     PARAMETERS,
     atmosphere_of,

@@ -3,9 +3,9 @@
 
 import pytest
 
-from starpos import instrument_file
 from starpos.errors import InstrumentError
-from starpos.instrument import Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Instrument
 from starpos_solver.saving import save
 
 INSTRUMENT = Instrument(1234.0)

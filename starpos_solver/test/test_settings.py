@@ -5,9 +5,9 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
-from starpos import instrument_file
-from starpos.camera import Camera
-from starpos.instrument import Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 from starpos_common.testing import take_domain
 from starpos_solver.settings import Settings
 

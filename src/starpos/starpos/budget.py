@@ -7,8 +7,8 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState, curvature_radii_m
-from starpos.inclinometer import Tilt, a2_matrix
-from starpos.mounting import Mounting
+from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.mounting import Mounting
 
 STEP_RAD = 1e-6
 HOUR_S = 3600.0

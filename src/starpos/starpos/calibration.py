@@ -12,8 +12,8 @@ from starpos.earth.orientation import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix import Fix
 from starpos.frames.stars import Stars
-from starpos.inclinometer import Tilt, a2_matrix
-from starpos.instrument import ARCSEC, MOST_C, Calibration, Instrument
+from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.instrument import ARCSEC, MOST_C, Calibration, Instrument
 from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky import Site

@@ -11,12 +11,12 @@ import numpy as np
 
 from starpos import rotation
 from starpos.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
-from starpos.camera import Camera
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
-from starpos.inclinometer import Tilt, a2_matrix
-from starpos.mounting import Mounting
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.mounting import Mounting
 from starpos.scatter import expected_extra, judged
 
 MAX_ROUNDS = 6

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.instrument.camera import Camera
 from starpos.scatter import distance2, judged
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

@@ -14,15 +14,15 @@ import numpy as np
 from starpos import rotation
 from starpos.average import Average, average
 from starpos.calibration import calibrate_at
-from starpos.camera import Camera
 from starpos.catalogue import EPOCH, MAS, Catalogue
 from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
 from starpos.frames.stars import Stars
-from starpos.inclinometer import InclinometerErrors, TiltLog
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import InclinometerErrors, TiltLog
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.rotation import half_turn
 from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
 from starpos.sky import Site, camera_to_enu

@@ -15,7 +15,7 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import FixError
 from starpos.fix import Fix
-from starpos.inclinometer import InclinometerErrors, a2_matrix
+from starpos.instrument.inclinometer import InclinometerErrors, a2_matrix
 from starpos.solve import Solution
 
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes

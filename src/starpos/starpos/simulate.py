@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import erf
 
-from starpos.camera import Camera
 from starpos.catalogue import Catalogue
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky import Site, camera_to_enu
 
 FWHM_PER_SIGMA = 2.354820045

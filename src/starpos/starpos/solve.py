@@ -11,7 +11,6 @@ import numpy as np
 
 from starpos import identification as ident
 from starpos import triangles
-from starpos.camera import Camera
 from starpos.catalogue import Catalogue
 from starpos.earth.orientation import EarthState, earth_motion, earth_state
 from starpos.earth.refraction import Atmosphere
@@ -19,8 +18,9 @@ from starpos.errors import FixError, InstrumentError, StarposError, TiltError, T
 from starpos.fix import Fix, MatchedStars, solve_fix
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
-from starpos.inclinometer import Tilt, a2_matrix
-from starpos.instrument import Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
 from starpos.standing import Standing

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.calibration import Calibrated, calibrate
 from starpos.frames.stars import Stars
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos.plumb import Plumb, Readings, level
 from starpos.progress import Progress, quiet
 from starpos.solve import Solver

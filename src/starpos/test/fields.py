@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.fix import Fix, MatchedStars, Mounting, solve_fix
-from starpos.inclinometer import Tilt
-from starpos.instrument import TOP_OF_FRAME
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.instrument import TOP_OF_FRAME
 from starpos.sky import Site, camera_to_enu
 
 ARCSEC = np.radians(1 / 3600)

@@ -8,8 +8,8 @@ from scenes import EXPOSURE, START
 from scipy.optimize import least_squares
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.earth.refraction import Atmosphere
+from starpos.instrument.camera import Camera
 from starpos.intrinsics import Sighting
 from starpos.simulate import Optics, detected, expose, scene_of
 

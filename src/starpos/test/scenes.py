@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.stars import Stars
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos.simulate import Optics, Scene, detected, expose, read_tilt, scene_of
 from starpos.solve import Solver
 

@@ -7,8 +7,8 @@ import numpy as np
 from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
-from starpos.inclinometer import Tilt
-from starpos.instrument import ARCSEC, Calibration, Instrument
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.instrument import ARCSEC, Calibration, Instrument
 from starpos.simulate import Scene
 from starpos.solve import Solver
 

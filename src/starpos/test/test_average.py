@@ -11,7 +11,7 @@ from starpos.average import Averager, average
 from starpos.budget import ALWAYS, ErrorTerm, correlation
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos.running import UNIT, Plane
 
 STATE = earth_state(UTC)

@@ -13,7 +13,7 @@ from starpos import rotation
 from starpos.average import Averager, average
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 
 STATE = earth_state(UTC)
 NOISE, A3_ERROR = 12.6 * ARCSEC, 5.0 * ARCSEC

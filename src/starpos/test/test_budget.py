@@ -10,7 +10,7 @@ from fields import ARCSEC, UTC, Field
 from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.fix import Mounting
-from starpos.inclinometer import EXACT, InclinometerErrors, Tilt
+from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 
 STATE = earth_state(UTC)
 ARCSEC_M = (30.95, 30.82)  # east, north at 35.7 deg, radii of WGS 84

@@ -13,8 +13,8 @@ from starpos.calibration import VALID_DAYS, calibrate_at
 from starpos.earth.orientation import DAY_S, curvature_radii_m
 from starpos.errors import FixError
 from starpos.frames.stars import no_stars
-from starpos.inclinometer import InclinometerErrors
-from starpos.instrument import Calibration
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Calibration
 from starpos.solve import Status
 
 NOISE_ARCSEC = 12.6  # of one reading

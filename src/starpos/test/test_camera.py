@@ -3,8 +3,8 @@ import cv2
 import numpy as np
 import pytest
 
-from starpos.camera import Camera
 from starpos.errors import InstrumentError
+from starpos.instrument.camera import Camera
 
 SIZE = (5616, 3744)
 STRONG = (-0.28, 0.11, 1.2e-3, -8e-4, -0.02)  # of a wide lens

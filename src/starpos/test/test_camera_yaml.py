@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from starpos import camera_yaml
-from starpos.camera import Camera
 from starpos.errors import InstrumentError
+from starpos.instrument import camera_file
+from starpos.instrument.camera import Camera
 
 CAMERA = Camera(640, 480, 7800.5, 7801.25, 320.1, 239.7, (0.1, -0.2, 1e-4, -2e-4, 0.05))
 # as camera_calibration's `commit` writes it
@@ -41,13 +41,13 @@ projection_matrix:
 def test_reads_what_ros_writes(tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(WRITTEN_BY_ROS)
-    assert camera_yaml.read(path) == CAMERA
+    assert camera_file.read(path) == CAMERA
 
 
 def test_reads_what_it_writes_even_into_a_new_folder(tmp_path):
     path = tmp_path / "new" / "camera.yaml"
-    camera_yaml.write(path, CAMERA, "camera")
-    assert camera_yaml.read(path) == CAMERA
+    camera_file.write(path, CAMERA, "camera")
+    assert camera_file.read(path) == CAMERA
     assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
 
 
@@ -72,14 +72,14 @@ def test_bad_files_are_refused_in_a_sentence(tmp_path, old, new, sentence):
     path = tmp_path / "camera.yaml"
     path.write_text(WRITTEN_BY_ROS.replace(old, new, 1))
     with pytest.raises(InstrumentError, match=sentence) as caught:
-        camera_yaml.read(path)
+        camera_file.read(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_another_reader_finds_every_key_where_it_should_be(tmp_path):
     """OpenCV's parser, which wants its own first line; the comment says nothing to it."""
     path = tmp_path / "camera.yaml"
-    camera_yaml.write(path, CAMERA, "camera", "sigma: fx 0.1\nimage_width: 5")
+    camera_file.write(path, CAMERA, "camera", "sigma: fx 0.1\nimage_width: 5")
     file = cv2.FileStorage(
         "%YAML:1.0\n---\n" + path.read_text(), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
     )
@@ -99,14 +99,14 @@ def test_another_reader_finds_every_key_where_it_should_be(tmp_path):
     assert (file.getNode("image_width").real(), file.getNode("image_height").real()) == (640, 480)
     assert file.getNode("distortion_model").string() == "plumb_bob"
     assert file.getNode("camera_name").string() == "camera"
-    assert camera_yaml.read(path) == CAMERA
+    assert camera_file.read(path) == CAMERA
 
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     path = tmp_path / "camera.yaml"
     os.mkfifo(path)
     with pytest.raises(InstrumentError, match="no regular file"):
-        camera_yaml.read(path)
+        camera_file.read(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"[1, 2]", b"\xff\xfe", b" " * (1 << 21)])
@@ -114,23 +114,23 @@ def test_what_is_no_calibration_at_all(tmp_path, content):
     path = tmp_path / "camera.yaml"
     path.write_bytes(content)
     with pytest.raises(InstrumentError):
-        camera_yaml.read(path)
+        camera_file.read(path)
 
 
 def test_a_reader_never_sees_half_a_file(tmp_path):
     path = tmp_path / "camera.yaml"
     other = Camera(1234, 567, 1e3, 1e3, 1.0, 2.0)
-    camera_yaml.write(path, CAMERA, "camera")
+    camera_file.write(path, CAMERA, "camera")
 
     def write():
         for _ in range(20):
-            camera_yaml.write(path, other, "camera")
-            camera_yaml.write(path, CAMERA, "camera")
+            camera_file.write(path, other, "camera")
+            camera_file.write(path, CAMERA, "camera")
 
     writer = threading.Thread(target=write)
     writer.start()
     while writer.is_alive():
-        assert camera_yaml.read(path) in (CAMERA, other)
+        assert camera_file.read(path) in (CAMERA, other)
     writer.join()
 
 
@@ -138,5 +138,5 @@ def test_where_it_cannot_be_written_the_old_file_stays_and_nothing_is_left(tmp_p
     path = tmp_path / "camera.yaml"
     path.mkdir()
     with pytest.raises(InstrumentError, match="cannot be written"):
-        camera_yaml.write(path, CAMERA, "camera")
+        camera_file.write(path, CAMERA, "camera")
     assert [p.name for p in tmp_path.iterdir()] == ["camera.yaml"]

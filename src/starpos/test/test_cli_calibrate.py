@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from lenses import FIELDS, night, random_camera, values
 
-from starpos import camera_yaml
 from starpos.cli import main
-from starpos.instrument import Calibration
+from starpos.instrument import camera_file
+from starpos.instrument.instrument import Calibration
 from starpos.intrinsics import PARAMETERS
 from starpos.night import write_stars
 from starpos.utc import utc_text
@@ -72,7 +72,7 @@ def test_the_file_holds_the_camera_the_table_says_how_well(skies, run, tmp_path)
         tmp_path / "map.png",
     )  # fmt: skip
     assert (status, errors) == (0, [A3_TOO])
-    camera = camera_yaml.read(out)
+    camera = camera_file.read(out)
     first, *table, last = said.splitlines()
     assert first.startswith("4 frames, ")
     assert [line.split()[0] for line in table] == list(PARAMETERS)
@@ -96,7 +96,7 @@ def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
     )  # fmt: skip
     assert (status, errors) == (0, [A3_TOO])
     answer = json.loads(said)
-    camera = camera_yaml.read(tmp_path / "camera.yaml")
+    camera = camera_file.read(tmp_path / "camera.yaml")
     found = [*(answer[k] for k in ("fx", "fy", "cx", "cy")), *answer["distortion"]]
     np.testing.assert_array_equal(found, values(camera))
     covariance = np.array(answer["covariance"])
@@ -131,7 +131,7 @@ def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
         "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", "--instrument", instrument, *AIR, "--camera",
         tmp_path / "again.yaml", "--json",
     )  # fmt: skip
-    again = values(camera_yaml.read(tmp_path / "again.yaml"))
+    again = values(camera_file.read(tmp_path / "again.yaml"))
     assert (np.abs(again - found) < 0.3 * np.sqrt(np.diag(covariance))).all()
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from sites import TRUE_A3_DEG, a3_error, shots
 
-from starpos import camera_yaml, instrument_file
 from starpos.cli import main
+from starpos.instrument import camera_file, instrument_file
 from starpos.night import write_stars
 from starpos.utc import utc_text
 
@@ -122,7 +122,7 @@ def test_json_is_an_object_a_line(known, elsewhere, run, tmp_path):
     assert camera["camera"] == str(a)
     assert site["instrument"] == str(b)
     i = instrument_file.read(b)
-    assert i.camera == camera_yaml.read(a)  # the camera that was found, and A3 with it
+    assert i.camera == camera_file.read(a)  # the camera that was found, and A3 with it
     assert i.focal_px == i.camera.fx == camera["fx"]
     assert site["misalignment_deg"] == pytest.approx(i.calibration.misalignment_deg)
     np.testing.assert_allclose(site["covariance_arcsec2"], i.calibration.covariance_arcsec2)

@@ -7,7 +7,7 @@ import pytest
 from test_cli import AIR, PLACE, WIDE, objects, run
 
 from starpos.cli import main
-from starpos.instrument_file import read
+from starpos.instrument.instrument_file import read
 
 
 def simulated(folder, *more):

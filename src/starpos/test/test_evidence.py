@@ -6,10 +6,10 @@ import pytest
 from test_identification import random_attitude, seen, sky_for
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.identification import Plumb, Pointing, full, identify, identify_directions, search
 from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, Prior, anywhere, log_evidence
 from starpos.identification.pose import Field, Pose, directions, slopes
+from starpos.instrument.camera import Camera
 from starpos.montecarlo import Conditions, draw
 
 # so few pixels that chance has a chance

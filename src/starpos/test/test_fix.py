@@ -8,12 +8,12 @@ import pytest
 from fields import ARCSEC, PAPER, UTC, Field, random_field, turn
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.fix import Mounting
-from starpos.inclinometer import Tilt
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt
 
 STATE = earth_state(UTC)
 PLACES = {

@@ -6,9 +6,9 @@ import pytest
 from scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos import triangles
-from starpos.camera import Camera
 from starpos.identification import Sky, identify, identify_directions, search
 from starpos.identification.lookup import LOOSE_PX
+from starpos.instrument.camera import Camera
 
 FIELDS = {
     "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import TiltError, TiltRangeError
-from starpos.inclinometer import (
+from starpos.instrument.inclinometer import (
     SCA100T_NOISE_RAD,
     Tilt,
     TiltLog,

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.errors import InstrumentError
-from starpos.inclinometer import InclinometerErrors
-from starpos.instrument import ARCSEC, Calibration, Instrument, focal_px_of
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import ARCSEC, Calibration, Instrument, focal_px_of
 
 
 def test_misalignment_is_r3_r2_r1():

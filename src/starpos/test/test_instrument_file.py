@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from starpos import camera_yaml
-from starpos.camera import Camera
 from starpos.errors import InstrumentError
-from starpos.inclinometer import InclinometerErrors
-from starpos.instrument import Calibration, Instrument
-from starpos.instrument_file import read, write
+from starpos.instrument import camera_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.instrument_file import read, write
 from starpos.rotation import from_vector
 
 SIMPLE = "starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\n"
@@ -61,7 +61,7 @@ def test_every_key(reads):
 
 def test_the_camera_of_a_calibration_file_beside_it_or_elsewhere(reads, tmp_path):
     camera = Camera(1392, 1040, 5200.5, 5201.5, 700.25, 520.0, (-0.1, 0.01, 1e-3, -2e-3, 0.0))
-    camera_yaml.write(tmp_path / "optics" / "camera.yaml", camera, "camera")
+    camera_file.write(tmp_path / "optics" / "camera.yaml", camera, "camera")
     for name in ("optics/camera.yaml", tmp_path / "optics" / "camera.yaml"):
         i = reads(f"starpos_instrument: 1\ncamera: {{calibration: {name}}}\n")
         assert (i.camera, i.focal_px) == (camera, 5200.5)

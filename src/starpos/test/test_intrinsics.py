@@ -8,9 +8,9 @@ import pytest
 from lenses import FIELDS, VACUUM, ideal, k1_of, prediction_errors, random_camera, sightings, values
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
+from starpos.instrument.camera import Camera
 from starpos.intrinsics import PARAMETERS, Sighting, check_sound, fewest_stars, fit_camera, rms, unbent
 
 

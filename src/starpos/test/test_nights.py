@@ -9,9 +9,9 @@ import pytest
 from scenes import FOCAL_PX, SIZE
 
 from starpos import nights
-from starpos.camera import Camera
 from starpos.cli import main
-from starpos.inclinometer import InclinometerErrors
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import InclinometerErrors
 
 CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)  # 15 deg, whose triangles build fast
 KINDS = {

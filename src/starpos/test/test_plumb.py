@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.inclinometer import a2_matrix
+from starpos.instrument.inclinometer import a2_matrix
 from starpos.plumb import Readings, hang, level
 
 ARCSEC = np.radians(1 / 3600)

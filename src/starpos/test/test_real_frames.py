@@ -9,7 +9,7 @@ import pytest
 
 from starpos.detection import detect
 from starpos.frames.reading import read_frame
-from starpos.instrument import Instrument
+from starpos.instrument.instrument import Instrument
 from starpos.solve import Solver, Status
 
 YEAR = {"openstartracker": 2017.4, "tetra3": 2019.6, "panoptes": 2016.7}

@@ -11,8 +11,8 @@ import pytest
 from starpos.average import average
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.reading import read_frame
-from starpos.inclinometer import read_tilt_csv
-from starpos.instrument import Instrument, focal_px_of
+from starpos.instrument.inclinometer import read_tilt_csv
+from starpos.instrument.instrument import Instrument, focal_px_of
 from starpos.simulate import scene_of
 from starpos.solve import Solver
 

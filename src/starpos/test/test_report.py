@@ -15,8 +15,8 @@ from reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solve
 from starpos.cli import main
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.inclinometer import SCA100T_NOISE_RAD
-from starpos.instrument import Instrument
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument.instrument import Instrument
 from starpos.report import folder, measures
 from starpos.report.working import Workshop, worked
 

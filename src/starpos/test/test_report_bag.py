@@ -17,7 +17,7 @@ from bags import Recorder, typestore
 from rosbags.rosbag2 import StoragePlugin
 
 from starpos.frames.reading import read_frame
-from starpos.inclinometer import read_tilt_csv
+from starpos.instrument.inclinometer import read_tilt_csv
 
 RECORDED = Path(__file__).resolve().parents[3] / "test" / "data" / "night"
 FOCAL_PX = 29.67e3 / 6.4

@@ -8,12 +8,12 @@ import pytest
 from reports import simulate
 
 from starpos.budget import ALWAYS, ErrorTerm
-from starpos.camera import Camera
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.inclinometer import SCA100T_NOISE_RAD
-from starpos.instrument import Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument.instrument import Instrument
 from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, Place, Shot, Truth
 from starpos.report.working import Workshop, worked

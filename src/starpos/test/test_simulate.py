@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.frames.reading import read_frame
-from starpos.inclinometer import a2_matrix, read_tilt_csv
+from starpos.instrument.inclinometer import a2_matrix, read_tilt_csv
 from starpos.night import write_night
 from starpos.simulate import Exposed, Optics, TiltErrors, expose, read_tilt, render
 from starpos.sky import Site, camera_to_enu

@@ -22,13 +22,13 @@ from scenes import (
 )
 
 from starpos.average import average
-from starpos.camera import Camera
 from starpos.cli.common import tell_extrapolation
 from starpos.earth.orientation import curvature_radii_m, earth_state, station_velocity
 from starpos.errors import TiltError
 from starpos.frames.stars import SATURATED, Stars, no_stars
-from starpos.inclinometer import EXACT, Tilt, TiltLog
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import EXACT, Tilt, TiltLog
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.solve import Solver, Status
 from starpos.utc import utc_text
 

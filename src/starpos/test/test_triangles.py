@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starpos import triangles
-from starpos.camera import Camera
+from starpos.instrument.camera import Camera
 
 WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
 

@@ -11,8 +11,8 @@ from starpos import rotation
 from starpos.average import average
 from starpos.earth.orientation import curvature_radii_m
 from starpos.frames.stars import no_stars
-from starpos.inclinometer import Tilt, a2_matrix
-from starpos.instrument import Calibration, Instrument
+from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky import camera_to_enu
 from starpos.solve import Solver, Status
 from starpos.turning import turn

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
-from starpos.camera import Camera
 from starpos.errors import StarposError
 from starpos.frames.frame import Frame
+from starpos.instrument.camera import Camera
 from starpos_common.parameters import Parameter
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import camera_yaml, catalogue
-from starpos.camera import Camera
+from starpos import catalogue
 from starpos.camera_from_sky import FromSky
 from starpos.camera_from_sky import calibrate as camera_from_sky
 from starpos.cli import calibrate_site, common
@@ -17,8 +16,10 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
-from starpos.inclinometer import TiltLog, a2_matrix, read_tilt_csv
-from starpos.instrument import Instrument
+from starpos.instrument import camera_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import TiltLog, a2_matrix, read_tilt_csv
+from starpos.instrument.instrument import Instrument
 from starpos.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
 
 NOTHING = 1  # exit status
@@ -103,7 +104,7 @@ def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | 
     if tilts is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
-    camera_yaml.write(Path(args.camera), found.fit.camera, CAMERA_NAME, about + _covariance_text(found.fit))
+    camera_file.write(Path(args.camera), found.fit.camera, CAMERA_NAME, about + _covariance_text(found.fit))
     if args.map is not None:
         _draw(args.map, found)
     if args.json:

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue, instrument_file
+from starpos import catalogue
 from starpos.calibration import Calibrated, calibrate_at
 from starpos.cli import common
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError
 from starpos.frames.stars import Stars
-from starpos.inclinometer import TiltLog
-from starpos.instrument import Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.inclinometer import TiltLog
+from starpos.instrument.instrument import Instrument
 from starpos.sky import Site
 from starpos.solve import Solver
 

@@ -103,7 +103,7 @@ def show_paper() -> int:
 
 def show_field(camera) -> int:
     from starpos import triangles
-    from starpos.instrument import Instrument
+    from starpos.instrument.instrument import Instrument
     from starpos.solve import Solver
 
     c = catalogue.load()

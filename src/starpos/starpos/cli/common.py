@@ -9,8 +9,6 @@ import time
 
 import numpy as np
 
-from starpos import instrument, instrument_file
-from starpos.camera import Camera
 from starpos.earth import geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
@@ -19,6 +17,8 @@ from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
+from starpos.instrument import instrument, instrument_file
+from starpos.instrument.camera import Camera
 
 GIVEN_STDDEV_ARCSEC = 1.0  # of a deflection given by hand without its error
 

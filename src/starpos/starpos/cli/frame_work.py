@@ -20,8 +20,8 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.inclinometer import TiltLog, read_tilt_csv
-from starpos.instrument import Instrument
+from starpos.instrument.inclinometer import TiltLog, read_tilt_csv
+from starpos.instrument.instrument import Instrument
 from starpos.solve import Solution, Solver
 
 if TYPE_CHECKING:

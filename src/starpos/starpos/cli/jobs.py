@@ -10,7 +10,7 @@ from starpos import catalogue
 from starpos.cli import common
 from starpos.cli.frame_work import About
 from starpos.errors import InstrumentError, StarposError
-from starpos.instrument import Instrument
+from starpos.instrument.instrument import Instrument
 from starpos.parallel.call import Here, Workers
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Processes, processors

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from starpos import catalogue, montecarlo
-from starpos.camera import Camera
 from starpos.cli import common, montecarlo_nights
 from starpos.errors import FrameError
-from starpos.instrument import Instrument
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 from starpos.solve import Solver
 
 PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}  # % of 1000 fields with so many false stars

@@ -10,7 +10,7 @@ from starpos import catalogue
 from starpos.cli import common
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.stars import Stars, no_stars
-from starpos.instrument import Instrument
+from starpos.instrument.instrument import Instrument
 from starpos.report.night import Night
 from starpos.utc import utc_text
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from starpos import catalogue
 from starpos.cli import common
-from starpos.instrument import focal_px_of
+from starpos.instrument.instrument import focal_px_of
 from starpos.night import write_night
 from starpos.simulate import scene_of
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue, instrument_file
+from starpos import catalogue
 from starpos.average import Average, average
 from starpos.cli import common, jobs
 from starpos.cli.archive import Night, nights_of
@@ -16,7 +16,8 @@ from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix import Fix
 from starpos.frames.stars import Stars
-from starpos.inclinometer import TiltLog
+from starpos.instrument import instrument_file
+from starpos.instrument.inclinometer import TiltLog
 from starpos.solve import Solution, Solver, Status
 from starpos.turning import turn
 from starpos.utc import utc_text

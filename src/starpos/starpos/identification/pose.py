@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.camera import Camera
+from starpos.instrument.camera import Camera
 
 STEPS, SMALL_STEP = 2, 3e-5  # of a fit; rad
 LEAST_SIGMA_PX = 1e-3  # no centroid is better, whatever is said

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from starpos.camera import Camera
 from starpos.identification.evidence import TEST_STARS, anywhere
 from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
@@ -14,6 +13,7 @@ from starpos.identification.pose import Field, Pose, Poses
 from starpos.identification.prior import Attempt, Plumb, Pointing
 from starpos.identification.screen import MATCH_SIGMA, promising
 from starpos.identification.sky import Sky
+from starpos.instrument.camera import Camera
 
 # (brightest stars, their error in px); the last kinds are for lenses that distort
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from starpos import bags
-from starpos.camera import Camera
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError
-from starpos.inclinometer import TiltLog
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import TiltLog
 from starpos.progress import Progress
 from starpos.report.folder import truth_in
 from starpos.report.messages import camera_of, deflection_of, shot_of, tilt_row

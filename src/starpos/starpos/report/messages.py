@@ -4,12 +4,12 @@
 import numpy as np
 
 from starpos.budget import ALWAYS, ErrorTerm
-from starpos.camera import Camera
 from starpos.earth.orientation import curvature_radii_m
 from starpos.earth.vertical import ARCSEC, Deflection
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.frames.stars import Stars
-from starpos.inclinometer import LIMIT_RAD
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import LIMIT_RAD
 from starpos.report.folder import Exposure
 from starpos.report.night import NO_TILT, Place, Shot
 from starpos.rotation import full_turn

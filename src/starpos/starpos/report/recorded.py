@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.budget import ErrorTerm
 from starpos.errors import InstrumentError, TiltError
-from starpos.inclinometer import Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos.report.bag import Recorded, star_lists
 from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import offset_m, turn

@@ -15,8 +15,8 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
 from starpos.fix import Fix
 from starpos.frames.stars import Stars
-from starpos.inclinometer import a2_matrix
-from starpos.instrument import Instrument
+from starpos.instrument.inclinometer import a2_matrix
+from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import turn as wrapped

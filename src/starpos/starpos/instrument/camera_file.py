@@ -4,9 +4,9 @@
 import reprlib
 from pathlib import Path
 
-from starpos import yaml_file
-from starpos.camera import Camera
 from starpos.errors import InstrumentError
+from starpos.instrument import yaml_file
+from starpos.instrument.camera import Camera
 
 LARGEST_SIDE = 1_000_000  # px of a frame
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.inclinometer import EXACT, InclinometerErrors
+from starpos.instrument.inclinometer import EXACT, InclinometerErrors
 
 
 @dataclass(frozen=True)

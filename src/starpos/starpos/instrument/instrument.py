@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.camera import Camera
 from starpos.earth.orientation import DAY_S
 from starpos.errors import InstrumentError
-from starpos.inclinometer import LIMIT_RAD, InclinometerErrors
-from starpos.mounting import Mounting
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import LIMIT_RAD, InclinometerErrors
+from starpos.instrument.mounting import Mounting
 from starpos.utc import utc_text
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (DESIGN section 2)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import camera_yaml, yaml_file
-from starpos.camera import Camera
-from starpos.camera_yaml import LARGEST_SIDE
 from starpos.errors import InstrumentError, TimeError
-from starpos.inclinometer import InclinometerErrors
-from starpos.instrument import Calibration, Instrument, focal_px_of
+from starpos.instrument import camera_file, yaml_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.camera_file import LARGEST_SIDE
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
 from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
@@ -125,7 +125,7 @@ def _camera(camera, folder: Path) -> tuple[Camera | None, float]:
             raise InstrumentError(
                 f"the camera's calibration is {_short(camera['calibration'])}: give the name of a file"
             )
-        full = camera_yaml.read(folder / camera["calibration"])
+        full = camera_file.read(folder / camera["calibration"])
         return full, full.fx
     axes = ("fx", "fy", "cx", "cy")
     _refuse_others(camera, ("width", "height", *axes, "distortion"))
