@@ -8,7 +8,7 @@ from graph import stamp_of
 from shots import scene_at, shoot
 
 from starpos.instrument.instrument import Calibration
-from starpos.sky import Site
+from starpos.sky.site import Site
 
 METRES = 6.371e6  # a sphere will do
 

@@ -29,7 +29,7 @@ from starpos.earth.orientation import curvature_radii_m
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.sky import Site
+from starpos.sky.site import Site
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Solution
 

@@ -9,8 +9,8 @@ import numpy as np
 from astropy.io import fits
 from rosbags.rosbag2.storage_mcap import zstd
 
-from starpos.catalogue import load
 from starpos.simulate import expose, render, scene_of
+from starpos.sky.catalogue import load
 
 
 def rice(pixels) -> bytes:

@@ -19,11 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue, montecarlo, triangles
+from starpos import montecarlo, triangles
 from starpos.cli.common import ProgressBar
 from starpos.cli.montecarlo import looking
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
+from starpos.sky import catalogue
 from starpos.solve import Solver
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's

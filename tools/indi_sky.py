@@ -90,8 +90,8 @@ def main() -> int:
     port, folder, exposure_s, seed, place = sys.argv[1:]
     folder, exposure_s, rng = Path(folder), float(exposure_s), np.random.default_rng(int(seed))
     scene = Place(**json.loads(place)).scene()
-    from starpos.catalogue import load
     from starpos.simulate import expose, render
+    from starpos.sky.catalogue import load
 
     catalogue = load()
     expose(scene, catalogue, time.time(), exposure_s, rng)  # what takes long the first time

@@ -170,9 +170,9 @@ def write_frames(folder: Path):
     from shots import EXPOSURE_S, NOISE_DEG, tilts_of
     from shots import START_S as BEGIN_S
 
-    from starpos.catalogue import load
     from starpos.night import write_fits
     from starpos.simulate import expose, render, scene_of
+    from starpos.sky.catalogue import load
     from starpos.utc import utc_text
 
     rng, scene, tilts = np.random.default_rng(1), scene_of(tilt_noise_deg=NOISE_DEG), []

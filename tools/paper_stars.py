@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos import catalogue
 from starpos.paper import LIMIT_MAG, plain_cut
-from starpos.tycho2 import johnson_v
+from starpos.sky import catalogue
+from starpos.sky.tycho2 import johnson_v
 
 
 def paper_rows(folder: Path):

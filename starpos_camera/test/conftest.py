@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from starpos.catalogue import load as load_catalogue
 from starpos.night import write_fits
 from starpos.simulate import expose, render, scene_of
+from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.testing import Listener, Process, take_domain
 
 SIZE = (640, 480)

@@ -12,10 +12,10 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
 import raws
 
-from starpos.catalogue import load as load_catalogue
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.simulate import expose
+from starpos.sky.catalogue import load as load_catalogue
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings, SourceEnded
 from starpos_camera.sources.registry import SOURCES

@@ -19,7 +19,7 @@ from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix import Fix
 from starpos.instrument.instrument import Calibration
 from starpos.plumb import UNKNOWN_ARCSEC
-from starpos.sky import Site
+from starpos.sky.site import Site
 from starpos.solve import Solver
 from starpos.turning import turn
 from starpos_common.diagnostics import Level

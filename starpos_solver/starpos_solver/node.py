@@ -14,13 +14,13 @@ from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from starpos import catalogue
 from starpos.average import Average
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Geodetic
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
+from starpos.sky import catalogue
 from starpos.solve import Solution as Answer
 from starpos.solve import Solver, Status
 from starpos.standing import Standing

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 
 from rclpy.node import Node
 
-from starpos.catalogue import Catalogue
 from starpos.earth.geoid import Geoid
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.sky.catalogue import Catalogue
 from starpos.solve import Solver
 from starpos_common.parameters import declare
 from starpos_solver import parameters

@@ -11,7 +11,7 @@ from starpos.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix import Fix
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
-from starpos.sky import Site, camera_to_enu
+from starpos.sky.site import Site, camera_to_enu
 from starpos_solver.memory import Seen
 
 T0 = 1_793_642_400.0

@@ -16,7 +16,7 @@ from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import ARCSEC, MOST_C, Calibration, Instrument
 from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
-from starpos.sky import Site
+from starpos.sky.site import Site
 from starpos.solve import Solution, Solver
 
 ROUNDS = 4

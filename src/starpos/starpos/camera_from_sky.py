@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import triangles
-from starpos.catalogue import Catalogue
 from starpos.earth.orientation import earth_motion
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
@@ -26,6 +25,7 @@ from starpos.intrinsics import (
     unbent,
 )
 from starpos.progress import Progress, quiet
+from starpos.sky.catalogue import Catalogue
 from starpos.solve import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
 
 # what the coarse matches of the first rounds may tell: a term too many, and the corners' wrong matches make it come true

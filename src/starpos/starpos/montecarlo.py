@@ -12,10 +12,10 @@ from itertools import count
 
 import numpy as np
 
-from starpos.catalogue import Catalogue
 from starpos.errors import CatalogueError
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
+from starpos.sky.catalogue import Catalogue
 
 TOLERANCE_ARCSEC = 20.0  # of the frame's centre, or a pixel where that is more
 FALSE_STEP_MAG = 0.1  # a false star outshines the next one by this

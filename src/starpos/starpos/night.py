@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.catalogue import Catalogue
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.progress import Progress, quiet
 from starpos.simulate import Scene, detected, expose, read_tilt, render
+from starpos.sky.catalogue import Catalogue
 from starpos.utc import unix_of
 
 TILT_RATE_HZ = 10.0

@@ -14,7 +14,6 @@ import numpy as np
 from starpos import rotation
 from starpos.average import Average, average
 from starpos.calibration import calibrate_at
-from starpos.catalogue import EPOCH, MAS, Catalogue
 from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
@@ -25,7 +24,8 @@ from starpos.instrument.inclinometer import InclinometerErrors, TiltLog
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.rotation import half_turn
 from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
-from starpos.sky import Site, camera_to_enu
+from starpos.sky.catalogue import EPOCH, MAS, Catalogue
+from starpos.sky.site import Site, camera_to_enu
 from starpos.solve import Solver
 from starpos.turning import turn
 

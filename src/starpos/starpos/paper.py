@@ -7,8 +7,8 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from starpos.catalogue import EPOCH, MAS, Catalogue
 from starpos.errors import CatalogueError
+from starpos.sky.catalogue import EPOCH, MAS, Catalogue
 from starpos.triangles import angles, opposite_sides
 
 LIMIT_MAG = 7.0

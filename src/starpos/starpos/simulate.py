@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import erf
 
-from starpos.catalogue import Catalogue
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.sky import Site, camera_to_enu
+from starpos.sky.catalogue import Catalogue
+from starpos.sky.site import Site, camera_to_enu
 
 FWHM_PER_SIGMA = 2.354820045
 STAMP_SIGMAS = 5.0

@@ -11,7 +11,6 @@ import numpy as np
 
 from starpos import identification as ident
 from starpos import triangles
-from starpos.catalogue import Catalogue
 from starpos.earth.orientation import EarthState, earth_motion, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
@@ -23,6 +22,7 @@ from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
+from starpos.sky.catalogue import Catalogue
 from starpos.standing import Standing
 
 J2000 = 2000.0

@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.catalogue import Catalogue
 from starpos.progress import Progress, quiet
-from starpos.zones import CELLS, ZONES, cell_starts, ranges
+from starpos.sky.catalogue import Catalogue
+from starpos.sky.zones import CELLS, ZONES, cell_starts, ranges
 
 PREFIX = "triangles-9-"  # of the folders in the cache; the number is the format's
 SCRATCH = "unfinished-"

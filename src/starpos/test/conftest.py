@@ -25,7 +25,7 @@ def triangle_cache(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def catalogue():
-    from starpos import catalogue
+    from starpos.sky import catalogue
 
     return catalogue.load()
 

@@ -12,7 +12,7 @@ from starpos.fix import Fix, MatchedStars, Mounting, solve_fix
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import TOP_OF_FRAME
-from starpos.sky import Site, camera_to_enu
+from starpos.sky.site import Site, camera_to_enu
 
 ARCSEC = np.radians(1 / 3600)
 UTC = 1793642400.0  # 2026-11-02T18:00:00

@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from starpos import catalogue as module
-from starpos.catalogue import MAS, Catalogue, load, pack, read, save
 from starpos.errors import CatalogueError
+from starpos.sky import catalogue as module
+from starpos.sky.catalogue import MAS, Catalogue, load, pack, read, save
 
 ARCSEC = np.radians(1 / 3600)
 

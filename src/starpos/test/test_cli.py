@@ -346,7 +346,7 @@ def test_catalogue_info(capsys):
 
 
 def test_a_catalogue_that_cannot_be_written(capsys, monkeypatch, catalogue, tmp_path):
-    from starpos import tycho2
+    from starpos.sky import tycho2
 
     monkeypatch.setattr(tycho2, "build", lambda *_: catalogue)  # the real one reads 500 MB
     status, _, errors = run(

@@ -24,7 +24,7 @@ from starpos.earth.orientation import (
 )
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import TimeError
-from starpos.sky import Site
+from starpos.sky.site import Site
 
 ARCSEC = np.radians(1 / 3600)
 MAS = ARCSEC / 1000

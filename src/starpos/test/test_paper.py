@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from starpos import paper, triangles
-from starpos.catalogue import pack
 from starpos.cli import main
 from starpos.errors import CatalogueError
+from starpos.sky.catalogue import pack
 
 
 def test_the_papers_stars_and_triangles(catalogue):

@@ -17,7 +17,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, Place, Shot, Truth
 from starpos.report.working import Workshop, worked
-from starpos.sky import Site, camera_to_enu
+from starpos.sky.site import Site, camera_to_enu
 from starpos.solve import Status
 
 ARCSEC = np.radians(1 / 3600)

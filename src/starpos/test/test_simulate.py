@@ -15,7 +15,7 @@ from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import a2_matrix, read_tilt_csv
 from starpos.night import write_night
 from starpos.simulate import Exposed, Optics, TiltErrors, expose, read_tilt, render
-from starpos.sky import Site, camera_to_enu
+from starpos.sky.site import Site, camera_to_enu
 from starpos.utc import unix_of
 
 

@@ -13,7 +13,7 @@ from starpos.earth.orientation import curvature_radii_m
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.sky import camera_to_enu
+from starpos.sky.site import camera_to_enu
 from starpos.solve import Solver, Status
 from starpos.turning import turn
 

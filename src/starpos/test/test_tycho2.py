@@ -6,9 +6,9 @@ import tarfile
 import numpy as np
 import pytest
 
-from starpos.catalogue import MAS
 from starpos.errors import CatalogueError
-from starpos.tycho2 import build, johnson_v
+from starpos.sky.catalogue import MAS
+from starpos.sky.tycho2 import build, johnson_v
 
 
 def record(size, **fields):

@@ -113,8 +113,8 @@ class Simulated:
         """Nothing: the sky is always there."""
 
     def capture(self, settings: Settings) -> Exposure:
-        from starpos.catalogue import load as load_catalogue
         from starpos.simulate import expose, render
+        from starpos.sky.catalogue import load as load_catalogue
 
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s

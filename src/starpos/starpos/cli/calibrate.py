@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue
 from starpos.camera_from_sky import FromSky
 from starpos.camera_from_sky import calibrate as camera_from_sky
 from starpos.cli import calibrate_site, common
@@ -21,6 +20,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import TiltLog, a2_matrix, read_tilt_csv
 from starpos.instrument.instrument import Instrument
 from starpos.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
+from starpos.sky import catalogue
 
 NOTHING = 1  # exit status
 CAMERA_NAME = "camera"  # the node's

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue
 from starpos.cli import common
 from starpos.errors import CatalogueError
+from starpos.sky import catalogue
 
 ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source package tycho2:
     apt-get source --download-only tycho2        (with a deb-src line in the apt sources)
@@ -61,7 +61,7 @@ def show(args) -> int:
 
 
 def build_file(args) -> int:
-    from starpos import tycho2
+    from starpos.sky import tycho2
 
     made = tycho2.build(args.originals, args.limit_mag, common.ProgressBar())
     try:

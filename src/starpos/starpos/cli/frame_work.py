@@ -12,7 +12,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos import catalogue
 from starpos.cli.common import stars_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
@@ -22,6 +21,7 @@ from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import TiltLog, read_tilt_csv
 from starpos.instrument.instrument import Instrument
+from starpos.sky import catalogue
 from starpos.solve import Solution, Solver
 
 if TYPE_CHECKING:

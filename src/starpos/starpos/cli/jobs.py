@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
-from starpos import catalogue
 from starpos.cli import common
 from starpos.cli.frame_work import About
 from starpos.errors import InstrumentError, StarposError
@@ -14,6 +13,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.parallel.call import Here, Workers
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Processes, processors
+from starpos.sky import catalogue
 from starpos.solve import Solver
 
 MOST_JOBS = 1000

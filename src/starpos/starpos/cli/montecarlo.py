@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue, montecarlo
+from starpos import montecarlo
 from starpos.cli import common, montecarlo_nights
 from starpos.errors import FrameError
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
+from starpos.sky import catalogue
 from starpos.solve import Solver
 
 PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}  # % of 1000 fields with so many false stars

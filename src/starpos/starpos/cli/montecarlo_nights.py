@@ -9,9 +9,10 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from starpos import catalogue, nights
+from starpos import nights
 from starpos.cli import common
 from starpos.nights import Outcome
+from starpos.sky import catalogue
 
 PAPER_ARCSEC = (30.2, 49.0)  # mean absolute errors of latitude and longitude over its 50 nights
 PAPER_CLOCK_S = 0.001

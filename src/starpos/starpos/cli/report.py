@@ -6,12 +6,12 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from starpos import catalogue
 from starpos.cli import common
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.stars import Stars, no_stars
 from starpos.instrument.instrument import Instrument
 from starpos.report.night import Night
+from starpos.sky import catalogue
 from starpos.utc import utc_text
 
 NO_FIX = 1

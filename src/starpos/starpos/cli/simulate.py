@@ -3,11 +3,11 @@
 
 import numpy as np
 
-from starpos import catalogue
 from starpos.cli import common
 from starpos.instrument.instrument import focal_px_of
 from starpos.night import write_night
 from starpos.simulate import scene_of
+from starpos.sky import catalogue
 
 
 def define(parser) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import catalogue
 from starpos.average import Average, average
 from starpos.cli import common, jobs
 from starpos.cli.archive import Night, nights_of
@@ -18,6 +17,7 @@ from starpos.fix import Fix
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import TiltLog
+from starpos.sky import catalogue
 from starpos.solve import Solution, Solver, Status
 from starpos.turning import turn
 from starpos.utc import utc_text

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.catalogue import Catalogue
 from starpos.identification.evidence import TEST_STARS, Prior, log_evidence
 from starpos.identification.pairs import close_pairs, mutual_nearest
 from starpos.identification.pose import Field, Pose, directions
 from starpos.identification.sky import Sky
-from starpos.zones import rows_near
+from starpos.sky.catalogue import Catalogue
+from starpos.sky.zones import rows_near
 
 FEWEST_STARS = 4  # an identification has
 ENOUGH = np.log(1e9)  # a frame of nothing is taken for some part of the sky once in as many

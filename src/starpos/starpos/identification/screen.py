@@ -5,7 +5,7 @@ import numpy as np
 
 from starpos.identification.pose import Field, Poses
 from starpos.identification.sky import Sky
-from starpos.zones import rows_near
+from starpos.sky.zones import rows_near
 
 MATCH_SIGMA = 3.5  # a star is within so many of its error
 LOG_FALSE = np.log(0.35)  # of the detections that may be no catalogue star

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.catalogue import Catalogue
+from starpos.sky.catalogue import Catalogue
 from starpos.triangles import TriangleCatalogue
 
 

@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 
 import starpos
-from starpos import catalogue
+from starpos.sky import catalogue
 
 Same = dict[str, str]  # what, and which of it
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import residual_map
-from starpos.catalogue import Catalogue
 from starpos.errors import TimeError
 from starpos.report import frame_figures, measures, place_figures, sky_figure
 from starpos.report.night import Night
 from starpos.report.style import figures_of, new_figure, png_of
+from starpos.sky.catalogue import Catalogue
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ import numpy as np
 
 from starpos.average import average
 from starpos.budget import heading_of, place_of
-from starpos.catalogue import Catalogue
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
@@ -21,6 +20,7 @@ from starpos.progress import Progress, quiet
 from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import turn as wrapped
 from starpos.report.night import NO_TILT, Night, Place, Shot
+from starpos.sky.catalogue import Catalogue
 from starpos.solve import Solution, Solver, Status
 from starpos.turning import turn
 from starpos.utc import utc_text

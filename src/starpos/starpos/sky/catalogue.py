@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import CatalogueError
-from starpos.zones import ZONES, cell_starts, rows_near
+from starpos.sky.zones import ZONES, cell_starts, rows_near
 
 EPOCH = 2000.0  # of ra, dec, Julian year
 FORMAT = 3

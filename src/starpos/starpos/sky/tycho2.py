@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.catalogue import EPOCH, Catalogue, pack
 from starpos.errors import CatalogueError
 from starpos.progress import Progress, quiet
+from starpos.sky.catalogue import EPOCH, Catalogue, pack
 
 SUPPLEMENT_EPOCH = 1991.25
 # 68 % of the measured proper motions of stars of magnitude V, one axis, are below: what an unmeasured one may be

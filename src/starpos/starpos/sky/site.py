@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos import rotation
-from starpos.catalogue import Catalogue
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import Atmosphere
+from starpos.sky.catalogue import Catalogue
 
 
 @dataclass(frozen=True)
