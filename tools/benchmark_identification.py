@@ -19,9 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import montecarlo, triangles
+from starpos import montecarlo
 from starpos.cli.common import ProgressBar
 from starpos.cli.montecarlo import looking
+from starpos.identification import triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue

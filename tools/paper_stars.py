@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos.paper import LIMIT_MAG, plain_cut
+from starpos.identification.paper import LIMIT_MAG, plain_cut
 from starpos.sky import catalogue
 from starpos.sky.tycho2 import johnson_v
 

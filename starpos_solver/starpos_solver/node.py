@@ -19,11 +19,11 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Geodetic
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.frames.stars import Stars
+from starpos.identification.hint import Standing
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
 from starpos.solve import Solution as Answer
 from starpos.solve import Solver, Status
-from starpos.standing import Standing
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
 from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix

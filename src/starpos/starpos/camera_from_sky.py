@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos import triangles
 from starpos.earth.orientation import earth_motion
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.frames.stars import Stars
-from starpos.identification import Identification, Pointing, Sky, identify_directions
+from starpos.identification import Identification, Pointing, Sky, identify_directions, triangles
 from starpos.instrument.camera import Camera
 from starpos.intrinsics import (
     PARAMETERS,

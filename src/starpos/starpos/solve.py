@@ -10,20 +10,20 @@ import erfa
 import numpy as np
 
 from starpos import identification as ident
-from starpos import triangles
 from starpos.earth.orientation import EarthState, earth_motion, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix import Fix, MatchedStars, solve_fix
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
+from starpos.identification import triangles
+from starpos.identification.hint import Standing
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
-from starpos.standing import Standing
 
 J2000 = 2000.0
 UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED

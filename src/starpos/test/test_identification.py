@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scenes import FOCAL_PX, SIZE, random_stars
 
-from starpos import triangles
-from starpos.identification import Sky, identify, identify_directions, search
+from starpos.identification import Sky, identify, identify_directions, search, triangles
 from starpos.identification.lookup import LOOSE_PX
 from starpos.instrument.camera import Camera
 

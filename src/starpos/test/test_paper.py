@@ -6,9 +6,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from starpos import paper, triangles
 from starpos.cli import main
 from starpos.errors import CatalogueError
+from starpos.identification import paper, triangles
 from starpos.sky.catalogue import pack
 
 

@@ -401,7 +401,7 @@ def test_true_stars_with_absurd_errors_give_a_fix_with_an_absurd_sigma_or_none(n
 def test_prepare_builds_what_solve_needs(night, monkeypatch):
     _, stars, tilt, solver = night
     solver.prepare(*SIZE)
-    from starpos import triangles
+    from starpos.identification import triangles
 
     monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built while solving"))
     assert solver.solve(stars, tilt).ok

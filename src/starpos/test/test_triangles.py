@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starpos import triangles
+from starpos.identification import triangles
 from starpos.instrument.camera import Camera
 
 WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field

@@ -78,7 +78,7 @@ def show_triangles(args) -> int:
 
 
 def show_paper() -> int:
-    from starpos import paper
+    from starpos.identification import paper
 
     c = catalogue.load()
     row = paper.stars(c)
@@ -102,7 +102,7 @@ def show_paper() -> int:
 
 
 def show_field(camera) -> int:
-    from starpos import triangles
+    from starpos.identification import triangles
     from starpos.instrument.instrument import Instrument
     from starpos.solve import Solver
 

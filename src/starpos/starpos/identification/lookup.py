@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos.identification.evidence import SCALE_TOLERANCE
 from starpos.identification.pose import Field, directions
-from starpos.triangles import TriangleCatalogue, angles, counter_clockwise, opposite_sides
+from starpos.identification.triangles import TriangleCatalogue, angles, counter_clockwise, opposite_sides
 
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
 TRIANGLE_SIGMA = 3.0

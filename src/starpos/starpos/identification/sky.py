@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.identification.triangles import TriangleCatalogue
 from starpos.sky.catalogue import Catalogue
-from starpos.triangles import TriangleCatalogue
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from starpos.errors import CatalogueError
+from starpos.identification.triangles import angles, opposite_sides
 from starpos.sky.catalogue import EPOCH, MAS, Catalogue
-from starpos.triangles import angles, opposite_sides
 
 LIMIT_MAG = 7.0
 LONGEST_SIDE_DEG = 4.13  # the diagonal of 3.43 x 2.30 deg
