@@ -22,11 +22,11 @@ import numpy as np
 from starpos import montecarlo
 from starpos.cli.common import ProgressBar
 from starpos.cli.montecarlo import looking
+from starpos.fix.solver import Solver
 from starpos.identification import triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
-from starpos.solve import Solver
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
 LIMIT_MAG, DEEPER_MAG = 9.0, 0.5  # a peer's catalogue reaches deeper, for the scatter of brightness

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.average import MOVED_FIXES, Average, Averager
 from starpos.earth.orientation import curvature_radii_m
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
 from starpos.plumb import EARTH_RADIUS_M
 from starpos.pose import slip_s
 from starpos_common.diagnostics import Level

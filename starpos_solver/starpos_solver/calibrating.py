@@ -16,11 +16,11 @@ from rclpy.task import Future
 from starpos.average import Average, Averager, average
 from starpos.calibration import Calibrated, calibrate_at
 from starpos.errors import FixError, InstrumentError, StarposError
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Calibration
 from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.sky.site import Site
-from starpos.solve import Solver
 from starpos.turning import turn
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report

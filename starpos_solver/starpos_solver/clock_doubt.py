@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from starpos.earth.orientation import zenith_of
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
 from starpos.plumb import EARTH_RADIUS_M
 from starpos.pose import CREEP_RAD, SIGMAS, slip_s
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos.errors import TiltError
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt, TiltLog
 from starpos.pose import slip_s

@@ -18,12 +18,12 @@ from starpos.average import Average
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Geodetic
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
+from starpos.fix.solver import Solution as Answer
+from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Standing
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
-from starpos.solve import Solution as Answer
-from starpos.solve import Solver, Status
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
 from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix

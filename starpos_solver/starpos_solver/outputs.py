@@ -10,8 +10,8 @@ from std_msgs.msg import Header
 from starpos import rotation
 from starpos.average import Average
 from starpos.earth.vertical import ARCSEC, Geodetic, Vertical, geodetic
-from starpos.solve import Solution as Answer
-from starpos.solve import Status
+from starpos.fix.solver import Solution as Answer
+from starpos.fix.solver import Status
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces.msg import ErrorTerm, Solution
 

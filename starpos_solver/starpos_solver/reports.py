@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from starpos.solve import Solution as Answer
+from starpos.fix.solver import Solution as Answer
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 

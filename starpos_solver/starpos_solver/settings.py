@@ -9,11 +9,11 @@ from rclpy.node import Node
 from starpos.earth.geoid import Geoid
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
+from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.catalogue import Catalogue
-from starpos.solve import Solver
 from starpos_common.parameters import declare
 from starpos_solver import parameters
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from starpos import rotation
-from starpos.budget import ALWAYS, ErrorTerm, heading_of
-from starpos.fix import Fix
+from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.fix.fix import Fix
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.sky.site import Site, camera_to_enu

@@ -9,11 +9,11 @@ import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
-from starpos.budget import ErrorTerm, heading_of
 from starpos.earth.vertical import Deflection
-from starpos.fix import Fix
-from starpos.solve import Solution as Answer
-from starpos.solve import Status
+from starpos.fix.budget import ErrorTerm, heading_of
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution as Answer
+from starpos.fix.solver import Status
 from starpos_interfaces.msg import Solution
 from starpos_solver import outputs
 

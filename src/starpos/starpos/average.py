@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.budget import ErrorTerm
 from starpos.errors import FixError
-from starpos.fix import Fix
+from starpos.fix.budget import ErrorTerm
+from starpos.fix.fix import Fix
 from starpos.pose import slip_s
 from starpos.running import Running
 

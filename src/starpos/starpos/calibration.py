@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.earth.orientation import curvature_radii_m
 from starpos.errors import FixError
-from starpos.fix import Fix
+from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution, Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import ARCSEC, MOST_C, Calibration, Instrument
 from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
-from starpos.solve import Solution, Solver
 
 ROUNDS = 4
 SETTLED_RAD = np.radians(0.02 / 3600)

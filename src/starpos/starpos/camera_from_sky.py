@@ -10,6 +10,7 @@ import numpy as np
 from starpos.earth.orientation import earth_motion
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.fix.solver import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
 from starpos.frames.stars import Stars
 from starpos.identification import Identification, Pointing, Sky, identify_directions, triangles
 from starpos.instrument.camera import Camera
@@ -25,7 +26,6 @@ from starpos.intrinsics import (
 )
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.solve import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
 
 # what the coarse matches of the first rounds may tell: a term too many, and the corners' wrong matches make it come true
 FREE = (("fx", "fy", "k1"), ("fx", "fy", "cx", "cy", "k1"), ("fx", "fy", "cx", "cy", "k1", "k2"))

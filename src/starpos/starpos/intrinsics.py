@@ -15,8 +15,8 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.fix.outliers import distance2, judged
 from starpos.instrument.camera import Camera
-from starpos.scatter import distance2, judged
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 # 1 sigma of the priors about the given camera: mean focal length, fx over fy, principal point (of the longer side), and

@@ -18,6 +18,7 @@ from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, 
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors, TiltLog
@@ -26,7 +27,6 @@ from starpos.rotation import half_turn
 from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
 from starpos.sky.catalogue import EPOCH, MAS, Catalogue
 from starpos.sky.site import Site, camera_to_enu
-from starpos.solve import Solver
 from starpos.turning import turn
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's

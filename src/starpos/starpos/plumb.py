@@ -14,9 +14,9 @@ import numpy as np
 
 from starpos import rotation
 from starpos.errors import FixError
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution
 from starpos.instrument.inclinometer import InclinometerErrors, a2_matrix
-from starpos.solve import Solution
 
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
 ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10  # beyond it a frame pulls no harder

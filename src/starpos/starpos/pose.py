@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
 
 SIGMAS = 6.0  # that errors may reach
 CREEP_RAD = np.radians(10 / 3600)  # by which a mount may settle that nobody touches

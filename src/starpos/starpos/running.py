@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.budget import ErrorTerm, correlation, symmetric_root
 from starpos.earth.orientation import curvature_radii_m, zenith_of
-from starpos.fix import Fix
+from starpos.fix.budget import ErrorTerm, correlation, symmetric_root
+from starpos.fix.fix import Fix
 from starpos.rotation import full_turn, half_turn
 
 UNIT = np.array([1.0, 1.0, 1e-6])  # m and rad, brought to like sizes

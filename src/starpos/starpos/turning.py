@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from starpos.calibration import Calibrated, calibrate
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.plumb import Plumb, Readings, level
 from starpos.progress import Progress, quiet
-from starpos.solve import Solver
 
 
 def turn(

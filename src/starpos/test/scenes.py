@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulate import Optics, Scene, detected, expose, read_tilt, scene_of
-from starpos.solve import Solver
 
 START = 1793642400.0  # 2026-11-02T18:00:00
 EXPOSURE = 0.5

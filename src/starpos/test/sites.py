@@ -7,10 +7,10 @@ import numpy as np
 from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
+from starpos.fix.solver import Solver
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import ARCSEC, Calibration, Instrument
 from starpos.simulate import Scene
-from starpos.solve import Solver
 
 TRUE_A3_DEG = (1.5, -2.0, 130.0)
 

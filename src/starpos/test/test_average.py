@@ -8,9 +8,9 @@ from fields import ARCSEC, UTC, Field, random_field, turn
 
 from starpos import rotation
 from starpos.average import Averager, average
-from starpos.budget import ALWAYS, ErrorTerm, correlation
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
+from starpos.fix.budget import ALWAYS, ErrorTerm, correlation
 from starpos.instrument.inclinometer import Tilt
 from starpos.running import UNIT, Plane
 

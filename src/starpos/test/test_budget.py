@@ -9,7 +9,7 @@ from fields import ARCSEC, UTC, Field
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
-from starpos.fix import Mounting
+from starpos.fix.fix import Mounting
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 
 STATE = earth_state(UTC)

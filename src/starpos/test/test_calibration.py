@@ -12,10 +12,10 @@ from starpos.average import average
 from starpos.calibration import VALID_DAYS, calibrate_at
 from starpos.earth.orientation import DAY_S, curvature_radii_m
 from starpos.errors import FixError
+from starpos.fix.solver import Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration
-from starpos.solve import Status
 
 NOISE_ARCSEC = 12.6  # of one reading
 

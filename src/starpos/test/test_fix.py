@@ -11,7 +11,7 @@ from starpos import rotation
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
-from starpos.fix import Mounting
+from starpos.fix.fix import Mounting
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 

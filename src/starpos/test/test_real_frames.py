@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
+from starpos.fix.solver import Solver, Status
 from starpos.frames.reading import read_frame
 from starpos.instrument.instrument import Instrument
-from starpos.solve import Solver, Status
 
 YEAR = {"openstartracker": 2017.4, "tetra3": 2019.6, "panoptes": 2016.7}
 

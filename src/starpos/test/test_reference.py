@@ -10,11 +10,11 @@ import pytest
 
 from starpos.average import average
 from starpos.earth.refraction import Atmosphere
+from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import read_tilt_csv
 from starpos.instrument.instrument import Instrument, focal_px_of
 from starpos.simulate import scene_of
-from starpos.solve import Solver
 
 ARCSEC = np.radians(1 / 3600)
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from reports import simulate
 
-from starpos.budget import ALWAYS, ErrorTerm
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
+from starpos.fix.budget import ALWAYS, ErrorTerm
+from starpos.fix.solver import Status
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Instrument
@@ -18,7 +19,6 @@ from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, Place, Shot, Truth
 from starpos.report.working import Workshop, worked
 from starpos.sky.site import Site, camera_to_enu
-from starpos.solve import Status
 
 ARCSEC = np.radians(1 / 3600)
 FOCAL_PX = 29.67e3 / 6.4

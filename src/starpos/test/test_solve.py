@@ -25,11 +25,11 @@ from starpos.average import average
 from starpos.cli.common import tell_extrapolation
 from starpos.earth.orientation import curvature_radii_m, earth_state, station_velocity
 from starpos.errors import TiltError
+from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import EXACT, Tilt, TiltLog
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.solve import Solver, Status
 from starpos.utc import utc_text
 
 ARCSEC = np.radians(1 / 3600)

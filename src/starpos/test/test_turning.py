@@ -10,11 +10,11 @@ from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 from starpos import rotation
 from starpos.average import average
 from starpos.earth.orientation import curvature_radii_m
+from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.site import camera_to_enu
-from starpos.solve import Solver, Status
 from starpos.turning import turn
 
 

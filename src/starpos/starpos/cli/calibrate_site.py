@@ -10,13 +10,13 @@ from starpos.calibration import Calibrated, calibrate_at
 from starpos.cli import common
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import TiltLog
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 from starpos.sky.site import Site
-from starpos.solve import Solver
 
 UNKNOWN_DEG = 60.0  # an angle with such an error is any
 

@@ -102,9 +102,9 @@ def show_paper() -> int:
 
 
 def show_field(camera) -> int:
+    from starpos.fix.solver import Solver
     from starpos.identification import triangles
     from starpos.instrument.instrument import Instrument
-    from starpos.solve import Solver
 
     c = catalogue.load()
     Solver(Instrument(camera.fx), c, progress=common.ProgressBar()).prepare(camera.width, camera.height)

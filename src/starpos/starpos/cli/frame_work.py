@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from starpos.cli.common import stars_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
+from starpos.fix.solver import Solution, Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
@@ -22,7 +23,6 @@ from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import TiltLog, read_tilt_csv
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
-from starpos.solve import Solution, Solver
 
 if TYPE_CHECKING:
     from starpos.detection import Detection

@@ -6,7 +6,7 @@ import numpy as np
 from starpos.cli import common, jobs
 from starpos.cli.frame_work import Identifying, Listing, Look, Reader
 from starpos.errors import FrameError
-from starpos.solve import Solution, Status
+from starpos.fix.solver import Solution, Status
 
 
 def define(parser) -> None:

@@ -9,12 +9,12 @@ from contextlib import suppress
 from starpos.cli import common
 from starpos.cli.frame_work import About
 from starpos.errors import InstrumentError, StarposError
+from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument
 from starpos.parallel.call import Here, Workers
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Processes, processors
 from starpos.sky import catalogue
-from starpos.solve import Solver
 
 MOST_JOBS = 1000
 AUTO = "auto"

@@ -12,10 +12,10 @@ import numpy as np
 from starpos import montecarlo
 from starpos.cli import common, montecarlo_nights
 from starpos.errors import FrameError
+from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
-from starpos.solve import Solver
 
 PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}  # % of 1000 fields with so many false stars
 PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}  # % of fields of so many stars

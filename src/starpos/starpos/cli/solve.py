@@ -13,12 +13,12 @@ from starpos.cli.archive import Night, nights_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
-from starpos.fix import Fix
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import TiltLog
 from starpos.sky import catalogue
-from starpos.solve import Solution, Solver, Status
 from starpos.turning import turn
 from starpos.utc import utc_text
 

@@ -3,17 +3,17 @@
 
 import numpy as np
 
-from starpos.budget import ALWAYS, ErrorTerm
 from starpos.earth.orientation import curvature_radii_m
 from starpos.earth.vertical import ARCSEC, Deflection
 from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.fix.budget import ALWAYS, ErrorTerm
+from starpos.fix.solver import Attitude, Status
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import LIMIT_RAD
 from starpos.report.folder import Exposure
 from starpos.report.night import NO_TILT, Place, Shot
 from starpos.rotation import full_turn
-from starpos.solve import Attitude, Status
 from starpos.utc import utc_text
 
 UNUSABLE = 1 | 2 | 4  # of Tilt.flags: out of range, stuck, saturated

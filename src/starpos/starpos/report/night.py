@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos.average import Average
-from starpos.budget import ErrorTerm
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix import Fix
-from starpos.solve import Attitude, Status
+from starpos.fix.budget import ErrorTerm
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Attitude, Status
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))

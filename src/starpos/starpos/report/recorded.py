@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from starpos.budget import ErrorTerm
 from starpos.errors import InstrumentError, TiltError
+from starpos.fix.budget import ErrorTerm
 from starpos.instrument.inclinometer import Tilt
 from starpos.report.bag import Recorded, star_lists
 from starpos.report.folder import Exposure, Exposures

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
+from starpos.fix.solver import Attitude
 from starpos.report.frame_figures import pointed
 from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site
-from starpos.solve import Attitude
 
 OUTLINES = 12  # frames whose stars are shown
 BRIGHT = 60  # stars shown that no frame need have seen

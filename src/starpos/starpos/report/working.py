@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.average import average
-from starpos.budget import heading_of, place_of
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
-from starpos.fix import Fix
+from starpos.fix.budget import heading_of, place_of
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import a2_matrix
 from starpos.instrument.instrument import Instrument
@@ -21,7 +22,6 @@ from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import turn as wrapped
 from starpos.report.night import NO_TILT, Night, Place, Shot
 from starpos.sky.catalogue import Catalogue
-from starpos.solve import Solution, Solver, Status
 from starpos.turning import turn
 from starpos.utc import utc_text
 

@@ -13,7 +13,7 @@ from starpos import identification as ident
 from starpos.earth.orientation import EarthState, earth_motion, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
-from starpos.fix import Fix, MatchedStars, solve_fix
+from starpos.fix.fix import Fix, MatchedStars, solve_fix
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 from starpos.identification import triangles

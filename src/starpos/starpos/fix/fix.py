@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
+from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
+from starpos.fix.outliers import expected_extra, judged
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.mounting import Mounting
-from starpos.scatter import expected_extra, judged
 
 MAX_ROUNDS = 6
 MAX_SCATTER = 0.003  # of the frame's diagonal: identified stars that scatter more are not these stars
