@@ -5,11 +5,11 @@ from enum import Enum, auto
 
 import numpy as np
 
-from starpos.average import MOVED_FIXES, Average, Averager
+from starpos.averaging.average import MOVED_FIXES, Average, Averager
+from starpos.averaging.slip import slip_s
 from starpos.earth.orientation import curvature_radii_m
 from starpos.fix.fix import Fix
 from starpos.plumb import EARTH_RADIUS_M
-from starpos.pose import slip_s
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 

@@ -13,7 +13,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
-from starpos.average import Average, Averager, average
+from starpos.averaging.average import Average, Averager, average
 from starpos.calibration import Calibrated, calibrate_at
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix

@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
+from starpos.averaging.slip import CREEP_RAD, SIGMAS, slip_s
 from starpos.earth.orientation import zenith_of
 from starpos.fix.fix import Fix
 from starpos.plumb import EARTH_RADIUS_M
-from starpos.pose import CREEP_RAD, SIGMAS, slip_s
 
 # So many that agree with each other outvote one that had come before them: it was stamped wrongly, no clock was set.
 OUTVOTE_ONE = 10

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from starpos.averaging.slip import slip_s
 from starpos.errors import TiltError
 from starpos.fix.fix import Fix
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt, TiltLog
-from starpos.pose import slip_s
 
 MOST_POSES = 36
 MOST_TILTS = 64  # of a pose, the newest

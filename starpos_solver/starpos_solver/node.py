@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from starpos.average import Average
+from starpos.averaging.average import Average
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Geodetic
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError

@@ -8,7 +8,7 @@ from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
 from starpos import rotation
-from starpos.average import Average
+from starpos.averaging.average import Average
 from starpos.earth.vertical import ARCSEC, Geodetic, Vertical, geodetic
 from starpos.fix.solver import Solution as Answer
 from starpos.fix.solver import Status

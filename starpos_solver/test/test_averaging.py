@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fixes import fix_at, north_of
 
-from starpos.average import average
+from starpos.averaging.average import average
 from starpos_common.diagnostics import Level
 from starpos_solver.averaging import Averaging, News
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.average import Average, average
+from starpos.averaging.average import Average, average
 from starpos.calibration import calibrate_at
 from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
 from starpos.earth.refraction import Atmosphere

@@ -7,12 +7,12 @@ import pytest
 from fields import ARCSEC, UTC, Field, random_field, turn
 
 from starpos import rotation
-from starpos.average import Averager, average
+from starpos.averaging.average import Averager, average
+from starpos.averaging.filter import UNIT, Plane
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, correlation
 from starpos.instrument.inclinometer import Tilt
-from starpos.running import UNIT, Plane
 
 STATE = earth_state(UTC)
 

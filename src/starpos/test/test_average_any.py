@@ -10,7 +10,7 @@ import pytest
 from fields import ARCSEC, UTC, Field
 
 from starpos import rotation
-from starpos.average import Averager, average
+from starpos.averaging.average import Averager, average
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.instrument.inclinometer import Tilt

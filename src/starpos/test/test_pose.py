@@ -8,8 +8,8 @@ import pytest
 from fields import ARCSEC, Field
 
 from starpos import rotation
+from starpos.averaging.slip import slip_s
 from starpos.earth.orientation import ROTATION_RAD_S, earth_state
-from starpos.pose import slip_s
 
 
 @pytest.fixture

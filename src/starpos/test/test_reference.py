@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from starpos.average import average
+from starpos.averaging.average import average
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame

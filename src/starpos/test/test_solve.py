@@ -21,7 +21,7 @@ from scenes import (
     with_false_stars,
 )
 
-from starpos.average import average
+from starpos.averaging.average import average
 from starpos.cli.common import tell_extrapolation
 from starpos.earth.orientation import curvature_radii_m, earth_state, station_velocity
 from starpos.errors import TiltError

@@ -8,7 +8,7 @@ import pytest
 from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
-from starpos.average import average
+from starpos.averaging.average import average
 from starpos.earth.orientation import curvature_radii_m
 from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import no_stars

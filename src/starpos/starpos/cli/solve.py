@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.average import Average, average
+from starpos.averaging.average import Average, average
 from starpos.cli import common, jobs
 from starpos.cli.archive import Night, nights_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts

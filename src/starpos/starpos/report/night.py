@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from starpos.average import Average
+from starpos.averaging.average import Average
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.budget import ErrorTerm

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.averaging.filter import Running
+from starpos.averaging.slip import slip_s
 from starpos.errors import FixError
 from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix
-from starpos.pose import slip_s
-from starpos.running import Running
 
 GATE_SIGMA = 6.0  # further off a fix is not of this place, or wrong
 MOVED_FIXES, MOVED_SIGMA = 3, 4.5  # so many fixes of a turned camera, so far off, are another place
