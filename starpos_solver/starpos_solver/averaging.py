@@ -7,9 +7,9 @@ import numpy as np
 
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
+from starpos.calibration.plumb_line import EARTH_RADIUS_M
 from starpos.earth.orientation import curvature_radii_m
 from starpos.fix.fix import Fix
-from starpos.plumb import EARTH_RADIUS_M
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 

@@ -14,14 +14,14 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from starpos.averaging.average import Average, Averager, average
-from starpos.calibration import Calibrated, calibrate_at
+from starpos.calibration.misalignment import Calibrated, calibrate_at
+from starpos.calibration.plumb_line import UNKNOWN_ARCSEC
+from starpos.calibration.turning import turn
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Calibration
-from starpos.plumb import UNKNOWN_ARCSEC
 from starpos.sky.site import Site
-from starpos.turning import turn
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 from starpos_interfaces.srv import Calibrate, SelfCalibrate

@@ -116,6 +116,6 @@ def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
 
 
 def tilts_of(seen: Sequence[Seen]) -> Callable[[float, float], Tilt]:
-    """What `starpos.calibration` asks for the tilt of an exposure."""
+    """What `starpos.calibration.misalignment` asks for the tilt of an exposure."""
     by_time = {s.stars.mid_unix_s: s.tilt for s in seen}
     return lambda mid_unix_s, _: by_time[mid_unix_s]

@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
+from starpos.calibration.plumb_line import UNKNOWN_ARCSEC
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
@@ -13,7 +14,6 @@ from starpos.errors import GeoidError, InstrumentError
 from starpos.instrument import instrument, instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.plumb import UNKNOWN_ARCSEC
 from starpos_common.parameters import FRAME_NAME, Parameter
 from starpos_common.paths import path_of
 

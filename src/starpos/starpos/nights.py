@@ -13,7 +13,8 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.average import Average, average
-from starpos.calibration import calibrate_at
+from starpos.calibration.misalignment import calibrate_at
+from starpos.calibration.turning import turn
 from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
@@ -27,7 +28,6 @@ from starpos.rotation import half_turn
 from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
 from starpos.sky.catalogue import EPOCH, MAS, Catalogue
 from starpos.sky.site import Site, camera_to_enu
-from starpos.turning import turn
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
 EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0

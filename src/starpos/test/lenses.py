@@ -8,9 +8,9 @@ from scenes import EXPOSURE, START
 from scipy.optimize import least_squares
 
 from starpos import rotation
+from starpos.calibration.intrinsics import Sighting
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
-from starpos.intrinsics import Sighting
 from starpos.simulate import Optics, detected, expose, scene_of
 
 AIR = Atmosphere(88000.0, 12.0, 0.3)

@@ -9,7 +9,7 @@ from scenes import START
 from sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.averaging.average import average
-from starpos.calibration import VALID_DAYS, calibrate_at
+from starpos.calibration.misalignment import VALID_DAYS, calibrate_at
 from starpos.earth.orientation import DAY_S, curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.solver import Status

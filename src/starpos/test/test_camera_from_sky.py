@@ -9,14 +9,14 @@ import pytest
 from lenses import AIR, FIELDS, ideal, k1_of, night, prediction_errors, random_camera, values
 from scenes import random_stars, with_false_stars
 
-from starpos.camera_from_sky import calibrate
+from starpos.calibration.camera import calibrate
+from starpos.calibration.intrinsics import rms
 from starpos.detection import detect
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
-from starpos.intrinsics import rms
 
 
 def flipped(stars: Stars) -> Stars:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from lenses import FIELDS, night, random_camera, values
 
+from starpos.calibration.intrinsics import PARAMETERS
 from starpos.cli import main
 from starpos.instrument import camera_file
 from starpos.instrument.instrument import Calibration
-from starpos.intrinsics import PARAMETERS
 from starpos.night import write_stars
 from starpos.utc import utc_text
 

@@ -8,10 +8,18 @@ import pytest
 from lenses import FIELDS, VACUUM, ideal, k1_of, prediction_errors, random_camera, sightings, values
 
 from starpos import rotation
+from starpos.calibration.intrinsics import (
+    PARAMETERS,
+    Sighting,
+    check_sound,
+    fewest_stars,
+    fit_camera,
+    rms,
+    unbent,
+)
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.instrument.camera import Camera
-from starpos.intrinsics import PARAMETERS, Sighting, check_sound, fewest_stars, fit_camera, rms, unbent
 
 
 def moved(sighting: Sighting, rows, by) -> Sighting:

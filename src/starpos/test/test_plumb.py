@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from starpos import rotation
+from starpos.calibration.plumb_line import Readings, hang, level
 from starpos.instrument.inclinometer import a2_matrix
-from starpos.plumb import Readings, hang, level
 
 ARCSEC = np.radians(1 / 3600)
 SCA100T, QUIET = 12.6 * ARCSEC, 0.1 * ARCSEC

@@ -7,9 +7,9 @@ import pytest
 from lenses import VACUUM, ideal, sightings
 from matplotlib.figure import Figure
 
-from starpos import residual_map
-from starpos.intrinsics import fit_camera
-from starpos.residual_map import MOST_ARROWS, draw_residuals, draw_rms
+from starpos.calibration import residual_map
+from starpos.calibration.intrinsics import fit_camera
+from starpos.calibration.residual_map import MOST_ARROWS, draw_residuals, draw_rms
 
 
 def drawn(xy, residual, width=1000, height=700):

@@ -9,13 +9,13 @@ from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
 from starpos.averaging.average import average
+from starpos.calibration.turning import turn
 from starpos.earth.orientation import curvature_radii_m
 from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.site import camera_to_enu
-from starpos.turning import turn
 
 
 def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(0.2, -0.1), lean=0.0):

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.camera_from_sky import FromSky
-from starpos.camera_from_sky import calibrate as camera_from_sky
+from starpos.calibration.camera import FromSky
+from starpos.calibration.camera import calibrate as camera_from_sky
+from starpos.calibration.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
 from starpos.cli import calibrate_site, common
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
@@ -19,7 +20,6 @@ from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import TiltLog, a2_matrix, read_tilt_csv
 from starpos.instrument.instrument import Instrument
-from starpos.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
 from starpos.sky import catalogue
 
 NOTHING = 1  # exit status
@@ -170,7 +170,7 @@ def _covariance_text(fit: Intrinsics) -> str:
 
 
 def _draw(path: str, found: FromSky) -> None:
-    from starpos import residual_map
+    from starpos.calibration import residual_map
 
     fit = found.fit
     c = fit.camera

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.calibration import Calibrated, calibrate_at
+from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.cli import common
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError

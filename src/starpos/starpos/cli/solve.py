@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.averaging.average import Average, average
+from starpos.calibration.turning import turn
 from starpos.cli import common, jobs
 from starpos.cli.archive import Night, nights_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
@@ -19,7 +20,6 @@ from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import TiltLog
 from starpos.sky import catalogue
-from starpos.turning import turn
 from starpos.utc import utc_text
 
 NO_FIX = 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos import residual_map
+from starpos.calibration import residual_map
 from starpos.errors import TimeError
 from starpos.report import frame_figures, measures, place_figures, sky_figure
 from starpos.report.night import Night

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.averaging.average import average
+from starpos.calibration.turning import turn
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
@@ -22,7 +23,6 @@ from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import turn as wrapped
 from starpos.report.night import NO_TILT, Night, Place, Shot
 from starpos.sky.catalogue import Catalogue
-from starpos.turning import turn
 from starpos.utc import utc_text
 
 STILL_SIGMA = 8.0  # readings further than this from their mean say that the camera was moved

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.calibration.plumb_line import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.earth.orientation import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
@@ -15,7 +16,6 @@ from starpos.fix.solver import Solution, Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import ARCSEC, MOST_C, Calibration, Instrument
-from starpos.plumb import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
 

@@ -7,14 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth.orientation import earth_motion
-from starpos.earth.refraction import Atmosphere
-from starpos.errors import CalibrationError, InstrumentError
-from starpos.fix.solver import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
-from starpos.frames.stars import Stars
-from starpos.identification import Identification, Pointing, Sky, identify_directions, triangles
-from starpos.instrument.camera import Camera
-from starpos.intrinsics import (
+from starpos.calibration.intrinsics import (
     PARAMETERS,
     Intrinsics,
     Sighting,
@@ -24,6 +17,13 @@ from starpos.intrinsics import (
     fit_camera,
     unbent,
 )
+from starpos.earth.orientation import earth_motion
+from starpos.earth.refraction import Atmosphere
+from starpos.errors import CalibrationError, InstrumentError
+from starpos.fix.solver import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
+from starpos.frames.stars import Stars
+from starpos.identification import Identification, Pointing, Sky, identify_directions, triangles
+from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 

@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from starpos.calibration import Calibrated, calibrate
+from starpos.calibration.misalignment import Calibrated, calibrate
+from starpos.calibration.plumb_line import Plumb, Readings, level
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
-from starpos.plumb import Plumb, Readings, level
 from starpos.progress import Progress, quiet
 
 

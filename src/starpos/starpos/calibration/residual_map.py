@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from starpos.intrinsics import Intrinsics, rms
+from starpos.calibration.intrinsics import Intrinsics, rms
 
 MOST_ARROWS = 400  # more stars than this are drawn as the means of cells
 ARROW_CELLS, COLOUR_CELLS = 22, 12  # along the longer side
