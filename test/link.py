@@ -9,7 +9,7 @@ import numpy as np
 from hosts import Cable, Ear, Host
 from shots import FULL, focal_of
 
-from starpos.simulate import scene_of
+from starpos.simulation.scene import scene_of
 
 FULL_FRAME_BYTES = FULL[0] * FULL[1] * 2
 PIXEL_UM = 6.4

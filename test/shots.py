@@ -9,7 +9,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt
-from starpos.simulate import Scene, detected, expose, read_tilt, render, scene_of
+from starpos.simulation.scene import Scene, detected, expose, read_tilt, render, scene_of
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.messages import camera_to_message, frame_to_message, stars_to_message, tilt_to_message
 from starpos_interfaces.msg import Capture, StarArray

@@ -11,7 +11,7 @@ import pytest
 from link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, traffic, two_hosts
 from shots import SMALL
 
-from starpos.simulate import scene_of
+from starpos.simulation.scene import scene_of
 from starpos_interfaces.msg import Solution
 
 NIGHT = Path(__file__).parent / "data" / "night"

@@ -32,7 +32,7 @@ NODES = {
 def instrument(graph, tmp_path_factory):
     """All four nodes and an emulated inclinometer; a function that starts one of them."""
     from starpos.earth.refraction import Atmosphere
-    from starpos.simulate import scene_of
+    from starpos.simulation.scene import scene_of
 
     folder, count = tmp_path_factory.mktemp("instrument"), iter(range(1000))
     port = folder / "port"

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from rosbags.rosbag2.storage_mcap import zstd
 
-from starpos.simulate import expose, render, scene_of
+from starpos.simulation.scene import expose, render, scene_of
 from starpos.sky.catalogue import load
 
 

@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import montecarlo
 from starpos.cli.common import ProgressBar
 from starpos.cli.montecarlo import looking
 from starpos.fix.solver import Solver
 from starpos.identification import triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
+from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
@@ -38,13 +38,13 @@ class Absent(Exception):
     """Why a peer takes no part."""
 
 
-def starpos(stars, args) -> montecarlo.Answer:
+def starpos(stars, args) -> montecarlo_fields.Answer:
     solver = Solver(Instrument(CAMERA.fx), stars, progress=ProgressBar())
     solver.prepare(CAMERA.width, CAMERA.height)
     return looking(solver)
 
 
-def cedar_solve(stars, args) -> montecarlo.Answer:
+def cedar_solve(stars, args) -> montecarlo_fields.Answer:
     if importlib.util.find_spec("tetra3") is None:
         raise Absent("not installed (pip install cedar-solve)")
     from tetra3 import Tetra3
@@ -95,7 +95,7 @@ def write_tyc_main(stars, limit_mag: float, path: Path) -> None:
             f.write("|".join(row) + "\n")
 
 
-def astrometry_net(stars, args) -> montecarlo.Answer:
+def astrometry_net(stars, args) -> montecarlo_fields.Answer:
     if importlib.util.find_spec("astrometry") is None:
         raise Absent("not installed (pip install astrometry)")
     index = sorted(args.index.rglob("index-*.fits")) if args.index else []
@@ -154,13 +154,13 @@ def main() -> int:
             answers[name] = peer(stars, args)
         except Absent as reason:
             print(f"{name}: skipped, {reason}")
-    for title, make in (("ideal", montecarlo.ideal), ("realistic", montecarlo.Conditions)):
+    for title, make in (("ideal", montecarlo_fields.ideal), ("realistic", montecarlo_fields.Conditions)):
         conditions = make(CAMERA, LIMIT_MAG)
         print(f"{args.fields} {title} fields, seed {args.seed}")
         print(f"{'':18}{'false':>6}{'correct %':>11}{'wrong':>7}{'none':>6}{'median ms':>11}{'worst ms':>10}")
         for k in args.false:
-            tallies, bar = {name: montecarlo.Tally() for name in answers}, ProgressBar()
-            fields = islice(montecarlo.false_stars(stars, conditions, args.seed, k), args.fields)
+            tallies, bar = {name: montecarlo_fields.Tally() for name in answers}, ProgressBar()
+            fields = islice(montecarlo_fields.false_stars(stars, conditions, args.seed, k), args.fields)
             for done, given in enumerate(fields, 1):
                 for name, tally in tallies.items():
                     tally.ask(given, given.stars(conditions), answers[name], conditions.tolerance_rad)

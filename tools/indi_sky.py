@@ -90,7 +90,7 @@ def main() -> int:
     port, folder, exposure_s, seed, place = sys.argv[1:]
     folder, exposure_s, rng = Path(folder), float(exposure_s), np.random.default_rng(int(seed))
     scene = Place(**json.loads(place)).scene()
-    from starpos.simulate import expose, render
+    from starpos.simulation.scene import expose, render
     from starpos.sky.catalogue import load
 
     catalogue = load()

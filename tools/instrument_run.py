@@ -45,7 +45,7 @@ class Place:
 
     def scene(self):
         from starpos.earth.refraction import Atmosphere
-        from starpos.simulate import scene_of
+        from starpos.simulation.scene import scene_of
 
         air = Atmosphere(self.pressure, self.temperature, self.humidity)
         pointing = (self.azimuth, self.altitude, self.roll)

@@ -110,7 +110,7 @@ def from_start(folder: Path, starts: int) -> Row:
     import numpy as np
     from shots import SMALL, SOLVER, focal_of
 
-    from starpos.simulate import scene_of
+    from starpos.simulation.scene import scene_of
 
     tilt = np.degrees(scene_of(SMALL, focal_of(SMALL)).tilt)
     sky = ("source:=simulated", "cadence:=0.6", f"focal_mm:={focal_of(SMALL) * 6.4e-3}")
@@ -170,8 +170,8 @@ def write_frames(folder: Path):
     from shots import EXPOSURE_S, NOISE_DEG, tilts_of
     from shots import START_S as BEGIN_S
 
-    from starpos.night import write_fits
-    from starpos.simulate import expose, render, scene_of
+    from starpos.simulation.night_on_disk import write_fits
+    from starpos.simulation.scene import expose, render, scene_of
     from starpos.sky.catalogue import load
     from starpos.utc import utc_text
 

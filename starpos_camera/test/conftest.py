@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from starpos.night import write_fits
-from starpos.simulate import expose, render, scene_of
+from starpos.simulation.night_on_disk import write_fits
+from starpos.simulation.scene import expose, render, scene_of
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.testing import Listener, Process, take_domain
 

@@ -21,7 +21,7 @@ from starpos.detection import detect
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
-from starpos.simulate import expose
+from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_common.testing import lacks

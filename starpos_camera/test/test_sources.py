@@ -14,7 +14,7 @@ import raws
 
 from starpos.detection import detect
 from starpos.errors import FrameError
-from starpos.simulate import expose
+from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings, SourceEnded

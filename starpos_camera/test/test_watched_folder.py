@@ -13,7 +13,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError, StarposError
-from starpos.night import write_fits
+from starpos.simulation.night_on_disk import write_fits
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import CaptureError, NothingYet, Settings
 from starpos_camera.sources.files import Files

@@ -38,7 +38,7 @@ AIR = {"pressure": 95000.0, "temperature": 8.0, "humidity": 0.4}
 def tilt_deg(place: dict[str, float], roll_deg: float):
     """What the inclinometer of an instrument reads that stands so."""
     from starpos.earth.refraction import Atmosphere
-    from starpos.simulate import scene_of
+    from starpos.simulation.scene import scene_of
 
     scene = scene_of(
         latitude_deg=place["latitude"],

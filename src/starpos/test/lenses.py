@@ -11,7 +11,7 @@ from starpos import rotation
 from starpos.calibration.intrinsics import Sighting
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
-from starpos.simulate import Optics, detected, expose, scene_of
+from starpos.simulation.scene import Optics, detected, expose, scene_of
 
 AIR = Atmosphere(88000.0, 12.0, 0.3)
 VACUUM = Atmosphere(0.0, 10.0, 0.0)

@@ -9,7 +9,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
-from starpos.simulate import Optics, Scene, detected, expose, read_tilt, scene_of
+from starpos.simulation.scene import Optics, Scene, detected, expose, read_tilt, scene_of
 
 START = 1793642400.0  # 2026-11-02T18:00:00
 EXPOSURE = 0.5

@@ -10,7 +10,7 @@ from starpos import rotation
 from starpos.fix.solver import Solver
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import ARCSEC, Calibration, Instrument
-from starpos.simulate import Scene
+from starpos.simulation.scene import Scene
 
 TRUE_A3_DEG = (1.5, -2.0, 130.0)
 

@@ -13,7 +13,7 @@ from starpos.calibration.intrinsics import PARAMETERS
 from starpos.cli import main
 from starpos.instrument import camera_file
 from starpos.instrument.instrument import Calibration
-from starpos.night import write_stars
+from starpos.simulation.night_on_disk import write_stars
 from starpos.utc import utc_text
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")

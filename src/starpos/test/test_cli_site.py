@@ -11,7 +11,7 @@ from sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.cli import main
 from starpos.instrument import camera_file, instrument_file
-from starpos.night import write_stars
+from starpos.simulation.night_on_disk import write_stars
 from starpos.utc import utc_text
 
 LAT, LON = 35.7046, 51.4106

@@ -10,7 +10,7 @@ from starpos.identification import Plumb, Pointing, full, identify, identify_dir
 from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, Prior, anywhere, log_evidence
 from starpos.identification.pose import Field, Pose, directions, slopes
 from starpos.instrument.camera import Camera
-from starpos.montecarlo import Conditions, draw
+from starpos.simulation.montecarlo_fields import Conditions, draw
 
 # so few pixels that chance has a chance
 SMALL = Camera.from_focal(300, 225, 375 / 2 / np.tan(np.radians(5.5)))

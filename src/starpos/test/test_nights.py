@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scenes import FOCAL_PX, SIZE
 
-from starpos import nights
 from starpos.cli import main
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.simulation import montecarlo_nights
 
 CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)  # 15 deg, whose triangles build fast
 KINDS = {
-    "turned": partial(nights.turned_night, headings=4, frames=1, camera=CAMERA),
-    "calibrated": partial(nights.calibrated_night, frames=1, camera=CAMERA),
+    "turned": partial(montecarlo_nights.turned_night, headings=4, frames=1, camera=CAMERA),
+    "calibrated": partial(montecarlo_nights.calibrated_night, frames=1, camera=CAMERA),
 }
 
 
@@ -62,7 +62,7 @@ def test_a_seed_is_a_night(kind, catalogue, outcomes):
 
 def test_a_quiet_inclinometer_makes_a_better_night(catalogue):
     noisy, quiet = (KINDS["turned"](np.random.default_rng(3), catalogue, errors=e)
-                    for e in (nights.tiltmeter(60.0), nights.tiltmeter(0.5)))  # fmt: skip
+                    for e in (montecarlo_nights.tiltmeter(60.0), montecarlo_nights.tiltmeter(0.5)))  # fmt: skip
     sigma = [np.sqrt(np.trace(o.covariance[:2, :2]) / 2) for o in (noisy, quiet)]
     assert sigma[0] > 10 * sigma[1]
     assert quiet.position_nees < 16
@@ -71,8 +71,8 @@ def test_a_quiet_inclinometer_makes_a_better_night(catalogue):
 def test_nothing_told_is_what_was_drawn(catalogue):
     """Else the nights would flatter: A3, zero, scale, air and stars are all other than the instrument is told."""
     rng = np.random.default_rng(1)
-    world, begin = nights.draw(rng, catalogue, nights.SCA100T, 0.01, CAMERA)
-    assert nights.FIRST_UNIX_S < begin < nights.LAST_UNIX_S
+    world, begin = montecarlo_nights.draw(rng, catalogue, montecarlo_nights.SCA100T, 0.01, CAMERA)
+    assert montecarlo_nights.FIRST_UNIX_S < begin < montecarlo_nights.LAST_UNIX_S
     assert world.told.calibration.misalignment_deg == (0.0, 0.0, 0.0)
     assert np.abs(world.scene.instrument.calibration.misalignment_deg).max() > 0.1
     assert np.abs(world.scene.tilt_errors.zero).min() > 0
@@ -90,7 +90,7 @@ def test_nothing_told_is_what_was_drawn(catalogue):
 def test_a_zero_wanders_by_the_root_of_time():
     walked = []
     for seed in range(300):
-        zero = nights.Zero(InclinometerErrors(), np.random.default_rng(seed), 1000.0)
+        zero = montecarlo_nights.Zero(InclinometerErrors(), np.random.default_rng(seed), 1000.0)
         for hour in (1, 3, 9):
             off = zero.at(1000.0 + 3600 * hour)
         walked.append(off)
@@ -99,7 +99,7 @@ def test_a_zero_wanders_by_the_root_of_time():
 
 
 def test_a_night_that_cannot_be_worked_says_why(catalogue):
-    o = nights.turned_night(np.random.default_rng(0), catalogue, headings=2, frames=1,
+    o = montecarlo_nights.turned_night(np.random.default_rng(0), catalogue, headings=2, frames=1,
                             camera=Camera.from_focal(8, 8, FOCAL_PX))  # fmt: skip
     assert o.trouble
     assert "\n" not in o.trouble
@@ -122,7 +122,7 @@ def run(capsys):
 
 def test_the_papers_nights(run, monkeypatch):
     """But for 4 frames a heading where the paper has 25."""
-    monkeypatch.setattr(nights, "turned_night", partial(nights.turned_night, frames=4))
+    monkeypatch.setattr(montecarlo_nights, "turned_night", partial(montecarlo_nights.turned_night, frames=4))
     status, said, errors = run("nights", "--nights", 2, "--seed", 5, "--tiltmeter", 1, "--json", "--jobs", 1)
     assert (status, errors) == (0, [])
     *each, all_of_them = [json.loads(line) for line in said.splitlines()]

@@ -13,8 +13,8 @@ from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import a2_matrix, read_tilt_csv
-from starpos.night import write_night
-from starpos.simulate import Exposed, Optics, TiltErrors, expose, read_tilt, render
+from starpos.simulation.night_on_disk import write_night
+from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render
 from starpos.sky.site import Site, camera_to_enu
 from starpos.utc import unix_of
 

@@ -113,7 +113,7 @@ class Simulated:
         """Nothing: the sky is always there."""
 
     def capture(self, settings: Settings) -> Exposure:
-        from starpos.simulate import expose, render
+        from starpos.simulation.scene import expose, render
         from starpos.sky.catalogue import load as load_catalogue
 
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
@@ -132,7 +132,7 @@ class Simulated:
 
 def scene_from(values: Mapping):
     """The starpos.simulate.Scene of the node's parameters."""
-    from starpos.simulate import scene_of
+    from starpos.simulation.scene import scene_of
 
     return scene_of(
         size=(values["simulated.width"], values["simulated.height"]),

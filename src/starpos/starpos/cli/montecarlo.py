@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import montecarlo
 from starpos.cli import common, montecarlo_nights
 from starpos.errors import FrameError
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
+from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue
 
 PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}  # % of 1000 fields with so many false stars
@@ -87,7 +87,7 @@ def run(args) -> int:
         _print_head(conditions, stars)
     wrong = 0
     for label, paper, number, fields in _rows(args, stars, conditions):
-        tally, bar = montecarlo.Tally(), common.ProgressBar()
+        tally, bar = montecarlo_fields.Tally(), common.ProgressBar()
         for done, given in enumerate(islice(fields, number), 1):
             tally.ask(given, given.stars(conditions), looking(solver), conditions.tolerance_rad)
             bar(label, done / number)
@@ -98,7 +98,7 @@ def run(args) -> int:
     return int(wrong > 0)
 
 
-def looking(solver: Solver) -> montecarlo.Answer:
+def looking(solver: Solver) -> montecarlo_fields.Answer:
     """Where `solver` says that a frame's centre looks."""
 
     def answer(stars):
@@ -110,13 +110,15 @@ def looking(solver: Solver) -> montecarlo.Answer:
     return answer
 
 
-def _conditions(args, stars, camera) -> montecarlo.Conditions:
+def _conditions(args, stars, camera) -> montecarlo_fields.Conditions:
     limit = args.limit_mag
     if limit is None:
         limit = (
-            PAPER_LIMIT_MAG if camera == PAPER_CAMERA else montecarlo.limit_for(camera, stars, PAPER_STARS)
+            PAPER_LIMIT_MAG
+            if camera == PAPER_CAMERA
+            else montecarlo_fields.limit_for(camera, stars, PAPER_STARS)
         )
-    make = montecarlo.ideal if args.ideal else montecarlo.Conditions
+    make = montecarlo_fields.ideal if args.ideal else montecarlo_fields.Conditions
     return make(camera, limit, sigma_px=args.noise_px, focal_error=args.focal_error / 100)
 
 
@@ -124,14 +126,14 @@ def _rows(args, stars, conditions):
     """Label, the paper's figure in %, number of fields and fields of each row of the table."""
     papers = conditions.camera == PAPER_CAMERA and conditions.limit_mag == PAPER_LIMIT_MAG
     for k in args.false:
-        fields = montecarlo.false_stars(stars, conditions, args.seed, k)
+        fields = montecarlo_fields.false_stars(stars, conditions, args.seed, k)
         yield f"{k} false star{'s'[: k != 1]}", PAPER_FALSE.get(k, "") if papers else "", args.fields, fields
     for k in args.stars:
-        fields = montecarlo.few_stars(stars, conditions, args.seed, k)
+        fields = montecarlo_fields.few_stars(stars, conditions, args.seed, k)
         yield f"{k} stars", PAPER_FEW.get(k, "") if papers else "", args.fields, fields
     number = args.fields // 5 if args.points is None else args.points
     if number:
-        yield "random points", "", number, montecarlo.points(conditions, args.seed)
+        yield "random points", "", number, montecarlo_fields.points(conditions, args.seed)
 
 
 def _print_head(conditions, stars) -> None:
@@ -147,8 +149,8 @@ def _print_head(conditions, stars) -> None:
     )
 
 
-def _print_row(label: str, paper: str, t: montecarlo.Tally, as_json: bool) -> None:
-    low, high = montecarlo.wilson(t.correct, t.fields)
+def _print_row(label: str, paper: str, t: montecarlo_fields.Tally, as_json: bool) -> None:
+    low, high = montecarlo_fields.wilson(t.correct, t.fields)
     median, worst = (float(f(t.cpu_ms)) if t.cpu_ms else float("nan") for f in (np.median, np.max))
     if as_json:
         common.print_json(
@@ -167,7 +169,7 @@ def _print_row(label: str, paper: str, t: montecarlo.Tally, as_json: bool) -> No
     )
 
 
-def _keep(tally: montecarlo.Tally, conditions, folder: Path) -> None:
+def _keep(tally: montecarlo_fields.Tally, conditions, folder: Path) -> None:
     """Fields that failed, as CSV with their truth in the first line."""
     head = {"NAXIS1": conditions.camera.width, "NAXIS2": conditions.camera.height}
     try:

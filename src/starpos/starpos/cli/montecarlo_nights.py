@@ -9,9 +9,9 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from starpos import nights
 from starpos.cli import common
-from starpos.nights import Outcome
+from starpos.simulation import montecarlo_nights
+from starpos.simulation.montecarlo_nights import Outcome
 from starpos.sky import catalogue
 
 PAPER_ARCSEC = (30.2, 49.0)  # mean absolute errors of latitude and longitude over its 50 nights
@@ -55,7 +55,7 @@ def define(experiments) -> None:
 
 
 def run_nights(args) -> int:
-    night = partial(nights.turned_night, errors=_errors(args), clock_stddev_s=PAPER_CLOCK_S)
+    night = partial(montecarlo_nights.turned_night, errors=_errors(args), clock_stddev_s=PAPER_CLOCK_S)
     solved = [o for o in _all(args, night) if not o.trouble]
     off = np.array([o.off for o in solved]).reshape(-1, 3)
     error = np.abs(off[:, 1::-1]).mean(0) if solved else np.full(2, np.nan)  # north, east m
@@ -116,16 +116,18 @@ def _nees(solved: list[Outcome]) -> np.ndarray:
     return np.nanmean([(o.position_nees, o.ground_nees, o.heading_nees) for o in solved], axis=0)
 
 
-def _errors(args) -> nights.InclinometerErrors:
-    return nights.SCA100T if args.tiltmeter is None else nights.tiltmeter(args.tiltmeter)
+def _errors(args) -> montecarlo_nights.InclinometerErrors:
+    return (
+        montecarlo_nights.SCA100T if args.tiltmeter is None else montecarlo_nights.tiltmeter(args.tiltmeter)
+    )
 
 
 def _either(rng: np.random.Generator, stars, errors) -> Outcome:
     """A night of either kind; fewer frames than the paper's make more nights."""
     if rng.random() < 0.5:
         headings = int(rng.integers(3, 9))
-        return nights.turned_night(rng, stars, errors, headings, int(rng.integers(1, 7)))
-    return nights.calibrated_night(rng, stars, errors, int(rng.integers(1, 9)))
+        return montecarlo_nights.turned_night(rng, stars, errors, headings, int(rng.integers(1, 7)))
+    return montecarlo_nights.calibrated_night(rng, stars, errors, int(rng.integers(1, 9)))
 
 
 def _all(args, night: Callable) -> list[Outcome]:

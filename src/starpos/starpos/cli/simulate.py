@@ -5,8 +5,8 @@ import numpy as np
 
 from starpos.cli import common
 from starpos.instrument.instrument import focal_px_of
-from starpos.night import write_night
-from starpos.simulate import scene_of
+from starpos.simulation.night_on_disk import write_night
+from starpos.simulation.scene import scene_of
 from starpos.sky import catalogue
 
 

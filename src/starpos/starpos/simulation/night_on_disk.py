@@ -11,7 +11,7 @@ from starpos.errors import FrameError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.progress import Progress, quiet
-from starpos.simulate import Scene, detected, expose, read_tilt, render
+from starpos.simulation.scene import Scene, detected, expose, read_tilt, render
 from starpos.sky.catalogue import Catalogue
 from starpos.utc import unix_of
 

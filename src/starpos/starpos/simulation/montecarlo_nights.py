@@ -25,7 +25,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors, TiltLog
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.rotation import half_turn
-from starpos.simulate import Scene, TiltErrors, detected, expose, read_tilt
+from starpos.simulation.scene import Scene, TiltErrors, detected, expose, read_tilt
 from starpos.sky.catalogue import EPOCH, MAS, Catalogue
 from starpos.sky.site import Site, camera_to_enu
 
