@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from starpos import bags
+from starpos.recording import bounds
 
 TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 LAST_NS = (2**31 - 1) * 10**9  # what a Clock message holds
@@ -41,18 +41,18 @@ class Bag:
         if not self.path.exists():
             raise ReplayError(f"{self.path}: there is no such bag")
         try:
-            bags.check_folder(self.path)
-        except (bags.BagError, OSError) as error:
+            bounds.check_folder(self.path)
+        except (bounds.BagError, OSError) as error:
             raise self._broken(error) from None
         if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
             raise ReplayError(
                 f"{self.path}: a folder without metadata.yaml is no bag: name its .mcap or .db3 file"
             )
         try:
-            bags.bound_rosbags()
+            bounds.bound_rosbags()
             self._reader = Reader(self.path)
             self._reader.open()
-            bags.check_chunks(self._reader)
+            bounds.check_chunks(self._reader)
         except Exception as error:  # rosbags, ruamel.yaml, zstd and sqlite have their own for a broken file
             raise self._broken(error) from None
         return self
@@ -61,7 +61,7 @@ class Bag:
         self._reader.close()
 
     def _broken(self, error: Exception) -> ReplayError:
-        if isinstance(error, bags.BagError):
+        if isinstance(error, bounds.BagError):
             return ReplayError(f"{self.path}: {error}")
         return ReplayError(f"{self.path}: not a readable bag ({type(error).__name__}: {str(error)[:200]})")
 

@@ -8,7 +8,7 @@ pytest.importorskip("rosbags")
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from starpos import bags
+from starpos.recording import bounds
 from starpos_solver.bag import Bag, ReplayError
 from starpos_solver.bag_writer import BagWriter
 
@@ -22,7 +22,7 @@ def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatc
         topic = writer.add_connection("/a", KIND, typestore=get_typestore(Stores.ROS2_JAZZY))
         for size in (1 << 20, 1 << 21):
             writer.write(topic, size, bytes(size))
-    monkeypatch.setattr(bags, "MOST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bounds, "MOST_UNPACKED", 1 << 20)
     with Bag(tmp_path / "night") as bag:
         messages = bag.messages(bag.topics(None, left_out=pytest.fail))
         assert next(messages)[2] == bytes(1 << 20)
@@ -32,7 +32,7 @@ def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatc
 
 def test_metadata_of_many_megabytes_is_not_read(tmp_path):
     with (tmp_path / "metadata.yaml").open("wb") as file:
-        file.truncate(bags.MOST_METADATA + 1)
+        file.truncate(bounds.MOST_METADATA + 1)
     with pytest.raises(ReplayError, match="not the description of a bag"), Bag(tmp_path):
         pass
 

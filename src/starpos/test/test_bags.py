@@ -11,11 +11,11 @@ from lz4.frame import compress as lz4
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer, reader
 from rosbags.typesys import Stores, get_typestore
 
-from starpos import bags
 from starpos.errors import FrameError
+from starpos.recording import bounds
 from starpos.report import bag as report_bag
 
-bags.bound_rosbags()
+bounds.bound_rosbags()
 zstd = reader.zstd._zstd  # the module that rosbags found
 PACKERS = {"zstd": zstd.compress, "lz4": lz4, "": bytes}
 MAGIC = b"\x89MCAP0\r\n"
@@ -25,8 +25,8 @@ TOPIC, KIND = "/stars", "std_msgs/msg/UInt8MultiArray"
 @pytest.fixture
 def small(monkeypatch):
     """Bounds of a megabyte, so that a test need not have gigabytes."""
-    monkeypatch.setattr(bags, "MOST_UNPACKED", 1 << 20)
-    monkeypatch.setattr(bags, "MOST_AT_ONCE", 1 << 21)
+    monkeypatch.setattr(bounds, "MOST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bounds, "MOST_AT_ONCE", 1 << 21)
 
 
 def text(value: str) -> bytes:
@@ -60,7 +60,7 @@ def mcap(path, payloads, compression, stated=None, indexed=False):
 def read(path) -> list[bytes]:
     """As replay does."""
     with Reader(path) as opened:
-        bags.check_chunks(opened)
+        bounds.check_chunks(opened)
         return [bytes(data) for _, _, data in opened.messages()]
 
 
@@ -77,7 +77,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_whatever_size_it_states(
     tmp_path, small, compression, stated
 ):
     path = mcap(tmp_path / "a.mcap", [bytes(1 << 23)], compression, stated)
-    with pytest.raises(bags.BagError, match="a part of it unpacks to"):
+    with pytest.raises(bounds.BagError, match="a part of it unpacks to"):
         read(path)
     with pytest.raises(FrameError, match=r"a.mcap: a part of it unpacks to"):
         report_bag.read(path, None, 1e-5, lambda *_: None)
@@ -86,7 +86,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_whatever_size_it_states(
 def test_chunks_of_one_time_are_refused_where_they_are_too_much_together(tmp_path, small):
     honest = mcap(tmp_path / "two.mcap", [bytes(1 << 19)] * 2, "zstd", indexed=True)
     assert len(read(honest)) == 2
-    with pytest.raises(bags.BagError, match="have the same times"):
+    with pytest.raises(bounds.BagError, match="have the same times"):
         read(mcap(tmp_path / "ten.mcap", [bytes(1 << 19)] * 10, "zstd", indexed=True))
 
 
@@ -110,13 +110,13 @@ def packed_as(mode, path, payload):
 def test_a_compressed_message_is_bounded(tmp_path, small):
     fits = packed_as(CompressionMode.MESSAGE, tmp_path / "fits", bytes(1 << 20))
     assert read(fits) == [bytes(1 << 20)]
-    with pytest.raises(bags.BagError, match="a part of it unpacks to"):
+    with pytest.raises(bounds.BagError, match="a part of it unpacks to"):
         read(packed_as(CompressionMode.MESSAGE, tmp_path / "large", bytes(1 << 21)))
 
 
 def test_a_compressed_file_is_unpacked_only_where_there_is_room(tmp_path, monkeypatch):
     path = packed_as(CompressionMode.FILE, tmp_path / "a", bytes(1 << 21))
     assert read(path) == [bytes(1 << 21)]
-    monkeypatch.setattr(bags, "LEFT_ON_DISK", 1 << 60)  # as on a disk that is nearly full
-    with pytest.raises(bags.BagError, match="more than there is room for"):
+    monkeypatch.setattr(bounds, "LEFT_ON_DISK", 1 << 60)  # as on a disk that is nearly full
+    with pytest.raises(bounds.BagError, match="more than there is room for"):
         read(path)

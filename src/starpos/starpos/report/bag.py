@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos import bags
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import TiltLog
 from starpos.progress import Progress
+from starpos.recording import bounds
+from starpos.recording.messages import camera_of, deflection_of, shot_of, tilt_row
 from starpos.report.folder import truth_in
-from starpos.report.messages import camera_of, deflection_of, shot_of, tilt_row
 from starpos.report.night import Shot, Truth
 
 SUFFIXES = (".mcap", ".db3")
@@ -93,11 +93,11 @@ class _Bag:
         from rosbags.highlevel import AnyReader
 
         try:
-            bags.check_folder(self.path)
-            bags.bound_rosbags()
+            bounds.check_folder(self.path)
+            bounds.bound_rosbags()
             self._reader = AnyReader([self.path], default_typestore=_usual_types())
             self._reader.open()
-            bags.check_chunks(self._reader.readers[0])
+            bounds.check_chunks(self._reader.readers[0])
         except Exception as error:  # rosbags, its YAML, zstd and sqlite have their own for a broken file
             raise self._broken(error) from None
         return self
@@ -131,7 +131,7 @@ class _Bag:
             yield connection.msgtype, message
 
     def _broken(self, error: Exception) -> FrameError:
-        if isinstance(error, bags.BagError):
+        if isinstance(error, bounds.BagError):
             return FrameError(f"{self.path}: {error}")
         reason = " ".join(str(error).split())[:200]
         return FrameError(f"{self.path}: not a readable bag ({type(error).__name__}: {reason})")

@@ -9,10 +9,10 @@ import numpy as np
 from starpos.errors import InstrumentError, TiltError
 from starpos.fix.budget import ErrorTerm
 from starpos.instrument.inclinometer import Tilt
+from starpos.recording.messages import exposure_of
 from starpos.report.bag import Recorded, star_lists
 from starpos.report.folder import Exposure, Exposures
 from starpos.report.measures import offset_m, turn
-from starpos.report.messages import exposure_of
 from starpos.report.night import Night, Place
 from starpos.report.working import Workshop, why_none, worked
 from starpos.rotation import full_turn
