@@ -5,8 +5,8 @@ import os
 
 import pytest
 from domain_coordinator import domain_id
-from graph import Graph
-from shots import SOLVER
+from starpos_testing.graph.graph import Graph
+from starpos_testing.graph.shots import SOLVER
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -3,7 +3,7 @@
 
 import numpy as np
 from sensor_msgs.msg import Image
-from shots import SMALL, photograph
+from starpos_testing.graph.shots import SMALL, photograph
 
 from starpos.frames.annotate import IDENTIFIED
 from starpos.sky.catalogue import load as load_catalogue

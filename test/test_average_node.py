@@ -5,10 +5,17 @@ import math
 
 import numpy as np
 import pytest
-from graph import stamp_of
-from places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
 from sensor_msgs.msg import NavSatFix, NavSatStatus
-from shots import FULL_FOCAL_PX, LATITUDE_DEG, LONGITUDE_DEG, PRESSURE_PA, scene_at, shoot
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
+from starpos_testing.graph.shots import (
+    FULL_FOCAL_PX,
+    LATITUDE_DEG,
+    LONGITUDE_DEG,
+    PRESSURE_PA,
+    scene_at,
+    shoot,
+)
 from std_srvs.srv import Trigger
 
 from starpos.instrument import instrument_file

@@ -7,7 +7,7 @@ from copy import deepcopy
 
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
-from shots import FULL_FOCAL_PX, SOLVER, photograph, shoot
+from starpos_testing.graph.shots import FULL_FOCAL_PX, SOLVER, photograph, shoot
 
 from starpos_interfaces.msg import Solution
 

@@ -7,11 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import NavSatFix
-from shots import FULL_FOCAL_PX, LATITUDE_DEG, LONGITUDE_DEG, PRESSURE_PA, SOLVER, START_S, scene_at, shoot
+from starpos_testing.graph.places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
+from starpos_testing.graph.shots import (
+    FULL_FOCAL_PX,
+    LATITUDE_DEG,
+    LONGITUDE_DEG,
+    PRESSURE_PA,
+    SOLVER,
+    START_S,
+    scene_at,
+    shoot,
+)
 from std_srvs.srv import Trigger
 
 from starpos.instrument import instrument_file

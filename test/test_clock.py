@@ -5,9 +5,9 @@ import math
 import time
 
 import pytest
-from graph import stamp_of
 from sensor_msgs.msg import NavSatFix
-from shots import LATITUDE_DEG, shoot
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import LATITUDE_DEG, shoot
 from std_srvs.srv import Trigger
 
 from starpos_common.messages import stamp_to_unix, unix_to_stamp

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from starpos_common.testing import lacks
+from starpos_testing.lacking import lacks
 
 TOOL = Path(__file__).parent.parent / "tools" / "emulated_instrument.py"
 FRAMES = 3

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
-from shots import azimuth_for_heading, shoot
+from starpos_testing.graph.shots import azimuth_for_heading, shoot
 
 from starpos_interfaces.msg import Solution
 

@@ -5,11 +5,11 @@ import json
 import time
 from pathlib import Path
 
-import hosts
 import numpy as np
 import pytest
-from link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, traffic, two_hosts
-from shots import SMALL
+from starpos_testing.graph import hosts
+from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, traffic, two_hosts
+from starpos_testing.graph.shots import SMALL
 
 from starpos.simulation.scene import scene_of
 from starpos_interfaces.msg import Solution

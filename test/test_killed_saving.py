@@ -7,7 +7,7 @@ import sys
 
 import pytest
 from sensor_msgs.srv import SetCameraInfo
-from shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
+from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
 from starpos.instrument import camera_file, instrument_file
 from starpos.instrument.camera import Camera

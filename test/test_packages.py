@@ -34,7 +34,7 @@ OPTIONAL = {
 }  # fmt: skip
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/*.py")}  # modules beside the tests
 HELPERS |= {"late_starpos"}  # a test writes it
-FOR_TESTS = {"starpos_common.testing", "starpos_common.linters"}  # the shared part of the packages' tests
+FOR_TESTS = {"starpos_testing.nodes", "starpos_testing.linters"}  # the shared part of the packages' tests
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

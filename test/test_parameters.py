@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from shots import PRESSURE_PA, shoot
+from starpos_testing.graph.shots import PRESSURE_PA, shoot
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution

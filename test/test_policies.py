@@ -8,9 +8,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from graph import WAIT_S
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
+from starpos_testing.graph.graph import WAIT_S
 
 NIGHT = Path(__file__).parent / "data" / "night"
 POLICY = Path(__file__).parents[1] / "starpos_solver" / "sros2" / "policies.xml"

@@ -9,7 +9,7 @@ import pytest
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
-from shots import photograph, shoot
+from starpos_testing.graph.shots import photograph, shoot
 
 from starpos_interfaces.msg import Solution
 

@@ -7,21 +7,21 @@ import signal
 import sqlite3
 from pathlib import Path
 
-import make_bag
 import numpy as np
 import pytest
 import yaml
-from graph import stamp_of
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
-from shots import photograph
+from starpos_bringup.recording.bag_writer import offered_qos
+from starpos_testing.graph import make_bag
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import photograph
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution
-from starpos_solver.bag_writer import offered_qos
 
 NIGHT = Path(__file__).parent / "data" / "night"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -6,8 +6,8 @@ import signal
 import time
 
 import pytest
-from graph import stamp_of
-from shots import SMALL, focal_of
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import SMALL, focal_of
 
 from starpos_interfaces.msg import Solution
 

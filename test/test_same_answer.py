@@ -7,7 +7,7 @@ import math
 import subprocess
 
 import pytest
-from shots import focal_of
+from starpos_testing.graph.shots import focal_of
 
 from starpos.instrument.inclinometer import Tilt
 from starpos_common.messages import tilt_to_message

@@ -6,7 +6,7 @@ from copy import deepcopy
 from dataclasses import replace
 
 import pytest
-from shots import SOLVER, shoot
+from starpos_testing.graph.shots import SOLVER, shoot
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from graph import Graph, stamp_of
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import NavSatFix
-from shots import (
+from starpos_testing.graph.graph import Graph, stamp_of
+from starpos_testing.graph.shots import (
     EXPOSURE_S,
     HUMIDITY,
     PRESSURE_PA,

@@ -51,7 +51,7 @@ class Soak:
     def __init__(self, folder: Path, seed: int):
         from accelerated import World, parameters_of
         from fault_kinds import KINDS
-        from graph import Graph
+        from starpos_testing.graph.graph import Graph
 
         self.folder, self.graph = folder, Graph()
         self.parameters = parameters_of(folder)

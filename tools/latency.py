@@ -77,7 +77,7 @@ class Run:
     """A graph, and nodes that end with it."""
 
     def __init__(self, folder: Path):
-        from graph import Graph
+        from starpos_testing.graph.graph import Graph
 
         self.folder, self.graph, self._count = folder, Graph(), 0
         self.ears = Ears(self.graph)
@@ -108,7 +108,7 @@ def from_start(folder: Path, starts: int) -> Row:
     Frames are small here: the simulated sky takes a second to draw a whole one, which no camera does.
     """
     import numpy as np
-    from shots import SMALL, SOLVER, focal_of
+    from starpos_testing.graph.shots import SMALL, SOLVER, focal_of
 
     from starpos.simulation.scene import scene_of
 
@@ -130,7 +130,7 @@ def from_start(folder: Path, starts: int) -> Row:
 
 def from_start_of_solver(folder: Path, starts: int) -> Row:
     """The solver alone, from exec to the first fix of stars and tilts that come all the time."""
-    from shots import SOLVER, shoot
+    from starpos_testing.graph.shots import SOLVER, shoot
 
     seconds, shot = [], shoot()
     for _ in range(starts):
@@ -144,7 +144,7 @@ def from_start_of_solver(folder: Path, starts: int) -> Row:
 
 def from_stars(folder: Path, frames: int) -> Row:
     """A star message published to its fix received."""
-    from shots import SOLVER, shoot
+    from starpos_testing.graph.shots import SOLVER, shoot
 
     seconds = []
     with Run(folder) as run:
@@ -167,8 +167,8 @@ def from_stars(folder: Path, frames: int) -> Row:
 def write_frames(folder: Path):
     """FILES frames of the paper's camera and the tilts of each, in order of time."""
     import numpy as np
-    from shots import EXPOSURE_S, NOISE_DEG, tilts_of
-    from shots import START_S as BEGIN_S
+    from starpos_testing.graph.shots import EXPOSURE_S, NOISE_DEG, tilts_of
+    from starpos_testing.graph.shots import START_S as BEGIN_S
 
     from starpos.simulation.night_on_disk import write_fits
     from starpos.simulation.scene import expose, render, scene_of
@@ -187,8 +187,8 @@ def write_frames(folder: Path):
 
 def from_frames(folder: Path, frames: int, together: bool) -> list[Row]:
     """Frames of 21 megapixels off a disk at 1 Hz: from their capture message to their fix; CPU and memory."""
-    from shots import SOLVER
     from soak import cpu_s
+    from starpos_testing.graph.shots import SOLVER
 
     names = ("camera_detector",) if together else ("camera", "detector")
     where = "camera and detector in one process" if together else "camera and detector as two processes"

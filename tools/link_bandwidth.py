@@ -17,7 +17,7 @@ CADENCE_S = 2.0
 
 def main() -> int:
     from domain_coordinator import domain_id
-    from link import FULL_FRAME_BYTES, TILT_RATE_HZ, traffic
+    from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, traffic
 
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else 10
     with domain_id() as number, tempfile.TemporaryDirectory() as folder:

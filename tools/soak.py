@@ -20,8 +20,8 @@ DAY, WARM, ALLOWED_MB = 17280, 500, 2.0
 
 def main() -> int:
     from domain_coordinator import domain_id
-    from graph import Graph
-    from shots import SOLVER, shoot
+    from starpos_testing.graph.graph import Graph
+    from starpos_testing.graph.shots import SOLVER, shoot
 
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else DAY
     with domain_id() as number, tempfile.TemporaryDirectory() as folder:

@@ -16,8 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import yaml
-
-from starpos_common.testing import lacks
+from starpos_testing.lacking import lacks
 
 WIDTH, HEIGHT = 64, 48
 TOP_ROW, LEFT_COLUMN = 1.0, 0.25  # of the light of an asymmetric picture, black elsewhere

@@ -11,7 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from starpos_common.testing import WAIT_S, lacks
+from starpos_testing.lacking import lacks
+from starpos_testing.nodes import WAIT_S
 
 SIMULATOR, DEVICE = "indi_simulator_ccd", "CCD Simulator"
 LIAR = Path(__file__).parent / "indi_liar.py"

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
-import raws
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
+from starpos_testing.lacking import lacks
+from starpos_testing.skies import raws
 
 from starpos.detection import detect
 from starpos.frames.reading import read_frame
@@ -24,7 +25,6 @@ from starpos.instrument.camera import Camera
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
-from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 

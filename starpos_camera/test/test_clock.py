@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
+from starpos_testing.lacking import lacks
 
 from starpos.frames.frame import Frame
 from starpos_camera.sources import CaptureError, Exposure
 from starpos_camera.stamping import in_one_time
 from starpos_common.messages import stamp_to_unix
 from starpos_common.system_clock import StepWatch
-from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
 
 WARN = 1

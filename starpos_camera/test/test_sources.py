@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
-import raws
+from starpos_testing.lacking import lacks
+from starpos_testing.skies import raws
 
 from starpos.detection import detect
 from starpos.errors import FrameError
@@ -19,7 +20,6 @@ from starpos.sky.catalogue import load as load_catalogue
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import Settings, SourceEnded
 from starpos_camera.sources.registry import SOURCES
-from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
 
 NOW_S = 1793642400.0

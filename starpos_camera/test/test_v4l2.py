@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from starpos_testing.lacking import lacks
 
 from starpos_camera.sources import CaptureError
 from starpos_camera.sources.v4l2 import _from_jpeg
-from starpos_common.testing import lacks
 from starpos_interfaces.msg import Capture
 
 HERE = Path(__file__).parent

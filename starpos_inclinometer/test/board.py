@@ -9,7 +9,8 @@ import subprocess
 import tty
 from pathlib import Path
 
-from starpos_common.testing import lacks
+from starpos_testing.lacking import lacks
+
 from starpos_inclinometer.continuity import Continuity
 from starpos_inclinometer.protocol import Parser, Sample
 

@@ -15,9 +15,9 @@ from board import Board
 from corrupted import RATE_HZ, as_sent, decode, flipped, forged, lines
 from diagnostic_msgs.msg import DiagnosticArray
 from reader import WAIT_S
+from starpos_testing.nodes import Listener, Process, take_domain
 from wire import Wire
 
-from starpos_common.testing import Listener, Process, take_domain
 from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import Faults
 from starpos_inclinometer.host_clock import HostClock

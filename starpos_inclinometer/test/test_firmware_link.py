@@ -7,8 +7,8 @@ import signal
 import pytest
 from board import Board
 from diagnostic_msgs.msg import DiagnosticArray
+from starpos_testing.nodes import Listener, Process, take_domain
 
-from starpos_common.testing import Listener, Process, take_domain
 from starpos_inclinometer.source import Phase
 from starpos_interfaces.msg import Tilt
 

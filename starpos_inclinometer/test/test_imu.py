@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
+from starpos_testing.nodes import Listener, Process, take_domain
 
-from starpos_common.testing import Listener, Process, take_domain
 from starpos_inclinometer.imu import Average, Averager, BadMessage, felt
 from starpos_interfaces.msg import Tilt
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters
+from starpos_testing.nodes import Listener, Process, take_domain
 
-from starpos_common.testing import Listener, Process, take_domain
 from starpos_inclinometer import sensor
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS

@@ -4,7 +4,7 @@
 from copy import deepcopy
 
 from accelerated import World
-from shots import SMALL
+from starpos_testing.graph.shots import SMALL
 
 from fault_kinds.registry import HOSTILE, INF, kind
 from starpos_interfaces.msg import Star

@@ -4,7 +4,7 @@
 import math
 
 from accelerated import World
-from shots import EXPOSURE_S
+from starpos_testing.graph.shots import EXPOSURE_S
 
 from fault_kinds.registry import HOSTILE, kind, shift, some_time
 from starpos_interfaces.msg import Tilt

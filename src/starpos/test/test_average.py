@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fields import ARCSEC, UTC, Field, random_field, turn
+from starpos_testing.skies.fields import ARCSEC, UTC, Field, random_field, turn
 
 from starpos import rotation
 from starpos.averaging.average import Averager, average

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from fields import ARCSEC, UTC, Field
+from starpos_testing.skies.fields import ARCSEC, UTC, Field
 
 from starpos import rotation
 from starpos.averaging.average import Averager, average

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fields import ARCSEC, UTC, Field
+from starpos_testing.skies.fields import ARCSEC, UTC, Field
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state

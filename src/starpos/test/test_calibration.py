@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import START
-from sites import TRUE_A3_DEG, a3_error, shots
+from starpos_testing.skies.scenes import START
+from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.averaging.average import average
 from starpos.calibration.misalignment import VALID_DAYS, calibrate_at

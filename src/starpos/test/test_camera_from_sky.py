@@ -6,8 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lenses import AIR, FIELDS, ideal, k1_of, night, prediction_errors, random_camera, values
-from scenes import random_stars, with_false_stars
+from starpos_testing.skies.lenses import (
+    AIR,
+    FIELDS,
+    ideal,
+    k1_of,
+    night,
+    prediction_errors,
+    random_camera,
+    values,
+)
+from starpos_testing.skies.scenes import random_stars, with_false_stars
 
 from starpos.calibration.camera import calibrate
 from starpos.calibration.intrinsics import rms

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from lenses import FIELDS, night, random_camera, values
+from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
 from starpos.calibration.intrinsics import PARAMETERS
 from starpos.cli import main

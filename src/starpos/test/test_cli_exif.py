@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 
 import numpy as np
 import pytest
-import raws
+from starpos_testing.skies import raws
 
 from starpos.cli import main
 from starpos.frames.reading import read_frame

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sites import TRUE_A3_DEG, a3_error, shots
+from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.cli import main
 from starpos.instrument import camera_file, instrument_file

@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from raws import needs
+from starpos_testing.skies.raws import needs
 from test_cli_jobs import archive, frames, run, solve  # noqa: F401  # a fixture
 
 import starpos

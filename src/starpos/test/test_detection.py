@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from rendered import BIAS, bound, coloured, field, grid, match, noisy
 from scipy import ndimage
+from starpos_testing.skies.rendered import BIAS, bound, coloured, field, grid, match, noisy
 
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from rendered import field, grid, noisy
+from starpos_testing.skies.rendered import field, grid, noisy
 
 from starpos.detection import detect
 from starpos.errors import FrameError

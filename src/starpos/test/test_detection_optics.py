@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from rendered import bound, errors, field, grid, match, noisy, rms
+from starpos_testing.skies.rendered import bound, errors, field, grid, match, noisy, rms
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame

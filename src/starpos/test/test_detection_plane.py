@@ -2,7 +2,7 @@
 import cv2
 import numpy as np
 import pytest
-from rendered import field, grid, match
+from starpos_testing.skies.rendered import field, grid, match
 
 from starpos.detection import detect
 from starpos.detection.plane import plane_of

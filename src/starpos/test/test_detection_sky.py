@@ -5,8 +5,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from rendered import bound, coloured, errors, field, grid, match, noisy, rms
 from scipy import ndimage
+from starpos_testing.skies.rendered import bound, coloured, errors, field, grid, match, noisy, rms
 
 from starpos.detection import detect
 from starpos.detection.background import measure_background

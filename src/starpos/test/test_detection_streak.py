@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from rendered import bound, field, grid, match, noisy
+from starpos_testing.skies.rendered import bound, field, grid, match, noisy
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame

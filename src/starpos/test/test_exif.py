@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 import cv2
 import numpy as np
 import pytest
-import raws
+from starpos_testing.skies import raws
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exif import CameraClock

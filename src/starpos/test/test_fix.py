@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fields import ARCSEC, PAPER, UTC, Field, random_field, turn
+from starpos_testing.skies.fields import ARCSEC, PAPER, UTC, Field, random_field, turn
 
 from starpos import rotation
 from starpos.earth.orientation import curvature_radii_m, earth_state

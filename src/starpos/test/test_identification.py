@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from scenes import FOCAL_PX, SIZE, random_stars
+from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos.identification import Sky, identify, identify_directions, search, triangles
 from starpos.identification.lookup import LOOSE_PX

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from scenes import START, solver_of, stars_of, tilt_of, wide_scene
+from starpos_testing.skies.scenes import START, solver_of, stars_of, tilt_of, wide_scene
 from test_identification import FIELDS, check, random_attitude, seen, sky_for
 
 from starpos import rotation

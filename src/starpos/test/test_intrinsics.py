@@ -5,7 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lenses import FIELDS, VACUUM, ideal, k1_of, prediction_errors, random_camera, sightings, values
+from starpos_testing.skies.lenses import (
+    FIELDS,
+    VACUUM,
+    ideal,
+    k1_of,
+    prediction_errors,
+    random_camera,
+    sightings,
+    values,
+)
 
 from starpos import rotation
 from starpos.calibration.intrinsics import (

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scenes import FOCAL_PX, SIZE
+from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
 from starpos.cli import main
 from starpos.instrument.camera import Camera

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fields import ARCSEC, Field
+from starpos_testing.skies.fields import ARCSEC, Field
 
 from starpos import rotation
 from starpos.averaging.slip import slip_s

@@ -10,7 +10,7 @@ from contextlib import redirect_stdout
 
 import numpy as np
 import pytest
-from reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
+from starpos_testing.skies.reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
 
 from starpos.cli import main
 from starpos.earth.refraction import Atmosphere

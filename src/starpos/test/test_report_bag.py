@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reports import AIR, OPTICS, Page, assert_drawn, run, simulate, solved
+from starpos_testing.skies.reports import AIR, OPTICS, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rosbags")
 
-from bags import Recorder, typestore
 from rosbags.rosbag2 import StoragePlugin
+from starpos_testing.skies.bags import Recorder, typestore
 
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import read_tilt_csv

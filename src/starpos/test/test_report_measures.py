@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reports import simulate
+from starpos_testing.skies.reports import simulate
 
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.earth.refraction import Atmosphere

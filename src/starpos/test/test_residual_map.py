@@ -4,8 +4,8 @@
 import cv2
 import numpy as np
 import pytest
-from lenses import VACUUM, ideal, sightings
 from matplotlib.figure import Figure
+from starpos_testing.skies.lenses import VACUUM, ideal, sightings
 
 from starpos.calibration import residual_map
 from starpos.calibration.intrinsics import fit_camera

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 from scipy.spatial import cKDTree
+from starpos_testing.skies.scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError

@@ -8,7 +8,7 @@ from pathlib import Path
 import erfa
 import numpy as np
 import pytest
-from scenes import (
+from starpos_testing.skies.scenes import (
     EXPOSURE,
     FOCAL_PX,
     SIZE,

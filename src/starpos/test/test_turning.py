@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
+from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
 from starpos.averaging.average import average

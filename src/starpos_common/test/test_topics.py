@@ -4,10 +4,10 @@
 import pytest
 import rclpy
 from rclpy.qos import ReliabilityPolicy
+from starpos_testing.nodes import take_domain
 from std_msgs.msg import String
 
 from starpos_common.parameters import ParameterError
-from starpos_common.testing import take_domain
 from starpos_common.topics import publisher, subscription
 
 

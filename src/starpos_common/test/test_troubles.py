@@ -3,9 +3,9 @@
 
 import pytest
 import rclpy
+from starpos_testing.nodes import take_domain
 
 from starpos_common import troubles
-from starpos_common.testing import take_domain
 from starpos_common.troubles import MOST_KINDS, QUIET_S, Troubles
 
 

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole instrument under a simulated sky, at a place that only the simulation knows.
+
+    ros2 launch starpos_solver demo.launch.py latitude:=48.1 longitude:=11.6
+    ros2 topic echo /fix
+
+Compare `fix` with the place given. Its time is the computer's own; tools/demo.py does it with a place drawn at random.
+"""
+
+import atexit
+import os
+import shutil
+import tempfile
+
+import numpy as np
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import PushRosNamespace
+from launch_ros.substitutions import ExecutableInPackage
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
+
+ARGUMENTS = (
+    *COMMON_ARGUMENTS,
+    ("latitude", "35.7046", "where the simulated instrument stands, deg"),
+    ("longitude", "51.4106", "the same, east positive, deg"),
+    ("azimuth", "40", "of the optical axis, deg"),
+    ("altitude", "78", "of the optical axis, deg; the inclinometer reaches to 60"),
+    ("cadence", "3", "from frame to frame, s"),
+    ("dashboard", "true", "the web page, at http://127.0.0.1:8042"),
+)
+POINTING = ("latitude", "longitude", "azimuth", "altitude")
+MISALIGNMENT_DEG = (0.4, -0.3, 12.0)
+AIR = {"pressure": 95000.0, "temperature": 8.0, "humidity": 0.4}
+
+
+def tilt_deg(place: dict[str, float], roll_deg: float):
+    """What the inclinometer of an instrument reads that stands so."""
+    from starpos.earth.refraction import Atmosphere
+    from starpos.simulation.scene import scene_of
+
+    scene = scene_of(
+        latitude_deg=place["latitude"],
+        longitude_deg=place["longitude"],
+        atmosphere=Atmosphere(AIR["pressure"], AIR["temperature"], AIR["humidity"]),
+        pointing_deg=(place["azimuth"], place["altitude"], roll_deg),
+        misalignment_deg=MISALIGNMENT_DEG,
+    )
+    return np.degrees(scene.tilt)
+
+
+def nodes(context):
+    told = given(context, ARGUMENTS)
+    place = {name: float(told[name]) for name in POINTING}
+    roll_deg = 15.0
+    theta_x, theta_y = tilt_deg(place, roll_deg)
+    folder = tempfile.mkdtemp(prefix="starpos_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    link = os.path.join(folder, "inclinometer")
+    common = Common.of(told)
+    simulated = {f"simulated.{name}": value for name, value in (place | AIR).items()} | {
+        "simulated.roll": roll_deg
+    }
+    camera = {"source": "simulated", "cadence": float(told["cadence"]), **simulated}
+    solver = {f"refraction.{name}": value for name, value in AIR.items()} | {
+        "misalignment": list(MISALIGNMENT_DEG)
+    }
+    emulator = ExecutableInPackage("emulator", "starpos_inclinometer")
+    device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]
+    processes = [
+        ExecuteProcess(cmd=device, name="emulator", output="screen"),  # a device, no node
+        process("starpos_inclinometer", "inclinometer", common, {"inclinometer": {"port": link}}),
+        process("starpos_camera", "camera_detector", common, {"camera": camera}),
+        process("starpos_solver", "solver", common, {"solver": solver}),
+    ]
+    if is_true(told, "dashboard"):
+        processes.append(process("starpos_solver", "dashboard", common))
+    return processes
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            *declared(ARGUMENTS),
+            PushRosNamespace(LaunchConfiguration("namespace")),
+            OpaqueFunction(function=nodes),
+        ]
+    )

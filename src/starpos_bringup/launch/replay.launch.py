@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded night through the solver: its topics with their own time on /clock, everything ended with it.
+
+    ros2 launch starpos_solver replay.launch.py bag:=night rate:=0 params_file:=mine.yaml
+
+Of a bag that holds images and no stars, detector:=true finds the stars again.
+"""
+
+from launch import LaunchDescription
+from launch.actions import OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import PushRosNamespace
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
+
+ARGUMENTS = (
+    *COMMON_ARGUMENTS,
+    ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
+    ("rate", "1", "times real time; 0: as fast as the solver answers, with the same result"),
+    ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
+    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
+)
+SIMULATED = {"**": {"use_sim_time": True}}
+
+
+def nodes(context):
+    told = given(context, ARGUMENTS)
+    common = Common.of(told)
+    processes = [process("starpos_solver", "solver", common, SIMULATED)]
+    inputs = "stars"
+    if is_true(told, "detector"):
+        processes.append(process("starpos_camera", "detector", common, SIMULATED))
+        inputs = "images"
+    if is_true(told, "dashboard"):
+        processes.append(process("starpos_solver", "dashboard", common, SIMULATED))
+    player = ["--rate", told["rate"], "--inputs", inputs, "--", told["bag"]]
+    processes.append(
+        process(
+            "starpos_solver", "replay", common, arguments=player, on_exit=Shutdown(reason="the bag is played")
+        )
+    )
+    return processes
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            *declared(ARGUMENTS),
+            PushRosNamespace(LaunchConfiguration("namespace")),
+            OpaqueFunction(function=nodes),
+        ]
+    )

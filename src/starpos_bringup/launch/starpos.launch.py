@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The instrument: camera and detector in one process, inclinometer, solver.
+
+    ros2 launch starpos_solver starpos.launch.py port:=/dev/serial/by-id/... params_file:=mine.yaml
+
+An argument that is not given leaves what the parameter file says.
+"""
+
+from launch import LaunchDescription
+from launch.actions import OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import PushRosNamespace
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
+
+ARGUMENTS = (
+    *COMMON_ARGUMENTS,
+    ("use_sim_time", "", "true: time from /clock"),
+    ("camera", "", "source of frames: files, simulated, gphoto2, indi, alpaca, video"),
+    ("port", "", "serial port of the inclinometer; prefer a path under /dev/serial/by-id"),
+    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
+    ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
+)
+
+
+def nodes(context):
+    told = given(context, ARGUMENTS)
+    clock = {"use_sim_time": is_true(told, "use_sim_time")} if told["use_sim_time"] else {}
+    source = {"source": told["camera"]} if told["camera"] else {}
+    port = {"port": told["port"]} if told["port"] else {}
+    common = Common.of(told)
+    processes = [
+        process("starpos_camera", "camera_detector", common, {"**": clock, "camera": source}),
+        process("starpos_inclinometer", "inclinometer", common, {"**": clock, "inclinometer": port}),
+        process("starpos_solver", "solver", common, {"**": clock}),
+    ]
+    if is_true(told, "dashboard"):
+        processes.append(process("starpos_solver", "dashboard", common, {"**": clock}))
+    return processes
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            *declared(ARGUMENTS),
+            PushRosNamespace(LaunchConfiguration("namespace")),
+            OpaqueFunction(function=nodes),
+        ]
+    )

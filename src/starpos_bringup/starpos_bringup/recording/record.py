@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ros2 run starpos_solver record BAG`: a night as a rosbag2, byte for byte, compressed.
+
+For machines without `ros2 bag record`; the bag is one that `ros2 bag play`, `replay` and `starpos report` read.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from starpos_bringup.recording.bag_writer import BagError, BagWriter
+
+TOPICS = {  # relative name: type
+    "camera/camera_info": "sensor_msgs/msg/CameraInfo",
+    "camera/capture": "starpos_interfaces/msg/Capture",
+    "stars": "starpos_interfaces/msg/StarArray",
+    "tilt": "starpos_interfaces/msg/Tilt",
+    "fix": "sensor_msgs/msg/NavSatFix",
+    "fix_averaged": "sensor_msgs/msg/NavSatFix",
+    "heading/imu": "sensor_msgs/msg/Imu",
+    "solver/solution": "starpos_interfaces/msg/Solution",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+IMAGES = {"camera/image_raw": "sensor_msgs/msg/Image"}
+SAVED, BROKEN_OFF, REFUSED = 0, 1, 2  # exit statuses
+
+
+def record() -> int:
+    """The executable."""
+    from starpos_common.node_main import run
+
+    k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
+    options = _parser().parse_args(sys.argv[1:k])
+    topics = TOPICS | (IMAGES if options.images else {})
+    try:
+        writer = BagWriter(options.bag)
+    except BagError as error:
+        say(str(error))
+        return REFUSED
+    recorders = []
+
+    def make_nodes():
+        from starpos_bringup.recording.recorder import Recorder
+
+        recorders.append(Recorder(writer, topics, say))
+        yield recorders[0]
+
+    status = run(make_nodes)
+    return status or (BROKEN_OFF if any(r.trouble for r in recorders) else SAVED)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="record",
+        description="Record what the instrument publishes and what it is made of, until Ctrl-C.",
+        epilog="Exit status: 0 saved, 1 broken off (a full disk), 2 a bad call.",
+    )
+    parser.add_argument("bag", type=Path, metavar="BAG", help="a folder to make")
+    parser.add_argument("--images", action="store_true", help="the frames too: 16 MB each of 21 megapixels")
+    return parser
+
+
+def say(sentence: str) -> None:
+    print(f"record: {' '.join(sentence.split())}", file=sys.stderr, flush=True)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `record`: what comes on topics into a bag."""
+
+import shutil
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
+
+import rclpy
+from rclpy.node import Node
+from starpos_bringup.recording.bag_writer import BagError, BagWriter
+
+from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.topics import subscription
+
+LITTLE_BYTES = 1_000_000_000  # left on the disk
+DEPTH, IMAGE_DEPTH = 1000, 3  # an image may have 42 MB
+
+
+class Recorder(Node):
+    """Writes each message as it comes, with the node's time; ends the program where the bag takes no more.
+
+    topics: relative name to type.  say: takes a sentence for the person at the terminal.
+    """
+
+    def __init__(self, writer: BagWriter, topics: Mapping[str, str], say: Callable[[str], None]):
+        super().__init__("record", start_parameter_services=False)
+        self.trouble = ""  # why the recording broke off
+        self._writer, self._say = writer, say
+        for name, type_name in topics.items():
+            package, message = type_name.split("/msg/")
+            kind = getattr(import_module(f"{package}.msg"), message)
+            topic = self.resolve_topic_name(name)
+            writer.add_topic(topic, type_name)
+            depth = IMAGE_DEPTH if message == "Image" else DEPTH
+            subscription(self, kind, topic, partial(self._keep, name, topic), depth, raw=True)
+        self._counts = dict.fromkeys(topics, 0)
+        self._diagnostics = Diagnostics(self, {"Bag": self._report}, str(writer.folder))
+        say(f"{writer.folder}: recording {len(topics)} topics until Ctrl-C")
+
+    def destroy_node(self):
+        super().destroy_node()
+        try:
+            self._writer.close()
+            self._say(f"{self._writer.folder}: {self._writer.count} messages")
+        except BagError as error:
+            self.trouble = str(error)
+            self._say(self.trouble)
+
+    def _keep(self, name: str, topic: str, data: bytes):
+        if self.trouble:
+            return
+        try:
+            self._writer.write(topic, self.get_clock().now().nanoseconds, data)
+            self._counts[name] += 1
+        except BagError as error:
+            self.trouble = str(error)
+            self._say(self.trouble)
+            rclpy.shutdown()
+
+    def _report(self) -> Status:
+        free_bytes = shutil.disk_usage(self._writer.folder).free
+        values = {"messages": self._writer.count, "free (MB)": free_bytes // 10**6, **self._counts}
+        if free_bytes < LITTLE_BYTES:
+            return Status(
+                Level.WARN,
+                f"the disk has {free_bytes // 10**6} MB left: make room or end the recording.",
+                values,
+            )
+        return Status(Level.OK, f"recording to {self._writer.folder}.", values)

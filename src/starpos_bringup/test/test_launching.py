@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the launch files have in common."""
+
+import importlib
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
+
+from launch import LaunchContext
+
+launching = importlib.import_module("starpos_bringup.launching")
+
+
+@pytest.fixture
+def environment(tmp_path, monkeypatch):
+    """What a process of ours gets beside the environment, given variables of the user's."""
+    parameters = tmp_path / "mine.yaml"
+    parameters.write_text("")
+    common = launching.Common(str(parameters), "info", "/starpos")
+    for name in launching.PROFILES:
+        monkeypatch.delenv(name, raising=False)
+
+    def environment(**of_user):
+        for name, value in of_user.items():
+            monkeypatch.setenv(name, value)
+        context, process = LaunchContext(), launching.process("starpos_solver", "solver", common)
+        return dict(
+            ("".join(part.perform(context) for part in text) for text in pair)
+            for pair in process.additional_env or ()
+        )
+
+    return environment
+
+
+def test_nodes_find_each_other_at_once_and_the_rest_of_the_robot_is_as_it_was(environment):
+    profiles = environment()
+    assert set(profiles) == set(launching.PROFILES)
+    assert all(Path(path).name == "quick_start.xml" and Path(path).is_file() for path in profiles.values())
+    assert not set(launching.PROFILES) & set(os.environ)
+
+
+@pytest.mark.parametrize("name", ["FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"])
+def test_profiles_of_the_users_stay(environment, name):
+    assert environment(**{name: "/home/robot/lossy_link.xml"}) == {}

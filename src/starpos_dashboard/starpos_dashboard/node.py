@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `dashboard`: a read-only web page that shows the running instrument."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import Image, Imu, NavSatFix
+
+from starpos.errors import FrameError
+from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.messages import stamp_to_unix
+from starpos_common.parameters import declare
+from starpos_common.topics import subscription
+from starpos_dashboard import access, picture
+from starpos_dashboard.board import Board
+from starpos_dashboard.parameters import PARAMETERS, names
+from starpos_dashboard.server import Server, listen
+from starpos_interfaces.msg import Solution, Tilt
+
+HEARTBEAT_S = 1.0  # between states, where nothing comes: ages go on
+
+
+class DashboardNode(Node):
+    """See README.md."""
+
+    def __init__(self):
+        super().__init__("dashboard")
+        self._values = declare(self, PARAMETERS, apply=self._apply)
+        self._board = Board(
+            self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
+        )
+        address = self._values["address"]
+        self._server = Server(
+            listen(address, self._values["port"]),
+            access.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
+            self._values["clients"],
+        )
+        self._image: Image | None = None  # the newest that is not shown yet
+        self._images = None  # the subscription, while a page shows the frame
+        self._shown = 0  # frames
+        self._shown_at = self._told_at = 0.0  # monotonic, s
+        self._pages = 0
+        self._connect()
+        self._server.start()
+        self._announce(address)
+
+    def _connect(self):
+        board = self._board
+        for kind, topic, hear in (
+            (NavSatFix, "fix", board.hear_fix),
+            (NavSatFix, "fix_averaged", board.hear_average),
+            (Imu, "heading/imu", board.hear_heading),
+            (Tilt, "tilt", board.hear_tilt),
+            (Solution, "solver/solution", board.hear_solution),
+        ):
+            subscription(self, kind, topic, hear, 10)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        self.destroy_subscription(
+            self._subscribe_frames()
+        )  # a bad qos_override is refused now, not by the first page
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(1 / self._values["rate"], self._tell, clock=steady)
+        self._diagnostics = Diagnostics(self, {"Page": self._report})
+
+    def _announce(self, address: str):
+        host = f"[{address}]" if ":" in address else address
+        self._url = f"http://{host}:{self._server.port}"
+        self.get_logger().info(f"the instrument is shown at {self._url}")
+        if not access.is_loopback(address):
+            self.get_logger().warning(
+                f"every machine that reaches {address} can read there, without a password, where the instrument is"
+            )
+
+    def _apply(self, changed: frozenset[str]):
+        if "rate" in changed:
+            self._timer.timer_period_ns = round(1e9 / self._values["rate"])
+        if "track" in changed:
+            self._board.keep_track_of(self._values["track"])
+        if "lights" in changed:
+            self._board.only_lights_of(names(self._values["lights"]))
+        self._server.clients = self._values["clients"]
+
+    # what comes ------------------------------------------------------------------------------------------------------
+
+    def _on_diagnostics(self, message: DiagnosticArray):
+        self._board.hear_diagnostics(message)
+
+    def _on_image(self, message: Image):
+        self._image = message
+
+    # what goes -------------------------------------------------------------------------------------------------------
+
+    def _tell(self):
+        now = time.monotonic()
+        self._follow_viewers()
+        if self._image is not None and now - self._shown_at >= 1 / self._values["image_rate"]:
+            self._show_frame(now)
+        pages = self._server.pages
+        more, self._pages = pages > self._pages, pages
+        if pages and (more or self._board.changed or now - self._told_at >= HEARTBEAT_S):
+            self._told_at = now
+            unix_s = self.get_clock().now().nanoseconds * 1e-9
+            self._server.show(self._board.told(unix_s, self._values["stale_after"]), self._board.track)
+
+    def _follow_viewers(self):
+        """Subscribe the frames while somebody looks: until then the detector draws none."""
+        looking = self._server.looking
+        if looking and self._images is None:
+            self._images = self._subscribe_frames()
+        elif not looking and self._images is not None:
+            self.destroy_subscription(self._images)
+            self._images = self._image = None
+            self._server.show_frame(None)
+            self._board.hide_frame()
+
+    def _subscribe_frames(self):
+        return subscription(self, Image, "detector/image_annotated", self._on_image, 1)
+
+    def _show_frame(self, now_s: float):
+        image, self._image = self._image, None
+        self._shown_at = now_s
+        self._shown += 1
+        trouble = ""
+        try:
+            self._server.show_frame(picture.jpeg(image, self._values["image_side"]))
+        except FrameError as e:
+            trouble = str(e)
+            self._server.show_frame(None)
+        self._board.show_frame(self._shown, stamp_to_unix(image.header.stamp), trouble)
+
+    # its own health --------------------------------------------------------------------------------------------------
+
+    def _report(self) -> Status:
+        values = {
+            "pages": self._server.pages,
+            "pages refused": self._server.refused,
+            "frames shown": self._shown,
+            "loopback only": access.is_loopback(self._values["address"]),
+        }
+        if not self._server.alive:
+            trouble = self._server.trouble or "the server has ended"
+            return Status(Level.ERROR, f"{trouble}: start the dashboard again", values)
+        return Status(Level.OK, f"shown at {self._url}", values)
+
+    def destroy_node(self):
+        self._server.stop()
+        super().destroy_node()

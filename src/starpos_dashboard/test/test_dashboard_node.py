@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node itself: how it starts, what it refuses, what hostile topics do to it, how it ends."""
+
+import json
+import signal
+import socket
+import sys
+import urllib.request
+from contextlib import closing
+from importlib.util import find_spec
+
+import dashboard as said
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import Image, NavSatFix
+from starpos_testing.lacking import lacks
+from starpos_testing.nodes import Listener, Process, take_domain
+
+from starpos.errors import StarposError
+
+OK, WARN = 0, 1
+
+
+@pytest.fixture
+def listener():
+    take_domain()
+    listener = Listener()
+    yield listener
+    listener.close()
+
+
+@pytest.fixture
+def start():
+    if find_spec("tornado") is None:
+        lacks("tornado", "pip install")
+    processes = []
+
+    def start(*parameters, executable="dashboard", module="starpos_dashboard.main", namespace="/"):
+        processes.append(Process(module, executable, parameters, namespace))
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        process.kill()
+
+
+def address_of(listener, page="dashboard: Page") -> tuple[str, int]:
+    listener.wait_for_state(page, OK, "shown at http://")
+    host, _, port = listener.states[page].message.rpartition("/")[2].rpartition(":")
+    return host, int(port)
+
+
+def test_a_port_in_use_is_one_line_and_status_1(start):
+    with closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = taken.getsockname()[1]
+        status, output = start(f"port:={port}").end()
+    assert status == 1
+    (line,) = output.splitlines()
+    assert f"127.0.0.1:{port}" in line and "set the parameter port" in line
+
+
+@pytest.mark.parametrize("parameter", ["port:=70000", "clients:=0", "rate:=0.1", "image_side:=1"])
+def test_a_parameter_out_of_range_is_one_line_and_status_1(start, parameter):
+    status, output = start(parameter).end()
+    assert status == 1 and len(output.splitlines()) == 1 and "must be" in output
+
+
+@pytest.mark.parametrize("address", ["''", "' '", "'127.0.0.1 '"])
+def test_no_address_is_not_every_address(start, address):
+    status, output = start("port:=0", f"address:={address}").end()
+    (line,) = output.splitlines()
+    assert status == 1 and "parameter address must be an address of this machine" in line
+
+
+def test_without_tornado_it_says_how_to_install_it(monkeypatch):
+    from starpos_dashboard.main import make_nodes
+
+    monkeypatch.setitem(sys.modules, "tornado", None)
+    with pytest.raises(StarposError, match="sudo apt install python3-tornado"):
+        next(make_nodes())
+
+
+def test_an_address_others_reach_is_a_warning_and_loopback_is_none(start, listener):
+    open_to_all = start("port:=0", "address:='0.0.0.0'")
+    address_of(listener)
+    status, output = open_to_all.end(signal.SIGTERM)
+    assert status == 0 and "[WARN]" in output and "without a password" in output
+    own = start("port:=0")
+    listener.wait_for_state("dashboard: Page", OK, "http://127.0.0.1:")
+    status, output = own.end(signal.SIGTERM)
+    assert status == 0 and "[WARN]" not in output and len(output.splitlines()) == 1
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
+def test_it_ends_at_once_with_pages_open_and_hung(start, listener, signals):
+    process = start("port:=0")
+    address = address_of(listener)
+    with (
+        closing(socket.create_connection(address)) as hung,
+        closing(socket.create_connection(address)) as mute,
+    ):
+        hung.sendall(b"GET /events?frame HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        mute.sendall(b"GET /")
+        listener.wait(lambda: {"pages", "1"} <= set(words(listener)))
+        status, output = process.end(*signals)
+    assert status == 0 and "Traceback" not in output, output
+
+
+def words(listener) -> list[str]:
+    state = listener.states.get("dashboard: Page")
+    return [word for v in state.values[:1] for word in (v.key, v.value)] if state else []
+
+
+def test_the_solver_of_another_instrument_on_the_graph_is_not_its_own(start, listener):
+    start("port:=0", "lights:=solver", namespace="/a")
+    host, port = address_of(listener, "/a/dashboard: Page")
+
+    def names_shown(url=f"http://{host}:{port}/events"):
+        with urllib.request.urlopen(url, timeout=10) as page:
+            state = next(line for line in page if b'"lights"' in line)
+        return {light["name"] for light in json.loads(state.removeprefix(b"data: "))["lights"]}
+
+    start(executable="solver", module="starpos_solver.main", namespace="/b")
+    listener.wait(lambda: "/b/solver: Solution" in listener.states)
+    assert listener.set("a/dashboard", lights="/b/solver").successful
+    listener.wait(lambda: "/b/solver: Solution" in names_shown())  # it hears the other one
+    assert listener.set("a/dashboard", lights="solver").successful
+    listener.wait_for_state("/b/solver: Solution", WARN)
+    assert names_shown() == {"solver"}  # silent
+    start(executable="solver", module="starpos_solver.main", namespace="/a")
+    listener.wait(lambda: "solver: Solution" in names_shown())
+
+
+def test_hostile_messages_are_taken_in_its_stride(start, listener):
+    process = start("port:=0", "lights:=''")
+    host, port = address_of(listener)
+    node = listener.node
+    fix = node.create_publisher(NavSatFix, "fix", 10)
+    image = node.create_publisher(Image, "detector/image_annotated", 10)
+    diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    broken = said.image(64, 40)
+    broken.width = 2**31
+    flood = said.diagnostics(*((f"\x1b[2J\u202en{k}: T", 200, "<script>" * 500) for k in range(500)))
+    with urllib.request.urlopen(f"http://{host}:{port}/events?frame", timeout=10) as page:
+        listener.wait(lambda: image.get_subscription_count() == 1)
+        seen = []
+
+        def told():
+            fix.publish(said.fix(float("inf"), float("nan")))
+            image.publish(broken)
+            diagnostics.publish(flood)
+            seen.append(page.readline())
+            return any(b"too large to be shown" in line and b"n255: T" in line for line in seen)
+
+        listener.wait(told)
+    state = next(line for line in reversed(seen) if b'"lights"' in line)
+    assert (
+        len(state) < 100_000 and b"NaN" not in state and b"Infinity" not in state and b"\\u202e" not in state
+    )
+    listener.wait_for_state("dashboard: Page", OK)
+    status, output = process.end(signal.SIGINT)
+    assert status == 0 and "Traceback" not in output, output

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import find_packages, setup
+
+package = "starpos_testing"
+
+setup(
+    name=package,
+    version="0.1.0",
+    description="Helpers of the tests",
+    maintainer="starpos maintainers",
+    maintainer_email="maintainers@starpos.invalid",
+    license="Apache-2.0",
+    packages=find_packages(include=[package, f"{package}.*"]),
+    package_data={package: ["flake8.ini"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+)

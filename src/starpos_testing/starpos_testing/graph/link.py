@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The instrument on two hosts under a simulated sky, and what the cable between them carries."""
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from starpos_testing.graph.hosts import Cable, Ear, Host
+from starpos_testing.graph.shots import FULL, focal_of
+
+from starpos.simulation.scene import scene_of
+
+FULL_FRAME_BYTES = FULL[0] * FULL[1] * 2
+PIXEL_UM = 6.4
+TILT_RATE_HZ = 10  # of the inclinometer as it comes
+QUIET_S = 10.0  # without a camera, to see what the tilts take
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Two hosts, their cable, and an ear beside the solver."""
+
+    mount: Host
+    robot: Host
+    cable: Cable
+    ear: Ear
+
+    def wait(self, condition, **patience) -> None:
+        """Until it comes true of what the ear hears; else what the programs said."""
+        self.ear.wait(condition, self.mount, self.robot, **patience)
+
+
+@contextmanager
+def two_hosts(**environment):
+    """An instrument of which nothing runs yet; `environment` is set on both hosts."""
+    with (
+        Host("mount", **environment) as mount,
+        Host("robot", **environment) as robot,
+        Cable(mount, robot) as cable,
+        Ear(robot) as ear,
+    ):
+        yield Instrument(mount, robot, cable, ear)
+
+
+def start(instrument: Instrument, folder: Path, size: tuple[int, int], cadence_s: float, *patience: str):
+    """Camera and detector in one process and the inclinometer on the mount, the solver on the robot; the camera.
+
+    patience: more parameters of the solver.
+    """
+    mount, robot = instrument.mount, instrument.robot
+    focal_px, port = focal_of(size), folder / "port"
+    tilt_x, tilt_y = np.degrees(scene_of(size, focal_px).tilt)
+    tilts = ("--link", str(port), f"--tilt-x={tilt_x:.9f}", f"--tilt-y={tilt_y:.9f}", "--seed", "11")
+    robot.start(folder / "solver.log", "starpos_solver", "solver", "misalignment:=[0.0, 0.0, 0.0]", *patience)
+    mount.start(folder / "emulator.log", "starpos_inclinometer", "emulator", arguments=tilts)
+    mount.start(
+        folder / "inclinometer.log",
+        "starpos_inclinometer",
+        "inclinometer",
+        f"port:={port}",
+        f"rate:={TILT_RATE_HZ}",
+    )
+    return mount.start(
+        folder / "camera.log",
+        "starpos_camera",
+        "camera_detector",
+        "source:=simulated",
+        f"cadence:={cadence_s}",
+        "exposure:=0.5",
+        f"focal_mm:={focal_px * PIXEL_UM * 1e-3}",
+        f"pixel_um:={PIXEL_UM}",
+        f"simulated.width:={size[0]}",
+        f"simulated.height:={size[1]}",
+    )
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What went over the cable, both ways, all headers and DDS's own part included; `stars` of a frame, on average."""
+
+    frames: int
+    stars: float
+    bytes_per_frame: float  # above what flows without a camera
+    bytes_per_second: float  # of that: the tilts
+
+
+def traffic(folder: Path, frames: int, cadence_s: float) -> Traffic:
+    """Of so many frames of the whole camera; the first ones, while nodes and middleware find each other, do not count."""
+    with two_hosts() as instrument:
+        camera = start(instrument, folder, FULL, cadence_s)
+        ear, cable = instrument.ear, instrument.cable
+
+        def after(count: int) -> tuple[int, float]:
+            instrument.wait(lambda: len(ear.fixed) >= count, seconds=60.0 + count * cadence_s)
+            return cable.bytes, max(ear.at_s.values())
+
+        (begin, begin_s), first = after(2), len(ear.solutions)
+        end, end_s = after(2 + frames)
+        counted = len(ear.solutions) - first
+        camera.end()
+        quiet = cable.bytes
+        ear.comes(lambda: False, QUIET_S)
+        each_second = (cable.bytes - quiet) / QUIET_S
+        each_frame = (end - begin - each_second * (end_s - begin_s)) / counted
+        stars = np.mean([s.stars_detected for s in ear.solutions.values()])
+    return Traffic(counted, float(stars), each_frame, each_second)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""For the nodes' own tests: a node as a process, and someone who listens to it; it waits for events, never sleeps."""
+
+import atexit
+import os
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from functools import cache
+from importlib.util import find_spec
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+
+WAIT_S = 30.0  # for anything
+
+
+@cache
+def take_domain() -> None:
+    """A ROS domain of this process, on this machine only; no other test session has it where domain_coordinator is."""
+    if find_spec("domain_coordinator"):
+        from domain_coordinator import domain_id
+
+        held = ExitStack()
+        number = held.enter_context(domain_id())
+        atexit.register(held.close)
+    else:
+        number = 1 + os.getpid() % 99
+    os.environ["ROS_DOMAIN_ID"] = str(number)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+class Listener:
+    """A node that keeps what it hears and waits for what it wants; `states` are the newest diagnostics by name."""
+
+    def __init__(self):
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node("listener", context=self._context)
+        self.states = {}
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, 10)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def close(self):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def _diagnostics(self, message):
+        self.states |= {status.name: status for status in message.status}
+
+    def hear(self, kind, topic: str, depth: int = 10) -> list:
+        """A list that the topic's messages are appended to."""
+        heard = []
+        self.node.create_subscription(kind, topic, heard.append, depth)
+        return heard
+
+    def wait(self, condition):
+        end = time.monotonic() + WAIT_S
+        while not condition():
+            assert time.monotonic() < end, self.states
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def wait_for_state(self, name: str, level: int, text: str = "") -> dict[str, str]:
+        """The values of the next diagnostic of that name that has the level and the text in its sentence."""
+        self.states.pop(name, None)
+
+        def come():
+            state = self.states.get(name)
+            return state and state.level == bytes([level]) and text in state.message
+
+        self.wait(come)
+        return {v.key: v.value for v in self.states[name].values}
+
+    def call(self, kind, name: str, request):
+        """The answer of a service."""
+        client = self.node.create_client(kind, name)
+        self.wait(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait(future.done)
+        return future.result()
+
+    def set(self, node: str, **values):
+        """Set a node's parameters, all or none; a SetParametersResult."""
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        return self.call(SetParametersAtomically, f"/{node}/set_parameters_atomically", request).result
+
+
+class Process:
+    """The function `executable` of a module as a program of its own."""
+
+    def __init__(self, module: str, executable: str, parameters, namespace: str = "/"):
+        program = f"import sys; from {module} import {executable}; sys.exit({executable}())"
+        options = [word for p in parameters for word in ("-p", p)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", program, "--ros-args", "-r", f"__ns:={namespace}", *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def end(self, *signals) -> tuple[int, str]:
+        """Send the signals; the exit status and all output."""
+        for number in signals:
+            self._process.send_signal(number)
+        out, _ = self._process.communicate(timeout=WAIT_S)
+        return self._process.returncode, out
+
+    def kill(self):
+        """Whatever a test has left of it."""
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.communicate()

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras with lenses, the sky through them, and how far off a fitted one is: for the tests of calibration."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from starpos_testing.skies.scenes import EXPOSURE, START
+
+from starpos import rotation
+from starpos.calibration.intrinsics import Sighting
+from starpos.earth.refraction import Atmosphere
+from starpos.instrument.camera import Camera
+from starpos.simulation.scene import Optics, detected, expose, scene_of
+
+AIR = Atmosphere(88000.0, 12.0, 0.3)
+VACUUM = Atmosphere(0.0, 10.0, 0.0)
+# field of view in deg: size, focal length, limit of the stars
+FIELDS = {
+    3.4: ((5616, 3744), 93750.0, 10.0),
+    11: ((1024, 768), 5118.0, 8.0),
+    25: ((1000, 700), 2750.0, 6.8),
+}
+CORNER = (0.008, 0.002, 0.001, 0.001, 0.0005)  # 1 sigma of what k1, k2, p1, p2, k3 shift the corner by
+
+
+def ideal(field) -> Camera:
+    size, focal_px, _ = FIELDS[field]
+    return Camera.from_focal(*size, focal_px)
+
+
+def k1_of(camera: Camera, corner: float) -> float:
+    """The k1 that shifts the corner by this share of half the diagonal."""
+    return corner * 4 * camera.fx**2 / (camera.width**2 + camera.height**2)
+
+
+def random_camera(field, rng) -> Camera:
+    """1.5 % off in focal length, off centre by 2 % of the frame, with a lens."""
+    c = ideal(field)
+    r = np.hypot(c.width, c.height) / 2 / c.fx
+    distortion = rng.normal(0, CORNER) / [r**2, r**4, 3 * r, 3 * r, r**6]
+    f = c.fx * (1 + rng.uniform(-0.015, 0.015))
+    cx, cy = (np.array(c.centre_px) + rng.normal(0, 0.02, 2) * [c.width, c.height]).tolist()
+    return Camera(c.width, c.height, f, f * (1 + rng.normal(0, 5e-4)), cx, cy, tuple(distortion.tolist()))
+
+
+def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighting]:
+    """Identified stars all over the frames of a camera in a vacuum; the attitudes are 20 arcsec off."""
+    made = []
+    for _ in range(frames):
+        attitude = rotation.from_vector(rng.normal(0, 1, 3))
+        xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (stars, 2))
+        places = camera.directions(*xy.T) @ attitude
+        measured = xy + rng.normal(0, sigma, xy.shape)
+        covariance = np.eye(2)[None].repeat(stars, 0) * sigma**2
+        off = rotation.from_vector(rng.normal(0, 1e-4, 3)) @ attitude
+        made.append(Sighting(measured, covariance, places, np.full(stars, 1e-10), off, level, True))
+    return made
+
+
+def night(camera, frames, catalogue, rng, limit_mag, air=AIR, altitude=(60, 89), roll=(-180, 180)):
+    """Star lists of a simulated sky, and C into L of each."""
+    lists, levels = [], []
+    base = scene_of(size=(camera.width, camera.height), focal_px=camera.fx, atmosphere=air)
+    for k in range(frames):
+        scene = replace(
+            base, camera=camera, azimuth_deg=rng.uniform(0, 360), altitude_deg=rng.uniform(*altitude),
+            roll_deg=rng.uniform(*roll), optics=Optics(limit_mag=limit_mag, fwhm_px=2.2, sky_mag_arcsec2=20.0),
+        )  # fmt: skip
+        start = START + 60 * k
+        exposed = expose(scene, catalogue, start, EXPOSURE, rng)
+        lists.append(detected(scene, exposed, start + EXPOSURE / 2, EXPOSURE, rng, f"frame {k}"))
+        levels.append(scene.attitude)
+    return lists, levels
+
+
+def values(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+def prediction_errors(true: Camera, fitted: Camera, side=21) -> np.ndarray:
+    """Pixels (N, 2) by which a fitted camera errs over the frame, once attitude and scale are fitted."""
+    x, y = np.meshgrid(np.linspace(0, true.width - 1, side), np.linspace(0, true.height - 1, side))
+    xy = np.stack([x.ravel(), y.ravel()], -1)
+    v = true.directions(*xy.T)
+
+    def off(p):
+        return (fitted.scaled(1 + p[3]).project(v @ rotation.from_vector(p[:3]).T) - xy).ravel()
+
+    return least_squares(off, np.zeros(4), x_scale=np.full(4, 1e-3)).fun.reshape(-1, 2)
