@@ -14,10 +14,10 @@ from std_msgs.msg import Header
 from starpos.frames.annotate import Identified, annotate
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
-from starpos_camera.worker import Worker
 from starpos_common.messages import frame_to_message
 from starpos_common.topics import publisher, subscription
 from starpos_common.troubles import Troubles
+from starpos_common.worker import Worker
 from starpos_interfaces.msg import Solution
 
 PATIENCE_S = 2.0  # for a frame's solution; then it is shown without

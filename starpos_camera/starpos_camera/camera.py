@@ -24,7 +24,6 @@ from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import NothingYet, Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
-from starpos_camera.worker import Worker
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport
 from starpos_common.diagnostics import Diagnostics, Level, Status
@@ -32,6 +31,7 @@ from starpos_common.messages import camera_to_message, frame_to_message, message
 from starpos_common.parameters import declare
 from starpos_common.paths import path_of
 from starpos_common.topics import publisher
+from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 

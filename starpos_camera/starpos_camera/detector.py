@@ -17,12 +17,12 @@ from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
-from starpos_camera.worker import Worker
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.messages import encoding_of, message_to_frame, stars_to_message
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
 from starpos_common.troubles import Troubles
+from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
 
 IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB

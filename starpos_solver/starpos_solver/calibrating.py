@@ -24,10 +24,10 @@ from starpos.instrument.instrument import Calibration
 from starpos.sky.site import Site
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
+from starpos_common.job import Outcome, Worker
 from starpos_interfaces.srv import Calibrate, SelfCalibrate
 from starpos_solver.averaging import Averaging, News
 from starpos_solver.memory import Poses, RecentFrames, Seen, tilts_of
-from starpos_solver.worker import Outcome, Worker
 
 # Fewer headings hold no check that they are of one place; a service's caller says that they are.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4

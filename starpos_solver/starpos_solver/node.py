@@ -26,6 +26,7 @@ from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
 from starpos_common.diagnostics import Diagnostics, Level
 from starpos_common.diagnostics import Status as Report
+from starpos_common.job import Outcome, Worker
 from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos_common.paths import path_of
 from starpos_common.topics import publisher, subscription
@@ -38,7 +39,6 @@ from starpos_solver.inputs import Inputs
 from starpos_solver.memory import Seen
 from starpos_solver.settings import Settings
 from starpos_solver.tilts import TiltBuffer
-from starpos_solver.worker import Outcome, Worker
 
 WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
 POLL_S = 0.02

@@ -3,7 +3,7 @@
 
 import threading
 
-from starpos_camera.worker import Worker
+from starpos_common.worker import Worker
 
 WAIT_S = 10.0
 
