@@ -9,12 +9,12 @@ Exit status 0; 1 where it is less than 100 times real time.
 import sys
 import time
 
-from starpos_inclinometer import protocol
-from starpos_inclinometer.ascii_line import LineDecoder
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.ascii_line import LineDecoder
+from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 
 RATE_HZ, WANTED = 50, 100
 COMPENSATED = {
@@ -54,7 +54,7 @@ def serial(samples: int, values) -> float:
         arrivals = decoder.feed(line, Moment(k / RATE_HZ, k * 10**9 // RATE_HZ))
         readings += len(tilts.read(arrivals))
     took_s = time.process_time() - began_s
-    assert readings == samples and isinstance(decoder.identity, protocol.Identity)
+    assert readings == samples and isinstance(decoder.identity, mcu_protocol.Identity)
     return 1e6 * took_s / samples
 
 

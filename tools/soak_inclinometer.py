@@ -18,8 +18,8 @@ from memory import memory_mb
 
 from starpos_inclinometer.emulator import Faults, Mcu, Pty
 from starpos_inclinometer.host_clock import HostClock
-from starpos_inclinometer.mcu import McuSource
 from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.sources.mcu import McuSource
 
 RATE_HZ, ALLOWED_MB, ENOUGH = 50, 1.0, 0.6
 RESET_S, PULL_S, PULLED_S = 300.0, 420.0, 20.0

@@ -19,13 +19,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 from starpos.instrument.inclinometer import sca100t_volts
-from starpos_inclinometer import protocol, sensor
+from starpos_inclinometer.sources import mcu_protocol, sca100t
 
 FIRMWARE = 0x0100
 UNIT = 0x53494D00
 DEFAULT_RATE_HZ = 10
 ADC_NOISE_CODES = 27.0  # 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV a code
-LINE_S = protocol.SAMPLE_LINE * 10 / protocol.BAUD
+LINE_S = mcu_protocol.SAMPLE_LINE * 10 / mcu_protocol.BAUD
 WINDOW_MS = 20  # of a burst of conversions; a sample is the mean of those of its period, as the firmware's
 POLL_S = 0.2  # how soon a stop is noticed while nothing is due
 
@@ -78,7 +78,7 @@ class Mcu:
         rate_hz: int = DEFAULT_RATE_HZ,
         drift_ppm: float = 0.0,
         seed: int | None = None,
-        calibration: sensor.Calibration | None = None,
+        calibration: sca100t.Calibration | None = None,
     ):
         self.tilt = tilt
         self.noise_rad = noise_rad
@@ -87,9 +87,9 @@ class Mcu:
         self._power_up_rate = rate_hz
         self._tick = 1.0 + drift_ppm * 1e-6
         self._rng = random.Random(seed)
-        self._calibration = calibration or sensor.Calibration()
-        self._commands = protocol.LineSplitter()
-        self._codes = (sensor.CODE_ZERO, sensor.CODE_ZERO)
+        self._calibration = calibration or sca100t.Calibration()
+        self._commands = mcu_protocol.LineSplitter()
+        self._codes = (sca100t.CODE_ZERO, sca100t.CODE_ZERO)
         self.reset(0.0)
 
     def reset(self, now: float) -> bytes:
@@ -97,7 +97,7 @@ class Mcu:
         self._boot = now
         self._rate_hz = self._power_up_rate
         self._sequence = 0
-        self._status = protocol.Status.FIRST
+        self._status = mcu_protocol.Status.FIRST
         self._next = now + self._period
         return self._identify()
 
@@ -118,11 +118,11 @@ class Mcu:
         if not self.frozen:
             x, y = self.tilt(at)
             self._codes = (self._code(0, x), self._code(1, y))
-        counts = sensor.temperature_counts(self.temperature_c)
+        counts = sca100t.temperature_counts(self.temperature_c)
         ms = int((at - self._boot) * self._tick * 1e3)
-        line = protocol.sample_line(self._sequence, ms, *self._codes, counts, self._status)
+        line = mcu_protocol.sample_line(self._sequence, ms, *self._codes, counts, self._status)
         self._sequence += 1
-        self._status = protocol.Status(0)
+        self._status = mcu_protocol.Status(0)
         return line
 
     def skip_to(self, now: float):
@@ -137,9 +137,9 @@ class Mcu:
         return b"".join(self._answer(body, right) for body, right in self._commands.feed(data))
 
     def _answer(self, body: bytes, right: bool) -> bytes:
-        command = protocol.parse_command(body) if right else protocol.Reason.CHECKSUM
-        if isinstance(command, protocol.Reason):
-            return protocol.refusal_line(command)
+        command = mcu_protocol.parse_command(body) if right else mcu_protocol.Reason.CHECKSUM
+        if isinstance(command, mcu_protocol.Reason):
+            return mcu_protocol.refusal_line(command)
         name, rate = command
         if name == "R" and rate != self._rate_hz:
             self._next -= self._period
@@ -148,8 +148,10 @@ class Mcu:
         return self._identify()
 
     def _identify(self) -> bytes:
-        return protocol.identity_line(
-            protocol.Identity(protocol.VERSION, FIRMWARE, UNIT, self._rate_hz, delay_ms(self._rate_hz))
+        return mcu_protocol.identity_line(
+            mcu_protocol.Identity(
+                mcu_protocol.VERSION, FIRMWARE, UNIT, self._rate_hz, delay_ms(self._rate_hz)
+            )
         )
 
     def _code(self, axis: int, angle: float) -> int:
@@ -159,7 +161,7 @@ class Mcu:
         # The sensor's output ends at the rails.
         code = c.code(min(max(volts, 0.0), c.reference_volts))
         noisy = code + round(self._rng.gauss(0.0, ADC_NOISE_CODES))
-        return min(max(noisy, 0), sensor.CODE_MAX) if 0 < code < sensor.CODE_MAX else code
+        return min(max(noisy, 0), sca100t.CODE_MAX) if 0 < code < sca100t.CODE_MAX else code
 
 
 class Pty:
@@ -291,7 +293,13 @@ def _parser() -> argparse.ArgumentParser:
         help="white noise of a sample (%(default)s)",
     )
     add("--temperature", type=number(-40, 125), default=20.0, metavar="C")
-    add("--rate", type=int, choices=range(1, protocol.MAX_RATE_HZ + 1), default=DEFAULT_RATE_HZ, metavar="HZ")
+    add(
+        "--rate",
+        type=int,
+        choices=range(1, mcu_protocol.MAX_RATE_HZ + 1),
+        default=DEFAULT_RATE_HZ,
+        metavar="HZ",
+    )
     add(
         "--drift-ppm",
         type=number(-5e4, 5e4),

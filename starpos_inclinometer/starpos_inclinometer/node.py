@@ -9,13 +9,13 @@ from rclpy.time import Time
 from starpos_common.diagnostics import Diagnostics, Status
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher
-from starpos_inclinometer.ascii_line import AsciiSource
 from starpos_inclinometer.host_clock import HostClock
-from starpos_inclinometer.imu import TOPIC, ImuSource
-from starpos_inclinometer.mcu import McuSource
 from starpos_inclinometer.parameters import PARAMETERS, calibration, complaint
 from starpos_inclinometer.report import Reporter, step_sentence
-from starpos_inclinometer.source import Health, Phase, Reading, Source
+from starpos_inclinometer.sources.ascii_line import AsciiSource
+from starpos_inclinometer.sources.imu import TOPIC, ImuSource
+from starpos_inclinometer.sources.mcu import McuSource
+from starpos_inclinometer.sources.source import Health, Phase, Reading, Source
 from starpos_interfaces.msg import Tilt
 
 

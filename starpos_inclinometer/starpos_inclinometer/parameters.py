@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from starpos_common.parameters import FRAME_NAME, Parameter
-from starpos_inclinometer import protocol, sensor
-from starpos_inclinometer.ascii_line import UNITS, pattern_error
+from starpos_inclinometer.sources import mcu_protocol, sca100t
+from starpos_inclinometer.sources.ascii_line import UNITS, pattern_error
 
 SOURCES = ("serial", "imu", "ascii")
 NUMBER = r"[-+]?\d+\.?\d*"
@@ -32,7 +32,7 @@ PARAMETERS = (
     ),
     Parameter(
         "baud",
-        protocol.BAUD,
+        mcu_protocol.BAUD,
         "Speed of the serial line; with a wrong one nothing but garbage comes.",
         "baud",
         1200,
@@ -51,8 +51,8 @@ PARAMETERS = (
         10,
         "Samples a second from the microcontroller; above 18 Hz, the sensor's bandwidth, they add little.",
         "Hz",
-        protocol.MIN_RATE_HZ,
-        protocol.MAX_RATE_HZ,
+        mcu_protocol.MIN_RATE_HZ,
+        mcu_protocol.MAX_RATE_HZ,
     ),
     Parameter(
         "noise_stddev",
@@ -81,7 +81,7 @@ PARAMETERS = (
     ),
     Parameter(
         "divider",
-        sensor.DIVIDER,
+        sca100t.DIVIDER,
         "Divider between sensor and ADC, (R1 + R2) / R2; 0.1 % off is 36 arcsec at 10 deg of tilt.",
         "",
         1.0,
@@ -89,7 +89,7 @@ PARAMETERS = (
     ),
     Parameter(
         "reference_volts",
-        sensor.ADC_NOMINAL_REFERENCE_V,
+        sca100t.ADC_NOMINAL_REFERENCE_V,
         "Reference of the ADC and supply of the sensor that offset_volts and sensitivity were measured at; "
         "the circuit is ratiometric, so what it is at work does not matter.",
         "V",
@@ -237,10 +237,10 @@ def complaint(values: Mapping[str, Any]) -> str | None:
     return pattern_error(values["ascii.pattern"])
 
 
-def calibration(values: Mapping[str, Any]) -> sensor.Calibration:
+def calibration(values: Mapping[str, Any]) -> sca100t.Calibration:
     """The sensor's calibration that the parameters say."""
     floor = values["noise_stddev"]
-    return sensor.Calibration(
+    return sca100t.Calibration(
         values["offset_volts"],
         values["sensitivity"],
         values["divider"],

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from starpos_testing.lacking import lacks
 
-from starpos_inclinometer.continuity import Continuity
-from starpos_inclinometer.protocol import Parser, Sample
+from starpos_inclinometer.sources.mcu_continuity import Continuity
+from starpos_inclinometer.sources.mcu_protocol import Parser, Sample
 
 FIRMWARE = Path(__file__).parent.parent / "firmware"
 ELF, SIM = "inclinometer.elf", "inclinometer-sim"

@@ -3,22 +3,22 @@
 
 import numpy as np
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.host_clock import Moment
+from starpos_inclinometer.sources import mcu_protocol
 
 RATE_HZ = 50
 HEX = np.frombuffer(b"0123456789ABCDEF", np.uint8)
-IDENTITY = protocol.identity_line(protocol.Identity(1, 0x0100, 7, RATE_HZ, 14))
+IDENTITY = mcu_protocol.identity_line(mcu_protocol.Identity(1, 0x0100, 7, RATE_HZ, 14))
 
 
 def lines(n, rng, first=0):
     """n lines of an instrument at rest at RATE_HZ, (n, SAMPLE_LINE) bytes."""
     codes = 0x812345 + rng.normal(0, 770, (n, 2)).round().astype(int)
     made = (
-        protocol.sample_line(first + k, 1000 * (first + k) // RATE_HZ, x, y, 175, 0)
+        mcu_protocol.sample_line(first + k, 1000 * (first + k) // RATE_HZ, x, y, 175, 0)
         for k, (x, y) in enumerate(codes.tolist())
     )
-    return np.frombuffer(b"".join(made), np.uint8).reshape(n, protocol.SAMPLE_LINE)
+    return np.frombuffer(b"".join(made), np.uint8).reshape(n, mcu_protocol.SAMPLE_LINE)
 
 
 def flipped(sent, rng, share):
@@ -34,13 +34,13 @@ def forged(sent, rng):
     for line in sent.copy():
         where = rng.choice(digits, rng.integers(2, 7), replace=False)
         line[where] = rng.choice(HEX, len(where))
-        made.append(protocol.frame(line[1:-7].tobytes()))
+        made.append(mcu_protocol.frame(line[1:-7].tobytes()))
     return np.frombuffer(b"".join(made), np.uint8).reshape(sent.shape)
 
 
 def as_sent(sample):
     """The line of a sample that was believed."""
-    return protocol.sample_line(
+    return mcu_protocol.sample_line(
         sample.sequence, sample.milliseconds, sample.x, sample.y, sample.temperature, sample.status
     )
 
@@ -52,5 +52,5 @@ def decode(decoder, received, first=0):
         moment = Moment((first + begin + len(part)) / RATE_HZ, 0)
         for arrival in decoder.feed(part.tobytes(), moment):
             yield arrival.sample
-        if decoder.command() == protocol.identify_command():
+        if decoder.command() == mcu_protocol.identify_command():
             decoder.feed(IDENTITY, moment)

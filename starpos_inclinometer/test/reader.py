@@ -5,9 +5,9 @@ import threading
 import time
 
 from starpos_inclinometer.host_clock import HostClock
-from starpos_inclinometer.link import LinkState, SerialLink
-from starpos_inclinometer.mcu import McuDecoder
-from starpos_inclinometer.protocol import BAUD
+from starpos_inclinometer.sources.mcu import McuDecoder
+from starpos_inclinometer.sources.mcu_protocol import BAUD
+from starpos_inclinometer.sources.serial_link import LinkState, SerialLink
 
 WAIT_S = 20.0
 

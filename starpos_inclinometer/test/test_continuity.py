@@ -4,20 +4,20 @@
 import numpy as np
 import pytest
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.mcu import NEAR_CODES, McuDecoder
-from starpos_inclinometer.protocol import Status
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.mcu import NEAR_CODES, McuDecoder
+from starpos_inclinometer.sources.mcu_protocol import Status
 
 CODE = 0x812345
 
 
 def line(sequence, ms=None, x=CODE, y=CODE, status=0):
-    return protocol.sample_line(sequence, 100 * sequence if ms is None else ms, x, y, 175, status)
+    return mcu_protocol.sample_line(sequence, 100 * sequence if ms is None else ms, x, y, 175, status)
 
 
 def identity(rate_hz=10):
-    return protocol.identity_line(protocol.Identity(1, 0x0100, 7, rate_hz, 14))
+    return mcu_protocol.identity_line(mcu_protocol.Identity(1, 0x0100, 7, rate_hz, 14))
 
 
 class Line:
@@ -64,14 +64,14 @@ def test_a_fault_is_told_at_once_its_end_when_it_is_said_twice(cable):
 
 def test_without_temperature_its_number_means_nothing(cable):
     cable.send(line(0), line(1))
-    odd = protocol.sample_line(2, 200, CODE, CODE, 0xFF, Status.NO_TEMPERATURE)
+    odd = mcu_protocol.sample_line(2, 200, CODE, CODE, 0xFF, Status.NO_TEMPERATURE)
     assert numbers(cable.send(odd, line(3))) == [2, 3]
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        protocol.sample_line(3, 300, CODE, CODE, 0xAF ^ 0x40, 0),
+        mcu_protocol.sample_line(3, 300, CODE, CODE, 0xAF ^ 0x40, 0),
         line(3, x=CODE + 4 * NEAR_CODES),
         line(3, y=0xFFFFFF),
         line(3, ms=350),
@@ -131,7 +131,7 @@ def test_after_a_rejection_the_rate_is_asked_for_again(cable):
     cable.send(*(line(k, ms=20 * k) for k in range(5)), apart_s=0.02)
     assert cable.decoder.command() == b""
     assert cable.send(*(line(k) for k in range(7, 12))) == []
-    assert cable.decoder.command() == protocol.identify_command()
+    assert cable.decoder.command() == mcu_protocol.identify_command()
     assert numbers(cable.send(identity(), line(12), line(13))) and cable.counts.restarts <= 1
 
 

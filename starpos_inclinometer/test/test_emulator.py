@@ -10,10 +10,10 @@ import sys
 import numpy as np
 import pytest
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import Mcu, Pty
-from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Status
-from starpos_inclinometer.sensor import OUT_OF_RANGE, SATURATED, Sensor
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.mcu_protocol import Identity, Parser, Reason, Refusal, Status
+from starpos_inclinometer.sources.sca100t import OUT_OF_RANGE, SATURATED, Sensor
 
 COMMAND = [
     sys.executable,
@@ -60,9 +60,9 @@ def test_clock_and_sequence():
 def test_commands_are_answered():
     mcu = Mcu(seed=1)
     parser = Parser()
-    stream = protocol.identify_command() + protocol.rate_command(25)
+    stream = mcu_protocol.identify_command() + mcu_protocol.rate_command(25)
     assert [m.rate_hz for m in parser.feed(mcu.receive(stream[:5]) + mcu.receive(stream[5:]))] == [10, 25]
-    stream = protocol.frame(b"R,00") + protocol.frame(b"X") + b"$Q*0000\r\n"
+    stream = mcu_protocol.frame(b"R,00") + mcu_protocol.frame(b"X") + b"$Q*0000\r\n"
     refusals = [Refusal(r) for r in (Reason.OUT_OF_RANGE, Reason.UNKNOWN, Reason.CHECKSUM)]
     assert parser.feed(mcu.receive(stream)) == refusals
 

@@ -18,13 +18,13 @@ from reader import WAIT_S
 from starpos_testing.nodes import Listener, Process, take_domain
 from wire import Wire
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import Faults
 from starpos_inclinometer.host_clock import HostClock
-from starpos_inclinometer.mcu import McuDecoder, McuSource
 from starpos_inclinometer.parameters import PARAMETERS, calibration
 from starpos_inclinometer.report import Reporter
-from starpos_inclinometer.source import STUCK, Phase
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
+from starpos_inclinometer.sources.source import STUCK, Phase
 from starpos_interfaces.msg import Tilt
 
 TILT_DEG = (3.0, -11.0)
@@ -383,7 +383,7 @@ def test_lines_of_nonsense_with_the_right_checksum(tell):
     for row in fields:
         h = row.tobytes().hex().upper()
         body = f"T,{h[:4]},{h[4:12]},{h[12:18]},{h[18:24]},{h[24:26]},00"
-        stream.append(protocol.frame(body.encode()))
+        stream.append(mcu_protocol.frame(body.encode()))
     received = np.frombuffer(b"".join(stream), np.uint8).reshape(nonsense, -1)
     believed = list(decode(decoder, received))
     assert believed == []

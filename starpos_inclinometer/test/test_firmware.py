@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from board import ELF, FIRMWARE, SIM, Board
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import DEFAULT_RATE_HZ, Mcu
-from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Sample, Status
-from starpos_inclinometer.sensor import DIVIDER, Sensor
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.mcu_protocol import Identity, Parser, Reason, Refusal, Sample, Status
+from starpos_inclinometer.sources.sca100t import DIVIDER, Sensor
 
 BOOT_MS = 1000  # reset, calibration and a first sample
 ADC_NOISE_RAD = math.radians(0.0006)  # of one sample at 50 Hz, the sensor itself being still
@@ -58,7 +58,7 @@ def angles(messages):
 def at_rate(board, rate_hz):
     """Boot, ask for a rate; what the first samples at it say is the caller's."""
     board.run(BOOT_MS)
-    return next(m for m in board.messages(30, protocol.rate_command(rate_hz)) if isinstance(m, Identity))
+    return next(m for m in board.messages(30, mcu_protocol.rate_command(rate_hz)) if isinstance(m, Identity))
 
 
 def test_fits_the_microcontroller(built):
@@ -88,7 +88,7 @@ def test_says_who_it_is_before_the_first_sample(start):
     assert first == Identity(1, 0x0100, 0x53494D00, DEFAULT_RATE_HZ, 54)
     assert [s.status for s in samples(rest)] == [Status.FIRST] + [0] * (len(rest) - 1)
     assert [s.sequence for s in samples(rest)] == list(range(len(rest)))
-    assert board.messages(50, protocol.identify_command()).count(first) == 1
+    assert board.messages(50, mcu_protocol.identify_command()).count(first) == 1
 
 
 def test_a_unit_without_serial_number_says_0(board):
@@ -110,7 +110,7 @@ def test_takes_the_samples_of_its_rate(board, rate_hz):
     assert np.abs(steps - 1000 / rate_hz).max() < 1
     assert steps.sum() == pytest.approx(1000 / rate_hz * len(steps), abs=1)
     assert [s.status for s in got[1:]] == [0] * (len(got) - 1) and board.continuity.lost == 0
-    assert len(data) <= protocol.SAMPLE_LINE * (rate_hz * seconds + 1)
+    assert len(data) <= mcu_protocol.SAMPLE_LINE * (rate_hz * seconds + 1)
     sent_ms = board.tell("state")["line_ms"]
     assert sent_ms - got[-1].milliseconds == pytest.approx(identity.delay_ms, abs=0.3)
 
@@ -119,7 +119,7 @@ def test_the_rate_it_has_already_disturbs_no_sample(board):
     at_rate(board, 5)
     got = []
     for _ in range(40):
-        got += samples(board.messages(50, protocol.rate_command(5)))
+        got += samples(board.messages(50, mcu_protocol.rate_command(5)))
     assert len(got) == pytest.approx(10, abs=1) and {s.status for s in got[1:]} == {0}
     assert {b.milliseconds - a.milliseconds for a, b in pairwise(got)} == {200}
 
@@ -270,34 +270,34 @@ def test_the_cause_of_a_reset_is_not_that_of_the_next(board):
 
 
 COMMANDS = [
-    protocol.identify_command(),
-    protocol.rate_command(50),
-    protocol.frame(b"R,00"),
-    protocol.frame(b"R,33"),
-    protocol.frame(b"R,FF"),
-    protocol.frame(b"R,0a"),
-    protocol.frame(b"R,0"),
-    protocol.frame(b"R,00A"),
-    protocol.frame(b"R0A"),
-    protocol.frame(b"q"),
-    protocol.frame(b"QQ"),
-    protocol.frame(b"Q,"),
-    protocol.frame(b" Q"),
-    protocol.frame(b"T,0000"),
+    mcu_protocol.identify_command(),
+    mcu_protocol.rate_command(50),
+    mcu_protocol.frame(b"R,00"),
+    mcu_protocol.frame(b"R,33"),
+    mcu_protocol.frame(b"R,FF"),
+    mcu_protocol.frame(b"R,0a"),
+    mcu_protocol.frame(b"R,0"),
+    mcu_protocol.frame(b"R,00A"),
+    mcu_protocol.frame(b"R0A"),
+    mcu_protocol.frame(b"q"),
+    mcu_protocol.frame(b"QQ"),
+    mcu_protocol.frame(b"Q,"),
+    mcu_protocol.frame(b" Q"),
+    mcu_protocol.frame(b"T,0000"),
     b"$Q*0000\r\n",
     b"$R,32*0000\r\n",
-    protocol.frame(b"Q").lower(),
-    protocol.frame(b"Q").replace(b"\r", b""),
-    protocol.frame(b"Q").replace(b"\n", b""),
-    protocol.frame(b"Q").replace(b"$", b""),
-    protocol.frame(b"Q").replace(b"*", b""),
-    protocol.frame(b"Q*1234"),
+    mcu_protocol.frame(b"Q").lower(),
+    mcu_protocol.frame(b"Q").replace(b"\r", b""),
+    mcu_protocol.frame(b"Q").replace(b"\n", b""),
+    mcu_protocol.frame(b"Q").replace(b"$", b""),
+    mcu_protocol.frame(b"Q").replace(b"*", b""),
+    mcu_protocol.frame(b"Q*1234"),
     b"$*0000\r\n",
     b"$\r\n",
     b"\r\n",
-    b"$$" + protocol.frame(b"Q"),
-    b"$R,1" + protocol.frame(b"Q"),
-    bytes(range(256)) + protocol.frame(b"Q"),
+    b"$$" + mcu_protocol.frame(b"Q"),
+    b"$R,1" + mcu_protocol.frame(b"Q"),
+    bytes(range(256)) + mcu_protocol.frame(b"Q"),
 ]
 
 
@@ -312,18 +312,18 @@ def test_answers_as_the_protocol_says(board, command):
         return [(m.version, m.rate_hz) if isinstance(m, Identity) else m for m in messages]
 
     assert plain(got) == plain(said)
-    assert any(isinstance(m, Identity) for m in board.messages(100, protocol.identify_command()))
+    assert any(isinstance(m, Identity) for m in board.messages(100, mcu_protocol.identify_command()))
     assert board.parser.crc_errors == board.parser.malformed == 0
 
 
 def test_a_line_that_is_too_long_is_dropped_silently(board):
     board.run(BOOT_MS)
-    longest = protocol.frame(b"QQQQQQQQ")
+    longest = mcu_protocol.frame(b"QQQQQQQQ")
     assert len(longest) == 16
     assert Refusal(Reason.UNKNOWN) in board.messages(100, longest)
     for body in (b"QQQQQQQQQ", b"Q" * 40, b"Q" * 200):
-        assert all(isinstance(m, Sample) for m in board.messages(200, protocol.frame(body)))
-    assert any(isinstance(m, Identity) for m in board.messages(100, protocol.identify_command()))
+        assert all(isinstance(m, Sample) for m in board.messages(200, mcu_protocol.frame(body)))
+    assert any(isinstance(m, Identity) for m in board.messages(100, mcu_protocol.identify_command()))
 
 
 def test_noise_on_the_line_does_not_stop_it(board):
@@ -332,7 +332,9 @@ def test_noise_on_the_line_does_not_stop_it(board):
     for _ in range(20):
         noise = bytes(rng.choice(b"$$$QR,*0123456789ABCDEF\r\n\r\n\x00\xff") for _ in range(120))
         board.messages(100, noise)
-    assert any(isinstance(m, Identity) for m in board.messages(200, b"\r\n" + protocol.identify_command()))
+    assert any(
+        isinstance(m, Identity) for m in board.messages(200, b"\r\n" + mcu_protocol.identify_command())
+    )
     parser, continuity = board.parser, board.continuity
     assert (parser.crc_errors, parser.malformed, continuity.lost, continuity.restarts) == (0, 0, 0, 0)
 
@@ -342,7 +344,7 @@ def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
     board.messages(500)
     got = []
     for _ in range(10):
-        got += board.messages(100, protocol.identify_command() * 25)
+        got += board.messages(100, mcu_protocol.identify_command() * 25)
     got += board.messages(500)
     parser, continuity = board.parser, board.continuity
     assert (parser.crc_errors, parser.malformed, continuity.restarts) == (0, 0, 0)

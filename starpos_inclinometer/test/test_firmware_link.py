@@ -9,7 +9,7 @@ from board import Board
 from diagnostic_msgs.msg import DiagnosticArray
 from starpos_testing.nodes import Listener, Process, take_domain
 
-from starpos_inclinometer.source import Phase
+from starpos_inclinometer.sources.source import Phase
 from starpos_interfaces.msg import Tilt
 
 TILT_DEG = (3.0, -11.0)

@@ -9,11 +9,11 @@ import tracemalloc
 import numpy as np
 from corrupted import IDENTITY, RATE_HZ, as_sent, lines
 
-from starpos_inclinometer import protocol
-from starpos_inclinometer.ascii_line import LineDecoder
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.ascii_line import LineDecoder
+from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 
 VALUES = {p.name: p.default for p in PARAMETERS}
 PART = 340_000  # bytes of each kind
@@ -45,7 +45,7 @@ class Host:
             begin += len(chunk)
             self.now_s = self_s + seconds * begin / len(data)
             self.take(chunk)
-            if self.decoder.command() == protocol.identify_command():
+            if self.decoder.command() == mcu_protocol.identify_command():
                 self.take(b"\r\n" + IDENTITY)
 
 
@@ -80,12 +80,12 @@ def nonsense(rng):
             h[: rng.randrange(1, 28)],
         )
     )
-    return protocol.frame(body.encode())
+    return mcu_protocol.frame(body.encode())
 
 
 def test_a_million_fuzzed_bytes_raise_nothing_and_none_is_believed():
     rng, host = random.Random(1), Host()
-    sent = lines(3 * PART // protocol.SAMPLE_LINE, np.random.default_rng(1))
+    sent = lines(3 * PART // mcu_protocol.SAMPLE_LINE, np.random.default_rng(1))
     said = set(map(bytes, sent))
     whole = [bytes(line) for line in sent]
     third = len(whole) // 3

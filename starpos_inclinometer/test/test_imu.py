@@ -10,7 +10,7 @@ import pytest
 from sensor_msgs.msg import Imu
 from starpos_testing.nodes import Listener, Process, take_domain
 
-from starpos_inclinometer.imu import Average, Averager, BadMessage, felt
+from starpos_inclinometer.sources.imu import Average, Averager, BadMessage, felt
 from starpos_interfaces.msg import Tilt
 
 G = 9.80665

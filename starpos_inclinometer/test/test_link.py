@@ -7,9 +7,9 @@ import threading
 
 import pytest
 
-from starpos_inclinometer import link
 from starpos_inclinometer.emulator import Mcu
-from starpos_inclinometer.source import Phase
+from starpos_inclinometer.sources import serial_link
+from starpos_inclinometer.sources.source import Phase
 
 NOBODY = 65534
 
@@ -87,7 +87,7 @@ def test_lines_that_never_fit_one_another_are_said(bench, read):
 def test_nobody_else_opens_the_port(bench, read, monkeypatch, pseudo_terminal):
     """`cat` and terminal programs ask for no lock. A pseudo-terminal stays open to all: here one is taken for a port."""
     if not pseudo_terminal:
-        monkeypatch.setattr(link, "PTY_MAJORS", ())
+        monkeypatch.setattr(serial_link, "PTY_MAJORS", ())
     bench.plug(Mcu(seed=1, rate_hz=50))
     read().wait(lambda state, samples: samples)
     port = os.path.realpath(bench.path)

@@ -11,9 +11,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters
 from starpos_testing.nodes import Listener, Process, take_domain
 
-from starpos_inclinometer import sensor
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
+from starpos_inclinometer.sources import sca100t
 from starpos_interfaces.msg import Tilt
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from board import Board
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.noise import LONG, SHORT, NoiseTracker
-from starpos_inclinometer.sensor import Sensor
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.sca100t import Sensor
 
 SIGMA = math.radians(0.0035)
 
@@ -48,7 +48,7 @@ def pull_of_means(tilts, sigmas, n):
 def test_claims_hold_at_every_rate_and_noise(rate_hz, noise_deg):
     mcu = Mcu(lambda now: (0.1, -0.2), math.radians(noise_deg), rate_hz=rate_hz, seed=rate_hz)
     mcu.reset(0.0)
-    tilts, sigmas = measured(protocol.Parser().feed(b"".join(mcu.sample() for _ in range(3000))))
+    tilts, sigmas = measured(mcu_protocol.Parser().feed(b"".join(mcu.sample() for _ in range(3000))))
     assert ((tilts - tilts.mean(0)) / sigmas).std() == pytest.approx(1, abs=0.1)
     assert pull_of_means(tilts, sigmas, max(rate_hz, 5)) == pytest.approx(1, abs=0.15)
     assert np.degrees(sigmas).mean() == pytest.approx(noise_deg, rel=0.12)
@@ -60,8 +60,8 @@ def test_claims_hold_on_the_firmware(built, rate_hz, seconds):
     board = Board(built)
     board.connect()
     board.run(1000)
-    board.messages(50, protocol.rate_command(rate_hz))
-    tilts, sigmas = measured(m for m in board.messages(1000 * seconds) if isinstance(m, protocol.Sample))
+    board.messages(50, mcu_protocol.rate_command(rate_hz))
+    tilts, sigmas = measured(m for m in board.messages(1000 * seconds) if isinstance(m, mcu_protocol.Sample))
     assert board.close() == ""
     assert pull_of_means(tilts, sigmas, max(rate_hz, 2)) == pytest.approx(1, abs=0.2)
     assert 0.8 < ((tilts - tilts.mean(0)) / sigmas).std() < 1.15

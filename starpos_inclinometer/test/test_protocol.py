@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starpos_inclinometer import protocol
-from starpos_inclinometer.protocol import Identity, Parser, Reason, Refusal, Sample
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.mcu_protocol import Identity, Parser, Reason, Refusal, Sample
 
 PROTOCOL = Path(__file__).parent.parent / "PROTOCOL.md"
 
 
 def lines(n, start=0):
     return [
-        protocol.sample_line(start + i, 100 * (start + i), 0x800000 + 37 * i, 0x7F0000 + i, 0xAF, 0)
+        mcu_protocol.sample_line(start + i, 100 * (start + i), 0x800000 + 37 * i, 0x7F0000 + i, 0xAF, 0)
         for i in range(n)
     ]
 
@@ -31,28 +31,28 @@ def crc_as_avr_libc_documents_it(data, crc=0):
 
 
 def test_checksum_gives_the_published_check_values():
-    assert protocol.checksum(b"123456789") == 0x31C3  # CRC-16/XMODEM
+    assert mcu_protocol.checksum(b"123456789") == 0x31C3  # CRC-16/XMODEM
     assert (
         crc_hqx(b"123456789", 0xFFFF) == 0x29B1
     )  # CRC-16/CCITT-FALSE (IBM-3740): same polynomial, other start
     for text in (b"", b"T", b"T,0012,0000070A,800000,A8C9C5,AF,00", bytes(range(256))):
-        assert protocol.checksum(text) == crc_as_avr_libc_documents_it(text)
+        assert mcu_protocol.checksum(text) == crc_as_avr_libc_documents_it(text)
 
 
 def test_the_documents_example_is_a_line_of_this_protocol():
     example = re.search(r"\$T,[0-9A-F,]+\*[0-9A-F]{4}", PROTOCOL.read_text())[0].encode() + b"\r\n"
     (sample,) = Parser().feed(example)
     assert sample == Sample(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
-    assert example == protocol.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
-    assert len(example) == protocol.SAMPLE_LINE
+    assert example == mcu_protocol.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
+    assert len(example) == mcu_protocol.SAMPLE_LINE
 
 
 def test_messages_round_trip():
     identity = Identity(1, 0x0102, 0xDEADBEEF, 10, 20)
-    stream = protocol.identity_line(identity) + lines(1)[0] + protocol.refusal_line(Reason.UNKNOWN)
+    stream = mcu_protocol.identity_line(identity) + lines(1)[0] + mcu_protocol.refusal_line(Reason.UNKNOWN)
     messages = Parser().feed(stream)
     assert messages == [identity, Sample(0, 0, 0x800000, 0x7F0000, 0xAF, 0), Refusal(Reason.UNKNOWN)]
-    assert max(map(len, stream.splitlines(keepends=True))) <= protocol.MAX_LINE
+    assert max(map(len, stream.splitlines(keepends=True))) <= mcu_protocol.MAX_LINE
 
 
 def test_chunks_of_any_size_give_the_same_samples():
@@ -85,7 +85,7 @@ def test_memory_stays_bounded_whatever_comes():
     parser = Parser()
     for chunk in (b"$" * 10_000, b"$" + b"A" * 10_000, b"x" * 10_000, b"$T,"):
         assert parser.feed(chunk) == []
-        assert len(parser._splitter._rest) < protocol.MAX_LINE
+        assert len(parser._splitter._rest) < mcu_protocol.MAX_LINE
     assert [m.sequence for m in parser.feed(lines(1)[0])] == [0]
 
 
@@ -93,7 +93,7 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
     parser = Parser()
     line = lines(1)[0]
     assert parser.feed(line.replace(b"800000", b"800001")) == []
-    assert parser.feed(protocol.frame(b"Z,01") + protocol.frame(b"T,1,2,3")) == []
+    assert parser.feed(mcu_protocol.frame(b"Z,01") + mcu_protocol.frame(b"T,1,2,3")) == []
     assert (parser.good, parser.crc_errors, parser.malformed) == (0, 1, 2)
 
 
@@ -108,7 +108,7 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
 )
 def test_right_checksum_but_impossible_fields_are_no_message(body):
     parser = Parser()
-    assert parser.feed(protocol.frame(body)) == [] and parser.malformed == 1
+    assert parser.feed(mcu_protocol.frame(body)) == [] and parser.malformed == 1
 
 
 def test_random_bytes_never_raise_and_give_nothing():
@@ -131,7 +131,7 @@ def test_flipped_bits_never_make_a_wrong_sample(share):
     parser = Parser()
     samples = parser.feed((data ^ flips).tobytes())
     for s in samples:
-        line = protocol.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
+        line = mcu_protocol.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
         assert line == truth[s.sequence]
     clean = sum(not line.any() for line in flips.reshape(len(sent), -1))
     assert clean <= len(samples) <= clean + 3
@@ -151,9 +151,9 @@ def test_every_single_and_double_bit_error_in_a_line_is_found():
 
 
 def test_commands():
-    assert protocol.parse_command(b"Q") == ("Q", 0)
-    assert protocol.parse_command(b"R,0A") == ("R", 10)
-    assert protocol.parse_command(b"R,00") is Reason.OUT_OF_RANGE
-    assert protocol.parse_command(b"R,33") is Reason.OUT_OF_RANGE
-    assert protocol.parse_command(b"R,A") is Reason.UNKNOWN
-    assert protocol.rate_command(50) == protocol.frame(b"R,32")
+    assert mcu_protocol.parse_command(b"Q") == ("Q", 0)
+    assert mcu_protocol.parse_command(b"R,0A") == ("R", 10)
+    assert mcu_protocol.parse_command(b"R,00") is Reason.OUT_OF_RANGE
+    assert mcu_protocol.parse_command(b"R,33") is Reason.OUT_OF_RANGE
+    assert mcu_protocol.parse_command(b"R,A") is Reason.UNKNOWN
+    assert mcu_protocol.rate_command(50) == mcu_protocol.frame(b"R,32")

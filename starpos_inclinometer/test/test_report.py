@@ -8,11 +8,20 @@ import pytest
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.host_clock import Moment, Step
-from starpos_inclinometer.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.parameters import PARAMETERS, calibration
-from starpos_inclinometer.protocol import Identity, Sample
 from starpos_inclinometer.report import Reporter
-from starpos_inclinometer.source import GAP, OUT_OF_RANGE, SATURATED, STUCK, Arrival, Counts, Health, Phase
+from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
+from starpos_inclinometer.sources.source import (
+    GAP,
+    OUT_OF_RANGE,
+    SATURATED,
+    STUCK,
+    Arrival,
+    Counts,
+    Health,
+    Phase,
+)
 
 VALUES = {p.name: p.default for p in PARAMETERS}
 

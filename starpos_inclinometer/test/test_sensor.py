@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from starpos_inclinometer import sensor
-from starpos_inclinometer.protocol import Sample, Status
-from starpos_inclinometer.sensor import Calibration, Sensor
+from starpos_inclinometer.sources import sca100t
+from starpos_inclinometer.sources.mcu_protocol import Sample, Status
+from starpos_inclinometer.sources.sca100t import Calibration, Sensor
 
 
 def measure(sample, *calibration):
@@ -39,9 +39,9 @@ def test_offset_sensitivity_divider_and_reference_of_each_axis():
 
 
 def test_temperature_of_the_data_sheet():
-    assert sensor.temperature_c(197) == 0.0
-    assert sensor.temperature_c(170) == pytest.approx(24.93, abs=0.01)
-    assert [sensor.temperature_c(sensor.temperature_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
+    assert sca100t.temperature_c(197) == 0.0
+    assert sca100t.temperature_c(170) == pytest.approx(24.93, abs=0.01)
+    assert [sca100t.temperature_c(sca100t.temperature_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
         [-40, 20, 85], abs=0.47
     )
     assert math.isnan(measure(sample(status=Status.NO_TEMPERATURE)).temperature_c)
@@ -107,7 +107,7 @@ def test_temperature_polynomials(celsius):
         2.5 + 5e-4 * t - 2e-6 * t**2 + 1e-8 * t**3 + 4.0 * (1 + 1e-4 * t + 1e-6 * t**2) * 0.1,
         2.5 - 3e-4 * t + 1e-6 * t**2 + 4.0 * (1 - 2e-4 * t + 1e-8 * t**3) * -0.2,
     )
-    counts = sensor.temperature_counts(celsius)
+    counts = sca100t.temperature_counts(celsius)
     s = Sensor(WARM)
     reading = s.measure(sample(*map(WARM.code, volts), temperature=counts), 0.0)
     # one count is 0.92 deg C, of which the offset of x makes 0.007 deg
@@ -140,7 +140,7 @@ def offset_x(linear, square):
 
 def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
     c = Calibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
-    counts = sensor.temperature_counts(125.0)
+    counts = sca100t.temperature_counts(125.0)
     reading = measure(sample(x=0x880000, y=0x780000, temperature=counts), c)
     assert reading.x > 0 > reading.y and np.isfinite(reading.covariance).all()
 
@@ -174,14 +174,14 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
     ("what", "flags"),
     [
         (sample(), 0),
-        (sample(x=Calibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), sensor.OUT_OF_RANGE),
-        (sample(y=0), sensor.OUT_OF_RANGE | sensor.SATURATED),
-        (sample(y=0xFFFFFF), sensor.OUT_OF_RANGE | sensor.SATURATED),
-        (sample(lost=3), sensor.GAP),
-        (sample(restarted=True), sensor.GAP),
-        (sample(resumed=True), sensor.GAP),
-        (sample(status=Status.ADC_TIMEOUT), sensor.STUCK),
-        (sample(status=Status.NO_REFERENCE), sensor.STUCK),
+        (sample(x=Calibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), sca100t.OUT_OF_RANGE),
+        (sample(y=0), sca100t.OUT_OF_RANGE | sca100t.SATURATED),
+        (sample(y=0xFFFFFF), sca100t.OUT_OF_RANGE | sca100t.SATURATED),
+        (sample(lost=3), sca100t.GAP),
+        (sample(restarted=True), sca100t.GAP),
+        (sample(resumed=True), sca100t.GAP),
+        (sample(status=Status.ADC_TIMEOUT), sca100t.STUCK),
+        (sample(status=Status.NO_REFERENCE), sca100t.STUCK),
         (sample(status=Status.OVERRUN | 0xC0), 0),
     ],
 )
@@ -194,18 +194,18 @@ def test_flags(what, flags):
 def test_angles_stay_finite_where_there_is_none():
     reading = measure(sample(x=0, y=0xFFFFFF), Calibration(sensitivity_volts_per_g=(1.0, 1.0)))
     assert (reading.x, reading.y) == pytest.approx((-math.pi / 2, math.pi / 2))
-    assert reading.flags & sensor.OUT_OF_RANGE
+    assert reading.flags & sca100t.OUT_OF_RANGE
 
 
 def test_a_code_that_repeats_is_stuck_until_it_moves():
     s = Sensor()
     flags = [
-        s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags for i in range(sensor.STUCK_SAMPLES + 1)
+        s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags for i in range(sca100t.STUCK_SAMPLES + 1)
     ]
-    assert flags == [0] * (sensor.STUCK_SAMPLES - 1) + [sensor.STUCK] * 2
+    assert flags == [0] * (sca100t.STUCK_SAMPLES - 1) + [sca100t.STUCK] * 2
     assert s.measure(sample(y=0x812346), 9.0).flags == 0
 
 
 def test_both_codes_repeating_are_stuck_sooner():
     s = Sensor()
-    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, sensor.STUCK, sensor.STUCK]
+    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, sca100t.STUCK, sca100t.STUCK]

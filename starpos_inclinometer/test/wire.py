@@ -8,7 +8,7 @@ import threading
 import tty
 
 from starpos_inclinometer.emulator import Faults, Pty
-from starpos_inclinometer.protocol import Parser, Sample
+from starpos_inclinometer.sources.mcu_protocol import Parser, Sample
 
 WATCH_S = 0.05
 

@@ -15,7 +15,7 @@ from typing import Protocol
 import serial
 
 from starpos_inclinometer.host_clock import HostClock, Moment, Step
-from starpos_inclinometer.source import Arrival, Counts, Phase
+from starpos_inclinometer.sources.source import Arrival, Counts, Phase
 
 RETRY_S = 0.4  # so that a device that came back is read again within a second
 READ_TIMEOUT_S = 0.1  # how soon a stop, a command or silence is noticed

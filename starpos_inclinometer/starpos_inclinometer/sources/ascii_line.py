@@ -10,11 +10,11 @@ from typing import Any
 
 from starpos.instrument.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
 from starpos_inclinometer.clock import ArrivalFilter
-from starpos_inclinometer.continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.host_clock import HostClock, Moment
-from starpos_inclinometer.link import SerialLink
 from starpos_inclinometer.noise import NoiseTracker, noise_text
-from starpos_inclinometer.source import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
+from starpos_inclinometer.sources.serial_link import SerialLink
+from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
 
 MAX_LINE = 256  # bytes
 NEAR_RAD = math.radians(0.05)

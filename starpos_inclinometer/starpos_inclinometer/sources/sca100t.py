@@ -14,8 +14,8 @@ from starpos.instrument.inclinometer import (
     SCA100T_SENSITIVITY_V_PER_G,
 )
 from starpos_inclinometer.noise import NoiseTracker
-from starpos_inclinometer.protocol import Sample, Status
-from starpos_inclinometer.source import GAP, OUT_OF_RANGE, SATURATED, STUCK
+from starpos_inclinometer.sources.mcu_protocol import Sample, Status
+from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos_inclinometer.temperature import Temperature
 
 # Bipolar conversions of the AD7730 are offset binary: 0x000000 at minus full scale, 0x800000 at zero.

@@ -16,7 +16,7 @@ from starpos.instrument.inclinometer import LIMIT_RAD
 from starpos_common.topics import subscription
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.noise import NoiseTracker, noise_text
-from starpos_inclinometer.source import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
+from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
 
 TOPIC = "imu/data"
 STANDARD_GRAVITY = 9.80665  # m/s2; 0.3 % off anywhere on the ground

@@ -8,8 +8,8 @@ fit the samples around it: its number, its time or its tilt is off.
 from collections.abc import Callable
 from dataclasses import replace
 
-from starpos_inclinometer.protocol import Sample, Status
-from starpos_inclinometer.source import Arrival
+from starpos_inclinometer.sources.mcu_protocol import Sample, Status
+from starpos_inclinometer.sources.source import Arrival
 
 TOLERANCE_OF_CHANGE = 8.0  # times the usual change from sample to sample is still near
 CHANGE_SHARE = 1 / 8  # of a sample in the usual change

@@ -5,15 +5,15 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from starpos_inclinometer import protocol
 from starpos_inclinometer.clock import ArrivalFilter
-from starpos_inclinometer.continuity import Continuity, Gate, mcu_follows
 from starpos_inclinometer.host_clock import HostClock, Moment
-from starpos_inclinometer.link import SerialLink
 from starpos_inclinometer.noise import noise_text
-from starpos_inclinometer.protocol import Identity, Reason, Refusal
-from starpos_inclinometer.sensor import Calibration, Sensor
-from starpos_inclinometer.source import Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.mcu_continuity import Continuity, Gate, mcu_follows
+from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
+from starpos_inclinometer.sources.sca100t import Calibration, Sensor
+from starpos_inclinometer.sources.serial_link import SerialLink
+from starpos_inclinometer.sources.source import Arrival, Counts, Health, Reading
 
 BITS_PER_BYTE = 10  # 8N1
 NEAR_CODES = 11_000  # 0.05 deg, ten times the noise
@@ -32,7 +32,7 @@ class McuDecoder:
         self.answered = False
         self._ask = True  # who it is and at which rate
         self._refused_rate: int | None = None
-        self._parser = protocol.Parser()
+        self._parser = mcu_protocol.Parser()
         self._gate = Gate(self._follows, NEAR_CODES)
         self._continuity = Continuity()
 
@@ -71,7 +71,7 @@ class McuDecoder:
         believed = []
         self.answered = False
         for message in self._parser.feed(data):
-            if isinstance(message, protocol.Sample):
+            if isinstance(message, mcu_protocol.Sample):
                 believed += self._admit(Arrival(message, moment, self.identity))
                 continue
             self.answered = True
@@ -84,9 +84,9 @@ class McuDecoder:
 
     def command(self) -> bytes:
         if self._ask or self.identity is None:
-            return protocol.identify_command()
+            return mcu_protocol.identify_command()
         if self.identity.rate_hz != self.wanted_rate_hz and not self.refused:
-            return protocol.rate_command(self.wanted_rate_hz)
+            return mcu_protocol.rate_command(self.wanted_rate_hz)
         return b""
 
     def _admit(self, arrival: Arrival) -> list[Arrival]:
@@ -111,7 +111,7 @@ class McuTilts:
         self.sensor = Sensor()
         self.arrivals = ArrivalFilter()
         self._calibration = calibration
-        self._line_s = protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
+        self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
         self._delay_ms = DEFAULT_DELAY_MS
         self._rate_hz = 0
         self.configure(values)
