@@ -19,8 +19,8 @@ from memory import memory_mb
 
 from starpos.errors import StarposError
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import Settings
 from starpos_camera.sources.registry import SOURCES
+from starpos_camera.sources.source import Settings
 from starpos_common.parameters import ParameterError
 
 HALF_HOUR, ALLOWED_MB = 360, 2.0

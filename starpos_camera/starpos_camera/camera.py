@@ -21,8 +21,8 @@ from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import NothingYet, Settings, Source, SourceEnded
 from starpos_camera.sources.registry import SOURCES
+from starpos_camera.sources.source import NothingYet, Settings, Source, SourceEnded
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport

@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 
-from starpos_camera.sources import CaptureError, Exposure
+from starpos_camera.sources.source import CaptureError, Exposure
 from starpos_common.system_clock import StepWatch
 from starpos_interfaces.msg import Capture
 

@@ -14,8 +14,8 @@ from sensor_msgs.msg import Image
 from starpos_testing.nodes import WAIT_S
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings
 from starpos_camera.sources.alpaca import Alpaca
+from starpos_camera.sources.source import CaptureError, Settings
 from starpos_interfaces.msg import Capture
 
 SHORT = Settings(0.1, None, 5.0)

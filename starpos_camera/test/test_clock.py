@@ -10,7 +10,7 @@ from sensor_msgs.msg import Image
 from starpos_testing.lacking import lacks
 
 from starpos.frames.frame import Frame
-from starpos_camera.sources import CaptureError, Exposure
+from starpos_camera.sources.source import CaptureError, Exposure
 from starpos_camera.stamping import in_one_time
 from starpos_common.messages import stamp_to_unix
 from starpos_common.system_clock import StepWatch

@@ -18,9 +18,9 @@ from starpos_testing.lacking import lacks
 from starpos_testing.skies import raws
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings
 from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s
 from starpos_camera.sources.gphoto2_camera import nearest, seconds, sentence
+from starpos_camera.sources.source import CaptureError, Settings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 

@@ -13,8 +13,9 @@ from astropy.io import fits
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings, timing
+from starpos_camera.sources import timing
 from starpos_camera.sources.indi import Indi
+from starpos_camera.sources.source import CaptureError, Settings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 

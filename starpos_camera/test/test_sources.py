@@ -18,8 +18,8 @@ from starpos.errors import FrameError
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import Settings, SourceEnded
 from starpos_camera.sources.registry import SOURCES
+from starpos_camera.sources.source import Settings, SourceEnded
 from starpos_interfaces.msg import Capture
 
 NOW_S = 1793642400.0

@@ -12,7 +12,7 @@ from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings, SourceEnded
+from starpos_camera.sources.source import CaptureError, Settings, SourceEnded
 from starpos_camera.sources.video import Video
 from starpos_interfaces.msg import Capture
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import CaptureError, Settings
+from starpos_camera.sources.source import CaptureError, Settings
 from starpos_camera.sources.video import Video
 
 FOLDER = Path(os.environ["STARPOS_V4L2"])

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.source import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 

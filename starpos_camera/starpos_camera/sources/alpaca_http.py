@@ -16,7 +16,7 @@ from requests.adapters import HTTPAdapter
 from urllib3 import HTTPConnectionPool
 from urllib3.connection import HTTPConnection
 
-from starpos_camera.sources import CaptureError
+from starpos_camera.sources.source import CaptureError
 
 CALL_S = 5.0  # alpyca's own, for all but pictures
 STALL_S = 5.0  # between two pieces of a picture

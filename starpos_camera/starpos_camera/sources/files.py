@@ -12,7 +12,7 @@ from starpos.errors import FrameError
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import FITS, JPEG, PICTURE, RAW, read_frame
-from starpos_camera.sources import CaptureError, Exposure, NothingYet, Settings, SourceEnded, missing
+from starpos_camera.sources.source import CaptureError, Exposure, NothingYet, Settings, SourceEnded, missing
 from starpos_camera.sources.watched_folder import WatchedFolder
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture

@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 
 from starpos.errors import FrameError
 from starpos.frames.reading import RAW, decode_frame
-from starpos_camera.sources import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.gphoto2_camera import TOLERANCE, Gphoto2Camera, sentence
+from starpos_camera.sources.source import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.timing import middle_of_commanded
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import PurePosixPath
 
-from starpos_camera.sources import CaptureError
+from starpos_camera.sources.source import CaptureError
 
 TOLERANCE = 0.05  # of an exposure or a gain from one the camera has
 AFTER_S = 20.0  # from the end of an exposure to its file; slow cards take some seconds

@@ -8,9 +8,9 @@ from dataclasses import replace
 from starpos.errors import StarposError, one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
-from starpos_camera.sources import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
 from starpos_camera.sources.indi_server import Blob, Server
+from starpos_camera.sources.source import CaptureError, Exposure, Settings, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 

@@ -3,8 +3,8 @@
 
 from dataclasses import dataclass
 
-from starpos_camera.sources import CaptureError
 from starpos_camera.sources.indi_server import Blob, Device, Server
+from starpos_camera.sources.source import CaptureError
 
 LINK_S = 2.0
 ANSWER_S = 5.0  # of a driver that is asked or told something

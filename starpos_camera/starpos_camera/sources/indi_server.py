@@ -9,7 +9,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 
 from starpos.errors import one_line
-from starpos_camera.sources import CaptureError
+from starpos_camera.sources.source import CaptureError
 
 BEAT_S = 0.5  # a server that has gone is noticed two of these later
 LEAVE_S = 2.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.instrument import focal_px_of
-from starpos_camera.sources import Exposure, Settings
+from starpos_camera.sources.source import Exposure, Settings
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 

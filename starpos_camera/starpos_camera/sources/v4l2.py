@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources import CaptureError, Exposure, Settings
 from starpos_camera.sources.opencv_video import quiet
+from starpos_camera.sources.source import CaptureError, Exposure, Settings
 from starpos_interfaces.msg import Capture
 
 EXPOSURE_UNIT_S = 1e-4

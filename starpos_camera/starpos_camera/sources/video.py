@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from starpos_camera.sources import Exposure, Settings
+from starpos_camera.sources.source import Exposure, Settings
 from starpos_camera.sources.timing import read_utc
 from starpos_camera.sources.v4l2 import FORMATS, Device
 from starpos_camera.sources.video_file import SUFFIXES, Film

@@ -9,8 +9,8 @@ import numpy as np
 
 from starpos.errors import FrameError
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources import CaptureError, Exposure, Settings, SourceEnded
 from starpos_camera.sources.opencv_video import quiet
+from starpos_camera.sources.source import CaptureError, Exposure, Settings, SourceEnded
 from starpos_camera.sources.timing import read_utc
 from starpos_interfaces.msg import Capture
 
