@@ -22,7 +22,6 @@ from pathlib import Path
 from statistics import median
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "test"))
 
 WARM = 0.1  # of the faults, before memory is compared
 FAULTS_A_RESTART = 400

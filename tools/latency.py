@@ -18,7 +18,6 @@ from pathlib import Path
 from statistics import median
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "test"))
 
 QUICK_START = ROOT / "starpos_solver" / "config" / "quick_start.xml"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"

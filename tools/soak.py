@@ -13,7 +13,6 @@ from pathlib import Path
 
 from memory import memory_mb
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 DAY, WARM, ALLOWED_MB = 17280, 500, 2.0
 

@@ -2,7 +2,6 @@
 """The source `gphoto2`, on libgphoto2 with its virtual USB camera, a Nikon D750 that returns the pictures of a folder."""
 
 import re
-import sys
 import threading
 import time
 from importlib.util import find_spec
@@ -12,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
 from starpos_testing.lacking import lacks
 from starpos_testing.skies import raws
 

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame sources by themselves."""
 
-import sys
 from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "src" / "starpos" / "test"))
 from starpos_testing.lacking import lacks
 from starpos_testing.skies import raws
 
