@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo    the whole instrument on a simulated night      make test    linters, unit tests, whole-graph tests
-# make emulated   firmware on an emulated MCU, INDI camera under a sky, nodes: tools/emulated_instrument.py
+# make emulated   firmware on an emulated MCU, INDI camera under a sky, nodes: tools/demo/emulated_instrument.py
 # make build   set-up (once) and build                        make lint    linters only
 # make clean   removes what was built                         make distclean   and the set-up
 # PYTHON=python3.12 chooses the interpreter of the set-up; ARGS goes to the demo, to emulated or to pytest.
@@ -22,13 +22,13 @@ install/.built: .underlay/stamp $(INPUTS)
 	@tools/build
 
 .underlay/stamp: FORCE
-	@tools/underlay
+	@tools/setup/underlay
 
 demo: build
-	@. tools/env.sh && python tools/demo.py $(ARGS)
+	@. tools/env.sh && python tools/demo/demo.py $(ARGS)
 
 emulated: build
-	@. tools/env.sh && python tools/emulated_instrument.py $(ARGS)
+	@. tools/env.sh && python tools/demo/emulated_instrument.py $(ARGS)
 
 test: build
 	@. tools/env.sh && python tools/test.py $(ARGS)

@@ -5,6 +5,7 @@ import os
 
 import pytest
 from domain_coordinator import domain_id
+
 from starpos_testing.graph.graph import Graph
 from starpos_testing.graph.shots import SOLVER
 

@@ -3,12 +3,12 @@
 
 import numpy as np
 from sensor_msgs.msg import Image
-from starpos_testing.graph.shots import SMALL, photograph
 
 from starpos.frames.annotate import IDENTIFIED
 from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.messages import message_to_frame, message_to_stars
 from starpos_interfaces.msg import Solution, StarArray
+from starpos_testing.graph.shots import SMALL, photograph
 
 
 def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, solver, run):

@@ -6,6 +6,13 @@ import math
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
+from std_srvs.srv import Trigger
+
+from starpos.instrument import instrument_file
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos_interfaces.msg import Solution
+from starpos_interfaces.srv import SelfCalibrate
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
 from starpos_testing.graph.shots import (
@@ -16,13 +23,6 @@ from starpos_testing.graph.shots import (
     scene_at,
     shoot,
 )
-from std_srvs.srv import Trigger
-
-from starpos.instrument import instrument_file
-from starpos.instrument.inclinometer import InclinometerErrors
-from starpos.instrument.instrument import Calibration, Instrument
-from starpos_interfaces.msg import Solution
-from starpos_interfaces.srv import SelfCalibrate
 
 SITE = scene_at().site
 TILT_DEG = 0.002  # of one reading: it is what averages

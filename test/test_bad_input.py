@@ -7,9 +7,9 @@ from copy import deepcopy
 
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
-from starpos_testing.graph.shots import FULL_FOCAL_PX, SOLVER, photograph, shoot
 
 from starpos_interfaces.msg import Solution
+from starpos_testing.graph.shots import FULL_FOCAL_PX, SOLVER, photograph, shoot
 
 NAN = math.nan
 HALF_MINUTE_S = 30

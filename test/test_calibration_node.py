@@ -10,6 +10,12 @@ import pytest
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import NavSatFix
+from std_srvs.srv import Trigger
+
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos_interfaces.msg import Solution
+from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate
 from starpos_testing.graph.places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
 from starpos_testing.graph.shots import (
     FULL_FOCAL_PX,
@@ -21,12 +27,6 @@ from starpos_testing.graph.shots import (
     scene_at,
     shoot,
 )
-from std_srvs.srv import Trigger
-
-from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Calibration, Instrument
-from starpos_interfaces.msg import Solution
-from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate
 
 HERE = {"latitude": LATITUDE_DEG, "longitude": LONGITUDE_DEG}
 WRONG = misaligned()  # where the solver is told zeros

@@ -6,13 +6,13 @@ import time
 
 import pytest
 from sensor_msgs.msg import NavSatFix
-from starpos_testing.graph.graph import stamp_of
-from starpos_testing.graph.shots import LATITUDE_DEG, shoot
 from std_srvs.srv import Trigger
 
 from starpos_common.messages import stamp_to_unix, unix_to_stamp
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.srv import Solve
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import LATITUDE_DEG, shoot
 
 OK, WARN = b"\x00", b"\x01"
 METRES_PER_S = 465.1 * math.cos(math.radians(LATITUDE_DEG))

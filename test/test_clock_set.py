@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
-from starpos_testing.graph.shots import EXPOSURE_S, SOLVER, START_S, scene_at, shot_of
 
 from starpos_common.messages import stamp_to_unix, unix_to_stamp
 from starpos_interfaces.msg import Solution
+from starpos_testing.graph.shots import EXPOSURE_S, SOLVER, START_S, scene_at, shot_of
 
 AHEAD_S, LATENCY_S = 2.3, 0.5
 

@@ -11,9 +11,15 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = sorted(p.parent for p in (*ROOT.glob("*/package.xml"), *ROOT.glob("src/*/package.xml")))
 DOCUMENTS = sorted(
-    {*ROOT.glob("*.md"), *(ROOT / "test").glob("*.md"), *(d for p in PACKAGES for d in p.glob("*.md"))}
+    {d for folder in (ROOT, ROOT / "docs", ROOT / "test", *PACKAGES) for d in folder.glob("*.md")}
 )
-OF_NODES = {"camera": "starpos_camera", "detector": "starpos_camera", "inclinometer": "starpos_inclinometer"}
+OF_NODES = {
+    "camera": "starpos_camera",
+    "dashboard": "src/starpos_dashboard",
+    "detector": "starpos_camera",
+    "inclinometer": "starpos_inclinometer",
+    "solver": "starpos_solver",
+}
 
 
 def headings(document: Path) -> set[str]:
@@ -33,15 +39,15 @@ def test_every_link_and_every_tool_that_is_named_is_there(document):
         target = document.parent / path if path else document
         assert target.exists(), link
         assert not anchor or anchor in headings(target), link
-    for tool in re.findall(r"\b(?:tools|test)/\w+\.\w+", text):
+    for tool in re.findall(r"\b(?:tools|test)/(?:\w+/)*\w+\.\w+", text):
         assert any((folder / tool).exists() for folder in (ROOT, document.parent, *PACKAGES)), tool
 
 
 def test_every_parameter_is_in_its_packages_readme():
-    nodes = yaml.safe_load((ROOT / "starpos_solver" / "config" / "starpos.yaml").read_text())
+    nodes = yaml.safe_load((ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml").read_text())
     for name, node in nodes.items():
         name = name.rsplit("/", 1)[-1]
-        readme = (ROOT / OF_NODES.get(name, "starpos_solver") / "README.md").read_text()
+        readme = (ROOT / OF_NODES[name] / "README.md").read_text()
         missing = [p for p in flat(node["ros__parameters"]) if f"`{p}`" not in readme]
         assert not missing, name
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrument as it is built, devices emulated: tools/emulated_instrument.py, shortened."""
+"""The instrument as it is built, devices emulated: tools/demo/emulated_instrument.py, shortened."""
 
 import json
 import re
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from starpos_testing.lacking import lacks
 
-TOOL = Path(__file__).parent.parent / "tools" / "emulated_instrument.py"
+TOOL = Path(__file__).parent.parent / "tools" / "demo" / "emulated_instrument.py"
 FRAMES = 3
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hundreds of random faults from all inputs and no wrong fix, no crash: tools/fault_soak.py, shortened."""
+"""Hundreds of random faults from all inputs and no wrong fix, no crash: tools/faults/fault_soak.py, shortened."""
 
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
-TOOL = Path(__file__).parent.parent / "tools" / "fault_soak.py"
+TOOL = Path(__file__).parent.parent / "tools" / "faults" / "fault_soak.py"
 FAULTS, SEED, PATIENCE_S = 200, 20778, 240
 
 

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
-from starpos_testing.graph.shots import azimuth_for_heading, shoot
 
 from starpos_interfaces.msg import Solution
+from starpos_testing.graph.shots import azimuth_for_heading, shoot
 
 CARDINAL = [(0.01, 90), (359.99, 90), (90.01, 0), (89.99, 0), (180.01, -90), (179.99, -90), (270.0, 180)]
 

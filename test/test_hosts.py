@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from starpos.simulation.scene import scene_of
+from starpos_interfaces.msg import Solution
 from starpos_testing.graph import hosts
 from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, traffic, two_hosts
 from starpos_testing.graph.shots import SMALL
 
-from starpos.simulation.scene import scene_of
-from starpos_interfaces.msg import Solution
-
 NIGHT = Path(__file__).parent / "data" / "night"
-LOSSY = Path(__file__).parents[1] / "starpos_solver" / "config" / "lossy_link.xml"
+LOSSY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "config" / "lossy_link.xml"
 PATIENCE_S = 90.0
 
 
@@ -40,7 +40,7 @@ def play(instrument, folder: Path, together: bool) -> dict:
     robot.start(folder / "solver", "starpos_solver", "solver", *(f"{k}:={v}" for k, v in known.items()))
     mount.start(folder / "detector", "starpos_camera", "detector", "use_sim_time:=true")
     arguments = (str(NIGHT), "--rate", "0", "--wait", "30")
-    replay = mount.start(folder / "replay", "starpos_solver", "replay", arguments=arguments)
+    replay = mount.start(folder / "replay", "starpos_bringup", "replay", arguments=arguments)
     count = len(truth["frames"])
     instrument.wait(lambda: all(len(heard) == count for heard in ear.heard.values()))
     assert replay.wait() == 0, replay.output

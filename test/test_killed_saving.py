@@ -7,13 +7,13 @@ import sys
 
 import pytest
 from sensor_msgs.srv import SetCameraInfo
-from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
 from starpos.instrument import camera_file, instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_common.messages import camera_to_message
 from starpos_interfaces.srv import SaveCalibration
+from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
 KILLS, KILLED_NODES = 100, 3
 CALLS = 8  # that a service keeps

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
+
 from starpos_testing.graph.shots import LATITUDE_DEG, shoot
 
-RECIPE = Path(get_package_share_directory("starpos_solver")) / "config" / "robot_localization.yaml"
+RECIPE = Path(get_package_share_directory("starpos_bringup")) / "config" / "robot_localization.yaml"
 X, Y, YAW = 0, 1, 5  # of robot_localization's 15 state variables
 WIDEST_FIX_M = 1e6  # self_calibration's first
 

@@ -6,11 +6,11 @@ import struct
 
 import numpy as np
 import pytest
-from starpos_testing.graph.shots import PRESSURE_PA, shoot
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.srv import Solve
+from starpos_testing.graph.shots import PRESSURE_PA, shoot
 
 
 def test_solve_says_why_there_is_nothing_to_solve(graph, solver):

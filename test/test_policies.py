@@ -10,10 +10,11 @@ from xml.etree import ElementTree
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
+
 from starpos_testing.graph.graph import WAIT_S
 
 NIGHT = Path(__file__).parent / "data" / "night"
-POLICY = Path(__file__).parents[1] / "starpos_solver" / "sros2" / "policies.xml"
+POLICY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "sros2" / "policies.xml"
 SKY = ("source:=simulated", "focal_mm:=14.8", "simulated.width:=640", "simulated.height:=427", "cadence:=0.5")
 RULES = {("topics", "publish"), ("topics", "subscribe"), ("services", "reply")}
 
@@ -119,8 +120,8 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     secured("starpos_camera", "camera", sim, *SKY)
     secured("starpos_camera", "detector", sim)
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
-    secured("starpos_solver", "record", arguments=(str(tmp_path / "bag"), "--images"))
-    dashboard = secured("starpos_solver", "dashboard", sim, "port:=0")
+    secured("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), "--images"))
+    dashboard = secured("starpos_dashboard", "dashboard", sim, "port:=0")
     graph.wait(lambda: "http://" in dashboard.output)
     address = "http://" + dashboard.output.split("http://")[1].split()[0]
     with urllib.request.urlopen(f"{address}/events?frame", timeout=WAIT_S):
@@ -135,11 +136,17 @@ def test_the_policy_holds_for_camera_and_detector_in_one_process(graph, secured)
 
 
 def test_the_policy_holds_for_a_replay(graph, secured):
-    secured("starpos_solver", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "30"))
+    secured("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "30"))
     hold(graph, "/starpos/replay")
 
 
 def test_every_executable_has_an_enclave():
-    packages = ("starpos_camera", "starpos_inclinometer", "starpos_solver")
+    packages = (
+        "starpos_bringup",
+        "starpos_camera",
+        "starpos_dashboard",
+        "starpos_inclinometer",
+        "starpos_solver",
+    )
     made = {e.name for e in entry_points(group="console_scripts") if e.module.split(".")[0] in packages}
     assert {f"/starpos/{name}" for name in made - {"emulator"}} == set(allowed())  # a device, no node

@@ -9,9 +9,9 @@ import pytest
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
-from starpos_testing.graph.shots import photograph, shoot
 
 from starpos_interfaces.msg import Solution
+from starpos_testing.graph.shots import photograph, shoot
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def recorded(graph, run, tmp_path):
     """recorded(*options): start to record; stop(): the bag's messages by topic."""
 
     def recorded(*options):
-        process = run("starpos_solver", "record", arguments=(str(tmp_path / "bag"), *options))
+        process = run("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), *options))
         graph.wait(lambda: "recording" in process.output)
         graph.wait(
             lambda: graph.stars.get_subscription_count() == 2 and graph.tilt.get_subscription_count() == 2
@@ -84,7 +84,7 @@ def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
 
     graph.solutions.clear()
     again = run(
-        "starpos_solver", "replay", arguments=(str(tmp_path / "bag"), "--rate", "0", "--inputs", "stars")
+        "starpos_bringup", "replay", arguments=(str(tmp_path / "bag"), "--rate", "0", "--inputs", "stars")
     )
     assert again.wait() == 0, again.output
     for shot, before in zip(shots, answers, strict=True):
@@ -109,7 +109,7 @@ def test_a_full_disk_ends_the_recording_with_a_sentence(graph, solver, recorded)
 
 def test_the_recorder_hears_a_publisher_of_best_effort_where_it_is_told(graph, run, tmp_path):
     override = "qos_overrides./tilt.subscription.reliability:=best_effort"
-    process = run("starpos_solver", "record", override, arguments=(str(tmp_path / "bag"),))
+    process = run("starpos_bringup", "record", override, arguments=(str(tmp_path / "bag"),))
     graph.wait(lambda: "recording" in process.output)
 
     def reliability(topic):
@@ -127,7 +127,7 @@ def test_nothing_is_overwritten_and_nothing_made_in_a_place_that_is_none(run, tm
         (tmp_path / "file" / "x", "no bag can be made"),
     ):
         (tmp_path / "file").touch()
-        process = run("starpos_solver", "record", arguments=(str(place),))
+        process = run("starpos_bringup", "record", arguments=(str(place),))
         assert process.wait() == 2 and words in process.output and "Traceback" not in process.output, (
             process.output
         )

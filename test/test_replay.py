@@ -7,6 +7,7 @@ import signal
 import sqlite3
 from pathlib import Path
 
+import make_bag
 import numpy as np
 import pytest
 import yaml
@@ -14,14 +15,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
-from starpos_bringup.recording.bag_writer import offered_qos
-from starpos_testing.graph import make_bag
-from starpos_testing.graph.graph import stamp_of
-from starpos_testing.graph.shots import photograph
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from starpos_bringup.recording.bag_writer import offered_qos
 from starpos_interfaces.msg import Solution
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import photograph
 
 NIGHT = Path(__file__).parent / "data" / "night"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -34,7 +34,7 @@ def truth():
 
 
 def test_a_replay_that_nobody_hears_says_so(graph, run):  # before there is an instrument
-    replay = run("starpos_solver", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
+    replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
     assert replay.wait() == 0
     assert "nobody subscribes to" in replay.output and "/stars" in replay.output, replay.output
 
@@ -62,7 +62,7 @@ def play(graph, run, truth):
     """The bag as fast as it is taken: (solution, imu) of each frame, by stamp."""
     assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
     graph.solutions.clear(), graph.imus.clear()
-    replay = run("starpos_solver", "replay", arguments=(str(NIGHT), "--rate", "0"))
+    replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0"))
     assert replay.wait() == 0, replay.output
     count = len(truth["frames"])
     graph.wait(lambda: len(graph.solutions) == len(graph.imus) == count, f"for all; {replay.output}")
@@ -139,7 +139,7 @@ STRING = "std_msgs/msg/String"
 def test_latched_topics_reach_latecomers_and_a_signal_ends_it(graph, run, tmp_path, plugin):
     messages = [(S, "/words", STRING, text("early")), (1000 * S, "/words", STRING, text("late"))]
     bag = write_bag(tmp_path / "bag", messages, plugin)
-    replay = run("starpos_solver", "replay", arguments=(str(bag), "--wait", "0"))
+    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--wait", "0"))
     graph.wait(lambda: graph.node.count_publishers("/words"))
     clock = graph.hear(Clock, "/clock")
     graph.wait(lambda: len(clock) > 10)  # it is past its first message
@@ -157,7 +157,7 @@ def test_a_single_file_and_chosen_topics(graph, run, tmp_path):
     bag = write_bag(tmp_path / "bag", messages)
     heard = [graph.hear(String, f"/words{k}", LATCHED) for k in range(2)]
     replay = run(
-        "starpos_solver", "replay", arguments=(str(bag / "bag.mcap"), "--topics", "/words1", "--rate", "0")
+        "starpos_bringup", "replay", arguments=(str(bag / "bag.mcap"), "--topics", "/words1", "--rate", "0")
     )
     assert replay.wait() == 0, replay.output
     graph.wait(lambda: len(heard[1]) == 4)
@@ -177,7 +177,7 @@ def test_what_a_bag_may_not_bring(graph, run, tmp_path):
     ]
     bag = write_bag(tmp_path / "bag", messages)
     heard, clock = graph.hear(String, "/words", LATCHED), graph.hear(Clock, "/clock")
-    replay = run("starpos_solver", "replay", arguments=(str(bag), "--rate", "0"))
+    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--rate", "0"))
     assert replay.wait() == 0, replay.output
     graph.wait(lambda: heard)
     assert [m.data for m in heard] == ["good"]
@@ -242,7 +242,7 @@ def a_broken_database(tmp_path):
 )  # fmt: skip
 def test_what_is_no_bag_is_refused_in_a_sentence(domain, run, tmp_path, make):
     bag, words = make(tmp_path)
-    replay = run("starpos_solver", "replay", arguments=(str(bag),))
+    replay = run("starpos_bringup", "replay", arguments=(str(bag),))
     assert replay.wait() == 2
     assert words in replay.output and str(tmp_path) in replay.output
     assert "Traceback" not in replay.output and all(
@@ -260,7 +260,9 @@ def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_ma
         for said in heard.values():
             said.clear()
         replay = run(
-            "starpos_solver", "replay", arguments=(str(bag), "--rate", "0", "--inputs", inputs, "--wait", "3")
+            "starpos_bringup",
+            "replay",
+            arguments=(str(bag), "--rate", "0", "--inputs", inputs, "--wait", "3"),
         )
         assert replay.wait() == 0, replay.output
         graph.wait(lambda names=played: all(heard[name] for name in names))
@@ -277,7 +279,7 @@ def test_bad_calls(run):
         ((str(NIGHT), "--inputs", "stars", "--topics", "/stars"), "not allowed with"),
         ((str(NIGHT), "--ros-args", "-p"), "replay: "),
     ):
-        replay = run("starpos_solver", "replay", arguments=words)
+        replay = run("starpos_bringup", "replay", arguments=words)
         assert replay.wait() == 2 and said in replay.output and "Traceback" not in replay.output, (
             replay.output
         )
@@ -286,6 +288,6 @@ def test_bad_calls(run):
 def test_without_rosbags(run, tmp_path, monkeypatch):
     (tmp_path / "rosbags.py").write_text("raise ImportError\n")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    replay = run("starpos_solver", "replay", arguments=(str(NIGHT),))
+    replay = run("starpos_bringup", "replay", arguments=(str(NIGHT),))
     assert replay.wait() == 2
     assert replay.output == "replay: rosbags, which reads bags, is not installed: pip install rosbags\n"

@@ -6,10 +6,10 @@ import signal
 import time
 
 import pytest
-from starpos_testing.graph.graph import stamp_of
-from starpos_testing.graph.shots import SMALL, focal_of
 
 from starpos_interfaces.msg import Solution
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import SMALL, focal_of
 
 LATITUDE_DEG, LONGITUDE_DEG = 35.7046, 51.4106  # the simulated sky's
 AIR = ("101325.0", "15.0", "0.5")

@@ -7,12 +7,12 @@ import math
 import subprocess
 
 import pytest
-from starpos_testing.graph.shots import focal_of
 
 from starpos.instrument.inclinometer import Tilt
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.msg import Tilt as TiltMessage
+from starpos_testing.graph.shots import focal_of
 
 SIZE = (2000, 1400)
 FOCAL_MM, PIXEL_UM = focal_of(SIZE) * 6.4e-3, 6.4

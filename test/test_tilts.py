@@ -6,11 +6,11 @@ from copy import deepcopy
 from dataclasses import replace
 
 import pytest
-from starpos_testing.graph.shots import SOLVER, shoot
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.srv import Solve
+from starpos_testing.graph.shots import SOLVER, shoot
 
 ANSWER = (
     "latitude",

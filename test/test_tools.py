@@ -40,7 +40,7 @@ def run(tool, *arguments, cwd=None):
     return done.returncode, done.stdout
 
 
-@pytest.mark.parametrize("tool", ["demo.py", "emulated_instrument.py"])
+@pytest.mark.parametrize("tool", ["demo/demo.py", "demo/emulated_instrument.py"])
 @pytest.mark.parametrize("frames", ["0", "-3"])
 def test_a_run_of_no_frames_is_refused(tmp_path, tool, frames):
     status, said = run(tool, "--frames", frames, cwd=tmp_path)
@@ -60,12 +60,12 @@ def test_a_run_of_no_frames_is_refused(tmp_path, tool, frames):
     ],
 )
 def test_a_soak_with_words_that_are_none_ends_in_a_sentence(words, sentence):
-    assert run("soak_camera.py", "indi", *words) == (2, sentence + "\n")
+    assert run("soaks/soak_camera.py", "indi", *words) == (2, sentence + "\n")
 
 
 @pytest.mark.parametrize(("outcome", "bad"), OUTCOMES.items(), ids=["passed", "skipped", "failed", "broken"])
 def test_a_fault_whose_test_did_not_run_is_not_passed(tmp_path, monkeypatch, outcome, bad):
-    monkeypatch.syspath_prepend(str(TOOLS))
+    monkeypatch.syspath_prepend(str(TOOLS / "faults"))
     from faults import rows_of
 
     report = tmp_path / "report.xml"
@@ -83,14 +83,16 @@ def test_every_package_is_tested_with_ubuntus_versions_too():
     spec = importlib.util.spec_from_file_location("tools_test", TOOLS / "test.py")
     tests = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tests)
-    carrying = {str(f.parents[1].relative_to(tests.ROOT)) for f in tests.ROOT.glob("starpos*/test/test_*.py")}
-    assert set(tests.UBUNTU) == carrying | {"src/starpos"}
+    carrying = {
+        str(f.parents[1].relative_to(tests.ROOT)) for f in tests.ROOT.glob("**/starpos*/test/test_*.py")
+    }
+    assert set(tests.UBUNTU) == carrying
     assert all((tests.ROOT / path).is_file() for path in tests.NEWEST_ONLY)
 
 
 def test_no_profile_is_none_and_no_empty_path_to_one(monkeypatch):
     """Fast DDS prints an error for an empty path."""
-    monkeypatch.syspath_prepend(str(TOOLS))
+    monkeypatch.syspath_prepend(str(TOOLS / "benchmarks"))
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/home/robot/mine.xml")
     import latency
 
@@ -102,6 +104,6 @@ def test_no_profile_is_none_and_no_empty_path_to_one(monkeypatch):
 
 def test_a_signal_that_another_thread_of_the_sky_gets_does_not_end_it():
     numbers = subprocess.run(
-        [sys.executable, "-c", SIGNALLED], cwd=TOOLS, capture_output=True, text=True, check=False
+        [sys.executable, "-c", SIGNALLED], cwd=TOOLS / "demo", capture_output=True, text=True, check=False
     )
     assert (numbers.returncode, numbers.stdout) == (0, "29 15\n"), numbers.stderr

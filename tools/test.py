@@ -3,7 +3,7 @@
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
-the versions that Ubuntu 24.04 has (tools/ubuntu-24.04.txt) in an environment of its own; `test.py --both` runs all.
+the versions that Ubuntu 24.04 has (tools/setup/ubuntu-24.04.txt) in an environment of its own; `test.py --both` runs all.
 """
 
 import os
@@ -28,7 +28,7 @@ LANES = 3  # at once: some compute, others wait for nodes
 LONGEST_FIRST = (
     "starpos", "graph", "starpos_camera", "starpos, Ubuntu's", "starpos_inclinometer", "starpos_camera, Ubuntu's",
 )  # fmt: skip
-VERSIONS = "tools/ubuntu-24.04.txt"
+VERSIONS = "tools/setup/ubuntu-24.04.txt"
 UBUNTU = ("src/starpos", "starpos_camera", "starpos_common", "starpos_inclinometer", "starpos_solver")
 # with the newest only, since they wait for nodes and for programs of others: CI is to end soon
 NEWEST_ONLY = [

@@ -16,6 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import yaml
+
 from starpos_testing.lacking import lacks
 
 WIDTH, HEIGHT = 64, 48
@@ -31,7 +32,7 @@ def free_port() -> int:
 def needs(*modules: str):
     for module in modules:
         if not find_spec(module):
-            lacks("-r tools/counterparts.txt", "pip install")
+            lacks("-r tools/setup/counterparts.txt", "pip install")
 
 
 class Simulator:

@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from starpos_testing.nodes import Listener, Process, take_domain
 
 from starpos.simulation.night_on_disk import write_fits
 from starpos.simulation.scene import expose, render, scene_of
 from starpos.sky.catalogue import load as load_catalogue
+from starpos_testing.nodes import Listener, Process, take_domain
 
 SIZE = (640, 480)
 FOCAL_PX = 7812.5  # 50 mm on 6.4 um

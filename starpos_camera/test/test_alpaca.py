@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from alpaca_servers import HEIGHT, WIDTH, Liar, Simulator, free_port, image_bytes, needs
 from sensor_msgs.msg import Image
-from starpos_testing.nodes import WAIT_S
 
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.source import CaptureError, Settings
 from starpos_interfaces.msg import Capture
+from starpos_testing.nodes import WAIT_S
 
 SHORT = Settings(0.1, None, 5.0)
 LONG = Settings(2.0, None, 5.0)

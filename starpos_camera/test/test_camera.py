@@ -11,8 +11,6 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
-from starpos_testing.lacking import lacks
-from starpos_testing.skies import raws
 
 from starpos.detection import detect
 from starpos.frames.reading import read_frame
@@ -23,6 +21,8 @@ from starpos.sky.catalogue import load as load_catalogue
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
+from starpos_testing.lacking import lacks
+from starpos_testing.skies import raws
 
 SMALL = ("source:=simulated", "focal_mm:=50", "simulated.width:=640", "simulated.height:=480")
 OK, WARN, ERROR = 0, 1, 2

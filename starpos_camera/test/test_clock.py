@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
-from starpos_testing.lacking import lacks
 
 from starpos.frames.frame import Frame
 from starpos_camera.sources.source import CaptureError, Exposure
@@ -15,6 +14,7 @@ from starpos_camera.stamping import in_one_time
 from starpos_common.messages import stamp_to_unix
 from starpos_common.system_clock import StepWatch
 from starpos_interfaces.msg import Capture
+from starpos_testing.lacking import lacks
 
 WARN = 1
 PLAYED = ("files.loop:=true", "files.restamp:=true", "cadence:=0.1")

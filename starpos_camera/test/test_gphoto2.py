@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
-from starpos_testing.lacking import lacks
-from starpos_testing.skies import raws
 
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s
@@ -20,6 +18,8 @@ from starpos_camera.sources.gphoto2_camera import nearest, seconds, sentence
 from starpos_camera.sources.source import CaptureError, Settings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
+from starpos_testing.lacking import lacks
+from starpos_testing.skies import raws
 
 TENTH = Settings(0.1, None, 5.0)
 AS_IT_IS = Settings(None, None, 5.0)

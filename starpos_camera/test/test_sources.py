@@ -6,8 +6,6 @@ from importlib.util import find_spec
 import cv2
 import numpy as np
 import pytest
-from starpos_testing.lacking import lacks
-from starpos_testing.skies import raws
 
 from starpos.detection import detect
 from starpos.errors import FrameError
@@ -17,6 +15,8 @@ from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import Settings, SourceEnded
 from starpos_interfaces.msg import Capture
+from starpos_testing.lacking import lacks
+from starpos_testing.skies import raws
 
 NOW_S = 1793642400.0
 SETTINGS = Settings(None, None, 5.0)

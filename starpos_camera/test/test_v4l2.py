@@ -12,11 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from starpos_testing.lacking import lacks
 
 from starpos_camera.sources.source import CaptureError
 from starpos_camera.sources.v4l2 import _from_jpeg
 from starpos_interfaces.msg import Capture
+from starpos_testing.lacking import lacks
 
 HERE = Path(__file__).parent
 PERIOD_S, TRANSFER_S = 0.04, 0.01  # of the emulated camera

@@ -9,10 +9,9 @@ import subprocess
 import tty
 from pathlib import Path
 
-from starpos_testing.lacking import lacks
-
 from starpos_inclinometer.sources.mcu_continuity import Continuity
 from starpos_inclinometer.sources.mcu_protocol import Parser, Sample
+from starpos_testing.lacking import lacks
 
 FIRMWARE = Path(__file__).parent.parent / "firmware"
 ELF, SIM = "inclinometer.elf", "inclinometer-sim"

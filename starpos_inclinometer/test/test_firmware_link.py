@@ -7,10 +7,10 @@ import signal
 import pytest
 from board import Board
 from diagnostic_msgs.msg import DiagnosticArray
-from starpos_testing.nodes import Listener, Process, take_domain
 
 from starpos_inclinometer.sources.source import Phase
 from starpos_interfaces.msg import Tilt
+from starpos_testing.nodes import Listener, Process, take_domain
 
 TILT_DEG = (3.0, -11.0)
 

@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
-from starpos_testing.nodes import Listener, Process, take_domain
 
 from starpos_inclinometer.sources.imu import Average, Averager, BadMessage, felt
 from starpos_interfaces.msg import Tilt
+from starpos_testing.nodes import Listener, Process, take_domain
 
 G = 9.80665
 PERIOD_NS = 10_000_000

@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters
-from starpos_testing.nodes import Listener, Process, take_domain
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
-from starpos_inclinometer.sources import sca100t
 from starpos_interfaces.msg import Tilt
+from starpos_testing.nodes import Listener, Process, take_domain
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -159,4 +158,4 @@ def test_readme_names_every_parameter():
 
 def test_flags_are_those_of_the_message():
     for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "GAP"):
-        assert getattr(sensor, name) == getattr(Tilt, name)
+        assert getattr(sca100t, name) == getattr(Tilt, name)

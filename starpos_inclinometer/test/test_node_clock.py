@@ -8,11 +8,11 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
-from starpos_testing.nodes import WAIT_S, take_domain
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import InclinometerNode
 from starpos_interfaces.msg import Tilt
+from starpos_testing.nodes import WAIT_S, take_domain
 
 
 @pytest.fixture

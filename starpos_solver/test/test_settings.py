@@ -4,12 +4,12 @@
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
-from starpos_testing.nodes import take_domain
 
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_solver.settings import Settings
+from starpos_testing.nodes import take_domain
 
 CAMERA = Camera.from_focal(1000, 800, 2000.0)
 

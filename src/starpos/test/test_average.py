@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.fields import ARCSEC, UTC, Field, random_field, turn
 
 from starpos import rotation
 from starpos.averaging.average import Averager, average
@@ -13,6 +12,7 @@ from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, correlation
 from starpos.instrument.inclinometer import Tilt
+from starpos_testing.skies.fields import ARCSEC, UTC, Field, random_field, turn
 
 STATE = earth_state(UTC)
 

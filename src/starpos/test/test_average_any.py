@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.fields import ARCSEC, UTC, Field
 
 from starpos import rotation
 from starpos.averaging.average import Averager, average
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.errors import FixError
 from starpos.instrument.inclinometer import Tilt
+from starpos_testing.skies.fields import ARCSEC, UTC, Field
 
 STATE = earth_state(UTC)
 NOISE, A3_ERROR = 12.6 * ARCSEC, 5.0 * ARCSEC

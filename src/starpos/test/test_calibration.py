@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.scenes import START
-from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.averaging.average import average
 from starpos.calibration.misalignment import VALID_DAYS, calibrate_at
@@ -16,6 +14,8 @@ from starpos.fix.solver import Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration
+from starpos_testing.skies.scenes import START
+from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 NOISE_ARCSEC = 12.6  # of one reading
 

@@ -6,6 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from starpos.calibration.camera import calibrate
+from starpos.calibration.intrinsics import rms
+from starpos.detection import detect
+from starpos.earth.refraction import Atmosphere
+from starpos.errors import CalibrationError, InstrumentError
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import SATURATED, Stars, no_stars
+from starpos.instrument.camera import Camera
 from starpos_testing.skies.lenses import (
     AIR,
     FIELDS,
@@ -17,15 +26,6 @@ from starpos_testing.skies.lenses import (
     values,
 )
 from starpos_testing.skies.scenes import random_stars, with_false_stars
-
-from starpos.calibration.camera import calibrate
-from starpos.calibration.intrinsics import rms
-from starpos.detection import detect
-from starpos.earth.refraction import Atmosphere
-from starpos.errors import CalibrationError, InstrumentError
-from starpos.frames.reading import read_frame
-from starpos.frames.stars import SATURATED, Stars, no_stars
-from starpos.instrument.camera import Camera
 
 
 def flipped(stars: Stars) -> Stars:

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
 from starpos.calibration.intrinsics import PARAMETERS
 from starpos.cli import main
@@ -15,6 +14,7 @@ from starpos.instrument import camera_file
 from starpos.instrument.instrument import Calibration
 from starpos.simulation.night_on_disk import write_stars
 from starpos.utc import utc_text
+from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
 INSTRUMENT = "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncamera: {}\n"

@@ -6,10 +6,10 @@ from datetime import datetime, timezone
 
 import numpy as np
 import pytest
-from starpos_testing.skies import raws
 
 from starpos.cli import main
 from starpos.frames.reading import read_frame
+from starpos_testing.skies import raws
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")

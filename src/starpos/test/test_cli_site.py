@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 from starpos.cli import main
 from starpos.instrument import camera_file, instrument_file
 from starpos.simulation.night_on_disk import write_stars
 from starpos.utc import utc_text
+from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 LAT, LON = 35.7046, 51.4106
 PLACE = ("--site", str(LAT), str(LON))

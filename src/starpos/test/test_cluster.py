@@ -8,7 +8,6 @@ import socket
 from pathlib import Path
 
 import pytest
-from starpos_testing.skies.raws import needs
 from test_cli_jobs import archive, frames, run, solve  # noqa: F401  # a fixture
 
 import starpos
@@ -16,6 +15,7 @@ from starpos.errors import FrameError
 from starpos.parallel import cluster as cluster_module
 from starpos.parallel.cluster import Cluster, ClusterError
 from starpos.parallel.same import same_here
+from starpos_testing.skies.raws import needs
 
 pytestmark = needs("distributed")
 

@@ -2,12 +2,12 @@
 import numpy as np
 import pytest
 from scipy import ndimage
-from starpos_testing.skies.rendered import BIAS, bound, coloured, field, grid, match, noisy
 
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos_testing.skies.rendered import BIAS, bound, coloured, field, grid, match, noisy
 
 TRAIL = (2.6, -2.2)  # px: half a second of the sky
 

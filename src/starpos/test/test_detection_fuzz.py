@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from starpos_testing.skies.rendered import field, grid, noisy
 
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.frames.frame import PATTERNS, Frame, to_unsigned
+from starpos_testing.skies.rendered import field, grid, noisy
 
 TYPES = [
     "u1",

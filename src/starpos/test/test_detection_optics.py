@@ -3,10 +3,10 @@
 
 import numpy as np
 import pytest
-from starpos_testing.skies.rendered import bound, errors, field, grid, match, noisy, rms
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame
+from starpos_testing.skies.rendered import bound, errors, field, grid, match, noisy, rms
 
 SIZE, TRAIL = (900, 1300), (2.6, -2.2)
 FAINT, BRIGHT = 3000.0, 60000.0

@@ -2,11 +2,11 @@
 import cv2
 import numpy as np
 import pytest
-from starpos_testing.skies.rendered import field, grid, match
 
 from starpos.detection import detect
 from starpos.detection.plane import plane_of
 from starpos.frames.frame import PATTERNS, Frame
+from starpos_testing.skies.rendered import field, grid, match
 
 OF_MOSAIC = {
     "rggb": "BayerBG",

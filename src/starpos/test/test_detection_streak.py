@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from starpos_testing.skies.rendered import bound, field, grid, match, noisy
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame
 from starpos.frames.stars import ELONGATED
+from starpos_testing.skies.rendered import bound, field, grid, match, noisy
 
 SIZE = (700, 900)
 

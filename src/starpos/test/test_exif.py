@@ -9,12 +9,12 @@ from datetime import datetime, timezone
 import cv2
 import numpy as np
 import pytest
-from starpos_testing.skies import raws
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import decode_frame, read_frame
+from starpos_testing.skies import raws
 
 MOSAIC = raws.mosaic()
 SHOWN_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()  # raws.START, were it UTC

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.fields import ARCSEC, PAPER, UTC, Field, random_field, turn
 
 from starpos import rotation
 from starpos.earth.orientation import curvature_radii_m, earth_state
@@ -14,6 +13,7 @@ from starpos.errors import FixError
 from starpos.fix.fix import Mounting
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos_testing.skies.fields import ARCSEC, PAPER, UTC, Field, random_field, turn
 
 STATE = earth_state(UTC)
 PLACES = {

@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
 
 from starpos.identification import Sky, identify, identify_directions, search, triangles
 from starpos.identification.lookup import LOOSE_PX
 from starpos.instrument.camera import Camera
+from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
 
 FIELDS = {
     "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),

@@ -5,16 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.lenses import (
-    FIELDS,
-    VACUUM,
-    ideal,
-    k1_of,
-    prediction_errors,
-    random_camera,
-    sightings,
-    values,
-)
 
 from starpos import rotation
 from starpos.calibration.intrinsics import (
@@ -29,6 +19,16 @@ from starpos.calibration.intrinsics import (
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.instrument.camera import Camera
+from starpos_testing.skies.lenses import (
+    FIELDS,
+    VACUUM,
+    ideal,
+    k1_of,
+    prediction_errors,
+    random_camera,
+    sightings,
+    values,
+)
 
 
 def moved(sighting: Sighting, rows, by) -> Sighting:

@@ -6,13 +6,13 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
 from starpos.cli import main
 from starpos.errors import CatalogueError
 from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
 from starpos.simulation import montecarlo_fields as mc
+from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
 CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)  # 15 deg
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700")

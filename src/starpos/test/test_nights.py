@@ -6,12 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
 from starpos.cli import main
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.simulation import montecarlo_nights
+from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
 CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)  # 15 deg, whose triangles build fast
 KINDS = {

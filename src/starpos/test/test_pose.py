@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.fields import ARCSEC, Field
 
 from starpos import rotation
 from starpos.averaging.slip import slip_s
 from starpos.earth.orientation import ROTATION_RAD_S, earth_state
+from starpos_testing.skies.fields import ARCSEC, Field
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from contextlib import redirect_stdout
 
 import numpy as np
 import pytest
-from starpos_testing.skies.reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
 
 from starpos.cli import main
 from starpos.earth.refraction import Atmosphere
@@ -19,6 +18,7 @@ from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Instrument
 from starpos.report import folder, measures
 from starpos.report.working import Workshop, worked
+from starpos_testing.skies.reports import AIR, OPTICS, PLACE, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
 

@@ -8,16 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from starpos_testing.skies.reports import AIR, OPTICS, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rosbags")
 
 from rosbags.rosbag2 import StoragePlugin
-from starpos_testing.skies.bags import Recorder, typestore
 
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import read_tilt_csv
+from starpos_testing.skies.bags import Recorder, typestore
 
 RECORDED = Path(__file__).resolve().parents[3] / "test" / "data" / "night"
 FOCAL_PX = 29.67e3 / 6.4

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.reports import simulate
 
 from starpos.earth.orientation import curvature_radii_m, earth_state
 from starpos.earth.refraction import Atmosphere
@@ -19,6 +18,7 @@ from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, Place, Shot, Truth
 from starpos.report.working import Workshop, worked
 from starpos.sky.site import Site, camera_to_enu
+from starpos_testing.skies.reports import simulate
 
 ARCSEC = np.radians(1 / 3600)
 FOCAL_PX = 29.67e3 / 6.4

@@ -5,11 +5,11 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from starpos_testing.skies.lenses import VACUUM, ideal, sightings
 
 from starpos.calibration import residual_map
 from starpos.calibration.intrinsics import fit_camera
 from starpos.calibration.residual_map import MOST_ARROWS, draw_residuals, draw_rms
+from starpos_testing.skies.lenses import VACUUM, ideal, sightings
 
 
 def drawn(xy, residual, width=1000, height=700):

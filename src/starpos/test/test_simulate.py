@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from starpos_testing.skies.scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
@@ -17,6 +16,7 @@ from starpos.simulation.night_on_disk import write_night
 from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render
 from starpos.sky.site import Site, camera_to_enu
 from starpos.utc import unix_of
+from starpos_testing.skies.scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 
 
 def test_a_camera_points_where_it_is_told():

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 from starpos import rotation
 from starpos.averaging.average import average
@@ -16,6 +15,7 @@ from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.site import camera_to_enu
+from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 
 def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(0.2, -0.1), lean=0.0):

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole instrument under a simulated sky, at a place that only the simulation knows.
 
-    ros2 launch starpos_solver demo.launch.py latitude:=48.1 longitude:=11.6
+    ros2 launch starpos_bringup demo.launch.py latitude:=48.1 longitude:=11.6
     ros2 topic echo /fix
 
-Compare `fix` with the place given. Its time is the computer's own; tools/demo.py does it with a place drawn at random.
+Compare `fix` with the place given. Its time is the computer's own;
+tools/demo/demo.py does it with a place drawn at random.
 """
 
 import atexit
@@ -18,6 +19,7 @@ from launch.actions import ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 from launch_ros.substitutions import ExecutableInPackage
+
 from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
 
 ARGUMENTS = (
@@ -74,7 +76,7 @@ def nodes(context):
         process("starpos_solver", "solver", common, {"solver": solver}),
     ]
     if is_true(told, "dashboard"):
-        processes.append(process("starpos_solver", "dashboard", common))
+        processes.append(process("starpos_dashboard", "dashboard", common))
     return processes
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded night through the solver: its topics with their own time on /clock, everything ended with it.
 
-    ros2 launch starpos_solver replay.launch.py bag:=night rate:=0 params_file:=mine.yaml
+    ros2 launch starpos_bringup replay.launch.py bag:=night rate:=0 params_file:=mine.yaml
 
 Of a bag that holds images and no stars, detector:=true finds the stars again.
 """
@@ -10,6 +10,7 @@ from launch import LaunchDescription
 from launch.actions import OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
+
 from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
 
 ARGUMENTS = (
@@ -31,11 +32,15 @@ def nodes(context):
         processes.append(process("starpos_camera", "detector", common, SIMULATED))
         inputs = "images"
     if is_true(told, "dashboard"):
-        processes.append(process("starpos_solver", "dashboard", common, SIMULATED))
+        processes.append(process("starpos_dashboard", "dashboard", common, SIMULATED))
     player = ["--rate", told["rate"], "--inputs", inputs, "--", told["bag"]]
     processes.append(
         process(
-            "starpos_solver", "replay", common, arguments=player, on_exit=Shutdown(reason="the bag is played")
+            "starpos_bringup",
+            "replay",
+            common,
+            arguments=player,
+            on_exit=Shutdown(reason="the bag is played"),
         )
     )
     return processes

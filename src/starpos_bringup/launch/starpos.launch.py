@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The instrument: camera and detector in one process, inclinometer, solver.
 
-    ros2 launch starpos_solver starpos.launch.py port:=/dev/serial/by-id/... params_file:=mine.yaml
+    ros2 launch starpos_bringup starpos.launch.py port:=/dev/serial/by-id/... params_file:=mine.yaml
 
 An argument that is not given leaves what the parameter file says.
 """
@@ -10,6 +10,7 @@ from launch import LaunchDescription
 from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
+
 from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
 
 ARGUMENTS = (
@@ -34,7 +35,7 @@ def nodes(context):
         process("starpos_solver", "solver", common, {"**": clock}),
     ]
     if is_true(told, "dashboard"):
-        processes.append(process("starpos_solver", "dashboard", common, {"**": clock}))
+        processes.append(process("starpos_dashboard", "dashboard", common, {"**": clock}))
     return processes
 
 

@@ -18,7 +18,7 @@ COMMON_ARGUMENTS = (  # name, default, what it is
     ("namespace", "", "moves the whole instrument: /NAMESPACE/fix and so on"),
     (
         "params_file",
-        PathJoinSubstitution([FindPackageShare("starpos_solver"), "config", "starpos.yaml"]),
+        PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "starpos.yaml"]),
         "parameters of all nodes",
     ),
     ("log_level", "info", "debug, info, warn or error"),
@@ -30,7 +30,7 @@ COMMON_ARGUMENTS = (  # name, default, what it is
 )
 RESPAWN_DELAY_S = 2.0
 PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # until Jazzy, and after
-QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_solver"), "config", "quick_start.xml"])
+QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "quick_start.xml"])
 
 
 class LaunchError(Exception):

@@ -7,10 +7,10 @@ pytest.importorskip("rosbags")
 
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import Stores, get_typestore
-from starpos_bringup.recording.bag import Bag, ReplayError
-from starpos_bringup.recording.bag_writer import BagWriter
 
 from starpos.recording import bounds
+from starpos_bringup.recording.bag import Bag, ReplayError
+from starpos_bringup.recording.bag_writer import BagWriter
 
 KIND = "std_msgs/msg/UInt8MultiArray"
 

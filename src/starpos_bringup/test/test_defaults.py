@@ -4,6 +4,7 @@
 from pathlib import Path
 
 import yaml
+
 from starpos_bringup.defaults import NODES, parameter_file
 
 CONFIG = Path(__file__).parent.parent / "config" / "starpos.yaml"
@@ -11,7 +12,7 @@ CONFIG = Path(__file__).parent.parent / "config" / "starpos.yaml"
 
 def test_the_committed_file_is_the_nodes_own_tables():
     assert CONFIG.read_text() == parameter_file(), (
-        "run `python -m starpos_solver.defaults > config/starpos.yaml`"
+        "run `python -m starpos_bringup.defaults > config/starpos.yaml`"
     )
 
 

@@ -15,12 +15,14 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from sensor_msgs.msg import NavSatFix
+
 from starpos_testing.nodes import WAIT_S, Listener, take_domain
 
 pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
 
 import launch
 import launch_ros
+
 from starpos_bringup.launching import LaunchError
 
 FOLDER = Path(__file__).parent.parent / "launch"

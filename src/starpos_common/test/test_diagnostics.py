@@ -6,9 +6,9 @@ import time
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from starpos_testing.nodes import take_domain
 
 from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_testing.nodes import take_domain
 
 
 @pytest.fixture

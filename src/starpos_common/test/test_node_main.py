@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+
 from starpos_testing.nodes import take_domain
 
 WAIT_S = 20.0

@@ -7,7 +7,6 @@ import pytest
 import rclpy
 import yaml
 from rclpy.parameter import Parameter as RosParameter
-from starpos_testing.nodes import take_domain
 
 from starpos_common.parameters import (
     FRAME_NAME,
@@ -17,6 +16,7 @@ from starpos_common.parameters import (
     to_yaml,
     warn_of_unknown,
 )
+from starpos_testing.nodes import take_domain
 
 TABLE = (
     Parameter("rate", 10, "Samples a second.", "Hz", 1, 50),

@@ -4,11 +4,11 @@
 import pytest
 import rclpy
 from rclpy.qos import ReliabilityPolicy
-from starpos_testing.nodes import take_domain
 from std_msgs.msg import String
 
 from starpos_common.parameters import ParameterError
 from starpos_common.topics import publisher, subscription
+from starpos_testing.nodes import take_domain
 
 
 @pytest.fixture

@@ -3,10 +3,10 @@
 
 import pytest
 import rclpy
-from starpos_testing.nodes import take_domain
 
 from starpos_common import troubles
 from starpos_common.troubles import MOST_KINDS, QUIET_S, Troubles
+from starpos_testing.nodes import take_domain
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 import pytest
 from browser import CHROMIUM, OK, STALE_AFTER_S, Instrument, Page
+
 from starpos_testing.lacking import lacks
 from starpos_testing.nodes import Listener, Process, take_domain
 

@@ -9,11 +9,11 @@ import dashboard as said
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix
-from starpos_dashboard.board import Board
-from starpos_dashboard.picture import jpeg
 
 from starpos.errors import FrameError
 from starpos_dashboard import board, readings
+from starpos_dashboard.board import Board
+from starpos_dashboard.picture import jpeg
 from starpos_interfaces.msg import Tilt
 
 NAN, INF = math.nan, math.inf

@@ -13,10 +13,10 @@ import dashboard as said
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, NavSatFix
-from starpos_testing.lacking import lacks
-from starpos_testing.nodes import Listener, Process, take_domain
 
 from starpos.errors import StarposError
+from starpos_testing.lacking import lacks
+from starpos_testing.nodes import Listener, Process, take_domain
 
 OK, WARN = 0, 1
 

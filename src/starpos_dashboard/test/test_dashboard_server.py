@@ -10,9 +10,9 @@ from contextlib import ExitStack, closing
 from importlib.util import find_spec
 
 import pytest
-from starpos_testing.lacking import lacks
 
 from starpos_dashboard import access
+from starpos_testing.lacking import lacks
 
 WAIT_S = 10.0
 SECRETS = ("/../setup.py", "/..%2fserver.py", "/vendor/../../server.py", "//etc/passwd", "/assets/index.html",

@@ -15,7 +15,7 @@ REACHES = (8, 4, 2)
 # The neighbourhood whose roughness, the change of slope from node to node, tells what the grid leaves out, each way; and
 # how many times that is said to be missing: with it EGM96 misses the slopes of the national geoids of Australia, Austria,
 # Iceland, the Netherlands, Poland, South Africa, Spain, Switzerland and the USA by 0.3 (its islands) to 1.2 (Iceland)
-# sigma, root mean square (tools/geoid_sigma.py).
+# sigma, root mean square (tools/data/geoid_sigma.py).
 ROUGH_DEG, ROUGH_NODES = 0.5, (8, 60)
 UNRESOLVED = 1.5
 FLOOR_ARCSEC = 0.5

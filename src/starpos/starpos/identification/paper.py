@@ -36,7 +36,8 @@ def plain_cut(catalogue: Catalogue) -> np.ndarray:
 def stars(catalogue: Catalogue) -> np.ndarray:
     """Rows of the paper's stars, those of Tycho-2's main table; a merged pair of which it has both stars comes twice.
 
-    EXCEPTIONS holds what the compact catalogue no longer knows; `tools/paper_stars.py` makes it from the original files.
+    EXCEPTIONS holds what the compact catalogue no longer knows; `tools/data/paper_stars.py` makes it from the
+    original files.
     """
     *tyc, times = np.loadtxt(EXCEPTIONS, int, delimiter=",", skiprows=2, unpack=True)
     there = _number(catalogue.tyc.T.astype(int))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ros2 run starpos_solver record BAG`: a night as a rosbag2, byte for byte, compressed.
+"""`ros2 run starpos_bringup record BAG`: a night as a rosbag2, byte for byte, compressed.
 
 For machines without `ros2 bag record`; the bag is one that `ros2 bag play`, `replay` and `starpos report` read.
 """

@@ -8,8 +8,8 @@ from importlib import import_module
 
 import rclpy
 from rclpy.node import Node
-from starpos_bringup.recording.bag_writer import BagError, BagWriter
 
+from starpos_bringup.recording.bag_writer import BagError, BagWriter
 from starpos_common.diagnostics import Diagnostics, Level, Status
 from starpos_common.topics import subscription
 

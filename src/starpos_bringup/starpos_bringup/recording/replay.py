@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ros2 run starpos_solver replay BAG`: a rosbag2 into the running graph, byte for byte, with its own time on /clock.
+"""`ros2 run starpos_bringup replay BAG`: a rosbag2 into the running graph, byte for byte, with its own time on /clock.
 
 For machines without `ros2 bag play`, and for what that cannot do: as fast as the solver answers, with the same result.
 """

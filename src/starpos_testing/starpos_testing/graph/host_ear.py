@@ -10,6 +10,7 @@ import time
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+
 from starpos_testing.graph.hosts import KINDS
 
 

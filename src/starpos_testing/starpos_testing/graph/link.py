@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from starpos_testing.graph.hosts import Cable, Ear, Host
-from starpos_testing.graph.shots import FULL, focal_of
 
 from starpos.simulation.scene import scene_of
+from starpos_testing.graph.hosts import Cable, Ear, Host
+from starpos_testing.graph.shots import FULL, focal_of
 
 FULL_FRAME_BYTES = FULL[0] * FULL[1] * 2
 PIXEL_UM = 6.4

@@ -4,11 +4,11 @@
 from dataclasses import replace
 
 import numpy as np
-from starpos_testing.graph.graph import stamp_of
-from starpos_testing.graph.shots import scene_at, shoot
 
 from starpos.instrument.instrument import Calibration
 from starpos.sky.site import Site
+from starpos_testing.graph.graph import stamp_of
+from starpos_testing.graph.shots import scene_at, shoot
 
 METRES = 6.371e6  # a sphere will do
 

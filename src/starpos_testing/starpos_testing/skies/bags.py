@@ -9,7 +9,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-MESSAGES = Path(__file__).resolve().parents[3] / "starpos_interfaces" / "msg"
+MESSAGES = Path(__file__).resolve().parents[4] / "starpos_interfaces" / "msg"
 EMPTY = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from starpos_testing.skies.scenes import EXPOSURE, START
 
 from starpos import rotation
 from starpos.calibration.intrinsics import Sighting
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
 from starpos.simulation.scene import Optics, detected, expose, scene_of
+from starpos_testing.skies.scenes import EXPOSURE, START
 
 AIR = Atmosphere(88000.0, 12.0, 0.3)
 VACUUM = Atmosphere(0.0, 10.0, 0.0)

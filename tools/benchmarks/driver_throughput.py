@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CPU time of the inclinometer's driver, from bytes to readings, a sample; and how many times real time that is.
+
+    python tools/benchmarks/driver_throughput.py [SAMPLES]          20000, at 50 Hz, a line at a time as they come
+
+Exit status 0; 1 where it is less than 100 times real time.
+"""
+
+import sys
+import time
+
+from starpos_inclinometer.emulator import Mcu
+from starpos_inclinometer.host_clock import Moment
+from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.ascii_line import LineDecoder
+from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+
+RATE_HZ, WANTED = 50, 100
+COMPENSATED = {
+    "cross_axis": (1.0, 0.01, -0.01, 1.0),
+    "temperature.offset_x": (1e-4, 1e-6, 1e-8),
+    "temperature.sensitivity_y": (1e-4, 1e-6, 1e-8),
+}
+
+
+def main() -> int:
+    samples = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
+    values = {p.name: p.default for p in PARAMETERS}
+    slowest_us = max(
+        report("serial, as it is", serial(samples, values)),
+        report("serial, compensated", serial(samples, values | COMPENSATED)),
+        report("ascii, lines alone", ascii_lines(samples, values["ascii.pattern"])),
+    )
+    return int(1e6 / RATE_HZ / slowest_us < WANTED)
+
+
+def report(what: str, each_us: float) -> float:
+    print(
+        f"{what:22} {each_us:6.1f} us a sample, {1e6 / RATE_HZ / each_us:5.0f} times real time at {RATE_HZ} Hz"
+    )
+    return each_us
+
+
+def serial(samples: int, values) -> float:
+    """us of CPU a sample."""
+    mcu = Mcu(lambda now: (0.1, -0.2), rate_hz=RATE_HZ, seed=1)
+    identity = mcu.reset(0.0)
+    lines = [mcu.sample() for _ in range(samples)]
+    decoder, tilts = McuDecoder(RATE_HZ), McuTilts(values, calibration)
+    decoder.feed(identity, Moment(0.0, 0))
+    readings, began_s = 0, time.process_time()
+    for k, line in enumerate(lines):
+        arrivals = decoder.feed(line, Moment(k / RATE_HZ, k * 10**9 // RATE_HZ))
+        readings += len(tilts.read(arrivals))
+    took_s = time.process_time() - began_s
+    assert readings == samples and isinstance(decoder.identity, mcu_protocol.Identity)
+    return 1e6 * took_s / samples
+
+
+def ascii_lines(samples: int, pattern: str) -> float:
+    """us of CPU a line, from bytes to a believed sample."""
+    decoder = LineDecoder(pattern, "deg")
+    lines = [b"%.3f,%.3f\r\n" % (3 + k % 7 * 1e-3, -11 - k % 5 * 1e-3) for k in range(samples)]
+    began_s = time.process_time()
+    believed = sum(len(decoder.feed(line, Moment(k / RATE_HZ, 0))) for k, line in enumerate(lines))
+    took_s = time.process_time() - began_s
+    assert believed == samples
+    return 1e6 * took_s / samples
+
+
+if __name__ == "__main__":
+    sys.exit(main())

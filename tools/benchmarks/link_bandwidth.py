@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the network carries between the mount's computer and the robot's: two hosts of Linux namespaces, full frames.
+
+    python tools/benchmarks/link_bandwidth.py [FRAMES]          10; as root, with iproute2 and /dev/net/tun
+
+Counts Ethernet's bytes, both ways, with all that DDS adds. Detection is on the mount, so that stars and tilts cross.
+"""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+CADENCE_S = 2.0
+
+
+def main() -> int:
+    from domain_coordinator import domain_id
+
+    from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, traffic
+
+    frames = int(sys.argv[1]) if len(sys.argv) > 1 else 10
+    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        seen = traffic(Path(folder), frames, CADENCE_S)
+    each, second = seen.bytes_per_frame, seen.bytes_per_second
+    print(f"{seen.frames} frames, {seen.stars:.0f} stars each")
+    print(f"a frame's stars      {each / 1e3:8.1f} kB")
+    print(
+        f"tilts, {TILT_RATE_HZ:2d} Hz         {second / 1e3:8.1f} kB/s, whatever DDS says beside them included"
+    )
+    print(f"at a frame a second  {(each + second) * 8e-6:8.2f} Mbit/s")
+    print(
+        f"raw frames would be  {FULL_FRAME_BYTES * 8e-6:8.0f} Mbit/s (calculated: {FULL_FRAME_BYTES} bytes each)"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

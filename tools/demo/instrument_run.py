@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes as they are installed, run for some frames at a place that nobody tells them, and held against it.
+
+What tools/demo/demo.py and tools/demo/emulated_instrument.py have in common.
+"""
+
+import argparse
+import math
+import os
+import random
+import signal
+import subprocess
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+PATIENCE_S = 75.0
+ACCEPTED_SIGMA = 4.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the instrument stands, what it looks at, and how its parts are mounted; deg, Pa, deg C."""
+
+    latitude: float
+    longitude: float
+    azimuth: float
+    altitude: float
+    roll: float
+    misalignment: tuple[float, float, float]
+    pressure: float = 95000.0
+    temperature: float = 8.0
+    humidity: float = 0.4
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> "Place":
+        latitude = math.degrees(math.asin(rng.uniform(-0.94, 0.94)))
+        pointing = (rng.uniform(0, 360), rng.uniform(72, 84), rng.uniform(0, 360))
+        return cls(
+            latitude, rng.uniform(-180, 180), *pointing, (*rng.uniform(-1, 1, 2), rng.uniform(-180, 180))
+        )
+
+    def scene(self):
+        from starpos.earth.refraction import Atmosphere
+        from starpos.simulation.scene import scene_of
+
+        air = Atmosphere(self.pressure, self.temperature, self.humidity)
+        pointing = (self.azimuth, self.altitude, self.roll)
+        return scene_of(
+            latitude_deg=self.latitude,
+            longitude_deg=self.longitude,
+            atmosphere=air,
+            pointing_deg=pointing,
+            misalignment_deg=self.misalignment,
+        )
+
+
+@contextmanager
+def own_domain():
+    """A ROS_DOMAIN_ID that nobody has, least of all the graph of this shell, and only on this machine."""
+    others = [n for n in range(1, 100) if str(n) != os.environ.get("ROS_DOMAIN_ID")]
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.pop("ROS_STATIC_PEERS", None)
+    try:
+        from domain_coordinator import domain_id
+    except ImportError:  # a robot without ros-jazzy-domain-coordinator
+        os.environ["ROS_DOMAIN_ID"] = str(random.choice(others))
+        yield
+        return
+    with domain_id(lambda: random.choice(others)) as number:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        yield
+
+
+def executable(package: str, name: str) -> str:
+    from ament_index_python.packages import get_package_prefix
+
+    return str(Path(get_package_prefix(package)) / "lib" / package / name)
+
+
+class Processes:
+    """Programs that run until `stop`; the output of each goes to a file in `folder`."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.running = folder, {}
+
+    def start(self, name: str, command: list[str], **options) -> subprocess.Popen:
+        """options: those of Popen."""
+        with open(self.folder / f"{name}.log", "w") as log:
+            options = {"stdout": log, "stderr": log, "start_new_session": True} | options
+            self.running[name] = subprocess.Popen(command, **options)
+        return self.running[name]
+
+    def node(self, package: str, name: str, parameters: dict) -> None:
+        """A node with its parameters."""
+        options = [word for k, v in parameters.items() for word in ("-p", f"{k}:={v}")]
+        self.start(name, [executable(package, name), "--ros-args", *options])
+
+    def dead(self) -> str | None:
+        """A sentence about a process that has ended, if any has."""
+        name = next((name for name, p in self.running.items() if p.poll() is not None), None)
+        if name is None:
+            return None
+        said = (self.folder / f"{name}.log").read_text(errors="replace").splitlines() or ["nothing"]
+        return f"{name} has stopped with status {self.running[name].returncode}; it said last: {said[-1]}"
+
+    def peak_mb(self) -> dict[str, int]:
+        """Peak resident memory of each, 10^6 bytes."""
+        peak = {}
+        for name, p in self.running.items():
+            lines = Path(f"/proc/{p.pid}/status").read_text().splitlines()
+            peak[name] = next(
+                (round(int(n.split()[1]) * 1.024e-3) for n in lines if n.startswith("VmHWM")), 0
+            )
+        return peak
+
+    def stop(self) -> dict[str, int | str]:
+        """Stop all as launch does, with SIGINT; their exit codes."""
+        for p in self.running.values():
+            if p.poll() is None:
+                os.killpg(p.pid, signal.SIGINT)
+        codes = {}
+        for name, p in self.running.items():
+            try:
+                codes[name] = p.wait(10)
+            except subprocess.TimeoutExpired:
+                os.killpg(p.pid, signal.SIGKILL)
+                codes[name] = "killed"
+        return codes
+
+
+def known_of(place: Place) -> dict:
+    """The solver's parameters: what somebody who sets up the instrument there knows, which is not where it is."""
+    known = {f"refraction.{k}": getattr(place, k) for k in ("pressure", "temperature", "humidity")}
+    known["misalignment"] = "[" + ", ".join(f"{v:.9f}" for v in place.misalignment) + "]"
+    return known
+
+
+class Watcher:
+    """Listens to the graph: solutions, how the frames were taken, and the time to a fix, each by the frame's stamp."""
+
+    def __init__(self, place: Place):
+        import rclpy
+
+        from starpos_interfaces.msg import Capture, Solution
+
+        rclpy.init()
+        self.rclpy, self.node, self.place = rclpy, rclpy.create_node("watcher"), place
+        self.solutions, self.captures, self.seconds, self._heard = {}, {}, [], {}
+        self.node.create_subscription(Solution, "solver/solution", self._on_solution, 10)
+        self.node.create_subscription(Capture, "camera/capture", self._on_capture, 10)
+
+    def _on_capture(self, message):
+        self.captures[stamp_of(message)] = message
+        self._heard[stamp_of(message)] = time.monotonic()
+
+    def _on_solution(self, message):
+        stamp = stamp_of(message)
+        if stamp in self.solutions:  # a frame that is solved again is no other frame
+            return
+        if not self.solutions:
+            print(f"\n{HEADER}")
+        self.solutions[stamp] = message
+        self.seconds.append(time.monotonic() - self._heard.get(stamp, math.nan))
+        print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
+
+    def watch(self, frames: float, *processes: Processes, patience_s: float = PATIENCE_S) -> str | None:
+        """Until so many frames are solved; a sentence if it will not come to that."""
+        end = time.monotonic() + patience_s
+        while len(self.solutions) < frames:
+            self.rclpy.spin_once(self.node, timeout_sec=0.2)
+            if dead := next((sentence for p in processes if (sentence := p.dead())), None):
+                return dead
+            if time.monotonic() > end:
+                logs = processes[0].folder
+                return f"{len(self.solutions)} of {frames} frames in {patience_s:.0f} s: see {logs}/*.log"
+        return None
+
+    def good(self) -> list:
+        """The solutions that are fixes."""
+        return [s for s in self.solutions.values() if s.status == s.OK]
+
+    def close(self):
+        self.node.destroy_node()
+        self.rclpy.try_shutdown()
+
+
+def stamp_of(message) -> tuple[int, int]:
+    return message.header.stamp.sec, message.header.stamp.nanosec
+
+
+def _error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
+    """East and north of the truth."""
+    from starpos.earth.orientation import curvature_radii_m
+
+    phi = math.radians(place.latitude)
+    prime_vertical, meridian = curvature_radii_m(phi)
+    turn = math.radians((longitude - place.longitude + 180) % 360 - 180)
+    return turn * prime_vertical * math.cos(phi), math.radians(latitude - place.latitude) * meridian
+
+
+HEADER = "frame  stars  matched    latitude    longitude     heading  sigma, m  error, m  seconds"
+
+
+def _row(number: int, s, place: Place, seconds: float) -> str:
+    if s.status != s.OK:
+        return f"{number:5d}  {s.stars_detected:5d}  {s.status_text}"
+    sigma = math.sqrt((s.covariance[0] + s.covariance[4]) / 2)
+    error = math.hypot(*_error_m(s.latitude, s.longitude, place))
+    return (
+        f"{number:5d}  {s.stars_detected:5d}  {s.stars_matched:7d}  {s.latitude:+10.5f}  {s.longitude:+11.5f}  "
+        f"{s.heading:10.4f}  {sigma:8.0f}  {error:8.0f}  {seconds:7.2f}"
+    )
+
+
+def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarray]:
+    """The mean fix against the truth: a dict for people and scripts, the errors (N, 2) m, the covariance of one fix."""
+    errors = np.array([_error_m(s.latitude, s.longitude, place) for s in solutions])
+    one = np.array(solutions[-1].covariance).reshape(3, 3)
+    variance = np.zeros(2)
+    for term in solutions[-1].budget:  # what is new in every frame averages, the rest stays
+        if term.name == "deflection":  # of the geodetic position, which has no part in this
+            continue
+        share = 1 if term.common else len(solutions)
+        variance += np.array([term.east, term.north]) ** 2 / share
+    mean, sigma = errors.mean(0), np.sqrt(variance)
+    headings = np.array([s.heading for s in solutions])
+    truth = math.degrees(place.scene().heading)
+    heading_error = float(((headings - truth + 180) % 360 - 180).mean() * 3600)
+    summary = {
+        "latitude": place.latitude,
+        "longitude": place.longitude,
+        "frames": len(solutions),
+        "east_m": float(mean[0]),
+        "north_m": float(mean[1]),
+        "sigma_east_m": float(sigma[0]),
+        "sigma_north_m": float(sigma[1]),
+        "sigmas_off": float(np.max(np.abs(mean) / sigma)),
+        "heading_error_arcsec": heading_error,
+    }
+    return summary, errors, one
+
+
+def trouble_of(watcher: Watcher, codes: dict, trouble: str | None) -> str | None:
+    """A sentence where there is nothing to hold against the truth, or a program has ended badly."""
+    unclean = {name: code for name, code in codes.items() if code != 0}
+    if trouble or unclean:
+        return trouble or f"unclean exits {unclean}"
+    return None if watcher.good() else "no frame gave a fix"
+
+
+def say_errors(watcher: Watcher, summary: dict) -> bool:
+    """Print the mean fix beside the truth; whether the truth lies within ACCEPTED_SIGMA and every frame gave a fix."""
+    print(
+        f"\n{summary['frames']} fixes together: {summary['north_m']:+.0f} m north, {summary['east_m']:+.0f} m east "
+        f"of the truth, claimed {summary['sigma_north_m']:.0f} and {summary['sigma_east_m']:.0f} m; "
+        f"heading {summary['heading_error_arcsec']:+.1f} arcsec"
+    )
+    inside = summary["sigmas_off"] < ACCEPTED_SIGMA and len(watcher.good()) == len(watcher.solutions)
+    print(
+        f"the truth lies within {ACCEPTED_SIGMA:g} sigma"
+        if inside
+        else f"the truth lies OUTSIDE {ACCEPTED_SIGMA:g} sigma, or a frame gave no fix"
+    )
+    return inside
+
+
+def parser_of(text: str, frames: int, out: str) -> argparse.ArgumentParser:
+    """Of a command's --seed, --frames and --out."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--seed", type=int, help="another place and sky for another seed, 0 to 2147483647 (default: drawn)"
+    )
+    parser.add_argument("--frames", type=int, default=frames)
+    parser.add_argument("--out", type=Path, default=Path(out), help="folder of the summary and the logs")
+    return parser
+
+
+def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Its arguments, with a seed drawn where none is given."""
+    args = parser.parse_args()
+    if args.seed is None:
+        args.seed = int.from_bytes(os.urandom(4), "big") >> 1
+    if not 0 <= args.seed < 2**31:
+        parser.error(f"--seed {args.seed} is not from 0 to 2147483647")
+    if args.frames < 1:
+        parser.error(f"--frames {args.frames} is not 1 or more")
+    return args
+
+
+def introduce(seed: int, place: Place, who: str):
+    """Say where it is, and what runs."""
+    air = f"{place.pressure / 100:.0f} hPa, {place.temperature:g} deg C"
+    print(
+        f"seed {seed}: the instrument stands at {place.latitude:+.5f} {place.longitude:+.5f}, {air}; it is not told where"
+    )
+    print(f"{who}; the first run sorts the sky's triangles, some seconds, once")

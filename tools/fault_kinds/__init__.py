@@ -1,7 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The faults that tools/fault_soak.py injects: each module registers its own."""
-
-from fault_kinds import times, stars, tilts, graph, images  # noqa: F401, I001  (the order of the table)
-from fault_kinds.registry import KINDS, UNTOLD, Kind
-
-__all__ = ["KINDS", "UNTOLD", "Kind"]

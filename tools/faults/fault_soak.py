@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random faults from all inputs into the nodes as they are installed, thousands of them, and what became of each kind.
+
+    python tools/faults/fault_soak.py [--faults 10000] [--seed S]
+
+A simulated instrument in accelerated time (/clock) sends star lists to the solver and small images to the detector;
+between the faults it turns and drives.  Every fix of every topic is held against where it truly was: one further off
+than 5 of its own sigmas is wrong.  Prints a table in Markdown.  Exit status 0 only with no wrong fix, no crash, no
+defect in a log, recovery after every fault, and memory that stays.
+"""
+
+import argparse
+import math
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).resolve().parents[2]
+
+WARM = 0.1  # of the faults, before memory is compared
+FAULTS_A_RESTART = 400
+LEGITIMATE = 0.04  # chance of a turn or a drive before a fault
+PATIENCE = 30  # good frames after a fault, of at most a second each
+FEWEST_FOR_MEMORY = 2000  # faults; the first of each kind takes memory for good
+GROWN_MB = 12.0  # of a node: the allocator's arenas wander by ten, up and down, however long it runs
+
+
+@dataclass
+class Row:
+    """What became of one kind of fault."""
+
+    about: str
+    injected: int = 0
+    statuses: Counter = field(default_factory=Counter)
+    right: int = 0
+    wrong: int = 0
+    frames: list[int] = field(default_factory=list)  # good ones until a fix, the one with the fix included
+    seconds: list[float] = field(default_factory=list)
+
+
+class Soak:
+    """The nodes, the world they are in, and the count of what happens."""
+
+    def __init__(self, folder: Path, seed: int):
+        from accelerated import World, parameters_of
+        from kinds import KINDS
+
+        from starpos_testing.graph.graph import Graph
+
+        self.folder, self.graph = folder, Graph()
+        self.parameters = parameters_of(folder)
+        self.world = World(self.graph, seed, self.parameters)
+        self.kinds = KINDS
+        self.rows = {k.name: Row(k.about) for k in KINDS}
+        self.crashes: list[str] = []
+        self.stuck: list[str] = []
+        self.nodes, self.starts = {}, 0
+        for name in ("solver", "detector"):
+            self.start(name)
+
+    def start(self, name: str):
+        self.starts += 1
+        package = {"solver": "starpos_solver", "detector": "starpos_camera"}[name]
+        values = self.parameters if name == "solver" else {"use_sim_time": True}
+        texts = [f"{k}:={_yaml(v)}" for k, v in values.items()]
+        self.nodes[name] = self.graph.start(self.folder / f"{self.starts}-{name}.log", package, name, *texts)
+
+    def end(self, name: str, kill: bool):
+        """As a supervisor does it; the exit status and the log are looked at."""
+        node = self.nodes[name]
+        node.signal(signal.SIGKILL if kill else signal.SIGTERM)
+        status = node.wait()
+        if not kill and status != 0:
+            self.crashes.append(f"{name} ended with {status} at SIGTERM")
+        self.graph.processes.remove(node)
+        self._look_at(node)
+
+    def _look_at(self, node):
+        if "Traceback" in node.output:
+            where = max(node.output.index("Traceback") - 500, 0)
+            self.crashes.append(f"a defect in the log of {node.name}: {node.output[where:][:3000]}")
+
+    def watch(self):
+        """Whether all nodes live; a dead one is a crash, and is started again."""
+        for name, node in self.nodes.items():
+            if (status := node.process.poll()) is not None:
+                self.crashes.append(f"{name} has ended by itself with {status}: {node.output[-1500:]}")
+                self.graph.processes.remove(node)
+                self.start(name)
+
+    def settle(self, image: bool = False) -> tuple[int, float]:
+        """Good frames until one is a fix: how many, and the seconds; 0 frames where none is."""
+        begin = time.monotonic()
+        for n in range(1, PATIENCE + 1):
+            if self.world.good_image() if image else self.world.good():
+                return n, time.monotonic() - begin
+            self.watch()
+        return 0, time.monotonic() - begin
+
+    def legitimate(self):
+        """A turn or a drive, and some frames there, as no fault."""
+        world = self.world
+        if world.rng.random() < 0.5:
+            world.turn()
+        else:
+            world.drive()
+        for _ in range(4):
+            self.settle()
+        self._judge("turning and driving")
+
+    def _judge(self, name: str) -> Row:
+        row = self.rows.setdefault(name, Row("no fault"))
+        right, wrong = self.world.right.total(), len(self.world.wrong)
+        row.statuses += self.world.judge()
+        row.right += self.world.right.total() - right
+        row.wrong += len(self.world.wrong) - wrong
+        for line in self.world.wrong[wrong:]:
+            print(f"WRONG after {name}: {line}", file=sys.stderr, flush=True)
+        return row
+
+    def inject(self, name: str, about: str, fault, image: bool = False):
+        """One fault, and the good frames after it."""
+        row = self.rows.setdefault(name, Row(about))
+        row.injected += 1
+        fault()
+        frames, seconds = self.settle(image)
+        self.watch()
+        if not frames:
+            self.stuck.append(f"no fix within {seconds:.0f} s after {name}")
+            print(self.stuck[-1], file=sys.stderr, flush=True)
+        row.frames.append(frames or PATIENCE)
+        row.seconds.append(seconds)
+        self._judge(name)
+
+    def any_fault(self):
+        rng = self.world.rng
+        if rng.random() < LEGITIMATE:
+            self.legitimate()
+        weights = [k.weight for k in self.kinds]
+        kind = rng.choice(self.kinds, p=[w / sum(weights) for w in weights])
+        image = kind.name.startswith(("images", "captures"))
+        self.inject(kind.name, kind.about, lambda: kind.inject(self.world), image)
+
+    def restart(self):
+        name = str(self.world.rng.choice(list(self.nodes)))
+        kill = self.world.rng.random() < 0.5
+
+        def fault():
+            self.end(name, kill)
+            self.start(name)
+
+        how = "kill -9" if kill else "SIGTERM"
+        about = f"{how}, and started again; the time until a fix holds its start"
+        self.inject(f"{name} {'killed' if kill else 'ended'}", about, fault, name == "detector")
+
+    def close(self):
+        """End the nodes; their logs tell of defects, how they end of crashes."""
+        for name in self.nodes:
+            self.end(name, kill=False)
+        self.graph.close()
+
+
+def _yaml(value) -> str:
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else str(value)
+
+
+def run(faults: int, seed: int, folder: Path, restarts: int) -> tuple[Soak, dict[str, tuple[float, float]]]:
+    """The soak; and of each node its memory (MB) early and late."""
+    from starpos_testing.processes import memory_mb
+
+    soak, sizes, begin = Soak(folder, seed), {}, time.monotonic()
+    try:
+        assert soak.settle()[0] and soak.settle(image=True)[0], "no fix before any fault"
+        soak.world.judge()
+        for k in range(faults - restarts):
+            soak.any_fault()
+            if k >= WARM * faults:
+                for name, node in soak.nodes.items():
+                    sizes.setdefault(name, []).append(memory_mb(node.process.pid))
+            if sys.stderr.isatty() or k % 500 == 0:
+                passed = time.monotonic() - begin
+                print(
+                    f"{k} faults, {passed:.0f} s, {len(soak.world.wrong)} wrong", file=sys.stderr, flush=True
+                )
+        for _ in range(restarts):
+            soak.restart()
+    finally:
+        soak.close()
+    return soak, {name: _halves(mb) for name, mb in sizes.items()}
+
+
+def _halves(mb: list[float]) -> tuple[float, float]:
+    """The most of the first and of the last half."""
+    return max(mb[: len(mb) // 2]), max(mb[len(mb) // 2 :])
+
+
+def _spread(sigmas: dict[str, list[float]]) -> str:
+    """rms and most of the errors by topic: how near a wrong one was (of a place two coordinates: 1.41 were true)."""
+    return "; ".join(
+        f"{topic} {math.sqrt(sum(s * s for s in of) / len(of)):.2f}, {max(of):.1f}"
+        for topic, of in sigmas.items()
+    )
+
+
+def table(rows: dict[str, Row]) -> str:
+    """Markdown."""
+    lines = ["| fault | what | injected | answered | right | wrong | frames to a fix | s to a fix |"]
+    lines.append("| --- | --- | ---: | --- | ---: | ---: | --- | --- |")
+    for name, row in rows.items():
+        if not row.injected and not row.statuses:
+            continue
+        answered = ", ".join(f"{n} {status}" for status, n in row.statuses.most_common())
+        frames = f"{median(row.frames):g}, at most {max(row.frames)}" if row.frames else ""
+        seconds = f"{median(row.seconds):.2f}, at most {max(row.seconds):.2f}" if row.frames else ""
+        cells = (name, row.about, row.injected or "", answered, row.right, row.wrong, frames, seconds)
+        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--faults", type=int, default=10000)
+    today = int(time.time() // 86400)
+    parser.add_argument("--seed", type=int, default=today, help="default: of the day")
+    options = parser.parse_args(arguments)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    from domain_coordinator import domain_id
+
+    begin = time.monotonic()
+    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        restarts = max(4, options.faults // FAULTS_A_RESTART)
+        soak, memory = run(options.faults, options.seed, Path(folder), restarts)
+    return report(soak, memory, f"--faults {options.faults} --seed {options.seed}", time.monotonic() - begin)
+
+
+def report(soak: Soak, memory: dict[str, tuple[float, float]], options: str, seconds: float) -> int:
+    """Print what happened; the exit status."""
+    from kinds import UNTOLD
+
+    print(f"`tools/faults/fault_soak.py {options}`:\n")
+    print(table(soak.rows))
+    injected = sum(row.injected for row in soak.rows.values())
+    right = ", ".join(f"{n} of {topic}" for topic, n in soak.world.right.items())
+    print(f"\n{injected} faults in {seconds / 60:.0f} min; right: {right}; wrong: {len(soak.world.wrong)}; "
+          f"crashes and defects: {len(soak.crashes)}; without recovery: {len(soak.stuck)}")  # fmt: skip
+    print(f"off by, in their own sigmas, rms and most: {_spread(soak.world.sigmas)}")
+    grown = [f"{name} {first:.0f} then {last:.0f} MB" for name, (first, last) in memory.items()]
+    print(f"most memory in the first and in the last half: {'; '.join(grown)}")
+    print(f"\n{UNTOLD}")
+    for line in (*soak.world.wrong, *soak.crashes, *soak.stuck):
+        print(line, file=sys.stderr)
+    told = sum(row.injected for row in soak.rows.values()) >= FEWEST_FOR_MEMORY
+    flat = not told or all(last - first < GROWN_MB for first, last in memory.values())
+    return int(bool(soak.world.wrong or soak.crashes or soak.stuck or not flat))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tilts that are late, missing or wrong."""
+
+import math
+
+from accelerated import World
+
+from kinds.registry import HOSTILE, kind, shift, some_time
+from starpos_interfaces.msg import Tilt
+from starpos_testing.graph.shots import EXPOSURE_S
+
+
+@kind(3)
+def tilts_late(w: World):
+    """All tilts, or some, after their frame; within its patience or not."""
+    shot, some = w.shot(), int(w.rng.integers(0, 5))
+    w.tick()
+    early, shot.tilts = shot.tilts[:some], shot.tilts[some:]
+    for tilt in early:
+        w.graph.tilt.publish(tilt)
+    w.stars(shot)
+    w.spin(w.rng.uniform(0, 0.3))
+    w.tilts(shot)
+
+
+@kind(2)
+def tilts_doubled(w: World):
+    """Every tilt twice or three times."""
+    shot = w.shot()
+    shot.tilts = [t for t in shot.tilts for _ in range(w.rng.integers(2, 4))]
+    w.send(shot)
+
+
+@kind(2)
+def tilts_out_of_order(w: World):
+    """The tilts of an exposure in any order."""
+    shot = w.shot()
+    shot.tilts = [shot.tilts[k] for k in w.rng.permutation(len(shot.tilts))]
+    w.send(shot)
+
+
+@kind(1.5)
+def tilts_from_the_future(w: World):
+    """Tilts 2 s to 11 days ahead; when their time has come the instrument has been turned."""
+    shot = w.shot()
+    shift(shot.tilts, some_time(w))
+    w.send(shot)
+    for ahead in range(3, 8):  # just where the next frames will be
+        early = w.shot()
+        w.now_s -= 0.8
+        shift(early.tilts, 0.8 * ahead)
+        w.tilts(early)
+    w.spin(0.3)  # they come before that time does, also here, where a second passes in 50 ms
+    w.turn()
+
+
+@kind(2)
+def tilts_missing(w: World):
+    """Some or all tilts of an exposure are missing."""
+    shot = w.shot()
+    shot.tilts = [t for t in shot.tilts if w.rng.random() < 0.4]
+    w.send(shot)
+
+
+@kind(3)
+def tilts_not_numbers(w: World):
+    """NaN, infinity, 1e300, 0 or -1 for some number of some or all tilts."""
+    shot, value = w.shot(), float(w.rng.choice(HOSTILE))
+    name = w.rng.choice(["x", "y", "covariance", "temperature"])
+    bad = shot.tilts if not math.isfinite(value) or name == "covariance" else shot.tilts[:1]
+    for tilt in bad:
+        if name == "covariance":
+            tilt.covariance[w.rng.integers(4)] = value
+        else:
+            setattr(tilt, name, value)
+    w.send(shot)
+
+
+@kind(2)
+def tilts_with_any_flags(w: World):
+    """Random flags on random tilts, whose values are then anything."""
+    shot = w.shot()
+    for tilt in shot.tilts:
+        if w.rng.random() < 0.5:
+            tilt.flags = int(w.rng.choice([Tilt.OUT_OF_RANGE, Tilt.STUCK, Tilt.SATURATED, 7, 15, 255]))
+            tilt.x = w.rng.uniform(-0.5, 0.5)
+    w.send(shot)
+
+
+@kind(2)
+def tilts_with_a_leap(w: World):
+    """One reading of five off by up to 20 deg."""
+    shot = w.shot()
+    shot.tilts[w.rng.integers(5)].x += math.radians(some_time(w, 0.01, 20))
+    w.send(shot)
+
+
+@kind(1)
+def tilts_of_a_moving_instrument(w: World):
+    """A drift of 0.02 to 5 deg during the exposure."""
+    shot, rate = w.shot(), math.radians(some_time(w, 0.02, 5)) / EXPOSURE_S
+    for k, tilt in enumerate(shot.tilts):
+        tilt.y += rate * EXPOSURE_S * k / len(shot.tilts)
+    w.send(shot)

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A day of the solver as installed, as fast as it answers: its memory and its CPU time a frame, and whether they grow.
+
+    python tools/soaks/soak.py [FRAMES]          17280: a day of one frame every 5 s
+
+Exit status 0; 1 where the memory of the last half has grown by more than 2 MB against the half before.
+"""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from starpos_testing.processes import cpu_s, memory_mb
+
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+DAY, WARM, ALLOWED_MB = 17280, 500, 2.0
+
+
+def main() -> int:
+    from domain_coordinator import domain_id
+
+    from starpos_testing.graph.graph import Graph
+    from starpos_testing.graph.shots import SOLVER, shoot
+
+    frames = int(sys.argv[1]) if len(sys.argv) > 1 else DAY
+    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        graph = Graph()
+        try:
+            solver = graph.start(Path(folder) / "log", "starpos_solver", "solver", *SOLVER)
+            graph.wait_for_solver()
+            graph.answer(shoot())
+            sizes, begin_s = [], 0.0
+            for k in range(frames):
+                shot = shoot()
+                answer = graph.answer(shot)[0]
+                assert answer.status == answer.OK, answer.status_text
+                for kept in (graph.solutions, graph.fixes, graph.imus, graph.diagnostics):
+                    kept.clear()
+                if k == WARM:
+                    begin_s = cpu_s(solver.process.pid)
+                if k >= WARM:
+                    sizes.append(memory_mb(solver.process.pid))
+                if k % max(1, frames // 20) == 0:
+                    print(f"{k:6d} frames  {memory_mb(solver.process.pid):7.1f} MB", flush=True)
+            each_ms = 1e3 * (cpu_s(solver.process.pid) - begin_s) / max(1, frames - WARM - 1)
+        finally:
+            graph.close()
+    half = len(sizes) // 2
+    grown = max(sizes[half:]) - max(sizes[:half])
+    print(
+        f"{frames} frames: {each_ms:.1f} ms of CPU each; the last half's memory {grown:+.2f} MB against the first's"
+    )
+    return int(grown > ALLOWED_MB)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
