@@ -12,6 +12,7 @@ from rcl_interfaces.srv import DescribeParameters
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
+from starpos_inclinometer.sources import sca100t
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 

@@ -20,7 +20,7 @@ from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import read_tilt_csv
 from starpos_testing.skies.bags import Recorder, typestore
 
-RECORDED = Path(__file__).resolve().parents[3] / "test" / "data" / "night"
+RECORDED = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 FOCAL_PX = 29.67e3 / 6.4
 NOT_IDENTIFIED = 2
 
