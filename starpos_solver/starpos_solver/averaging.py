@@ -7,13 +7,13 @@ import numpy as np
 
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
-from starpos.calibration.plumb_line import EARTH_RADIUS_M
-from starpos.earth.orientation import curvature_radii_m
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.fix.fix import Fix
+from starpos.units import ARCSEC
 from starpos_common.diagnostics import Level
 from starpos_common.diagnostics import Status as Report
 
-WIDE_RAD = np.radians(600 / 3600)  # its square, which a linear filter does not know of, is 2 arcsec
+WIDE_RAD = 600 * ARCSEC  # its square, which a linear filter does not know of, is 2 arcsec
 ELSEWHERE_SIGMA = 3.0  # from the place of a turn; wrongly taken for another place it only costs precision
 JUST_MOVED = 10  # fixes; the diagnostics say so as long
 

@@ -9,8 +9,7 @@ import math
 import numpy as np
 
 from starpos.averaging.slip import CREEP_RAD, SIGMAS, slip_s
-from starpos.calibration.plumb_line import EARTH_RADIUS_M
-from starpos.earth.orientation import zenith_of
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.fix.fix import Fix
 
 # So many that agree with each other outvote one that had come before them: it was stamped wrongly, no clock was set.

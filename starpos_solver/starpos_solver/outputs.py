@@ -9,9 +9,10 @@ from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.averaging.average import Average
-from starpos.earth.vertical import ARCSEC, Geodetic, Vertical, geodetic
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.solver import Solution as Answer
 from starpos.fix.solver import Status
+from starpos.units import ARCSEC
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces.msg import ErrorTerm, Solution
 

@@ -9,7 +9,8 @@ import pytest
 from fixes import fix_at, north_of
 
 from starpos import rotation
-from starpos.earth.orientation import ROTATION_RAD_S, zenith_of
+from starpos.earth.ellipsoid import zenith_of
+from starpos.earth.orientation import ROTATION_RAD_S
 from starpos_solver.clock_doubt import ClockDoubt
 
 STATED_S = 0.01

@@ -194,7 +194,7 @@ def stamp_of(message) -> tuple[int, int]:
 
 def _error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
     """East and north of the truth."""
-    from starpos.earth.orientation import curvature_radii_m
+    from starpos.earth.ellipsoid import curvature_radii_m
 
     phi = math.radians(place.latitude)
     prime_vertical, meridian = curvature_radii_m(phi)

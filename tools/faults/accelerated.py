@@ -11,7 +11,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import NavSatFix
 
-from starpos.earth.orientation import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument

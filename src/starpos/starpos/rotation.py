@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small tools for rotation matrices (3, 3); angles in rad, rotations active."""
+"""Small tools for rotation matrices (3, 3) and unit vectors; angles in rad, rotations active."""
 
 import math
 
@@ -15,6 +15,17 @@ def full_turn(angle: float) -> float:
 def half_turn(angle: float) -> float:
     """An angle in [-pi, pi)."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def unit_vector(longitude, latitude) -> np.ndarray:
+    """Unit vectors (..., 3) at spherical coordinates in rad: right ascension and declination, or a place's."""
+    c = np.cos(latitude)
+    return np.stack([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)], -1)
+
+
+def normalised(v: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) at unit length."""
+    return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
 
 def about_axis(axis: int, angle: float) -> np.ndarray:

@@ -11,12 +11,14 @@ import threading
 import time
 from dataclasses import dataclass
 
+from starpos.units import DAY_S
+
 STA_UNSYNC = 0x0040
 TIME_ERROR = 5  # adjtimex's answer of a clock that is not synchronised
 UNIFORM = math.sqrt(3)  # bound over standard deviation of what is as likely anywhere within it
 STEP_S = 0.1
 QUICK_S, TRIES = 1e-3, 10
-UNKNOWN_S = 86400 / math.sqrt(12)  # any time of the day
+UNKNOWN_S = DAY_S / math.sqrt(12)  # any time of the day
 SLEW = 0.1  # the quickest slewing in use (chrony's maxslewrate is 0.083): more than this is a step
 
 

@@ -9,6 +9,7 @@ from decimal import Decimal
 from typing import Any
 
 from starpos.instrument.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
+from starpos.units import ARCSEC
 from starpos_inclinometer.clock import ArrivalFilter
 from starpos_inclinometer.host_clock import HostClock, Moment
 from starpos_inclinometer.noise import NoiseTracker, noise_text
@@ -23,7 +24,7 @@ OPTIONAL = {"temperature", "sequence", "milliseconds", "seconds"}
 ANGLES_RAD = {
     "deg": math.radians(1),
     "arcmin": math.radians(1 / 60),
-    "arcsec": math.radians(1 / 3600),
+    "arcsec": ARCSEC,
     "rad": 1.0,
     "mrad": 1e-3,
     "urad": 1e-6,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.orientation import curvature_radii_m, zenith_of
+from starpos.earth.ellipsoid import curvature_radii_m, zenith_of
 from starpos.fix.budget import ErrorTerm, correlation, symmetric_root
 from starpos.fix.fix import Fix
 from starpos.rotation import full_turn, half_turn

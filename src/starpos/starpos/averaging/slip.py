@@ -10,9 +10,10 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.fix.fix import Fix
+from starpos.units import ARCSEC
 
 SIGMAS = 6.0  # that errors may reach
-CREEP_RAD = np.radians(10 / 3600)  # by which a mount may settle that nobody touches
+CREEP_RAD = 10 * ARCSEC  # by which a mount may settle that nobody touches
 HIGHEST_LATITUDE = np.radians(89.0)  # beyond it any turn on the spot is one about the Earth's axis
 LARGE_TRACE = 2.9  # of a rotation by 0.3 rad; larger ones are no error
 

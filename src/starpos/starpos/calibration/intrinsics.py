@@ -182,8 +182,7 @@ def unbent(seen: np.ndarray, level: np.ndarray | None, atmosphere: Atmosphere) -
     """Directions (N, 3) in C without refraction; without a level, with a middling one undone."""
     if level is not None:
         return atmosphere.refraction().unbend(seen @ level.T) @ level
-    v = seen / np.append([_shrinking(atmosphere)] * 2, 1.0)
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
+    return rotation.normalised(seen / np.append([_shrinking(atmosphere)] * 2, 1.0))
 
 
 def _shrinking(atmosphere: Atmosphere) -> float:

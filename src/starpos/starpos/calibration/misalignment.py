@@ -7,20 +7,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.calibration.plumb_line import EARTH_RADIUS_M, UNKNOWN_ARCSEC, Plumb, Readings, hang
-from starpos.earth.orientation import curvature_radii_m
+from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, Plumb, Readings, hang
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix
-from starpos.instrument.instrument import ARCSEC, MOST_C, Calibration, Instrument
+from starpos.instrument.instrument import MOST_C, Calibration, Instrument
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
+from starpos.units import ARCSEC
 
 ROUNDS = 4
-SETTLED_RAD = np.radians(0.02 / 3600)
+SETTLED_RAD = 0.02 * ARCSEC
 OF_PLACE = (
     "refraction",
     "clock",

@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution
 from starpos.instrument.inclinometer import InclinometerErrors, a2_matrix
+from starpos.units import ARCSEC
 
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)  # of A3 before anything is known of it, about S's axes
 ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10  # beyond it a frame pulls no harder
@@ -30,7 +32,6 @@ NARROW_TURN = np.radians(20)  # within it no other turn need be tried
 AS_GOOD = 8.0  # half the chi-square by which a solution may be worse than the best and still be true
 SAME_AXIS = 1e-9  # share of the axis' weight below which the headings do not tell it
 MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
-EARTH_RADIUS_M = 6.371e6
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Readings:
 
     @property
     def mean_plumb(self) -> np.ndarray:
-        return self.plumb.sum(0) / np.linalg.norm(self.plumb.sum(0))
+        return rotation.normalised(self.plumb.sum(0))
 
 
 def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
@@ -169,7 +170,7 @@ def hang(
     """
     mean = readings.mean_plumb
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
-    start = rotation.shortest_turn(given @ (up / np.linalg.norm(up)), mean) @ given
+    start = rotation.shortest_turn(given @ rotation.normalised(up), mean) @ given
     known = _Known(zenith, max(zenith_sigma, 1e-12), turn_sigma)
     starts = _turns(mean, start) if turn_sigma > NARROW_TURN else [(0.0, start)]
     found = [_fitted(readings, start, known, angle) for angle, start in starts]
@@ -248,12 +249,12 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
     zenith = known.zenith
     if zenith is None:
         zenith = np.einsum("kji,jl,kl->i", to_camera, start.T, readings.plumb)
-    zenith = zenith / np.linalg.norm(zenith)
+    zenith = rotation.normalised(zenith)
     across = np.linalg.svd(zenith[None])[2][1:]  # two axes across the zenith
     turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T  # across the plumb line in S, and about it
     wandering = -np.einsum("kim,ij->kjm", readings.wandering, turns[:, :2])
     more = wandering.shape[2]
-    loose = np.radians(UNKNOWN_ARCSEC[0] / 3600)
+    loose = UNKNOWN_ARCSEC[0] * ARCSEC
     prior = 1 / np.array([loose, loose, known.turn_sigma, *[known.zenith_sigma] * 2, *[1.0] * more])
     a3, p = start, np.zeros(5 + more)
     p[2] = turned
@@ -289,7 +290,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
     return Plumb(
         a3,
         (whole + whole.T) / 2,
-        up / np.linalg.norm(up),
+        rotation.normalised(up),
         float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
         best,
         2 * best / max(2 * len(readings.sigma) - 5, 1),

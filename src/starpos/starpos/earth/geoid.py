@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.geoid_file import Grid, read_grid
-from starpos.earth.orientation import curvature_radii_m
-from starpos.earth.vertical import ARCSEC, Deflection
+from starpos.earth.vertical import Deflection
+from starpos.units import ARCSEC
 
 # Nodes each way under the spline: at 8 its ends no longer tell (0.27^8), at 2 it is one cubic.
 REACHES = (8, 4, 2)

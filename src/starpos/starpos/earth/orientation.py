@@ -13,23 +13,22 @@ from pathlib import Path
 import erfa
 import numpy as np
 
+from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
 from starpos.errors import TimeError
+from starpos.units import ARCSEC, DAY_S
 from starpos.utc import utc_text
 
 UNIX_EPOCH_JD = 2440587.5
-DAY_S = 86400.0
-ARCSEC = np.radians(1 / 3600)
 TT_MINUS_TAI_S = 32.184
 TT_MINUS_UTC_S = 69.184  # since 2017; in 1900 it was 72 s less, which is 0.3 mas of aberration
 SPEED_OF_LIGHT = erfa.CMPS
 ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
-EQUATOR_RADIUS_M, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3  # WGS 84
 FIRST_MJD = 41684.0  # 1973-01-02: the first day of the IERS table
 # Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
 # holding the pole (test_earth.py computes both).
 EXTRAPOLATION_DAYS = (0.0, 30.0, 90.0, 180.0, 365.0, 730.0, 1095.0)
 EXTRAPOLATION_SIGMA_S = (0.001, 0.013, 0.033, 0.053, 0.092, 0.25, 0.46)
-POLE_SIGMA_RAD = np.radians(0.2 / 3600)
+POLE_SIGMA_RAD = 0.2 * ARCSEC
 
 
 @dataclass(frozen=True)
@@ -202,18 +201,6 @@ def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
     """Velocity of the turning ground in units of c (3,), ITRS, under the unit vector `zenith_itrs` (3,)."""
     radius = EQUATOR_RADIUS_M / np.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
     return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
-
-
-def zenith_of(latitude: float, longitude: float) -> np.ndarray:
-    """Unit vector (3,) in ITRS that is up at a latitude and longitude (rad)."""
-    c = np.cos(latitude)
-    return np.array([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)])
-
-
-def curvature_radii_m(latitude: float) -> tuple[float, float]:
-    """Radii of curvature of WGS 84 (prime vertical, meridian) in m at a latitude in rad."""
-    w2 = 1 - ECCENTRICITY2 * np.sin(latitude) ** 2
-    return EQUATOR_RADIUS_M / np.sqrt(w2), EQUATOR_RADIUS_M * (1 - ECCENTRICITY2) / w2**1.5
 
 
 def _year(mjd: float) -> float:

@@ -6,11 +6,11 @@ from typing import Protocol
 
 import numpy as np
 
-from starpos.earth.orientation import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import InstrumentError
 from starpos.rotation import full_turn
+from starpos.units import ARCSEC
 
-ARCSEC = np.radians(1 / 3600)
 UNKNOWN_STDDEV_ARCSEC = (
     6.0  # of each component where nothing is known: the root mean square over the continents
 )

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import ROTATION_RAD_S, EarthState, curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.mounting import Mounting
+from starpos.units import HOUR_S
 
 STEP_RAD = 1e-6
-HOUR_S = 3600.0
 
 
 ALWAYS = ("always",)

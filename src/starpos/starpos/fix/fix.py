@@ -183,8 +183,7 @@ class _Problem:
 
     def predict(self, state: _State, refraction: Refraction | None = None) -> np.ndarray:
         """Pixels (N, 2) where the stars should be."""
-        v = self.itrs + station_velocity(state.a4[2])
-        v = v / np.linalg.norm(v, axis=1, keepdims=True)
+        v = rotation.normalised(self.itrs + station_velocity(state.a4[2]))
         observed = (refraction or self.refraction).bend(v @ state.a4.T)
         return self.camera.scaled(state.scale).project(observed @ self.g)
 

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.earth.ellipsoid import zenith_of
 from starpos.earth.orientation import EarthState
 from starpos.identification import Identification, Plumb, Pointing
+from starpos.units import ARCSEC
 
-PLUMB_TOLERANCE_RAD = np.radians(90 / 3600)  # 2.8 km of travel, or as much error of the tilt
+PLUMB_TOLERANCE_RAD = 90 * ARCSEC  # 2.8 km of travel, or as much error of the tilt
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,7 @@ class Standing:
         cls, found: Identification, state: EarthState, focal_px: float, latitude: float, longitude: float
     ) -> "Standing":
         """From an identification and the astronomic place (rad) that came of it; focal_px is the fitted one."""
-        up = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
-        return cls(found.attitude @ state.gcrs_to_itrs.T, np.array(up), focal_px)
+        return cls(found.attitude @ state.gcrs_to_itrs.T, zenith_of(latitude, longitude), focal_px)
 
     def priors(self, state: EarthState, zenith_camera: np.ndarray) -> tuple[Pointing, Plumb]:
         """For `identify` at another time: the attitude if nothing moved, else the plumb line zenith_camera (3,), in C."""

@@ -9,7 +9,9 @@ from scipy.spatial import cKDTree
 
 from starpos.errors import CatalogueError
 from starpos.identification.triangles import angles, opposite_sides
-from starpos.sky.catalogue import EPOCH, MAS, Catalogue
+from starpos.rotation import unit_vector
+from starpos.sky.catalogue import EPOCH, Catalogue
+from starpos.units import MAS
 
 LIMIT_MAG = 7.0
 LONGEST_SIDE_DEG = 4.13  # the diagonal of 3.43 x 2.30 deg
@@ -76,8 +78,7 @@ def angles_of_printed(catalogue: Catalogue) -> tuple[np.ndarray, np.ndarray]:
     ra, dec = ra + _A_PM_RA * MAS * years / np.cos(dec), dec + _A_PM_DEC * MAS * years
 
     def at(ra, dec):
-        a = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-        return angles(opposite_sides(np.stack([first, a, last])))
+        return angles(opposite_sides(np.stack([first, unit_vector(ra, dec), last])))
 
     here, step = at(ra, dec), _A_SIGMA_MAS * MAS
     return here, np.hypot(at(ra + step / np.cos(dec), dec) - here, at(ra, dec + step) - here)

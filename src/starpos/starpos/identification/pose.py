@@ -143,7 +143,7 @@ def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
     v = np.empty((*xy.shape[:2], 3))
     v[..., :2] = xy
     v[..., 2] = focal_px[:, None]
-    return v / np.sqrt(np.einsum("kni,kni->kn", v, v))[..., None]
+    return rotation.normalised(v)
 
 
 def _perimeter(v: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.identification.triangles import TriangleCatalogue
+from starpos.rotation import normalised
 from starpos.sky.catalogue import Catalogue
 
 
@@ -20,8 +21,7 @@ class Sky:
 
     def directions(self, index: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of the catalogue's stars."""
-        v = self.catalogue.directions(index, self.year) + np.asarray(self.velocity)
-        return v / np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
+        return normalised(self.catalogue.directions(index, self.year) + np.asarray(self.velocity))
 
     def bright(self, row: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of rows of the triangle catalogue's stars."""
@@ -29,5 +29,4 @@ class Sky:
 
     def unaberrated(self, v: np.ndarray) -> np.ndarray:
         """ICRS directions (n, 3) of those seen at v (n, 3)."""
-        v = v - np.asarray(self.velocity)
-        return v / np.linalg.norm(v, axis=1, keepdims=True)
+        return normalised(v - np.asarray(self.velocity))

@@ -24,6 +24,7 @@ import numpy as np
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import CELLS, ZONES, cell_starts, ranges
+from starpos.units import DAY_S
 
 PREFIX = "triangles-9-"  # of the folders in the cache; the number is the format's
 SCRATCH = "unfinished-"
@@ -356,7 +357,7 @@ def _clear(cache: Path) -> None:
             shutil.rmtree(old, ignore_errors=True)
     for left in cache.glob(f"{SCRATCH}*"):
         with suppress(OSError):
-            if time.time() - left.stat().st_mtime > 86400:
+            if time.time() - left.stat().st_mtime > DAY_S:
                 shutil.rmtree(left, ignore_errors=True)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
+from starpos.units import ARCSEC
 
 LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
@@ -61,8 +62,8 @@ class InclinometerErrors:
 
     noise_rad: float = SCA100T_NOISE_RAD
     quantum_rad: float = np.radians(0.0005)
-    drift_rad_per_sqrt_hour: float = np.radians(2 / 3600)
-    temperature_rad_per_c: float = np.radians(3 / 3600)
+    drift_rad_per_sqrt_hour: float = 2 * ARCSEC
+    temperature_rad_per_c: float = 3 * ARCSEC
     scale: float = 1e-4
 
     def __post_init__(self):

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import DAY_S
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import LIMIT_RAD, InclinometerErrors
 from starpos.instrument.mounting import Mounting
+from starpos.units import ARCSEC, DAY_S
 from starpos.utc import utc_text
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (DESIGN section 2)
@@ -21,7 +21,6 @@ MOST_ARCSEC, MOST_C = (
     200.0,
 )  # an error of some turns says that nothing is known; no inclinometer is so hot
 MOST_CLOCK_S = 86400.0
-ARCSEC = np.radians(1 / 3600)
 
 
 @dataclass(frozen=True)

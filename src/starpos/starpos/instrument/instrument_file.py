@@ -21,8 +21,8 @@ MOST_FRAMES = 1 << 31
 INCLINOMETER = {  # key, field, unit in rad or 1
     "tilt_noise_deg": ("noise_rad", math.radians(1)),
     "tilt_quantum_deg": ("quantum_rad", math.radians(1)),
-    "tilt_drift_arcsec_per_sqrt_hour": ("drift_rad_per_sqrt_hour", math.radians(1 / 3600)),
-    "tilt_temperature_arcsec_per_c": ("temperature_rad_per_c", math.radians(1 / 3600)),
+    "tilt_drift_arcsec_per_sqrt_hour": ("drift_rad_per_sqrt_hour", ARCSEC),
+    "tilt_temperature_arcsec_per_c": ("temperature_rad_per_c", ARCSEC),
     "tilt_scale": ("scale", 1.0),
 }
 KEYS = (

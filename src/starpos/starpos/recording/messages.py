@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from starpos.earth.orientation import curvature_radii_m
-from starpos.earth.vertical import ARCSEC, Deflection
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solver import Attitude, Status
@@ -14,6 +14,7 @@ from starpos.instrument.inclinometer import LIMIT_RAD
 from starpos.report.folder import Exposure
 from starpos.report.night import NO_TILT, Place, Shot
 from starpos.rotation import full_turn
+from starpos.units import ARCSEC
 from starpos.utc import utc_text
 
 UNUSABLE = 1 | 2 | 4  # of Tilt.flags: out of range, stuck, saturated

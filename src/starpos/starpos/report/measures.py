@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth.orientation import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.report.night import Night, Place, Truth
+from starpos.units import ARCSEC
 
-ARCSEC = np.radians(1 / 3600)
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
 FEWEST_FOR_OUTLIERS = 5
 SIGMA_PER_MAD = 1.4826

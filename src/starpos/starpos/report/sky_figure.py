@@ -6,11 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from starpos.earth.orientation import EarthState, earth_state, station_velocity
+from starpos.earth.orientation import EarthState, earth_state
 from starpos.fix.solver import Attitude
 from starpos.report.frame_figures import pointed
 from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE
+from starpos.rotation import normalised
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site
 
@@ -26,9 +27,11 @@ def draw_sky(figure, night: Night, catalogue: Catalogue) -> None:
     place = night.combined or night.fixed[0][1].place
     site = Site(np.degrees(place.latitude), np.degrees(place.longitude), night.atmosphere)
     shots = [s for s in night.shots if pointed(s)]
-    centres = np.concatenate([seen(site, earth_state(s.utc_unix_s), _axes(s.pointing)[2:]) for s in shots])
+    centres = np.concatenate(
+        [site.refracted(_axes(s.pointing)[2:], earth_state(s.utc_unix_s)) for s in shots]
+    )
     shown = _different(shots, centres)
-    outlines = [seen(site, earth_state(s.utc_unix_s), _outline(s)) for s in shown]
+    outlines = [site.refracted(_outline(s), earth_state(s.utc_unix_s)) for s in shown]
     reach = _reach(np.concatenate(outlines))
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
@@ -36,7 +39,7 @@ def draw_sky(figure, night: Night, catalogue: Catalogue) -> None:
     for shot, outline in zip(shown, outlines, strict=True):
         axes.plot(*polar(outline), color=ORANGE, lw=1.3)
         if len(shot.xy):
-            stars = seen(site, earth_state(shot.utc_unix_s), looking(shot, shot.xy))
+            stars = site.refracted(looking(shot, shot.xy), earth_state(shot.utc_unix_s))
             axes.scatter(*polar(stars), s=_dot(shot.magnitudes), color=BLUE, lw=0, zorder=3)
     axes.plot(*polar(centres), "+", color=ORANGE, ms=7, mew=1.4, zorder=4)
     axes.set_rlim(0, reach)
@@ -84,12 +87,6 @@ def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arctan2(enu[:, 0], enu[:, 1]), np.degrees(np.arctan2(np.hypot(enu[:, 0], enu[:, 1]), enu[:, 2]))
 
 
-def seen(site: Site, state: EarthState, icrs: np.ndarray) -> np.ndarray:
-    """Refracted directions (N, 3) in ENU of ICRS directions."""
-    v = state.to_itrs(icrs) + station_velocity(site.enu[2])
-    return site.atmosphere.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ site.enu.T)
-
-
 def _axes(a: Attitude) -> np.ndarray:
     """Rows x (columns), y (rows) and z of the camera in ICRS (3, 3)."""
     ca, sa, cd, sd = np.cos(a.ra), np.sin(a.ra), np.cos(a.dec), np.sin(a.dec)
@@ -104,7 +101,7 @@ def looking(shot: Shot, xy: np.ndarray) -> np.ndarray:
     centre = (np.array(shot.size) - 1) / 2
     plane = (xy - centre) / shot.pointing.focal_px
     v = np.column_stack([plane, np.ones(len(plane))]) @ _axes(shot.pointing)
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
+    return normalised(v)
 
 
 def _outline(shot: Shot) -> np.ndarray:

@@ -16,6 +16,7 @@ from starpos.errors import CatalogueError
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
+from starpos.units import ARCSEC
 
 TOLERANCE_ARCSEC = 20.0  # of the frame's centre, or a pixel where that is more
 FALSE_STEP_MAG = 0.1  # a false star outshines the next one by this
@@ -43,7 +44,7 @@ class Conditions:
     @property
     def tolerance_rad(self) -> float:
         """How far off the frame's centre may be in a right answer."""
-        return max(np.radians(TOLERANCE_ARCSEC / 3600), 1 / self.camera.fx)
+        return max(TOLERANCE_ARCSEC * ARCSEC, 1 / self.camera.fx)
 
 
 def ideal(camera: Camera, limit_mag: float = 9.0, **more) -> Conditions:

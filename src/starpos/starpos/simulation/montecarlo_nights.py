@@ -15,7 +15,8 @@ from starpos import rotation
 from starpos.averaging.average import Average, average
 from starpos.calibration.misalignment import calibrate_at
 from starpos.calibration.turning import turn
-from starpos.earth.orientation import DAY_S, ROTATION_RAD_S, curvature_radii_m, earth_orientation
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import ROTATION_RAD_S, earth_orientation
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
@@ -26,14 +27,14 @@ from starpos.instrument.inclinometer import InclinometerErrors, TiltLog
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.rotation import half_turn
 from starpos.simulation.scene import Scene, TiltErrors, detected, expose, read_tilt
-from starpos.sky.catalogue import EPOCH, MAS, Catalogue
+from starpos.sky.catalogue import EPOCH, Catalogue
 from starpos.sky.site import Site, camera_to_enu
+from starpos.units import ARCSEC, DAY_S, MAS
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
 EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
 FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0  # 2016 to 2026
 LEAN_DEG = 0.05  # how far off the plumb line a turn by hand is, 1 sigma
-ARCSEC = np.radians(1 / 3600)
 SCA100T = InclinometerErrors()
 
 

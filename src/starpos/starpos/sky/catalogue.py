@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import CatalogueError
+from starpos.rotation import normalised
 from starpos.sky.zones import ZONES, cell_starts, rows_near
+from starpos.units import MAS, MAS_DEG
 
 EPOCH = 2000.0  # of ra, dec, Julian year
 FORMAT = 3
-MAS_DEG = 1 / 3.6e6
-MAS = np.radians(MAS_DEG)
 EPOCH_ZERO = 1900.0
 SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = (
     1.0,
@@ -86,7 +86,7 @@ class Catalogue:
         )
         north = np.stack([-sd * cr, -sd * sr, cd], -1) * (self.pm_dec[index] * (year - EPOCH) * MAS)[:, None]
         v = v + east + north
-        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+        return normalised(v)
 
     def sigma(self, index, year: float) -> np.ndarray:
         """Error of a place at a Julian year, rad, one axis, 1 sigma (n,)."""

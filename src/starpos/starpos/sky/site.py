@@ -27,14 +27,18 @@ class Site:
             [
                 [-np.sin(lam), np.cos(lam), 0.0],
                 [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
-                [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+                rotation.unit_vector(lam, phi),
             ]
         )
 
     def observed(self, catalogue: Catalogue, index: np.ndarray, state: EarthState) -> np.ndarray:
         """Refracted directions (n, 3) in ENU of catalogue stars."""
-        v = state.to_itrs(catalogue.directions(index, state.year)) + station_velocity(self.enu[2])
-        return self.atmosphere.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ self.enu.T)
+        return self.refracted(catalogue.directions(index, state.year), state)
+
+    def refracted(self, icrs: np.ndarray, state: EarthState) -> np.ndarray:
+        """Refracted directions (n, 3) in ENU of ICRS directions (n, 3) at the state's date."""
+        v = rotation.normalised(state.to_itrs(icrs) + station_velocity(self.enu[2]))
+        return self.atmosphere.refraction().bend(v @ self.enu.T)
 
     def overhead(
         self, catalogue: Catalogue, state: EarthState, toward: np.ndarray, radius: float, limit_mag: float
@@ -42,16 +46,12 @@ class Site:
         """Catalogue indices within `radius` rad of an observed ENU direction (3,), brightest first."""
         itrs = self.atmosphere.refraction().unbend(toward) @ self.enu
         # aberration and precession of the direction itself are far below the margin
-        ra, dec = np.arctan2(itrs[1], itrs[0]), np.arcsin(np.clip(itrs[2], -1, 1))
-        icrs = (
-            np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]) @ state.gcrs_to_itrs
-        )
-        return catalogue.cone(icrs, radius + np.radians(0.05), limit_mag)
+        return catalogue.cone(itrs @ state.gcrs_to_itrs, radius + np.radians(0.05), limit_mag)
 
 
 def camera_to_enu(azimuth_deg: float, altitude_deg: float, roll_deg: float) -> np.ndarray:
     """Attitude (3, 3) of a camera that looks at azimuth, altitude; at roll 0 its x axis is level, to the right."""
     a, h = np.radians([azimuth_deg, altitude_deg])
-    z = np.array([np.sin(a) * np.cos(h), np.cos(a) * np.cos(h), np.sin(h)])
+    z = rotation.unit_vector(np.pi / 2 - a, h)
     x = np.array([np.cos(a), -np.sin(a), 0.0])
     return np.stack([x, np.cross(z, x), z], 1) @ rotation.about_axis(2, -np.radians(roll_deg))

@@ -8,11 +8,13 @@ import pytest
 from starpos import rotation
 from starpos.averaging.average import Averager, average
 from starpos.averaging.filter import UNIT, Plane
-from starpos.earth.orientation import curvature_radii_m, earth_state
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, correlation
 from starpos.instrument.inclinometer import Tilt
-from starpos_testing.skies.fields import ARCSEC, UTC, Field, random_field, turn
+from starpos.units import ARCSEC
+from starpos_testing.skies.fields import UTC, Field, random_field, turn
 
 STATE = earth_state(UTC)
 

@@ -10,10 +10,12 @@ import pytest
 
 from starpos import rotation
 from starpos.averaging.average import Averager, average
-from starpos.earth.orientation import curvature_radii_m, earth_state
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.instrument.inclinometer import Tilt
-from starpos_testing.skies.fields import ARCSEC, UTC, Field
+from starpos.units import ARCSEC
+from starpos_testing.skies.fields import UTC, Field
 
 STATE = earth_state(UTC)
 NOISE, A3_ERROR = 12.6 * ARCSEC, 5.0 * ARCSEC

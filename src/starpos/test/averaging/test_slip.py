@@ -9,7 +9,8 @@ import pytest
 from starpos import rotation
 from starpos.averaging.slip import slip_s
 from starpos.earth.orientation import ROTATION_RAD_S, earth_state
-from starpos_testing.skies.fields import ARCSEC, Field
+from starpos.units import ARCSEC
+from starpos_testing.skies.fields import Field
 
 
 @pytest.fixture

@@ -8,12 +8,13 @@ import pytest
 
 from starpos.averaging.average import average
 from starpos.calibration.misalignment import VALID_DAYS, calibrate_at
-from starpos.earth.orientation import DAY_S, curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.solver import Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration
+from starpos.units import DAY_S
 from starpos_testing.skies.scenes import START
 from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 

@@ -9,8 +9,8 @@ import pytest
 from starpos import rotation
 from starpos.calibration.plumb_line import Readings, hang, level
 from starpos.instrument.inclinometer import a2_matrix
+from starpos.units import ARCSEC
 
-ARCSEC = np.radians(1 / 3600)
 SCA100T, QUIET = 12.6 * ARCSEC, 0.1 * ARCSEC
 
 

@@ -9,7 +9,7 @@ import pytest
 from starpos import rotation
 from starpos.averaging.average import average
 from starpos.calibration.turning import turn
-from starpos.earth.orientation import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, a2_matrix

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from starpos.earth import geoid
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.geoid_file import find, read_grid
-from starpos.earth.orientation import curvature_radii_m
-from starpos.earth.vertical import ARCSEC, UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
+from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
 from starpos.errors import GeoidError
+from starpos.units import ARCSEC
 
 EVERYWHERE = [(90, 0), (90, 77), (89.9, -130), (-90, 10), (-89.95, 200), (85.03, 33), (60, 179.99), (47.3, -179.99),
               (0, 0), (0.01, -0.01), (-33.4, 123.456), (12.5, 180), (-70.1, 359.9), (45, -540.2)]  # fmt: skip

@@ -10,12 +10,12 @@ import erfa
 import numpy as np
 import pytest
 
+from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import (
     EXTRAPOLATION_DAYS,
     EXTRAPOLATION_SIGMA_S,
     POLE_SIGMA_RAD,
     EarthOrientation,
-    curvature_radii_m,
     earth_motion,
     earth_orientation,
     earth_state,
@@ -25,9 +25,7 @@ from starpos.earth.orientation import (
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import TimeError
 from starpos.sky.site import Site
-
-ARCSEC = np.radians(1 / 3600)
-MAS = ARCSEC / 1000
+from starpos.units import ARCSEC, MAS
 
 
 def unix_of(*utc):

@@ -5,8 +5,7 @@ import pytest
 
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import InstrumentError
-
-ARCSEC = np.radians(1 / 3600)
+from starpos.units import ARCSEC
 
 
 def at_zenith_distance(degrees):

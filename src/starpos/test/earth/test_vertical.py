@@ -4,8 +4,8 @@ import pytest
 
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import InstrumentError
+from starpos.units import ARCSEC
 
-ARCSEC = np.radians(1 / 3600)
 NONE = np.zeros((3, 3))
 
 

@@ -10,7 +10,8 @@ from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.fix.fix import Mounting
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
-from starpos_testing.skies.fields import ARCSEC, UTC, Field
+from starpos.units import ARCSEC
+from starpos_testing.skies.fields import UTC, Field
 
 STATE = earth_state(UTC)
 ARCSEC_M = (30.95, 30.82)  # east, north at 35.7 deg, radii of WGS 84

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.earth.orientation import curvature_radii_m, earth_state
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.fix.fix import Mounting
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos_testing.skies.fields import ARCSEC, PAPER, UTC, Field, random_field, turn
+from starpos.units import ARCSEC
+from starpos_testing.skies.fields import PAPER, UTC, Field, random_field, turn
 
 STATE = earth_state(UTC)
 PLACES = {

@@ -15,8 +15,7 @@ from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import read_tilt_csv
 from starpos.instrument.instrument import Instrument, focal_px_of
 from starpos.simulation.scene import scene_of
-
-ARCSEC = np.radians(1 / 3600)
+from starpos.units import ARCSEC
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,15 @@ import pytest
 
 from starpos.averaging.average import average
 from starpos.cli.common import tell_extrapolation
-from starpos.earth.orientation import curvature_radii_m, earth_state, station_velocity
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import earth_state, station_velocity
 from starpos.errors import TiltError
 from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import EXACT, Tilt, TiltLog
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.units import ARCSEC
 from starpos.utc import utc_text
 from starpos_testing.skies.scenes import (
     EXPOSURE,
@@ -31,8 +33,6 @@ from starpos_testing.skies.scenes import (
     wide_scene,
     with_false_stars,
 )
-
-ARCSEC = np.radians(1 / 3600)
 
 
 @pytest.fixture(scope="module")

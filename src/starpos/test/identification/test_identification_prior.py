@@ -7,9 +7,8 @@ from test_identification import FIELDS, check, random_attitude, seen, sky_for
 
 from starpos import rotation
 from starpos.identification import Plumb, Pointing, identify, search
+from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import START, solver_of, stars_of, tilt_of, wide_scene
-
-ARCSEC = np.radians(1 / 3600)
 
 
 @pytest.fixture

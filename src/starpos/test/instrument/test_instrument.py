@@ -11,7 +11,8 @@ from starpos import rotation
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
-from starpos.instrument.instrument import ARCSEC, Calibration, Instrument, focal_px_of
+from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
+from starpos.units import ARCSEC
 
 
 def test_misalignment_is_r3_r2_r1():

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starpos.earth.orientation import curvature_radii_m, earth_state
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ALWAYS, ErrorTerm
@@ -18,9 +19,9 @@ from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, Place, Shot, Truth
 from starpos.report.working import Workshop, worked
 from starpos.sky.site import Site, camera_to_enu
+from starpos.units import ARCSEC
 from starpos_testing.skies.reports import simulate
 
-ARCSEC = np.radians(1 / 3600)
 FOCAL_PX = 29.67e3 / 6.4
 AIR = Atmosphere(100000.0, 5.0, 0.3)
 
@@ -127,7 +128,7 @@ def test_stars_are_drawn_where_they_stand_on_the_sky(lists, catalogue):
     site = Site(np.degrees(n.combined.latitude), np.degrees(n.combined.longitude), AIR)
     for shot in n.shots:
         icrs = sky_figure.looking(shot, shot.xy)
-        azimuth, zenith_deg = sky_figure.polar(sky_figure.seen(site, earth_state(shot.utc_unix_s), icrs))
+        azimuth, zenith_deg = sky_figure.polar(site.refracted(icrs, earth_state(shot.utc_unix_s)))
         camera = Camera.from_focal(*shot.size, FOCAL_PX)
         true = camera.directions(*shot.xy.T) @ camera_to_enu(40.0, 78.0, 15.0).T  # as `simulate` points
         np.testing.assert_allclose(zenith_deg, np.degrees(np.arccos(true[:, 2])), atol=0.02)

@@ -4,9 +4,8 @@ import pytest
 
 from starpos.errors import CatalogueError
 from starpos.sky import catalogue as module
-from starpos.sky.catalogue import MAS, Catalogue, load, pack, read, save
-
-ARCSEC = np.radians(1 / 3600)
+from starpos.sky.catalogue import Catalogue, load, pack, read, save
+from starpos.units import ARCSEC, MAS
 
 
 def unit(ra_deg, dec_deg):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from starpos.errors import CatalogueError
-from starpos.sky.catalogue import MAS
 from starpos.sky.tycho2 import build, johnson_v
+from starpos.units import MAS
 
 
 def record(size, **fields):

@@ -8,8 +8,9 @@ import numpy as np
 from starpos import rotation
 from starpos.fix.solver import Solver
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import ARCSEC, Calibration, Instrument
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.simulation.scene import Scene
+from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 TRUE_A3_DEG = (1.5, -2.0, 130.0)

@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units that are not SI, in SI: radians and seconds."""
+
+import math
+
+ARCSEC = math.radians(1 / 3600)
+MAS = ARCSEC / 1000
+MAS_DEG = 1 / 3.6e6  # a milliarcsecond in degrees
+DAY_S = 86400.0
+HOUR_S = 3600.0
