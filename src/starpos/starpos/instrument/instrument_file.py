@@ -14,6 +14,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
+from starpos.units import ARCSEC
 from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
