@@ -10,8 +10,7 @@ import pytest
 
 from starpos.instrument.inclinometer import Tilt
 from starpos_common.messages import tilt_to_message
-from starpos_interfaces.msg import Solution
-from starpos_interfaces.msg import Tilt as TiltMessage
+from starpos_interfaces import msg
 from starpos_testing.graph.shots import focal_of
 
 SIZE = (2000, 1400)
@@ -34,7 +33,7 @@ def night(tmp_path_factory):
     return folder
 
 
-def read_tilts(path) -> list[TiltMessage]:
+def read_tilts(path) -> list[msg.Tilt]:
     """The rows of a tilt.csv; their covariance is left unknown."""
     with path.open() as f:
         rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(f)]
@@ -67,7 +66,7 @@ def test_the_graph_and_the_command_line_agree(graph, run, night):
     truth = json.loads((night / "truth.json").read_text())
     got = [graph.solutions[stamp][0] for stamp in sorted(graph.solutions)]
     for want, solution, frame in zip(expected, got, truth["frames"], strict=True):
-        assert (solution.status, want["status"]) == (Solution.OK, "ok"), solution.status_text
+        assert (solution.status, want["status"]) == (msg.Solution.OK, "ok"), solution.status_text
         for name in ("latitude", "longitude", "heading"):
             assert getattr(solution, name) == pytest.approx(want[name], abs=1e-8), (
                 name

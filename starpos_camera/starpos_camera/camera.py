@@ -22,11 +22,11 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
-from starpos_camera.sources.source import NothingYet, Settings, Source, SourceEnded
+from starpos_camera.sources.source import CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport
-from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_common.paths import path_of
@@ -86,7 +86,7 @@ class CameraNode(Node):
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
                     "and pixel_um, until ~/set_camera_info is called."
                 )
-        self._source: Source = SOURCES[self._values["source"]](self._values, self._now_s)
+        self._source: FrameSource = SOURCES[self._values["source"]](self._values, self._now_s)
 
         self._frames = self._failed = self._skipped = 0
         self._skipped_before = 0  # at the last report
@@ -158,7 +158,7 @@ class CameraNode(Node):
     def _heard(self) -> bool:
         return self._images.get_subscription_count() > 0 or any(t.wanted for t in self._takers)
 
-    def _take(self, settings: Settings) -> Taken:
+    def _take(self, settings: CaptureSettings) -> Taken:
         """In the worker's thread: a frame, ready to be published."""
         begin = time.monotonic()
         if self.get_clock().ros_time_is_active:
@@ -291,7 +291,7 @@ class CameraNode(Node):
         response.message = refusal or now
         return response
 
-    def _report(self) -> Status:
+    def _report(self) -> Diagnosis:
         level, sentence = self._state
         skipped, self._skipped_before = self._skipped - self._skipped_before, self._skipped
         cadence, last = self._values["cadence"], self._last
@@ -318,12 +318,12 @@ class CameraNode(Node):
                 "stamp error (s)": last.capture.stamp_stddev,
                 "taking one frame (s)": last.seconds,
             }
-        return Status(level, sentence, values)
+        return Diagnosis(level, sentence, values)
 
 
-def _settings(values) -> Settings:
+def _settings(values) -> CaptureSettings:
     exposure_s, gain = (None if math.isnan(values[name]) else values[name] for name in ("exposure", "gain"))
-    return Settings(exposure_s, gain, values["cadence"])
+    return CaptureSettings(exposure_s, gain, values["cadence"])
 
 
 def _complaint(values) -> str | None:

@@ -17,7 +17,7 @@ from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
-from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import encoding_of, message_to_frame, stars_to_message
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
@@ -40,7 +40,7 @@ class Job:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class DetectedFrame:
     """What became of a frame: its stars, ready to be published, and what it took. The frame goes once they are."""
 
     frame: Frame | None
@@ -64,7 +64,7 @@ class DetectorNode(Node):
         self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
         self._troubles = Troubles(self)
         self._complaint = ""  # about a frame since the last report
-        self._last: Outcome | None = None
+        self._last: DetectedFrame | None = None
         self._size = ""  # of the last frame, in words
         self._last_frame_s = self._interval_s = None  # monotonic
         self._publisher = publisher(self, StarArray, "stars", 10)
@@ -180,18 +180,18 @@ class DetectorNode(Node):
         exposure = exposure or self._values["exposure"] or None
         return {"exposure_s": exposure, "stamp_stddev_s": stamp, "clock_stddev_s": clock}
 
-    def _detect(self, job: Job) -> Outcome:
+    def _detect(self, job: Job) -> DetectedFrame:
         """In the worker's thread."""
         begin, cpu = time.monotonic(), time.thread_time()  # other threads may be drawing, or rendering
         detection = detect(job.frame, self._settings)
         message = stars_to_message(detection.stars, job.header.frame_id)
         message.header = job.header  # to the nanosecond: it is what goes with a frame finds it by
         cpu_ms = (time.thread_time() - cpu) * 1e3
-        return Outcome(job.frame, message, detection, cpu_ms, time.monotonic() - begin)
+        return DetectedFrame(job.frame, message, detection, cpu_ms, time.monotonic() - begin)
 
     def _on_wake(self):
         for result in self._worker.fetch():
-            if isinstance(result, Outcome):
+            if isinstance(result, DetectedFrame):
                 self._publisher.publish(result.message)
                 self._frames += 1
                 self._troubles.right("frames")
@@ -209,7 +209,7 @@ class DetectorNode(Node):
         self._complaint = sentence
         self._troubles.wrong("frames", sentence)
 
-    def _report(self) -> Status:
+    def _report(self) -> Diagnosis:
         level, sentence = Level.OK, "no stars in the last frame."
         complaint, self._complaint = self._complaint, ""
         last = self._last
@@ -234,7 +234,7 @@ class DetectorNode(Node):
                 "cpu_ms": last.cpu_ms,
                 "seconds": last.seconds,
             }
-        return Status(level, sentence, values)
+        return Diagnosis(level, sentence, values)
 
 
 def _key(header: Header) -> tuple[int, int]:

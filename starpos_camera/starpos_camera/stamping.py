@@ -3,14 +3,14 @@
 
 from collections.abc import Callable
 
-from starpos_camera.sources.source import CaptureError, Exposure
+from starpos_camera.sources.source import CapturedFrame, CaptureError
 from starpos_common.system_clock import StepWatch
 from starpos_interfaces.msg import Capture
 
 OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)
 
 
-def in_one_time(capture: Callable[[], Exposure], watch: StepWatch) -> Exposure:
+def in_one_time(capture: Callable[[], CapturedFrame], watch: StepWatch) -> CapturedFrame:
     """What `capture` gives; CaptureError where the system's clock, which stamped it, was set meanwhile.
 
     watch: one that is asked every second, also while the capture lasts.

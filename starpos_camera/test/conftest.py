@@ -6,7 +6,7 @@ import pytest
 
 from starpos.simulation.night_on_disk import write_fits
 from starpos.simulation.scene import expose, render, scene_of
-from starpos.sky.catalogue import load as load_catalogue
+from starpos.sky.catalogue import load_catalogue
 from starpos_testing.nodes import Listener, Process, take_domain
 
 SIZE = (640, 480)

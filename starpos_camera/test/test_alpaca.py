@@ -14,12 +14,12 @@ from sensor_msgs.msg import Image
 
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.alpaca import Alpaca
-from starpos_camera.sources.source import CaptureError, Settings
+from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_testing.nodes import WAIT_S
 
-SHORT = Settings(0.1, None, 5.0)
-LONG = Settings(2.0, None, 5.0)
+SHORT = CaptureSettings(0.1, None, 5.0)
+LONG = CaptureSettings(2.0, None, 5.0)
 
 
 def values(address, **changes):
@@ -80,14 +80,14 @@ def test_the_mosaic_is_that_of_the_bayer_offset_and_other_sensors_are_refused(si
 
 def test_exposure_and_gain_are_set_at_run_time_and_what_cannot_be_is_refused(simulator):
     source = make(simulator)
-    exposure = source.capture(Settings(0.2, 6.0, 5.0))
+    exposure = source.capture(CaptureSettings(0.2, 6.0, 5.0))
     assert exposure.frame.exposure_s == 0.2
     assert simulator.client().Gain == 7  # the simulator's Gain is one more than the index that was set
     assert "its gain is 7, though 6 was set" in exposure.remark
-    assert "out of range" in attempt(source, Settings(0.1, 99.0, 5.0))
-    assert "too long" in attempt(source, Settings(4000.0, None, 5000.0))
+    assert "out of range" in attempt(source, CaptureSettings(0.1, 99.0, 5.0))
+    assert "too long" in attempt(source, CaptureSettings(4000.0, None, 5000.0))
     given = values(simulator.address)
-    assert "whole number" in Alpaca.refusal(given, Settings(0.1, 1.5, 5.0))
+    assert "whole number" in Alpaca.refusal(given, CaptureSettings(0.1, 1.5, 5.0))
 
 
 def test_another_program_disconnects_bins_or_aborts(simulator, record_property):
@@ -169,10 +169,10 @@ def test_close_ends_an_exposure(simulator):
 
 def test_a_gain_is_set_once_and_kept(liar):
     source = make(liar)
-    assert source.capture(Settings(0.1, 50.0, 5.0)).remark == "" and liar.values["gain"] == 50
-    assert "its gain is 100, though 300 was set" in source.capture(Settings(0.1, 300.0, 5.0)).remark
+    assert source.capture(CaptureSettings(0.1, 50.0, 5.0)).remark == "" and liar.values["gain"] == 50
+    assert "its gain is 100, though 300 was set" in source.capture(CaptureSettings(0.1, 300.0, 5.0)).remark
     liar.values["gain"] = 3
-    assert "its gain is 3" in source.capture(Settings(0.1, 300.0, 5.0)).remark
+    assert "its gain is 3" in source.capture(CaptureSettings(0.1, 300.0, 5.0)).remark
 
 
 def test_the_node_ends_within_a_long_exposure(simulator, start):

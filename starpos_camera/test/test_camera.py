@@ -17,7 +17,7 @@ from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.simulation.scene import expose
-from starpos.sky.catalogue import load as load_catalogue
+from starpos.sky.catalogue import load_catalogue
 from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture

@@ -9,7 +9,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.frames.frame import Frame
-from starpos_camera.sources.source import CaptureError, Exposure
+from starpos_camera.sources.source import CapturedFrame, CaptureError
 from starpos_camera.stamping import in_one_time
 from starpos_common.messages import stamp_to_unix
 from starpos_common.system_clock import StepWatch
@@ -83,7 +83,7 @@ def test_a_frame_during_which_the_clock_was_set_is_left_out_unless_its_time_is_i
             for _ in range(int(exposure_s)):  # the diagnostics ask once a second
                 watch.step_s()
                 go(1.0)
-            return Exposure(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)
+            return CapturedFrame(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)
 
         return in_one_time(capture, watch)
 

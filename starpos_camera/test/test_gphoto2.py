@@ -15,14 +15,14 @@ from sensor_msgs.msg import Image
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s
 from starpos_camera.sources.gphoto2_camera import nearest, seconds, sentence
-from starpos_camera.sources.source import CaptureError, Settings
+from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 from starpos_testing.lacking import lacks
 from starpos_testing.skies import raws
 
-TENTH = Settings(0.1, None, 5.0)
-AS_IT_IS = Settings(None, None, 5.0)
+TENTH = CaptureSettings(0.1, None, 5.0)
+AS_IT_IS = CaptureSettings(None, None, 5.0)
 MOSAIC = raws.mosaic()
 GREY = (MOSAIC >> 8).astype(np.uint8)
 JPEG = cv2.imencode(".jpg", GREY, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
@@ -153,24 +153,24 @@ def test_frames_stay_in_the_camera_where_they_should(make):
 def test_exposures_are_the_cameras_own_to_five_percent(make):
     source = make()
     assert source.capture(AS_IT_IS).frame.exposure_s == pytest.approx(0.01)
-    assert source.capture(Settings(0.0515, None, 5.0)).frame.exposure_s == pytest.approx(0.05)
+    assert source.capture(CaptureSettings(0.0515, None, 5.0)).frame.exposure_s == pytest.approx(0.05)
     assert source.capture(AS_IT_IS).frame.exposure_s == pytest.approx(0.05)
-    said = attempt(source, Settings(0.3, None, 5.0))
+    said = attempt(source, CaptureSettings(0.3, None, 5.0))
     assert "no shutterspeed of 0.3 s" in said and "0.1000s and 1.0000s" in said
     assert source.capture(TENTH).frame.exposure_s == pytest.approx(0.1)
 
 
 def test_a_longer_exposure_is_held_open_which_this_camera_cannot(make):
     source = make()
-    assert "switch it off and on" in attempt(source, Settings(3.0, None, 5.0))
+    assert "switch it off and on" in attempt(source, CaptureSettings(3.0, None, 5.0))
     assert source.capture(TENTH).frame.exposure_s == pytest.approx(0.1)
 
 
 def test_the_gain_is_a_setting_the_camera_has(make):
-    assert "no setting 'iso'" in attempt(make(), Settings(0.1, 400.0, 5.0))
+    assert "no setting 'iso'" in attempt(make(), CaptureSettings(0.1, 400.0, 5.0))
     source = make(gphoto2__iso_setting="exposurecompensation")  # the only one of numbers that it has
-    assert source.capture(Settings(0.1, 2.0, 5.0)).frame is not None
-    assert "nearest are 2 and 2.5" in attempt(source, Settings(0.1, 2.2, 5.0))
+    assert source.capture(CaptureSettings(0.1, 2.0, 5.0)).frame is not None
+    assert "nearest are 2 and 2.5" in attempt(source, CaptureSettings(0.1, 2.2, 5.0))
     assert "no setting 'speed'" in attempt(make(gphoto2__shutter_setting="speed"))
 
 
@@ -258,7 +258,7 @@ def test_the_node_takes_frames_and_says_when_the_camera_is_gone(folder, start, l
 
 
 def test_what_is_refused_before_a_camera_is_looked_for():
-    assert "longer than `cadence`" in Gphoto2.refusal(values(), Settings(6.0, None, 5.0))
+    assert "longer than `cadence`" in Gphoto2.refusal(values(), CaptureSettings(6.0, None, 5.0))
 
 
 def test_a_camera_that_another_program_holds_is_said(folder):

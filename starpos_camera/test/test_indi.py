@@ -15,12 +15,12 @@ from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import timing
 from starpos_camera.sources.indi import Indi
-from starpos_camera.sources.source import CaptureError, Settings
+from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 
-SHORT = Settings(0.1, None, 5.0)
-LONG = Settings(60.0, None, 60.0)
+SHORT = CaptureSettings(0.1, None, 5.0)
+LONG = CaptureSettings(60.0, None, 60.0)
 SIZE = (1024, 1280)  # of the simulator
 
 
@@ -84,7 +84,7 @@ def source(server):
 
 def test_a_device_nobody_has_connected_gives_frames_with_the_drivers_time(source):
     begin = time.time()
-    exposure = source.capture(Settings(0.4, None, 5.0))
+    exposure = source.capture(CaptureSettings(0.4, None, 5.0))
     frame = exposure.frame
     assert (frame.pixels.shape, frame.pixels.dtype, frame.pattern) == (SIZE, np.uint16, "")
     assert frame.exposure_s == 0.4
@@ -122,10 +122,12 @@ def test_the_pixels_are_the_sensors_first_row_on_top(source, other, tmp_path, co
 
 
 def test_exposure_and_gain_are_set_at_run_time_and_what_cannot_be_is_refused(source, other):
-    assert source.capture(Settings(0.2, 42.0, 5.0)).frame.exposure_s == 0.2
+    assert source.capture(CaptureSettings(0.2, 42.0, 5.0)).frame.exposure_s == 0.2
     other.hear("CCD_GAIN", "Ok")
-    assert "its `gain` is 0 to 100, not 1000" in sentence(source, Settings(0.1, 1000.0, 5.0))
-    assert "its `exposure` (s) is 0.01 to 3600, not 0.001" in sentence(source, Settings(0.001, None, 5.0))
+    assert "its `gain` is 0 to 100, not 1000" in sentence(source, CaptureSettings(0.1, 1000.0, 5.0))
+    assert "its `exposure` (s) is 0.01 to 3600, not 0.001" in sentence(
+        source, CaptureSettings(0.001, None, 5.0)
+    )
     source.capture(SHORT)
 
 
@@ -230,7 +232,7 @@ def test_a_frame_that_does_not_come_in_time_is_given_up(server, source, other):
     source.capture(SHORT)
     impatient = make(server, indi__readout=2.0)
     other.catch_up()
-    attempt = Attempt(impatient, Settings(1.0, None, 5.0))
+    attempt = Attempt(impatient, CaptureSettings(1.0, None, 5.0))
     other.hear("CCD_EXPOSURE", "Busy")
     (driver,) = server.drivers()
     os.kill(driver, signal.SIGSTOP)
@@ -265,7 +267,7 @@ def liar(tmp_path):
     server.kill()
 
 
-QUICK = Settings(0.01, None, 5.0)
+QUICK = CaptureSettings(0.01, None, 5.0)
 
 
 @pytest.mark.parametrize(

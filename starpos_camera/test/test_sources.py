@@ -10,16 +10,16 @@ import pytest
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.simulation.scene import expose
-from starpos.sky.catalogue import load as load_catalogue
+from starpos.sky.catalogue import load_catalogue
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
-from starpos_camera.sources.source import Settings, SourceEnded
+from starpos_camera.sources.source import CaptureSettings, SourceEnded
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks
 from starpos_testing.skies import raws
 
 NOW_S = 1793642400.0
-SETTINGS = Settings(None, None, 5.0)
+SETTINGS = CaptureSettings(None, None, 5.0)
 
 
 def values(**changes):
@@ -101,8 +101,8 @@ def test_files_refuse_what_they_cannot_do():
     assert "files.path" in files.refusal(values(), SETTINGS)
     given = values(files__path="/x")
     assert files.refusal(given, SETTINGS) is None
-    assert "`exposure`" in files.refusal(given, Settings(0.5, None, 5.0))
-    assert "`gain`" in files.refusal(given, Settings(None, 3.0, 5.0))
+    assert "`exposure`" in files.refusal(given, CaptureSettings(0.5, None, 5.0))
+    assert "`gain`" in files.refusal(given, CaptureSettings(None, 3.0, 5.0))
 
 
 SMALL = {"source": "simulated", "focal_mm": 50.0, "simulated__width": 640, "simulated__height": 480}
@@ -124,7 +124,7 @@ def test_simulated_sky_follows_its_parameters(scene):
     source = make(**SMALL)
     before = source.capture(SETTINGS).frame
     source.update(values(**SMALL, simulated__azimuth=130.0))
-    after = source.capture(Settings(1.0, None, 5.0)).frame
+    after = source.capture(CaptureSettings(1.0, None, 5.0)).frame
     assert after.exposure_s == 1.0
     assert abs(before.pixels.astype(int) - after.pixels).max() > 1000
     with pytest.raises(AssertionError):
@@ -134,10 +134,10 @@ def test_simulated_sky_follows_its_parameters(scene):
 @pytest.mark.parametrize(
     ("settings", "changes", "sentence"),
     [
-        (Settings(11.0, None, 60.0), {}, "at most 10 s"),
-        (Settings(2.0, None, 1.0), {}, "longer than `cadence`"),
-        (Settings(None, None, 0.1), {}, "longer than `cadence`"),
-        (Settings(None, 1.0, 5.0), {}, "gain"),
+        (CaptureSettings(11.0, None, 60.0), {}, "at most 10 s"),
+        (CaptureSettings(2.0, None, 1.0), {}, "longer than `cadence`"),
+        (CaptureSettings(None, None, 0.1), {}, "longer than `cadence`"),
+        (CaptureSettings(None, 1.0, 5.0), {}, "gain"),
         (SETTINGS, {"simulated__width": 20000, "simulated__height": 20000}, "at most 100000000 px"),
     ],
 )

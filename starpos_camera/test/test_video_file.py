@@ -12,11 +12,11 @@ from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources.source import CaptureError, Settings, SourceEnded
+from starpos_camera.sources.source import CaptureError, CaptureSettings, SourceEnded
 from starpos_camera.sources.video import Video
 from starpos_interfaces.msg import Capture
 
-SETTINGS = Settings(None, None, 5.0)
+SETTINGS = CaptureSettings(None, None, 5.0)
 START, START_S = "2026-11-02T18:00:00.00", 1793642400.0
 RATE, FRAMES = 25.0, 5
 WIDTH, HEIGHT = 64, 48
@@ -170,11 +170,11 @@ def test_what_cannot_be_done_is_refused():
     for stream in ("", "rtsp://camera/1", "http://127.0.0.1/a.avi"):
         assert "of this machine" in refusal(stream)
     assert "a video file" in refusal("notes.txt")
-    assert "leave `exposure`" in refusal("a.avi", Settings(0.1, None, 5.0))
-    assert "leave `exposure`" in refusal("a.avi", Settings(None, 3.0, 5.0))
+    assert "leave `exposure`" in refusal("a.avi", CaptureSettings(0.1, None, 5.0))
+    assert "leave `exposure`" in refusal("a.avi", CaptureSettings(None, 3.0, 5.0))
     assert "video.format must be one of" in refusal("/dev/video0", video__format="H264")
     assert "together" in refusal("0", video__width=640)
-    assert refusal("0", Settings(0.1, 3.0, 5.0), video__format="Y16") is None
+    assert refusal("0", CaptureSettings(0.1, 3.0, 5.0), video__format="Y16") is None
 
 
 def test_a_camera_that_is_not_there_is_said():

@@ -16,11 +16,11 @@ from starpos.errors import FrameError, StarposError
 from starpos.simulation.night_on_disk import write_fits
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.files import Files
-from starpos_camera.sources.source import CaptureError, NothingYet, Settings
+from starpos_camera.sources.source import CaptureError, CaptureSettings, NothingYet
 from starpos_camera.sources.watched_folder import IDLE_S, MOST_LOOKED_AT, PATIENCE, WatchedFolder
 
 REST_S = 2.0
-SETTINGS = Settings(None, None, 5.0)
+SETTINGS = CaptureSettings(None, None, 5.0)
 OK, ERROR = 0, 2
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources.source import CaptureError, Settings
+from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_camera.sources.video import Video
 
 FOLDER = Path(os.environ["STARPOS_V4L2"])
-SETTINGS = Settings(None, None, 5.0)
+SETTINGS = CaptureSettings(None, None, 5.0)
 
 
 def wait(seconds):
@@ -56,7 +56,7 @@ def frames(source, settings=((None, None),)):
     """Of each pair of exposure and gain, one after the other."""
     out = []
     for exposure_s, gain in settings:
-        out.append(told(source, Settings(exposure_s, gain, 5.0)))
+        out.append(told(source, CaptureSettings(exposure_s, gain, 5.0)))
         wait(0.2)
     return out
 
@@ -71,7 +71,7 @@ def unplugged(source):
     out.append(told(source))
     pull = threading.Timer(0.1, plug.unlink)
     pull.start()
-    out.append(told(source, Settings(0.08, None, 5.0)))  # it settles for four frames first
+    out.append(told(source, CaptureSettings(0.08, None, 5.0)))  # it settles for four frames first
     pull.join()
     plug.touch()
     return [*out, told(source)]

@@ -78,7 +78,7 @@ class Mcu:
         rate_hz: int = DEFAULT_RATE_HZ,
         drift_ppm: float = 0.0,
         seed: int | None = None,
-        calibration: sca100t.Calibration | None = None,
+        calibration: sca100t.Sca100tCalibration | None = None,
     ):
         self.tilt = tilt
         self.noise_rad = noise_rad
@@ -87,7 +87,7 @@ class Mcu:
         self._power_up_rate = rate_hz
         self._tick = 1.0 + drift_ppm * 1e-6
         self._rng = random.Random(seed)
-        self._calibration = calibration or sca100t.Calibration()
+        self._calibration = calibration or sca100t.Sca100tCalibration()
         self._commands = mcu_protocol.LineSplitter()
         self._codes = (sca100t.CODE_ZERO, sca100t.CODE_ZERO)
         self.reset(0.0)
@@ -97,7 +97,7 @@ class Mcu:
         self._boot = now
         self._rate_hz = self._power_up_rate
         self._sequence = 0
-        self._status = mcu_protocol.Status.FIRST
+        self._status = mcu_protocol.SampleStatus.FIRST
         self._next = now + self._period
         return self._identify()
 
@@ -122,7 +122,7 @@ class Mcu:
         ms = int((at - self._boot) * self._tick * 1e3)
         line = mcu_protocol.sample_line(self._sequence, ms, *self._codes, counts, self._status)
         self._sequence += 1
-        self._status = mcu_protocol.Status(0)
+        self._status = mcu_protocol.SampleStatus(0)
         return line
 
     def skip_to(self, now: float):

@@ -6,7 +6,7 @@ import time
 from rclpy.node import Node
 from rclpy.time import Time
 
-from starpos_common.diagnostics import Diagnostics, Status
+from starpos_common.diagnostics import Diagnosis, Diagnostics
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher
 from starpos_inclinometer.host_clock import HostClock
@@ -15,7 +15,7 @@ from starpos_inclinometer.report import Reporter, step_sentence
 from starpos_inclinometer.sources.ascii_line import AsciiSource
 from starpos_inclinometer.sources.imu import TOPIC, ImuSource
 from starpos_inclinometer.sources.mcu import McuSource
-from starpos_inclinometer.sources.source import Health, Phase, Reading, Source
+from starpos_inclinometer.sources.source import Health, Phase, Reading, TiltSource
 from starpos_interfaces.msg import Tilt
 
 
@@ -42,7 +42,7 @@ class InclinometerNode(Node):
         self._source.stop()
         super().destroy_node()
 
-    def _make_source(self) -> Source:
+    def _make_source(self) -> TiltSource:
         clock, wake = self.host_clock, self._wake.trigger
         if self._values["source"] == "imu":
             return ImuSource(self, self._values, clock, wake)
@@ -90,7 +90,7 @@ class InclinometerNode(Node):
             self.get_logger().warning(step_sentence(step.seconds))
         return changed or stepped
 
-    def _report(self) -> Status:
+    def _report(self) -> Diagnosis:
         health = self._source.health()
         self._log(health)
         return self._reporter.report(health, time.monotonic())

@@ -237,10 +237,10 @@ def complaint(values: Mapping[str, Any]) -> str | None:
     return pattern_error(values["ascii.pattern"])
 
 
-def calibration(values: Mapping[str, Any]) -> sca100t.Calibration:
+def calibration(values: Mapping[str, Any]) -> sca100t.Sca100tCalibration:
     """The sensor's calibration that the parameters say."""
     floor = values["noise_stddev"]
-    return sca100t.Calibration(
+    return sca100t.Sca100tCalibration(
         values["offset_volts"],
         values["sensitivity"],
         values["divider"],

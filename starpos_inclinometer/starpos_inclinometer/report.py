@@ -3,7 +3,7 @@
 
 from collections import Counter
 
-from starpos_common.diagnostics import Level, Status
+from starpos_common.diagnostics import Diagnosis, Level
 from starpos_inclinometer.sources.source import OUT_OF_RANGE, SATURATED, STUCK, Counts, Health, Phase
 
 BAD_SHARE = 0.05  # of lines corrupted or lost since the last report, above which the link is worth a warning
@@ -29,7 +29,7 @@ class Reporter:
         self._known |= new
         return bool(new)
 
-    def report(self, health: Health, now_s: float) -> Status:
+    def report(self, health: Health, now_s: float) -> Diagnosis:
         """now_s: monotonic."""
         counts, before, self._counts = health.counts, self._counts, health.counts
         flags, self._flags = self._flags, Counter()
@@ -73,7 +73,7 @@ class Reporter:
             "device resets": counts.restarts,
             **health.values,
         }
-        return Status(level, text, values)
+        return Diagnosis(level, text, values)
 
 
 def step_sentence(seconds: float) -> str:

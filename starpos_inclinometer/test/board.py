@@ -10,7 +10,7 @@ import tty
 from pathlib import Path
 
 from starpos_inclinometer.sources.mcu_continuity import Continuity
-from starpos_inclinometer.sources.mcu_protocol import Parser, Sample
+from starpos_inclinometer.sources.mcu_protocol import LineParser, Sample
 from starpos_testing.lacking import lacks
 
 FIRMWARE = Path(__file__).parent.parent / "firmware"
@@ -50,7 +50,7 @@ class Board:
         )
         self.path = self.process.stdout.readline().strip()
         assert self.path, self.process.communicate()[1]
-        self.parser, self.continuity = Parser(), Continuity()
+        self.parser, self.continuity = LineParser(), Continuity()
         self._host = None
         self._read = self._written = 0
 

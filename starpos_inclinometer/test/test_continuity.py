@@ -7,7 +7,7 @@ import pytest
 from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import NEAR_CODES, McuDecoder
-from starpos_inclinometer.sources.mcu_protocol import Status
+from starpos_inclinometer.sources.mcu_protocol import SampleStatus
 
 CODE = 0x812345
 
@@ -57,14 +57,14 @@ def test_the_first_sample_waits_for_a_second_one(cable):
 
 def test_a_fault_is_told_at_once_its_end_when_it_is_said_twice(cable):
     cable.send(line(0), line(1))
-    got = cable.send(line(2, status=Status.ADC_TIMEOUT), line(3, status=Status.ADC_TIMEOUT))
+    got = cable.send(line(2, status=SampleStatus.ADC_TIMEOUT), line(3, status=SampleStatus.ADC_TIMEOUT))
     assert numbers(got) == [2, 3]
     assert cable.send(line(4)) == [] and numbers(cable.send(line(5))) == [4, 5]
 
 
 def test_without_temperature_its_number_means_nothing(cable):
     cable.send(line(0), line(1))
-    odd = mcu_protocol.sample_line(2, 200, CODE, CODE, 0xFF, Status.NO_TEMPERATURE)
+    odd = mcu_protocol.sample_line(2, 200, CODE, CODE, 0xFF, SampleStatus.NO_TEMPERATURE)
     assert numbers(cable.send(odd, line(3))) == [2, 3]
 
 
@@ -78,7 +78,7 @@ def test_without_temperature_its_number_means_nothing(cable):
         line(3, ms=3000),
         line(0xF003, ms=300),
         line(1, ms=100, x=CODE + 1),
-        line(0, ms=300, status=Status.FIRST),
+        line(0, ms=300, status=SampleStatus.FIRST),
         line(0x0103, ms=0x103 * 100),
     ],
 )
@@ -155,7 +155,7 @@ def test_lost_doubled_and_wrapped_sequence(cable):
 def test_millisecond_wrap_is_no_reset_but_going_back_is(cable):
     first = [line(6, 0xFFFFFF8C), line(7, 0xFFFFFFF0)]
     wrapped = [line(8, 84)]
-    reset = [line(0, 10, status=Status.FIRST | Status.WATCHDOG), line(1, 110)]
+    reset = [line(0, 10, status=SampleStatus.FIRST | SampleStatus.WATCHDOG), line(1, 110)]
     unannounced = [line(0, 5), line(1, 105)]
     got = cable.send(*first, *wrapped, *reset, identity(), *unannounced)
     assert [s.restarted for s in got] == [False, False, False, True, False, True, False]

@@ -12,7 +12,7 @@ import pytest
 
 from starpos_inclinometer.emulator import Mcu, Pty
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.mcu_protocol import Identity, Parser, Reason, Refusal, Status
+from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, SampleStatus
 from starpos_inclinometer.sources.sca100t import OUT_OF_RANGE, SATURATED, Sensor
 
 COMMAND = [
@@ -23,7 +23,7 @@ COMMAND = [
 
 
 def readings(mcu, n):
-    sensor, parser = Sensor(), Parser()
+    sensor, parser = Sensor(), LineParser()
     return [
         sensor.measure(s, s.milliseconds * 1e-3)
         for s in parser.feed(b"".join(mcu.sample() for _ in range(n)))
@@ -48,10 +48,10 @@ def test_beyond_its_range_it_says_so():
 
 def test_clock_and_sequence():
     mcu = Mcu(seed=1, rate_hz=20, drift_ppm=1000)
-    (identity,) = Parser().feed(mcu.reset(5.0))
+    (identity,) = LineParser().feed(mcu.reset(5.0))
     assert identity == Identity(1, 0x0100, 0x53494D00, 20, 24)
-    samples = Parser().feed(b"".join(mcu.sample() for _ in range(101)))
-    assert samples[0].status == Status.FIRST and samples[1].status == 0
+    samples = LineParser().feed(b"".join(mcu.sample() for _ in range(101)))
+    assert samples[0].status == SampleStatus.FIRST and samples[1].status == 0
     # Its samples are due by its own clock, which is fast.
     assert samples[-1].milliseconds - samples[0].milliseconds == pytest.approx(5000, abs=1)
     assert mcu.due - 5.0 == pytest.approx(102 * 0.05 / 1.001 + 0.0352, abs=1e-3)
@@ -59,7 +59,7 @@ def test_clock_and_sequence():
 
 def test_commands_are_answered():
     mcu = Mcu(seed=1)
-    parser = Parser()
+    parser = LineParser()
     stream = mcu_protocol.identify_command() + mcu_protocol.rate_command(25)
     assert [m.rate_hz for m in parser.feed(mcu.receive(stream[:5]) + mcu.receive(stream[5:]))] == [10, 25]
     stream = mcu_protocol.frame(b"R,00") + mcu_protocol.frame(b"X") + b"$Q*0000\r\n"

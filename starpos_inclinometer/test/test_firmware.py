@@ -17,7 +17,14 @@ from board import ELF, FIRMWARE, SIM, Board
 
 from starpos_inclinometer.emulator import DEFAULT_RATE_HZ, Mcu
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.mcu_protocol import Identity, Parser, Reason, Refusal, Sample, Status
+from starpos_inclinometer.sources.mcu_protocol import (
+    Identity,
+    LineParser,
+    Reason,
+    Refusal,
+    Sample,
+    SampleStatus,
+)
 from starpos_inclinometer.sources.sca100t import DIVIDER, Sensor
 
 BOOT_MS = 1000  # reset, calibration and a first sample
@@ -86,7 +93,7 @@ def test_says_who_it_is_before_the_first_sample(start):
     board.connect()
     first, *rest = board.messages(BOOT_MS)
     assert first == Identity(1, 0x0100, 0x53494D00, DEFAULT_RATE_HZ, 54)
-    assert [s.status for s in samples(rest)] == [Status.FIRST] + [0] * (len(rest) - 1)
+    assert [s.status for s in samples(rest)] == [SampleStatus.FIRST] + [0] * (len(rest) - 1)
     assert [s.sequence for s in samples(rest)] == list(range(len(rest)))
     assert board.messages(50, mcu_protocol.identify_command()).count(first) == 1
 
@@ -168,7 +175,7 @@ def test_temperature(board, celsius):
 
 def test_without_the_sensors_answer_it_says_so_and_sends_on(board):
     board.tell("sensor 0")
-    assert {s.status for s in samples(board.messages(2000))[1:]} == {Status.NO_TEMPERATURE}
+    assert {s.status for s in samples(board.messages(2000))[1:]} == {SampleStatus.NO_TEMPERATURE}
     board.tell("sensor 1")
     assert samples(board.messages(1000))[-1].status == 0
 
@@ -182,7 +189,7 @@ def test_a_stuck_converter_is_flagged_reset_and_calibrated_again(board, rate_hz)
     resets = board.tell("freeze 1")["adc_resets"]
     stuck = samples(board.messages(2000))[2:]
     assert len(stuck) == pytest.approx(2 * rate_hz - 2, abs=2)
-    assert {s.status for s in stuck} == {Status.ADC_TIMEOUT}
+    assert {s.status for s in stuck} == {SampleStatus.ADC_TIMEOUT}
     assert {(s.x, s.y) for s in stuck[1:]} == {(stuck[0].x, stuck[0].y)}
     assert abs(stuck[0].x - before.x) < 1000
     assert board.tell("freeze 0")["adc_resets"] > resets
@@ -198,7 +205,7 @@ def test_a_converter_that_a_spike_has_reset_never_sends_an_uncalibrated_code_unf
     at_rate(board, 50)
     assert not board.tell("adc")["calibrated"]
     got = samples(board.messages(2000))
-    assert Status.ADC_TIMEOUT in {s.status for s in got} and got[-1].status == 0
+    assert SampleStatus.ADC_TIMEOUT in {s.status for s in got} and got[-1].status == 0
     assert np.abs(angles([s for s in got if not s.status]) - [20, -20]).max() < 0.005
 
 
@@ -224,7 +231,7 @@ def test_without_reference_it_says_so_and_calibrates_when_it_is_back(board, from
         at_rate(board, 50)
     board.tell("reference 0")
     without = samples(board.messages(2000))[2:]
-    assert {s.status for s in without} == {Status.NO_REFERENCE}
+    assert {s.status for s in without} == {SampleStatus.NO_REFERENCE}
     assert {(s.x, s.y) for s in without} == {(0xFFFFFF, 0xFFFFFF)}
     board.tell("reference 1")
     got = samples(board.messages(3000))
@@ -234,7 +241,11 @@ def test_without_reference_it_says_so_and_calibrates_when_it_is_back(board, from
 
 @pytest.mark.parametrize(
     ("cause", "status"),
-    [("hang", Status.FIRST | Status.WATCHDOG), ("reset", Status.FIRST), ("power", Status.FIRST)],
+    [
+        ("hang", SampleStatus.FIRST | SampleStatus.WATCHDOG),
+        ("reset", SampleStatus.FIRST),
+        ("power", SampleStatus.FIRST),
+    ],
 )
 def test_a_reset_in_the_middle_tells_its_cause(board, cause, status):
     at_rate(board, 50)
@@ -257,15 +268,18 @@ def test_a_write_to_the_converter_that_a_reset_cut_short_leaves_no_trace(board, 
     at_rate(board, 50)
     board.tell(f"hang {left}")
     got = samples(board.messages(3000))
-    assert sum(s.status & Status.WATCHDOG != 0 for s in got) == 1 and got[-1].status == 0
+    assert sum(s.status & SampleStatus.WATCHDOG != 0 for s in got) == 1 and got[-1].status == 0
     assert np.abs(angles([s for s in got if not s.status]) - [20, -20]).max() < 0.005
 
 
 def test_the_cause_of_a_reset_is_not_that_of_the_next(board):
-    for cause, status in (("hang", Status.FIRST | Status.WATCHDOG), ("reset", Status.FIRST)):
+    for cause, status in (
+        ("hang", SampleStatus.FIRST | SampleStatus.WATCHDOG),
+        ("reset", SampleStatus.FIRST),
+    ):
         board.run(BOOT_MS)
         board.tell(cause)
-        (first,) = (s for s in samples(board.messages(BOOT_MS)) if s.status & Status.FIRST)
+        (first,) = (s for s in samples(board.messages(BOOT_MS)) if s.status & SampleStatus.FIRST)
         assert first.status == status
 
 
@@ -304,7 +318,7 @@ COMMANDS = [
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: repr(c[-20:]))
 def test_answers_as_the_protocol_says(board, command):
     """The Python emulation reads the same bytes; only the delay is the board's own."""
-    said = Parser().feed(Mcu().receive(command))
+    said = LineParser().feed(Mcu().receive(command))
     board.run(BOOT_MS)
     got = [m for m in board.messages(200, command + b"\r\n") if not isinstance(m, Sample)]
 
@@ -350,7 +364,7 @@ def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
     assert (parser.crc_errors, parser.malformed, continuity.restarts) == (0, 0, 0)
     assert continuity.lost > 0
     for sample in samples(got):
-        assert bool(sample.status & Status.OVERRUN) == (sample.lost > 0)
+        assert bool(sample.status & SampleStatus.OVERRUN) == (sample.lost > 0)
     assert [s.status for s in samples(got)[-10:]] == [0] * 10
 
 

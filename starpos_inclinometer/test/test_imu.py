@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-from starpos_inclinometer.sources.imu import Average, Averager, BadMessage, felt
+from starpos_inclinometer.sources.imu import BadMessage, ForceAverager, MeanForce, felt
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
@@ -35,7 +35,7 @@ def message(force, stamp_ns=BEGIN_NS, rotation=(0.0, 0.0, 0.0), variance=0.0):
 
 
 def average(forces, **options):
-    return Average.of([felt(message(f, BEGIN_NS + k * PERIOD_NS, **options)) for k, f in enumerate(forces)])
+    return MeanForce.of([felt(message(f, BEGIN_NS + k * PERIOD_NS, **options)) for k, f in enumerate(forces)])
 
 
 @pytest.mark.parametrize("tilt", [(0, 0), (3, -11), (-29, 20)])
@@ -104,7 +104,7 @@ def averaged(averager, stamps_ns):
 
 
 def test_doubled_and_disordered_messages_are_left_out():
-    averager = Averager(0.1)
+    averager = ForceAverager(0.1)
     stamps = [k * PERIOD_NS for k in range(11)]
     disturbed = [*stamps[:4], stamps[3], stamps[2], *stamps[4:]]
     (got,) = averaged(averager, disturbed)
@@ -113,7 +113,7 @@ def test_doubled_and_disordered_messages_are_left_out():
 
 
 def test_gaps_and_a_clock_that_was_set_break_the_sequence():
-    averager = Averager(0.1)
+    averager = ForceAverager(0.1)
     averaged(averager, [k * PERIOD_NS for k in range(12)])
     assert averager.breaks == 0
     assert len(averaged(averager, [5 * 10**9 + k * PERIOD_NS for k in range(12)])) == 1

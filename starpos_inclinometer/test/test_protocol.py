@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.mcu_protocol import Identity, Parser, Reason, Refusal, Sample
+from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, Sample
 
 PROTOCOL = Path(__file__).parent.parent / "PROTOCOL.md"
 
@@ -41,7 +41,7 @@ def test_checksum_gives_the_published_check_values():
 
 def test_the_documents_example_is_a_line_of_this_protocol():
     example = re.search(r"\$T,[0-9A-F,]+\*[0-9A-F]{4}", PROTOCOL.read_text())[0].encode() + b"\r\n"
-    (sample,) = Parser().feed(example)
+    (sample,) = LineParser().feed(example)
     assert sample == Sample(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
     assert example == mcu_protocol.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
     assert len(example) == mcu_protocol.SAMPLE_LINE
@@ -50,24 +50,24 @@ def test_the_documents_example_is_a_line_of_this_protocol():
 def test_messages_round_trip():
     identity = Identity(1, 0x0102, 0xDEADBEEF, 10, 20)
     stream = mcu_protocol.identity_line(identity) + lines(1)[0] + mcu_protocol.refusal_line(Reason.UNKNOWN)
-    messages = Parser().feed(stream)
+    messages = LineParser().feed(stream)
     assert messages == [identity, Sample(0, 0, 0x800000, 0x7F0000, 0xAF, 0), Refusal(Reason.UNKNOWN)]
     assert max(map(len, stream.splitlines(keepends=True))) <= mcu_protocol.MAX_LINE
 
 
 def test_chunks_of_any_size_give_the_same_samples():
     stream = b"".join(lines(50))
-    whole = Parser().feed(stream)
+    whole = LineParser().feed(stream)
     assert len(whole) == 50
     for size in (1, 2, 7, 42, 43, 44, 1000):
-        parser = Parser()
+        parser = LineParser()
         pieces = [m for i in range(0, len(stream), size) for m in parser.feed(stream[i : i + size])]
         assert pieces == whole
         assert (parser.good, parser.crc_errors, parser.malformed, parser.garbage_bytes) == (50, 0, 0, 0)
 
 
 def test_resynchronises_after_garbage_and_counts_it():
-    parser = Parser()
+    parser = LineParser()
     a, b, c = lines(3)
     garbage = b"\x00\xff$T,00*\r\n$$$*"
     assert [m.sequence for m in parser.feed(garbage + a + garbage + b[:20] + c)] == [0, 2]
@@ -76,13 +76,13 @@ def test_resynchronises_after_garbage_and_counts_it():
 
 def test_a_stray_start_does_not_cost_the_line_after_it():
     line = lines(1)[0]
-    parser = Parser()
+    parser = LineParser()
     assert parser.feed(b"$" + b"x" * 30 + line[:30]) == []
     assert len(parser.feed(line[30:])) == 1
 
 
 def test_memory_stays_bounded_whatever_comes():
-    parser = Parser()
+    parser = LineParser()
     for chunk in (b"$" * 10_000, b"$" + b"A" * 10_000, b"x" * 10_000, b"$T,"):
         assert parser.feed(chunk) == []
         assert len(parser._splitter._rest) < mcu_protocol.MAX_LINE
@@ -90,7 +90,7 @@ def test_memory_stays_bounded_whatever_comes():
 
 
 def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
-    parser = Parser()
+    parser = LineParser()
     line = lines(1)[0]
     assert parser.feed(line.replace(b"800000", b"800001")) == []
     assert parser.feed(mcu_protocol.frame(b"Z,01") + mcu_protocol.frame(b"T,1,2,3")) == []
@@ -107,13 +107,13 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
     ],
 )
 def test_right_checksum_but_impossible_fields_are_no_message(body):
-    parser = Parser()
+    parser = LineParser()
     assert parser.feed(mcu_protocol.frame(body)) == [] and parser.malformed == 1
 
 
 def test_random_bytes_never_raise_and_give_nothing():
     rng = np.random.default_rng(1)
-    parser = Parser()
+    parser = LineParser()
     alphabet = np.frombuffer(b"$*,\r\nTINR0123456789ABCDEF", np.uint8)
     for data in (rng.integers(0, 256, 100_000, np.uint8), rng.choice(alphabet, 100_000)):
         for chunk in np.array_split(data, 777):
@@ -128,7 +128,7 @@ def test_flipped_bits_never_make_a_wrong_sample(share):
     truth = dict(enumerate(sent))
     data = np.frombuffer(b"".join(sent), np.uint8)
     flips = np.packbits(rng.random((len(data), 8)) < share, axis=1)[:, 0]
-    parser = Parser()
+    parser = LineParser()
     samples = parser.feed((data ^ flips).tobytes())
     for s in samples:
         line = mcu_protocol.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
@@ -147,7 +147,7 @@ def test_every_single_and_double_bit_error_in_a_line_is_found():
             bad[i // 8] ^= 1 << i % 8
             if j is not None:
                 bad[j // 8] ^= 1 << j % 8
-            assert Parser().feed(bytes(bad)) == []
+            assert LineParser().feed(bytes(bad)) == []
 
 
 def test_commands():

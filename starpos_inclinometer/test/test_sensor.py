@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from starpos_inclinometer.sources import sca100t
-from starpos_inclinometer.sources.mcu_protocol import Sample, Status
-from starpos_inclinometer.sources.sca100t import Calibration, Sensor
+from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
+from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
 
 
 def measure(sample, *calibration):
@@ -21,7 +21,7 @@ def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):
 
 def test_codes_by_hand():
     """31 x 80 mV = 2.48 V of the sensor's output is half the range; 30 deg is 2 V, 2 / 2.48 of it."""
-    c = Calibration()
+    c = Sca100tCalibration()
     assert c.volts(0x800000) == 2.5
     assert c.volts(0) == pytest.approx(0.02, abs=1e-12)
     assert c.code(4.5) == 0x800000 + round(2.0 / 2.48 * 2**23)
@@ -32,7 +32,7 @@ def test_codes_by_hand():
 
 
 def test_offset_sensitivity_divider_and_reference_of_each_axis():
-    c = Calibration((2.4, 2.6), (3.9, 4.1), 40.0, 5.2)
+    c = Sca100tCalibration((2.4, 2.6), (3.9, 4.1), 40.0, 5.2)
     reading = measure(sample(c.code(2.4 + 3.9 * 0.1), c.code(2.6 - 4.1 * 0.2)), c)
     assert math.sin(reading.x) == pytest.approx(0.1, abs=1e-6)
     assert math.sin(reading.y) == pytest.approx(-0.2, abs=1e-6)
@@ -44,7 +44,7 @@ def test_temperature_of_the_data_sheet():
     assert [sca100t.temperature_c(sca100t.temperature_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
         [-40, 20, 85], abs=0.47
     )
-    assert math.isnan(measure(sample(status=Status.NO_TEMPERATURE)).temperature_c)
+    assert math.isnan(measure(sample(status=SampleStatus.NO_TEMPERATURE)).temperature_c)
 
 
 def test_until_the_noise_is_known_it_is_the_stated_one_and_the_quantisation():
@@ -56,10 +56,10 @@ def test_until_the_noise_is_known_it_is_the_stated_one_and_the_quantisation():
 def test_the_noise_parameter_is_a_floor_that_the_samples_may_rise_above():
     rng = np.random.default_rng(1)
     for floor, noise, expected in ((0.004, 0.001, 0.004), (0.001, 0.004, 0.004)):
-        s = Sensor(Calibration(noise_floor_rad=math.radians(floor)))
+        s = Sensor(Sca100tCalibration(noise_floor_rad=math.radians(floor)))
         for k in range(300):
             volts = 2.5 + 4 * np.radians(noise) * rng.standard_normal(2)
-            last = s.measure(sample(*map(Calibration().code, volts)), 0.1 * k)
+            last = s.measure(sample(*map(Sca100tCalibration().code, volts)), 0.1 * k)
         sigma = np.degrees(np.sqrt([last.covariance[0], last.covariance[3]]))
         assert sigma == pytest.approx([expected] * 2, rel=0.2)
 
@@ -74,7 +74,7 @@ def turned(gx, gy, c, at=20.0):
 
 
 def test_cross_axis_matrix_and_its_covariance():
-    c = Calibration(cross_axis=(0.99, 0.05, -0.03, 1.01))
+    c = Sca100tCalibration(cross_axis=(0.99, 0.05, -0.03, 1.01))
     gx, gy = math.sin(math.radians(12)), math.sin(math.radians(-20))
     reading = measure(sample(*turned(gx, gy, c)), c)
     assert np.degrees([reading.x, reading.y]) == pytest.approx([12, -20], abs=1e-5)
@@ -93,7 +93,7 @@ def test_cross_axis_matrix_and_its_covariance():
     assert abs(expected[0, 1]) > 0.01 * expected[0, 0]
 
 
-WARM = Calibration(
+WARM = Sca100tCalibration(
     temperature_reference_c=25.0,
     offset_per_c=((5e-4, -2e-6, 1e-8), (-3e-4, 1e-6, 0.0)),
     sensitivity_per_c=((1e-4, 1e-6, 0.0), (-2e-4, 0.0, 1e-8)),
@@ -124,10 +124,10 @@ def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing
     stepped = s.measure(sample(x, y, temperature=174), 0.1)
     whole = 0.92 * 5e-4 / 4
     assert abs(stepped.x - first.x) < 0.01 * whole
-    missing = s.measure(sample(x, y, status=Status.NO_TEMPERATURE, temperature=0), 0.2)
+    missing = s.measure(sample(x, y, status=SampleStatus.NO_TEMPERATURE, temperature=0), 0.2)
     assert math.isnan(missing.temperature_c) and missing.x == stepped.x
     for k in range(1, 61):
-        later = s.measure(sample(x, y, status=Status.NO_TEMPERATURE, temperature=0), 10.0 * k)
+        later = s.measure(sample(x, y, status=SampleStatus.NO_TEMPERATURE, temperature=0), 10.0 * k)
     assert later.x == stepped.x
     assert math.sqrt(later.covariance[0]) > 20 * whole / 0.92 / 2
     back = s.measure(sample(x, y, temperature=174), 601.0)
@@ -135,18 +135,19 @@ def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing
 
 
 def offset_x(linear, square):
-    return Calibration(offset_per_c=((linear, square, 0.0), (0.0, 0.0, 0.0)))
+    return Sca100tCalibration(offset_per_c=((linear, square, 0.0), (0.0, 0.0, 0.0)))
 
 
 def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
-    c = Calibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
+    c = Sca100tCalibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
     counts = sca100t.temperature_counts(125.0)
     reading = measure(sample(x=0x880000, y=0x780000, temperature=counts), c)
     assert reading.x > 0 > reading.y and np.isfinite(reading.covariance).all()
 
 
 @pytest.mark.parametrize(
-    "odd", [{"lost": 1}, {"status": Status.ADC_TIMEOUT}, {"x": 0}, {"x": Calibration().code(4.9)}]
+    "odd",
+    [{"lost": 1}, {"status": SampleStatus.ADC_TIMEOUT}, {"x": 0}, {"x": Sca100tCalibration().code(4.9)}],
 )
 def test_what_is_flagged_tells_no_noise(odd):
     s = Sensor()
@@ -164,25 +165,25 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
         (offset_x(-5e-4, 1e-5), 0.036),
     )
     for c, volts in x_alone:
-        reading = measure(sample(status=Status.NO_TEMPERATURE), c)
+        reading = measure(sample(status=SampleStatus.NO_TEMPERATURE), c)
         assert math.sqrt(reading.covariance[0]) > 0.8 * volts / 4
         assert measure(sample(temperature=170), c).covariance[0] < reading.covariance[0] / 100
-    assert measure(sample(status=Status.NO_TEMPERATURE)).covariance == measure(sample()).covariance
+    assert measure(sample(status=SampleStatus.NO_TEMPERATURE)).covariance == measure(sample()).covariance
 
 
 @pytest.mark.parametrize(
     ("what", "flags"),
     [
         (sample(), 0),
-        (sample(x=Calibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), sca100t.OUT_OF_RANGE),
+        (sample(x=Sca100tCalibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), sca100t.OUT_OF_RANGE),
         (sample(y=0), sca100t.OUT_OF_RANGE | sca100t.SATURATED),
         (sample(y=0xFFFFFF), sca100t.OUT_OF_RANGE | sca100t.SATURATED),
         (sample(lost=3), sca100t.GAP),
         (sample(restarted=True), sca100t.GAP),
         (sample(resumed=True), sca100t.GAP),
-        (sample(status=Status.ADC_TIMEOUT), sca100t.STUCK),
-        (sample(status=Status.NO_REFERENCE), sca100t.STUCK),
-        (sample(status=Status.OVERRUN | 0xC0), 0),
+        (sample(status=SampleStatus.ADC_TIMEOUT), sca100t.STUCK),
+        (sample(status=SampleStatus.NO_REFERENCE), sca100t.STUCK),
+        (sample(status=SampleStatus.OVERRUN | 0xC0), 0),
     ],
 )
 def test_flags(what, flags):
@@ -192,7 +193,7 @@ def test_flags(what, flags):
 
 
 def test_angles_stay_finite_where_there_is_none():
-    reading = measure(sample(x=0, y=0xFFFFFF), Calibration(sensitivity_volts_per_g=(1.0, 1.0)))
+    reading = measure(sample(x=0, y=0xFFFFFF), Sca100tCalibration(sensitivity_volts_per_g=(1.0, 1.0)))
     assert (reading.x, reading.y) == pytest.approx((-math.pi / 2, math.pi / 2))
     assert reading.flags & sca100t.OUT_OF_RANGE
 

@@ -8,7 +8,7 @@ import threading
 import tty
 
 from starpos_inclinometer.emulator import Faults, Pty
-from starpos_inclinometer.sources.mcu_protocol import Parser, Sample
+from starpos_inclinometer.sources.mcu_protocol import LineParser, Sample
 
 WATCH_S = 0.05
 
@@ -24,7 +24,7 @@ class Wire:
         self.faults = Faults()
         self.sent: list[Sample] = []
         self._board_path = board_path
-        self._parser = Parser()
+        self._parser = LineParser()
         self._rng = random.Random(1)
         self._thread = None
         self._cut = threading.Event()

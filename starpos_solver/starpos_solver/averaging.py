@@ -10,8 +10,7 @@ from starpos.averaging.slip import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.fix.fix import Fix
 from starpos.units import ARCSEC
-from starpos_common.diagnostics import Level
-from starpos_common.diagnostics import Status as Report
+from starpos_common.diagnostics import Diagnosis, Level
 
 WIDE_RAD = 600 * ARCSEC  # its square, which a linear filter does not know of, is 2 arcsec
 ELSEWHERE_SIGMA = 3.0  # from the place of a turn; wrongly taken for another place it only costs precision
@@ -82,11 +81,11 @@ class Averaging:
             return News.LEFT_OUT if before and after.left_out > before.left_out else News.USED
         return News.MOVED
 
-    def report(self) -> Report:
+    def report(self) -> Diagnosis:
         """For /diagnostics."""
         place = self.place
         if place is None:
-            return Report(Level.OK, "no fix yet", {"moved": self._moved})
+            return Diagnosis(Level.OK, "no fix yet", {"moved": self._moved})
         east, north, _ = place.covariance.diagonal() ** 0.5
         here = self._averager.average or place
         values = {
@@ -98,10 +97,12 @@ class Averaging:
         values |= {"sigma east (m)": float(east), "sigma north (m)": float(north)}
         if self._news is News.LEFT_OUT:
             far = "the newest fix lies further from the average than its error allows: it is left out"
-            return Report(Level.WARN, far, values)
+            return Diagnosis(Level.WARN, far, values)
         if self._moved and here.frames <= JUST_MOVED:
-            return Report(Level.WARN, "the instrument has moved: the average begins anew", values)
-        return Report(Level.OK, "of the turn on the spot" if self._turned else "of all frames here", values)
+            return Diagnosis(Level.WARN, "the instrument has moved: the average begins anew", values)
+        return Diagnosis(
+            Level.OK, "of the turn on the spot" if self._turned else "of all frames here", values
+        )
 
 
 def _is_wide(fix: Fix) -> bool:

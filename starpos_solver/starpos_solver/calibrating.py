@@ -22,12 +22,11 @@ from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Calibration
 from starpos.sky.site import Site
-from starpos_common.diagnostics import Level
-from starpos_common.diagnostics import Status as Report
-from starpos_common.job import Outcome, Worker
+from starpos_common.diagnostics import Diagnosis, Level
+from starpos_common.job import JobRunner, Outcome
 from starpos_interfaces.srv import Calibrate, SelfCalibrate
 from starpos_solver.averaging import Averaging, News
-from starpos_solver.memory import Poses, RecentFrames, Seen, tilts_of
+from starpos_solver.memory import PoseMemory, RecentFrames, Seen, tilts_of
 
 # Fewer headings hold no check that they are of one place; a service's caller says that they are.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
@@ -66,12 +65,12 @@ class Calibrating:
         self._log = node.get_logger()
         self._values, self._solver, self._changed = values, solver, changed
         self._recent = RecentFrames(values["calibration_frames"])
-        self._poses = Poses()
+        self._poses = PoseMemory()
         self._newest_unix_s = self._late_unix_s = -math.inf
         self._late = 0  # frames in a row that are older than the newest, each younger than the one before
         self._plumb_arcsec = math.nan  # how well `found` has the plumb line; nan: it is not known
         self._era = 0  # what was begun in an older one is of another instrument or place
-        self._worker = Worker(node)
+        self._worker = JobRunner(node)
         self._running: Future | None = None
         self._asked = self._again = False  # by a service; to turn once more when there is time
         self._about = self._said = ""  # of `found`; of the last turn by itself
@@ -325,7 +324,7 @@ class Calibrating:
         self._running = self._worker.run(job)
         return self._running
 
-    def report(self) -> Report:
+    def report(self) -> Diagnosis:
         """For /diagnostics."""
         values = {"frames kept": len(self._recent), "headings": len(self._poses)}
         values |= {"self-calibration": self._values["self_calibration"], "working": self._worker.busy}
@@ -334,8 +333,8 @@ class Calibrating:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
             sentence = "camera against inclinometer is not known: " + (self._said or "turn it on the spot")
-            return Report(Level.WARN, sentence, values)
-        return Report(Level.OK, self._about or "that of the parameters", values)
+            return Diagnosis(Level.WARN, sentence, values)
+        return Diagnosis(Level.OK, self._about or "that of the parameters", values)
 
 
 def _turn(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:

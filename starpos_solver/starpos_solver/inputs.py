@@ -5,8 +5,7 @@ import time
 
 from rclpy.node import Node
 
-from starpos_common.diagnostics import Level
-from starpos_common.diagnostics import Status as Report
+from starpos_common.diagnostics import Diagnosis, Level
 from starpos_common.troubles import Troubles
 
 STALE_S = 5.0
@@ -32,7 +31,7 @@ class Inputs:
         self.refused += 1
         self._troubles.wrong(name, sentence)
 
-    def report(self, tilts_kept: int) -> Report:
+    def report(self, tilts_kept: int) -> Diagnosis:
         """For /diagnostics."""
         now = time.monotonic()
         ages_s = {name: now - came for name, came in self._came_s.items()}
@@ -41,7 +40,7 @@ class Inputs:
         values |= {"tilts kept": tilts_kept, "refused": self.refused}
         refusals = self._troubles.lately(STALE_S)
         if missing:
-            return Report(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
+            return Diagnosis(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
         if refusals:
-            return Report(Level.WARN, f"refused: {'; '.join(refusals)}", values)
-        return Report(Level.OK, "all inputs arrive", values)
+            return Diagnosis(Level.WARN, f"refused: {'; '.join(refusals)}", values)
+        return Diagnosis(Level.OK, "all inputs arrive", values)

@@ -65,7 +65,7 @@ class _Pose:
         self.tilts.append(seen.tilt)
 
 
-class Poses:
+class PoseMemory:
     """The stars of the last frame of each pose, with the mean tilt of its frames; the oldest pose goes."""
 
     def __init__(self):

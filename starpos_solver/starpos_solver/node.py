@@ -18,26 +18,24 @@ from starpos.averaging.average import Average
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Geodetic
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
-from starpos.fix.solver import Solution as Answer
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
-from starpos.identification.hint import Standing
+from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
-from starpos_common.diagnostics import Diagnostics, Level
-from starpos_common.diagnostics import Status as Report
-from starpos_common.job import Outcome, Worker
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
+from starpos_common.job import JobRunner, Outcome
 from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos_common.paths import path_of
 from starpos_common.topics import publisher, subscription
-from starpos_interfaces.msg import Solution, StarArray, Tilt
+from starpos_interfaces import msg
 from starpos_interfaces.srv import SaveCalibration, Solve
 from starpos_solver import outputs, reports, saving
 from starpos_solver.calibrating import Calibrating
 from starpos_solver.clock_doubt import ClockDoubt
 from starpos_solver.inputs import Inputs
 from starpos_solver.memory import Seen
-from starpos_solver.settings import Settings
+from starpos_solver.settings import SolverSettings
 from starpos_solver.tilts import TiltBuffer
 
 WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
@@ -56,7 +54,7 @@ class Waiting:
     whether its stars speak against its time.
     """
 
-    message: StarArray
+    message: msg.StarArray
     stars: Stars
     since_ns: int
     ahead_s: float
@@ -69,9 +67,9 @@ class SolverNode(Node):
     def __init__(self):
         super().__init__("solver")
         self._camera: Camera | None = None
-        self._settings = Settings(self, lambda: self._camera, self._apply)
+        self._settings = SolverSettings(self, lambda: self._camera, self._apply)
         self._values = self._settings.values
-        self._catalogue = catalogue.load()
+        self._catalogue = catalogue.load_catalogue()
         # reads the tables of the Earth's rotation, so that the first frame is not slow
         earth_state(J2000_UNIX_S)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -79,11 +77,11 @@ class SolverNode(Node):
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
         self._solver: Solver | None = None
-        self._preparing = Worker(self)
+        self._preparing = JobRunner(self)
         self._trouble = ""  # why there is no solver
         self._latest: Waiting | None = None
-        self._answer: Answer | None = None
-        self._standing: Standing | None = None  # of the last fix
+        self._answer: Solution | None = None
+        self._hint: Hint | None = None  # of the last fix
         self._doubt = ClockDoubt()
         self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
         self._inputs = Inputs(self)
@@ -94,10 +92,10 @@ class SolverNode(Node):
         self._fix = publisher(self, NavSatFix, "fix", 10)
         self._fix_averaged = publisher(self, NavSatFix, "fix_averaged", 10)
         self._imu = publisher(self, Imu, "heading/imu", 10)
-        self._solution = publisher(self, Solution, "solver/solution", 10)
+        self._solution = publisher(self, msg.Solution, "solver/solution", 10)
         subscription(self, CameraInfo, "camera/camera_info", self._on_camera, 10)
-        subscription(self, Tilt, "tilt", self._on_tilt, 1000)
-        subscription(self, StarArray, "stars", self._on_stars, 10)
+        subscription(self, msg.Tilt, "tilt", self._on_tilt, 1000)
+        subscription(self, msg.StarArray, "stars", self._on_stars, 10)
         self.create_service(Solve, "solver/solve", self._on_solve)
         self.create_service(Trigger, "solver/reset", self._on_reset)
         self.create_service(SaveCalibration, "solver/save_calibration", self._on_save_calibration)
@@ -149,7 +147,7 @@ class SolverNode(Node):
         self._inputs.came("camera_info")
         if camera == self._camera:
             return
-        self._camera, self._solver, self._trouble, self._standing = camera, None, "", None
+        self._camera, self._solver, self._trouble, self._hint = camera, None, "", None
         self._calibrating.camera_changed()
         if not self._preparing.busy:
             self._prepare(camera)
@@ -175,7 +173,7 @@ class SolverNode(Node):
             self._remake_solver()  # with the parameters of now
         self._work()
 
-    def _on_tilt(self, message: Tilt):
+    def _on_tilt(self, message: msg.Tilt):
         self._watch_clock()
         try:
             ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
@@ -189,7 +187,7 @@ class SolverNode(Node):
         if self._waiting:
             self._work()
 
-    def _on_stars(self, message: StarArray):
+    def _on_stars(self, message: msg.StarArray):
         self._inputs.came("stars")
         self._watch_clock()
         try:
@@ -198,7 +196,9 @@ class SolverNode(Node):
             if not math.isnan(self._values["clock_stddev"]):
                 stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
-            self._publish(message.header, Answer(Status.BAD_INPUT, str(e), "stars", None, len(message.stars)))
+            self._publish(
+                message.header, Solution(Status.BAD_INPUT, str(e), "stars", None, len(message.stars))
+            )
             return
         ahead_s = self._ahead_s(stars.mid_unix_s)
         self._waiting.append(Waiting(message, stars, self._steady.now().nanoseconds, ahead_s))
@@ -255,7 +255,7 @@ class SolverNode(Node):
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting):
-        answer = self._answer_to(frame, self._standing)
+        answer = self._answer_to(frame, self._hint)
         if answer.ok:
             frame, answer = self._with_doubt(frame, answer)
         self._latest = frame
@@ -263,7 +263,7 @@ class SolverNode(Node):
         if self._solver is not None:
             self._learn(frame, answer)
 
-    def _with_doubt(self, frame: Waiting, answer: Answer) -> tuple[Waiting, Answer]:
+    def _with_doubt(self, frame: Waiting, answer: Solution) -> tuple[Waiting, Solution]:
         """The frame, and its answer, with the error of its time that the stars of earlier frames tell."""
         stated_s = math.hypot(self._solver.clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s)
         self._doubt.add(answer.fix, stated_s)
@@ -271,8 +271,8 @@ class SolverNode(Node):
             return frame, answer
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self._doubt.seconds), doubted=True)
         if self._doubt.leans_otherwise:
-            return frame, Answer.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
-        return frame, self._answer_to(frame, answer.standing)
+            return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
+        return frame, self._answer_to(frame, answer.hint)
 
     def _solver_now(self) -> Solver:
         """InstrumentError with the reason while there is none."""
@@ -284,25 +284,25 @@ class SolverNode(Node):
             waiting = "the triangles of this field are being built"
         raise InstrumentError(self._trouble or waiting)
 
-    def _answer_to(self, frame: Waiting, standing: Standing | None) -> Answer:
+    def _answer_to(self, frame: Waiting, hint: Hint | None) -> Solution:
         stars = frame.stars
         try:
             solver = self._solver_now()
-            answer = solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), standing)
+            answer = solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), hint)
             if answer.ok and frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
                 raise TimeError(
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
             return answer
         except (InstrumentError, TimeError) as e:
-            return Answer.failed(stars, Status.BAD_INPUT, str(e))
+            return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:  # a defect costs this frame, not the night
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
-            return Answer.failed(
+            return Solution.failed(
                 stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
             )
 
-    def _learn(self, frame: Waiting, answer: Answer):
+    def _learn(self, frame: Waiting, answer: Solution):
         """What a calibration and the average take from a frame, also from one that a stale calibration refuses.
 
         One whose time is in doubt teaches nothing.  fix_averaged comes with the frames that are of it.
@@ -326,11 +326,11 @@ class SolverNode(Node):
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
-    def _publish(self, about: Header, answer: Answer):
+    def _publish(self, about: Header, answer: Solution):
         self._answer = answer
         self._counts["frames"] += 1
         self._counts["fixes"] += answer.ok
-        self._standing = answer.standing or self._standing
+        self._hint = answer.hint or self._hint
         header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
         message, fix, imu = self._messages(header, answer)
         self._fix.publish(fix)
@@ -339,11 +339,11 @@ class SolverNode(Node):
         self._solution.publish(message)
         self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
 
-    def _messages(self, header: Header, answer: Answer):
+    def _messages(self, header: Header, answer: Solution):
         ground = outputs.on_ground(answer, self._settings.vertical)
         message = outputs.solution(header, answer, ground)
         if self._solver is None and self._camera is None:
-            message.status = Solution.NO_CAMERA
+            message.status = msg.Solution.NO_CAMERA
         return (
             message,
             self._nav_sat_fix(header, ground),
@@ -372,7 +372,7 @@ class SolverNode(Node):
     def _on_solve(self, request, response):
         if self._latest is None:
             response.message = "no frame has arrived yet: start the camera and the detector"
-            response.solution = Solution(status=Solution.BAD_INPUT, status_text=response.message)
+            response.solution = msg.Solution(status=msg.Solution.BAD_INPUT, status_text=response.message)
             return response
         answer = self._answer_to(self._latest, None)  # from scratch: what was before has no say
         header = Header(stamp=self._latest.message.header.stamp, frame_id=self._values["frame_id"])
@@ -383,7 +383,7 @@ class SolverNode(Node):
     def _on_reset(self, request, response):
         self._tilts.clear()
         self._waiting.clear()
-        self._latest = self._answer = self._standing = None
+        self._latest = self._answer = self._hint = None
         self._doubt.clear()
         self._calibrating.forget()
         response.success = True
@@ -407,15 +407,15 @@ class SolverNode(Node):
 
     # diagnostics -----------------------------------------------------------------------------------------------------
 
-    def _report_solution(self) -> Report:
+    def _report_solution(self) -> Diagnosis:
         if self._answer is None:
             waiting = "building the triangles of this field" if self._preparing.busy else "no frame yet"
-            return Report(Level.WARN, self._trouble or waiting, self._counts)
+            return Diagnosis(Level.WARN, self._trouble or waiting, self._counts)
         return reports.of_solution(self._answer, self._counts)
 
-    def _report_clock(self) -> Report:
+    def _report_clock(self) -> Diagnosis:
         if self._latest is None:
-            return Report(Level.WARN, "no frame yet")
+            return Diagnosis(Level.WARN, "no frame yet")
         stars = self._latest.stars
         clock_s = self._solver.clock_stddev_s(stars) if self._solver else stars.clock_stddev_s
         doubt_s = self._doubt.seconds if self._latest.doubted else 0.0

@@ -10,28 +10,27 @@ from std_msgs.msg import Header
 from starpos import rotation
 from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.solver import Solution as Answer
-from starpos.fix.solver import Status
+from starpos.fix.solver import Solution, Status
 from starpos.units import ARCSEC
 from starpos_common.messages import tilt_to_message
-from starpos_interfaces.msg import ErrorTerm, Solution
+from starpos_interfaces import msg
 
 STATUS = {
-    Status.OK: Solution.OK,
-    Status.TOO_FEW_STARS: Solution.TOO_FEW_STARS,
-    Status.NOT_IDENTIFIED: Solution.NOT_IDENTIFIED,
-    Status.NO_TILT: Solution.NO_TILT,
-    Status.TILT_OUT_OF_RANGE: Solution.TILT_OUT_OF_RANGE,
-    Status.TIME_OUTSIDE_TABLES: Solution.TIME_OUTSIDE_TABLES,
-    Status.BAD_INPUT: Solution.BAD_INPUT,
-    Status.POOR_FIT: Solution.POOR_FIT,
+    Status.OK: msg.Solution.OK,
+    Status.TOO_FEW_STARS: msg.Solution.TOO_FEW_STARS,
+    Status.NOT_IDENTIFIED: msg.Solution.NOT_IDENTIFIED,
+    Status.NO_TILT: msg.Solution.NO_TILT,
+    Status.TILT_OUT_OF_RANGE: msg.Solution.TILT_OUT_OF_RANGE,
+    Status.TIME_OUTSIDE_TABLES: msg.Solution.TIME_OUTSIDE_TABLES,
+    Status.BAD_INPUT: msg.Solution.BAD_INPUT,
+    Status.POOR_FIT: msg.Solution.POOR_FIT,
 }
 DEFLECTION = "deflection"  # in the budget, though of the geodetic position only
 UNKNOWN_ALTITUDE_VARIANCE = 1e8  # m2; a NaN would make consumers drop the whole matrix
 NAN = math.nan
 
 
-def on_ground(answer: Answer, vertical: Vertical) -> Geodetic | None:
+def on_ground(answer: Solution, vertical: Vertical) -> Geodetic | None:
     """The geodetic position of an answer; None without a fix."""
     fix = answer.fix
     return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical) if fix else None
@@ -64,7 +63,7 @@ def nav_sat_fix(
     return message
 
 
-def imu(header: Header, answer: Answer, ground: Geodetic) -> Imu:
+def imu(header: Header, answer: Solution, ground: Geodetic) -> Imu:
     """The attitude of the base link in true-north ENU; rates and accelerations are not measured."""
     fix = answer.fix
     to_geodetic_north = rotation.about_axis(
@@ -83,9 +82,9 @@ def imu(header: Header, answer: Answer, ground: Geodetic) -> Imu:
     return message
 
 
-def solution(header: Header, answer: Answer, ground: Geodetic | None) -> Solution:
+def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.Solution:
     """All there is to say about one frame."""
-    message = Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
+    message = msg.Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
     message.ids = list(answer.names)
     message.indices = [] if answer.star is None else answer.star.tolist()
@@ -122,7 +121,9 @@ def solution(header: Header, answer: Answer, ground: Geodetic | None) -> Solutio
     sources.append((DEFLECTION, ground.covariance - fix.covariance, True))
     for name, covariance, common in sources:
         east, north, heading = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) * degrees).tolist()
-        message.budget.append(ErrorTerm(name=name, east=east, north=north, heading=heading, common=common))
+        message.budget.append(
+            msg.ErrorTerm(name=name, east=east, north=north, heading=heading, common=common)
+        )
     message.refraction = fix.refraction_arcsec
     message.diurnal_aberration = fix.diurnal_aberration_arcsec
     message.ut1_minus_utc = fix.ut1_minus_utc_s

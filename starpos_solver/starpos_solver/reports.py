@@ -5,9 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from starpos.fix.solver import Solution as Answer
-from starpos_common.diagnostics import Level
-from starpos_common.diagnostics import Status as Report
+from starpos.fix.solver import Solution
+from starpos_common.diagnostics import Diagnosis, Level
 
 WIDE_CLOCK_S = 0.1
 EQUATOR_M_PER_S = 465.1
@@ -20,7 +19,7 @@ OTHER_TILTS = (
 )
 
 
-def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
+def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
     """The newest frame's."""
     values = counts | {"status": answer.status.value, "stars detected": answer.stars_detected}
     values |= {
@@ -37,24 +36,24 @@ def of_solution(answer: Answer, counts: Mapping[str, int]) -> Report:
         }
     if answer.extrapolated_days > 0:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
-        return Report(Level.WARN, old if answer.ok else answer.message, values)
-    return Report(Level.OK if answer.ok else Level.WARN, answer.message, values)
+        return Diagnosis(Level.WARN, old if answer.ok else answer.message, values)
+    return Diagnosis(Level.OK if answer.ok else Level.WARN, answer.message, values)
 
 
-def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt_s: float) -> Report:
+def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt_s: float) -> Diagnosis:
     """How well the time of the newest frame is known.
 
     ahead_s: by how much it was ahead of this node's clock; doubt_s: by how much the stars contradict it, or 0.
     """
     values = {"clock sigma (s)": clock_stddev_s, "stamp sigma (s)": stamp_stddev_s, "frame age (s)": -ahead_s}
     if ahead_s > AHEAD_S:
-        return Report(
+        return Diagnosis(
             Level.WARN,
             f"frames come {ahead_s:.3g} s before their time and are refused: {ONE_CLOCK}",
             values,
         )
     if doubt_s:
-        return Report(
+        return Diagnosis(
             Level.WARN,
             f"by their stamps the camera at rest has turned with the Earth for {doubt_s:.3g} s: a clock was set, or a "
             "frame stamped wrongly. Fixes are as wide as that until it is back, or solver/reset is called",
@@ -62,10 +61,10 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
         )
     wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))
     if wide > WIDE_CLOCK_S:
-        return Report(
+        return Diagnosis(
             Level.WARN,
             f"the time is known to {wide:.2g} s only, {wide * EQUATOR_M_PER_S:.0f} m at the equator: synchronise the "
             "camera's clock, or set clock_stddev where you know better",
             values,
         )
-    return Report(Level.OK, f"the time is known to {wide:.2g} s", values)
+    return Diagnosis(Level.OK, f"the time is known to {wide:.2g} s", values)

@@ -20,7 +20,7 @@ from starpos_solver import parameters
 ANY_CAMERA = Camera.from_focal(100, 100, 1000.0)
 
 
-class Settings:
+class SolverSettings:
     """`values` by name, and what they make of files.
 
     A file is read once, when its parameter is set and the value validated: what is applied is what was found sound, and a

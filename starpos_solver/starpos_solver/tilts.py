@@ -8,10 +8,10 @@ import numpy as np
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt, TiltLog
 from starpos_common.messages import message_to_tilt, stamp_to_unix
-from starpos_interfaces.msg import Tilt as TiltMessage
+from starpos_interfaces import msg
 
 CAPACITY = 6000  # ten minutes at 10 Hz
-UNUSABLE = TiltMessage.OUT_OF_RANGE | TiltMessage.STUCK | TiltMessage.SATURATED
+UNUSABLE = msg.Tilt.OUT_OF_RANGE | msg.Tilt.STUCK | msg.Tilt.SATURATED
 TOGETHER = 20  # samples of an exposure have no more others between them
 NEAR_S = 1.0  # how far from an exposure a flagged sample still explains why there is no good one
 USUAL_PERIOD_S, JITTER = 0.1, 0.9  # between samples; how much of it the next one may come early
@@ -32,7 +32,7 @@ class TiltBuffer:
         self._good.clear()
         self._flagged.clear()
 
-    def add(self, message: TiltMessage, unknown_stddev_rad: float) -> None:
+    def add(self, message: msg.Tilt, unknown_stddev_rad: float) -> None:
         """Keep a sample; TiltError where the message is broken."""
         if message.flags & UNUSABLE:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
@@ -40,7 +40,7 @@ class TiltBuffer:
         try:
             sample = message_to_tilt(message, unknown_stddev_rad)
         except TiltRangeError:
-            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, TiltMessage.OUT_OF_RANGE))
+            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, msg.Tilt.OUT_OF_RANGE))
             raise
         self._came += 1
         self._good.append((self._came, sample))
@@ -95,7 +95,7 @@ class TiltBuffer:
         for moment, flag in self._flagged:
             if abs(moment - mid_unix_s) <= span_s / 2 + NEAR_S:
                 flags |= flag
-        if flags & (TiltMessage.OUT_OF_RANGE | TiltMessage.SATURATED):
+        if flags & (msg.Tilt.OUT_OF_RANGE | msg.Tilt.SATURATED):
             raise TiltRangeError(
                 "tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright"
             )

@@ -6,7 +6,7 @@ import pytest
 from fixes import NOISE, T0, fix_at, seen_at, tilt_at
 
 from starpos.errors import TiltError
-from starpos_solver.memory import MOST_POSES, MOST_TILTS, Poses, RecentFrames, mean_tilt, tilts_of
+from starpos_solver.memory import MOST_POSES, MOST_TILTS, PoseMemory, RecentFrames, mean_tilt, tilts_of
 
 
 def test_days_of_frames_stay_bounded_and_the_newest_are_kept():
@@ -34,9 +34,9 @@ def test_fewer_are_kept_from_now_on():
     assert len(recent) == 4
 
 
-def poses_of(*frames) -> Poses:
+def poses_of(*frames) -> PoseMemory:
     """Frames of (seconds, azimuth)."""
-    poses = Poses()
+    poses = PoseMemory()
     for seconds, azimuth in frames:
         poses.add(seen_at(seconds), fix_at(seconds, azimuth))
     return poses
@@ -60,7 +60,7 @@ def test_many_frames_of_one_pose_and_many_poses_stay_bounded():
 
 
 def test_it_is_worth_a_look_at_a_new_pose_and_each_time_its_frames_have_doubled():
-    poses = Poses()
+    poses = PoseMemory()
     worth = [poses.add(seen_at(k), fix_at(k)) for k in range(20)]
     assert [k + 1 for k, w in enumerate(worth) if w] == [1, 2, 4, 8, 16]
     assert poses.add(seen_at(20), fix_at(20, 90.0))

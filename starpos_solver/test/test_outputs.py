@@ -12,9 +12,8 @@ from std_msgs.msg import Header
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ErrorTerm, heading_of
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution as Answer
-from starpos.fix.solver import Status
-from starpos_interfaces.msg import Solution
+from starpos.fix.solver import Solution, Status
+from starpos_interfaces import msg
 from starpos_solver import outputs
 
 EXACT = Deflection(0.0, 0.0, 0.0)
@@ -30,8 +29,8 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
                np.arange(3), np.zeros((3, 2)), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05, np.eye(3), 1e-6)  # fmt: skip
 
 
-def answer_facing(azimuth_deg: float) -> Answer:
-    return Answer(
+def answer_facing(azimuth_deg: float) -> Solution:
+    return Solution(
         Status.OK,
         "fix",
         "stars",
@@ -60,7 +59,7 @@ def test_heading_north_is_not_taken_for_none():
     answer = answer_facing(0.0)
     message = outputs.solution(Header(), answer, outputs.on_ground(answer, EXACT))
     assert message.heading == 0.0
-    assert message.status == Solution.OK
+    assert message.status == msg.Solution.OK
 
 
 def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
@@ -131,7 +130,7 @@ def test_without_a_fix_every_number_that_is_missing_is_nan():
     )
     message = outputs.solution(Header(), answer, None)
     assert not message.ids and not message.indices and not message.magnitudes
-    assert message.status == Solution.NOT_IDENTIFIED
+    assert message.status == msg.Solution.NOT_IDENTIFIED
     assert message.status_text == "why"
     for name in (
         "latitude",

@@ -8,7 +8,7 @@ from rclpy.parameter import Parameter
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
-from starpos_solver.settings import Settings
+from starpos_solver.settings import SolverSettings
 from starpos_testing.nodes import take_domain
 
 CAMERA = Camera.from_focal(1000, 800, 2000.0)
@@ -24,7 +24,7 @@ def make():
         overrides = [Parameter(name, value=value) for name, value in given.items()]
         nodes.append(rclpy.create_node("settings", context=context, parameter_overrides=overrides))
         applied = []
-        return nodes[-1], Settings(nodes[-1], lambda: CAMERA, applied.append), applied
+        return nodes[-1], SolverSettings(nodes[-1], lambda: CAMERA, applied.append), applied
 
     yield make
     for node in nodes:

@@ -10,7 +10,7 @@ from astropy.io import fits
 from rosbags.rosbag2.storage_mcap import zstd
 
 from starpos.simulation.scene import expose, render, scene_of
-from starpos.sky.catalogue import load
+from starpos.sky.catalogue import load_catalogue
 
 
 def rice(pixels) -> bytes:
@@ -26,7 +26,7 @@ def png(pixels) -> bytes:
 def main() -> None:
     rng, start = np.random.default_rng(1), 1793642400.0
     scene = scene_of()
-    pixels = render(scene, expose(scene, load(), start, 0.5, rng), start, 0.5, rng).pixels
+    pixels = render(scene, expose(scene, load_catalogue(), start, 0.5, rng), start, 0.5, rng).pixels
     noise = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(pixels.astype(int), axis=1)))
     bits = 8 * pixels.itemsize
     least = np.log2(noise * np.sqrt(2 * np.pi * np.e)) / bits

@@ -144,7 +144,7 @@ def main() -> int:
     parser.add_argument("--index", type=Path, metavar="FOLDER", help="astrometry.net's index files")
     args = parser.parse_args()
     logging.basicConfig(level=logging.WARNING)  # one peer's log would be timed as its work
-    stars, answers = catalogue.load(), {}
+    stars, answers = catalogue.load_catalogue(), {}
     for name, peer in (
         ("starpos", starpos),
         ("cedar-solve", cedar_solve),

@@ -169,7 +169,7 @@ def write_frames(folder: Path):
 
     from starpos.simulation.night_on_disk import write_fits
     from starpos.simulation.scene import expose, render, scene_of
-    from starpos.sky.catalogue import load
+    from starpos.sky.catalogue import load_catalogue
     from starpos.utc import utc_text
     from starpos_testing.graph.shots import EXPOSURE_S, NOISE_DEG, tilts_of
     from starpos_testing.graph.shots import START_S as BEGIN_S
@@ -177,7 +177,7 @@ def write_frames(folder: Path):
     rng, scene, tilts = np.random.default_rng(1), scene_of(tilt_noise_deg=NOISE_DEG), []
     for k in range(FILES):
         start = BEGIN_S + 10.0 * k
-        light = expose(scene, load(), start, EXPOSURE_S, rng)
+        light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
         frame = render(scene, light, start, EXPOSURE_S, rng)
         write_fits(folder / f"{k}.fits", frame, utc_text(start))
         tilts += tilts_of(scene, start, rng)

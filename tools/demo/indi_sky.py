@@ -91,9 +91,9 @@ def main() -> int:
     folder, exposure_s, rng = Path(folder), float(exposure_s), np.random.default_rng(int(seed))
     scene = Place(**json.loads(place)).scene()
     from starpos.simulation.scene import expose, render
-    from starpos.sky.catalogue import load
+    from starpos.sky.catalogue import load_catalogue
 
-    catalogue = load()
+    catalogue = load_catalogue()
     expose(scene, catalogue, time.time(), exposure_s, rng)  # what takes long the first time
     picture = Picture(folder / "sky.fits", scene.camera.width, scene.camera.height)
     set_up(port, folder)

@@ -19,7 +19,7 @@ import yaml
 from starpos.errors import StarposError
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
-from starpos_camera.sources.source import Settings
+from starpos_camera.sources.source import CaptureSettings
 from starpos_common.parameters import ParameterError
 from starpos_testing.processes import memory_mb
 
@@ -40,7 +40,9 @@ def main() -> int:
     if not frames:
         print("0 frames are no soak: give 1 or more.")
         return 2
-    settings = Settings(set_or_none(values["exposure"]), set_or_none(values["gain"]), values["cadence"])
+    settings = CaptureSettings(
+        set_or_none(values["exposure"]), set_or_none(values["gain"]), values["cadence"]
+    )
     if refusal := SOURCES[name].refusal(values, settings):
         print(refusal)
         return 2

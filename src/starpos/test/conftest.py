@@ -27,7 +27,7 @@ def triangle_cache(tmp_path_factory):
 def catalogue():
     from starpos.sky import catalogue
 
-    return catalogue.load()
+    return catalogue.load_catalogue()
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 
 from starpos_common import system_clock
-from starpos_common.diagnostics import Level, Status
+from starpos_common.diagnostics import Diagnosis, Level
 
 TOLD_S = 30.0  # how long a step is told
 ARCSEC_PER_S = 15.041  # of longitude
@@ -26,9 +26,9 @@ class ClockReport:
         self._set_s = self._step_s = 0.0
         self._stepped_at = -TOLD_S  # monotonic, s
 
-    def __call__(self) -> Status:
+    def __call__(self) -> Diagnosis:
         if self._node.get_clock().ros_time_is_active:
-            return Status(Level.OK, "time is simulated (use_sim_time).")
+            return Diagnosis(Level.OK, "time is simulated (use_sim_time).")
         now = time.monotonic()
         set_s = self.watch.set_s()
         step, self._set_s = set_s - self._set_s, set_s
@@ -44,13 +44,13 @@ class ClockReport:
                 "estimated error (s)": state.est_error_s,
             }
         if not self._matters():
-            return Status(Level.OK, "the frames carry times of their own.", values)
+            return Diagnosis(Level.OK, "the frames carry times of their own.", values)
         if now - self._stepped_at < TOLD_S:
-            return Status(Level.WARN, f"{self._said(self._step_s)}.", values)
+            return Diagnosis(Level.WARN, f"{self._said(self._step_s)}.", values)
         if state is None:
             cure = "the solver takes it for as good as its clock_stddev says"
-            return Status(Level.WARN, f"the system does not tell how good its clock is; {cure}.", values)
-        return Status(Level.OK if state.synchronised else Level.WARN, state.sentence, values)
+            return Diagnosis(Level.WARN, f"the system does not tell how good its clock is; {cure}.", values)
+        return Diagnosis(Level.OK if state.synchronised else Level.WARN, state.sentence, values)
 
     def _said(self, step_s: float) -> str:
         way = "ahead" if step_s > 0 else "back"

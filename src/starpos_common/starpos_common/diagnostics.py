@@ -21,7 +21,7 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True)
-class Status:
+class Diagnosis:
     """What a task has to say: a level, a sentence, and named values (numbers, strings, booleans)."""
 
     level: Level
@@ -37,7 +37,7 @@ class Diagnostics:
     stamp is the node's own time. `hardware_id` may be changed at any time.
     """
 
-    def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Status]], hardware_id: str = "none"):
+    def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Diagnosis]], hardware_id: str = "none"):
         self.hardware_id = hardware_id
         self._node = node
         self._name = node.get_name() if node.get_namespace() == "/" else node.get_fully_qualified_name()
@@ -53,12 +53,12 @@ class Diagnostics:
         message.status = [self._status(name, task) for name, task in self._tasks.items()]
         self._publisher.publish(message)
 
-    def _status(self, name: str, task: Callable[[], Status]) -> DiagnosticStatus:
+    def _status(self, name: str, task: Callable[[], Diagnosis]) -> DiagnosticStatus:
         try:
             status = task()
         except Exception as error:
             # A health report that fails must say so instead of taking the instrument down.
-            status = Status(Level.ERROR, f"this diagnostic failed: {type(error).__name__}: {error}")
+            status = Diagnosis(Level.ERROR, f"this diagnostic failed: {type(error).__name__}: {error}")
         return DiagnosticStatus(
             level=bytes([status.level]),
             name=f"{self._name}: {name}",

@@ -23,7 +23,7 @@ class Outcome:
     trouble: str = ""
 
 
-class Worker:
+class JobRunner:
     """One job at a time; its end comes back into the node's executor."""
 
     def __init__(self, node: Node):

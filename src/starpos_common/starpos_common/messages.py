@@ -15,8 +15,7 @@ from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
-from starpos_interfaces.msg import Star, StarArray
-from starpos_interfaces.msg import Tilt as TiltMessage
+from starpos_interfaces import msg
 
 # encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
 ENCODINGS = {
@@ -53,7 +52,7 @@ def unix_to_stamp(unix_s: float | None) -> Time:
     return Time(sec=seconds, nanosec=microseconds * 1000)
 
 
-def stars_to_message(stars: Stars, frame_id: str) -> StarArray:
+def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
     """A StarArray."""
     covariance = stars.covariance.reshape(-1, 4)
     columns = zip(
@@ -65,18 +64,18 @@ def stars_to_message(stars: Stars, frame_id: str) -> StarArray:
         stars.flags.tolist(),
         strict=True,
     )
-    return StarArray(
+    return msg.StarArray(
         header=Header(stamp=unix_to_stamp(stars.mid_unix_s), frame_id=frame_id),
         width=int(stars.width),
         height=int(stars.height),
         exposure=float(stars.exposure_s or 0.0),
         stamp_stddev=float(stars.stamp_stddev_s),
         clock_stddev=float(stars.clock_stddev_s),
-        stars=[Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns],
+        stars=[msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns],
     )
 
 
-def message_to_stars(message: StarArray, source: str = "stars") -> Stars:
+def message_to_stars(message: msg.StarArray, source: str = "stars") -> Stars:
     """Stars; FrameError where the message does not hold together (sizes, NaN, order, covariance)."""
     rows = message.stars
     if len(rows) > MAX_STARS:
@@ -98,9 +97,9 @@ def message_to_stars(message: StarArray, source: str = "stars") -> Stars:
     )
 
 
-def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0) -> TiltMessage:
+def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0) -> msg.Tilt:
     """A starpos_interfaces/Tilt."""
-    return TiltMessage(
+    return msg.Tilt(
         header=Header(stamp=unix_to_stamp(tilt.utc_unix_s), frame_id=frame_id),
         x=float(tilt.theta_x),
         y=float(tilt.theta_y),
@@ -111,7 +110,7 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
     )
 
 
-def message_to_tilt(message: TiltMessage, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
+def message_to_tilt(message: msg.Tilt, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
     """A starpos Tilt; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
     The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over

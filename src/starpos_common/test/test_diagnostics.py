@@ -7,7 +7,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_testing.nodes import take_domain
 
 
@@ -34,7 +34,7 @@ def test_levels_are_those_of_the_message():
 def test_every_task_is_published_each_second_even_in_paused_simulated_time(node):
     node.set_parameters([rclpy.Parameter("use_sim_time", value=True)])
     tasks = {
-        "Link": lambda: Status(Level.WARN, "weak", {"rate (Hz)": 9.5, "port": "/dev/x", "lost": 3}),
+        "Link": lambda: Diagnosis(Level.WARN, "weak", {"rate (Hz)": 9.5, "port": "/dev/x", "lost": 3}),
         "Clock": broken,
     }
     diagnostics = Diagnostics(node, tasks, "unit 7")
@@ -65,7 +65,7 @@ def test_the_same_node_of_two_instruments_has_two_names(node):
     executor.add_node(node)
     twins = [rclpy.create_node("solver", context=node.context, namespace=ns) for ns in ("a", "/b/c", "")]
     for twin in twins:
-        Diagnostics(twin, {"Solution": lambda: Status(Level.OK, "")})
+        Diagnostics(twin, {"Solution": lambda: Diagnosis(Level.OK, "")})
         executor.add_node(twin)
     wanted = {"/a/solver: Solution", "/b/c/solver: Solution", "solver: Solution"}
     end = time.monotonic() + 20

@@ -10,14 +10,14 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos.errors import FrameError
-from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import stamp_to_unix
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
 from starpos_dashboard import access, picture
 from starpos_dashboard.board import Board
 from starpos_dashboard.parameters import PARAMETERS, names
-from starpos_dashboard.server import Server, listen
+from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import Solution, Tilt
 
 HEARTBEAT_S = 1.0  # between states, where nothing comes: ages go on
@@ -33,7 +33,7 @@ class DashboardNode(Node):
             self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
         )
         address = self._values["address"]
-        self._server = Server(
+        self._server = DashboardServer(
             listen(address, self._values["port"]),
             access.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
             self._values["clients"],
@@ -133,7 +133,7 @@ class DashboardNode(Node):
 
     # its own health --------------------------------------------------------------------------------------------------
 
-    def _report(self) -> Status:
+    def _report(self) -> Diagnosis:
         values = {
             "pages": self._server.pages,
             "pages refused": self._server.refused,
@@ -142,8 +142,8 @@ class DashboardNode(Node):
         }
         if not self._server.alive:
             trouble = self._server.trouble or "the server has ended"
-            return Status(Level.ERROR, f"{trouble}: start the dashboard again", values)
-        return Status(Level.OK, f"shown at {self._url}", values)
+            return Diagnosis(Level.ERROR, f"{trouble}: start the dashboard again", values)
+        return Diagnosis(Level.OK, f"shown at {self._url}", values)
 
     def destroy_node(self):
         self._server.stop()

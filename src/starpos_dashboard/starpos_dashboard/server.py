@@ -81,7 +81,7 @@ def files() -> dict[str, tuple[str, bytes]]:
     return found | {"/": found["/index.html"]}
 
 
-class Server:
+class DashboardServer:
     """`start`, then `show` what pages are to see, from any thread; `stop` ends it.
 
     sockets: of `listen`; names: under which it may be asked for; clients: pages at once.
@@ -155,7 +155,7 @@ class Server:
         logging.getLogger("tornado").setLevel(logging.CRITICAL)  # what a client sends is no line in our log
         self._ended = asyncio.Event()
         application = Application(
-            [("/events", Events), ("/frame.jpg", Frame), ("/.*", File)],
+            [("/events", Events), ("/frame.jpg", FrameReply), ("/.*", File)],
             server=self,
             log_function=lambda handler: None,
             compress_response=False,
@@ -198,7 +198,7 @@ class Reply(RequestHandler):
     """Reading only, from here only; errors are one sentence."""
 
     @property
-    def server(self) -> Server:
+    def server(self) -> DashboardServer:
         return self.settings["server"]
 
     def set_default_headers(self):
@@ -260,7 +260,7 @@ class File(Reply):
     head = get
 
 
-class Frame(Reply):
+class FrameReply(Reply):
     """The newest annotated frame."""
 
     async def get(self):

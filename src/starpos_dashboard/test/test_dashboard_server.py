@@ -23,9 +23,9 @@ SECRETS = ("/../setup.py", "/..%2fserver.py", "/vendor/../../server.py", "//etc/
 def server():
     if find_spec("tornado") is None:
         lacks("tornado", "pip install")
-    from starpos_dashboard.server import Server, listen
+    from starpos_dashboard.server import DashboardServer, listen
 
-    server = Server(listen("127.0.0.1", 0), access.own_names() | {"robot.example"}, clients=3)
+    server = DashboardServer(listen("127.0.0.1", 0), access.own_names() | {"robot.example"}, clients=3)
     server.start()
     yield server
     server.stop()
@@ -37,7 +37,7 @@ def server_of_little_patience(monkeypatch, server):
     from starpos_dashboard import server as module
 
     monkeypatch.setattr(module, "QUIET_S", 0.2)
-    impatient = module.Server(module.listen("127.0.0.1", 0), access.own_names(), clients=3)
+    impatient = module.DashboardServer(module.listen("127.0.0.1", 0), access.own_names(), clients=3)
     impatient.start()
     yield impatient
     impatient.stop()
@@ -117,7 +117,7 @@ def test_the_rules_go_with_every_answer(server):
         _, headers, _ = ask(server, path)
         policy = headers["Content-Security-Policy"]
         assert "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
-        assert headers["X-Content-Type-Options"] == "nosniff" and headers["Server"] is None
+        assert headers["X-Content-Type-Options"] == "nosniff" and headers["DashboardServer"] is None
         assert headers["Access-Control-Allow-Origin"] is None
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources.source import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 
@@ -47,7 +47,7 @@ class Alpaca:
     waits_for_listener = False
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         if lack := missing("alpaca", "alpyca"):
             return lack
         host, _, port = values["alpaca.address"].rpartition(":")
@@ -72,7 +72,7 @@ class Alpaca:
     def lacking(self) -> None:
         """Only a call to the server tells."""
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:
             if self._camera is None or not self._camera.Connected:  # another program may have disconnected it
                 self._open()
@@ -108,7 +108,7 @@ class Alpaca:
         self._size, self._pattern, self._gain = (width, height), _pattern(camera), None
         self._camera = camera
 
-    def _expose(self, settings) -> Exposure:
+    def _expose(self, settings) -> CapturedFrame:
         camera, wanted_s = self._camera, settings.exposure_s or DEFAULT_EXPOSURE_S
         remark = self._set_gain(settings.gain)
         commanded_s = self._now()
@@ -134,7 +134,7 @@ class Alpaca:
             clock_stddev_s=stamp.clock_stddev_s,
         )
         remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else remark
-        return Exposure(frame, stamp.source, remark=remark)
+        return CapturedFrame(frame, stamp.source, remark=remark)
 
     def _set_gain(self, gain):
         """Set it where it is another than was asked last; a remark where the camera has another."""

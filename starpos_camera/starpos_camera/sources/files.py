@@ -12,7 +12,14 @@ from starpos.errors import FrameError
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import FITS, JPEG, PICTURE, RAW, read_frame
-from starpos_camera.sources.source import CaptureError, Exposure, NothingYet, Settings, SourceEnded, missing
+from starpos_camera.sources.source import (
+    CapturedFrame,
+    CaptureError,
+    CaptureSettings,
+    NothingYet,
+    SourceEnded,
+    missing,
+)
 from starpos_camera.sources.watched_folder import WatchedFolder
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
@@ -89,7 +96,7 @@ class Files:
     parameters = PARAMETERS
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         path, watch = values["files.path"], values["files.watch"]
         if not path:
             return (
@@ -142,7 +149,7 @@ class Files:
             return f"{self._path}: it cannot be looked into ({error}); check files.path."
         return None
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         if self._watched is not None:
             return self._next_arrived(self._watched)
         if not self._queue:
@@ -160,7 +167,7 @@ class Files:
     def close(self):
         """Nothing is held open."""
 
-    def _read(self, path: Path) -> Exposure:
+    def _read(self, path: Path) -> CapturedFrame:
         frame = read_frame(path, self._clock)
         if not isinstance(frame, Frame):
             raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
@@ -168,16 +175,16 @@ class Files:
             # as if the exposure had just ended: the tilts that belong to it are there
             middle_s = self._now() - (frame.exposure_s or 0.0) / 2
             frame = replace(frame, mid_unix_s=middle_s, stamp_stddev_s=0.0)
-            return Exposure(frame, Capture.DRIVER)
+            return CapturedFrame(frame, Capture.DRIVER)
         by_camera = path.suffix.lower() in PICTURE + JPEG + RAW
         if frame.mid_unix_s is None:
             lack = (
                 "vouch for its camera's clock (files.exif)" if by_camera else "add DATE-OBS and EXPTIME to it"
             )
             raise FrameError(f"{path}: it does not say when it was taken; {lack}, or set files.restamp.")
-        return Exposure(frame, Capture.EXIF if by_camera else Capture.FILE)
+        return CapturedFrame(frame, Capture.EXIF if by_camera else Capture.FILE)
 
-    def _next_arrived(self, watched: WatchedFolder) -> Exposure:
+    def _next_arrived(self, watched: WatchedFolder) -> CapturedFrame:
         try:
             found = watched.next()
         except OSError as error:

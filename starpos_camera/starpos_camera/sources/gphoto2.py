@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from starpos.errors import FrameError
 from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources.gphoto2_camera import TOLERANCE, Gphoto2Camera, sentence
-from starpos_camera.sources.source import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, missing
 from starpos_camera.sources.timing import middle_of_commanded
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
@@ -74,7 +74,7 @@ class Gphoto2:
     waits_for_listener = False
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         for package in ("gphoto2", "exifread", *(("rawpy",) if values["gphoto2.raw"] else ())):
             if lack := missing(package, package):
                 return lack
@@ -95,7 +95,7 @@ class Gphoto2:
     def lacking(self) -> None:
         """Only a look at the bus tells."""
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         import gphoto2
 
         with self._in_use:
@@ -134,7 +134,7 @@ class Gphoto2:
                 camera.prefer(name, RAW_ALONE)
         return camera
 
-    def _expose(self, camera: Gphoto2Camera, settings: Settings) -> Exposure:
+    def _expose(self, camera: Gphoto2Camera, settings: CaptureSettings) -> CapturedFrame:
         camera.drain()
         set_s, bulb = camera.set_exposure(self._values["gphoto2.shutter_setting"], settings.exposure_s)
         if settings.gain is not None:
@@ -158,7 +158,7 @@ class Gphoto2:
         if not bulb:
             stddev_s = math.hypot(stddev_s, named_off_s(exposure_s) / 2)
         frame = replace(frame, exposure_s=exposure_s, mid_unix_s=mid_s, stamp_stddev_s=stddev_s)
-        return Exposure(frame, Capture.COMMAND, remark=remark)
+        return CapturedFrame(frame, Capture.COMMAND, remark=remark)
 
     def _delete(self, camera, files) -> str:
         """Remove from the camera what this exposure put there; a sentence where that failed."""

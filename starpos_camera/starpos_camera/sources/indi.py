@@ -9,8 +9,8 @@ from starpos.errors import StarposError, one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
-from starpos_camera.sources.indi_server import Blob, Server
-from starpos_camera.sources.source import CaptureError, Exposure, Settings, missing
+from starpos_camera.sources.indi_server import Blob, IndiServer
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 
@@ -58,7 +58,7 @@ class Indi:
     waits_for_listener = False
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         if lack := missing("indipyclient", "indipyclient"):
             return lack
         for name, what in (
@@ -75,7 +75,7 @@ class Indi:
         self.hardware_id = f"{self._device} of indiserver at {self._host}:{self._port}"
         self._values = values
         self._now = now
-        self._server: Server | None = None
+        self._server: IndiServer | None = None
         self._closing = False
 
     def lacking(self) -> None:
@@ -90,7 +90,7 @@ class Indi:
         if server := self._server:
             server.close()
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:
             return self._exposure(*self._take(settings))
         except StarposError as error:
@@ -105,7 +105,7 @@ class Indi:
         if self._closing:
             raise CaptureError("the node ends.")
         if self._server is None:
-            self._server = Server(self._host, self._port)
+            self._server = IndiServer(self._host, self._port)
             if self._closing:  # meanwhile
                 raise CaptureError("the node ends.")
         server = self._server
@@ -131,7 +131,7 @@ class Indi:
             self._server.close()
         self._server = None
 
-    def _exposure(self, blob, wanted_s, commanded_s, ready_s) -> Exposure:
+    def _exposure(self, blob, wanted_s, commanded_s, ready_s) -> CapturedFrame:
         frame, header = decode_fits(_unpacked(blob), "its frame")
         exposure_s = frame.exposure_s or wanted_s
         if exposure_s > ready_s - commanded_s + CLOCK_TOLERANCE_S:
@@ -150,7 +150,7 @@ class Indi:
             clock_stddev_s=stamp.clock_stddev_s,
         )
         remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else ""
-        return Exposure(frame, stamp.source, remark=remark)
+        return CapturedFrame(frame, stamp.source, remark=remark)
 
 
 def _unpacked(blob: Blob) -> bytes:

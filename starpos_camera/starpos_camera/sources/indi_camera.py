@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 
-from starpos_camera.sources.indi_server import Blob, Device, Server
+from starpos_camera.sources.indi_server import Blob, IndiDevice, IndiServer
 from starpos_camera.sources.source import CaptureError
 
 LINK_S = 2.0
@@ -28,7 +28,7 @@ class Wish:
     readout_s: float
 
 
-async def find(server: Server, name: str) -> Device:
+async def find(server: IndiServer, name: str) -> IndiDevice:
     """The device of that name, once it is there; CaptureError if it is not."""
     if not await server.until(lambda: server.connected, LINK_S):
         raise CaptureError("no INDI server answers: start indiserver, or correct indi.host and indi.port.")
@@ -39,7 +39,7 @@ async def find(server: Server, name: str) -> Device:
     return device
 
 
-async def connect(device: Device) -> None:
+async def connect(device: IndiDevice) -> None:
     """Have the driver open its camera; it may have been told so already, by anyone."""
 
     def connected():
@@ -64,7 +64,7 @@ async def connect(device: Device) -> None:
     await device.enable_blobs("CCD1")
 
 
-async def set_up(device: Device, wish: Wish) -> None:
+async def set_up(device: IndiDevice, wish: Wish) -> None:
     """All that an exposure needs; what the camera cannot do is refused."""
     if device.state("CCD_EXPOSURE") == "Busy":  # of a client that was killed
         await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
@@ -93,7 +93,7 @@ async def set_up(device: Device, wish: Wish) -> None:
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", wish.exposure_s, "`exposure` (s)")
 
 
-async def expose(device: Device, wish: Wish) -> Blob:
+async def expose(device: IndiDevice, wish: Wish) -> Blob:
     """The frame of an exposure begun now; it is aborted where it is given up."""
     server = device.server
 

@@ -24,7 +24,7 @@ class Blob:
     format: str
 
 
-class Server:
+class IndiServer:
     """One connection to an INDI server, made when this is, and of no more use once it is lost.
 
     `run` is for the caller's thread, `close` for any; all else is for the coroutine that `run` runs.
@@ -81,9 +81,9 @@ class Server:
         """Of those that are there now."""
         return [one_line(name) for name, found in self._client.items() if found.enable]
 
-    def device(self, name: str) -> "Device":
+    def device(self, name: str) -> "IndiDevice":
         """One by its name, whether it is there or not."""
-        return Device(self, self._client, name)
+        return IndiDevice(self, self._client, name)
 
     async def until(self, condition: Callable[[], object], seconds: float) -> bool:
         """Wait until something holds that a server or a device says; False where the time or the server ends before."""
@@ -138,10 +138,10 @@ class Server:
         self._talking.cancel()
 
 
-class Device:
+class IndiDevice:
     """What a device of a server says, as of now, and what it is told. One that is not there has no vectors."""
 
-    def __init__(self, server: Server, client, name: str):
+    def __init__(self, server: IndiServer, client, name: str):
         self.server, self.name = server, name
         self._client = client
 

@@ -6,10 +6,10 @@ from starpos_camera.sources.files import Files
 from starpos_camera.sources.gphoto2 import Gphoto2
 from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.simulated import Simulated
-from starpos_camera.sources.source import Source
+from starpos_camera.sources.source import FrameSource
 from starpos_camera.sources.video import Video
 
-SOURCES: dict[str, type[Source]] = {
+SOURCES: dict[str, type[FrameSource]] = {
     "files": Files,
     "simulated": Simulated,
     "alpaca": Alpaca,

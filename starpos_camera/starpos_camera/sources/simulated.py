@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.instrument import focal_px_of
-from starpos_camera.sources.source import Exposure, Settings
+from starpos_camera.sources.source import CapturedFrame, CaptureSettings
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
@@ -89,7 +89,7 @@ class Simulated:
     waits_for_listener = False
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         if values["simulated.width"] * values["simulated.height"] > MAX_PIXELS:
             return f"simulated.width times simulated.height must be at most {MAX_PIXELS} px."
@@ -112,16 +112,16 @@ class Simulated:
     def lacking(self) -> None:
         """Nothing: the sky is always there."""
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         from starpos.simulation.scene import expose, render
-        from starpos.sky.catalogue import load as load_catalogue
+        from starpos.sky.catalogue import load_catalogue
 
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s
         scene = self._scene
         stars = expose(scene, load_catalogue(), start, exposure_s, self._rng)
         frame = render(scene, stars, start, exposure_s, self._rng)
-        return Exposure(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)
+        return CapturedFrame(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)
 
     def update(self, values: Mapping):
         self._scene = scene_from(values)

@@ -25,7 +25,7 @@ class SourceEnded(StarposError):
 
 
 @dataclass(frozen=True)
-class Settings:
+class CaptureSettings:
     """How to take the next frame.
 
     exposure_s  None: the source's own
@@ -39,7 +39,7 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Exposure:
+class CapturedFrame:
     """One frame and how it was taken.
 
     frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s where another machine told it
@@ -54,7 +54,7 @@ class Exposure:
     remark: str = ""
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """A camera. Made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
 
     Making one opens nothing and cannot fail for want of a device: `capture` opens what is not open, so that a
@@ -67,13 +67,13 @@ class Source(Protocol):
     waits_for_listener: bool  # True: nothing is captured before someone subscribes to the images
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         """A sentence where a source with these parameters cannot be made, or cannot take such frames."""
 
     def lacking(self) -> str | None:
         """A sentence where `capture` would find nothing; asked before the first frame, each cadence."""
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         """Take the next frame, in a thread of the node's; blocks until it is there.
 
         StarposError in one sentence where there is none: the node reports it and calls again one cadence

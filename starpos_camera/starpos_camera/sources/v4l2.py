@@ -15,7 +15,7 @@ import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.opencv_video import quiet
-from starpos_camera.sources.source import CaptureError, Exposure, Settings
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 
 EXPOSURE_UNIT_S = 1e-4
@@ -44,7 +44,7 @@ JPEG = ("MJPG", "JPEG")
 FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
 
 
-class Device:
+class V4l2Device:
     """Keeps the camera streaming; `capture` gives the first frame that was exposed after it was asked for."""
 
     def __init__(self, path: str, values: Mapping, now: Callable[[], float]):
@@ -57,7 +57,7 @@ class Device:
         self._set: tuple | None = None  # exposure and gain as they were set last
         self._not_before_s = 0.0  # steady time: frames before it have other settings
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:
             with quiet() as cv2:
                 if self._capture is None:
@@ -73,7 +73,7 @@ class Device:
             text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
             raise CaptureError(f"{self._path}: {' '.join(text.split())}") from error
         frame = Frame(pixels, pattern, mid_s, exposure_s, self._path, stamp_stddev_s=stddev_s)
-        return Exposure(frame, stamp, remark=remark and f"{self._path}: {remark}")
+        return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
 
     def close(self):
         if self._capture is not None:

@@ -6,9 +6,9 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from starpos_camera.sources.source import Exposure, Settings
+from starpos_camera.sources.source import CapturedFrame, CaptureSettings
 from starpos_camera.sources.timing import read_utc
-from starpos_camera.sources.v4l2 import FORMATS, Device
+from starpos_camera.sources.v4l2 import FORMATS, V4l2Device
 from starpos_camera.sources.video_file import SUFFIXES, Film
 from starpos_common.parameters import Parameter
 
@@ -71,7 +71,7 @@ class Video:
     parameters = PARAMETERS
 
     @staticmethod
-    def refusal(values: Mapping, settings: Settings) -> str | None:
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         device = values["video.device"]
         if not device or "://" in device:
             return (
@@ -106,7 +106,7 @@ class Video:
         self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
         self._in_use = threading.Lock()
         self._from = (
-            Device(self.hardware_id, values, now)
+            V4l2Device(self.hardware_id, values, now)
             if is_camera(device)
             else Film(self.hardware_id, values["video.start"])
         )
@@ -116,7 +116,7 @@ class Video:
             return f"{self.hardware_id}: it is not there; plug it in, or correct video.device."
         return None
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         with self._in_use:
             return self._from.capture(settings)
 

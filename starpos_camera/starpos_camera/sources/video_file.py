@@ -10,7 +10,7 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.opencv_video import quiet
-from starpos_camera.sources.source import CaptureError, Exposure, Settings, SourceEnded
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, SourceEnded
 from starpos_camera.sources.timing import read_utc
 from starpos_interfaces.msg import Capture
 
@@ -45,7 +45,7 @@ class Film:
         self._first_s = self._last_s = -math.inf  # in the file's time
         self._ended = ""
 
-    def capture(self, settings: Settings) -> Exposure:
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
         if self._ended:
             raise SourceEnded(self._ended)
         if not Path(self._path).is_file():
@@ -78,7 +78,7 @@ class Film:
         mid_s = self._start_s + at_s - self._first_s + self._period_s / 2
         stddev_s = math.hypot(self._period_s, self._start_resolution_s) / math.sqrt(12)
         frame = Frame(pixels, mid_unix_s=mid_s, source=self._path, stamp_stddev_s=stddev_s)
-        return Exposure(frame, Capture.FILE)
+        return CapturedFrame(frame, Capture.FILE)
 
     def close(self):
         if self._capture is not None:

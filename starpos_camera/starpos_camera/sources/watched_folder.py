@@ -24,7 +24,7 @@ MOST_LOOKED_AT = 200  # files that have come, in one look; the others wait
 
 
 @dataclass(frozen=True)
-class Arrival:
+class NewFile:
     """A file that has come: its size (-1: not looked at) and time, since when it has had them, whether it was tried."""
 
     size: int
@@ -49,7 +49,7 @@ class WatchedFolder:
     ):
         """wanted: whether a name is a frame's; rest_s: a file is whole once it has not changed for so long."""
         self._folder, self._wanted, self._rest_s, self._clock = folder, wanted, rest_s, clock
-        self._arrivals: dict[str, Arrival] = {}
+        self._arrivals: dict[str, NewFile] = {}
         self._known = np.zeros(0, np.int64)  # hashes of the names of the last listing
         self._is: tuple[int, int] | None = None  # the folder's device and inode
         self._modified_ns = 0  # the folder's time, and when it was seen to change
@@ -124,7 +124,7 @@ class WatchedFolder:
         else:
             new = [name for name in names if self._is_newer(name)]
         for name in new:
-            self._arrivals.setdefault(name, Arrival(-1, 0, begin))
+            self._arrivals.setdefault(name, NewFile(-1, 0, begin))
         self._known, self._is = hashes, (status.st_dev, status.st_ino)
         self._listed_s, self._listing_s = begin, self._clock() - begin
 
@@ -144,4 +144,4 @@ class WatchedFolder:
         if not stat.S_ISREG(status.st_mode):
             del self._arrivals[name]
         elif (status.st_size, status.st_mtime_ns) != (arrival.size, arrival.modified_ns):
-            self._arrivals[name] = Arrival(status.st_size, status.st_mtime_ns, self._clock())
+            self._arrivals[name] = NewFile(status.st_size, status.st_mtime_ns, self._clock())

@@ -62,7 +62,7 @@ def felt(message: Imu) -> Felt:
 
 
 @dataclass(frozen=True)
-class Average:
+class MeanForce:
     """Messages of one span of time: (N, 3) forces; see `Felt`."""
 
     forces: np.ndarray
@@ -71,7 +71,7 @@ class Average:
     variance: np.ndarray  # (3,) m2/s4, stated for one message
 
     @classmethod
-    def of(cls, messages: list[Felt]) -> "Average":
+    def of(cls, messages: list[Felt]) -> "MeanForce":
         return cls(
             np.array([m.force for m in messages]),
             (messages[0].stamp_ns + messages[-1].stamp_ns) // 2,
@@ -112,7 +112,7 @@ class Average:
         return slope @ forces @ slope.T / len(self.forces) + LEAST_STDDEV_RAD**2 * np.eye(2)
 
 
-class Averager:
+class ForceAverager:
     """Messages to averages of a given length, in order of their stamps; counts what it drops."""
 
     def __init__(self, seconds: float):
@@ -122,7 +122,7 @@ class Averager:
         self._messages: list[Felt] = []
         self._last_ns = 0
 
-    def add(self, message: Felt) -> Average | None:
+    def add(self, message: Felt) -> MeanForce | None:
         """The average that has ended with this message's coming, if one has and is well covered."""
         last_ns, messages = self._last_ns, self._messages
         if message.stamp_ns == last_ns:
@@ -143,7 +143,7 @@ class Averager:
         if len(messages) < LEAST or messages[-1].stamp_ns - messages[0].stamp_ns < COVERED * length_ns:
             self.breaks += bool(messages)
             return None
-        return Average.of(messages)
+        return MeanForce.of(messages)
 
 
 class ImuSource:
@@ -153,7 +153,7 @@ class ImuSource:
         self._clock = clock
         self._now_ns = lambda: node.get_clock().now().nanoseconds
         self._wake = wake
-        self._averager = Averager(values["imu.average"])
+        self._averager = ForceAverager(values["imu.average"])
         self._noise = NoiseTracker()
         self._readings: deque[Reading] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
@@ -201,7 +201,7 @@ class ImuSource:
             self._tell(average)
         self._gap |= self._averager.breaks != breaks
 
-    def _tell(self, average: Average):
+    def _tell(self, average: MeanForce):
         before, self._unrest = self._unrest, average.unrest(self._max_force_error, self._max_rotation)
         if self._unrest:
             self._sequence += 1
@@ -214,7 +214,7 @@ class ImuSource:
         self._recent.append(self._heard_s)
         self._wake()
 
-    def _reading(self, average: Average) -> Reading:
+    def _reading(self, average: MeanForce) -> Reading:
         x, y = average.tilt()
         flags = self._flags(average, x, y)
         if flags & GAP:
@@ -232,7 +232,7 @@ class ImuSource:
             flags,
         )
 
-    def _flags(self, average: Average, x: float, y: float) -> int:
+    def _flags(self, average: MeanForce, x: float, y: float) -> int:
         flags = GAP if self._gap else 0
         self._gap = False
         still = not np.ptp(average.forces, axis=0).any()
@@ -243,7 +243,7 @@ class ImuSource:
             flags |= OUT_OF_RANGE
         return flags
 
-    def _covariance(self, average: Average) -> np.ndarray:
+    def _covariance(self, average: MeanForce) -> np.ndarray:
         """Of the messages within, or of what averages differ by where that is more: an IMU's noise is not white."""
         covariance = average.covariance()
         found = np.sqrt(np.diag(covariance))

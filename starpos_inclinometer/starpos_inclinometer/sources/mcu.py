@@ -11,7 +11,7 @@ from starpos_inclinometer.noise import noise_text
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_continuity import Continuity, Gate, mcu_follows
 from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
-from starpos_inclinometer.sources.sca100t import Calibration, Sensor
+from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
 from starpos_inclinometer.sources.serial_link import SerialLink
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Reading
 
@@ -32,7 +32,7 @@ class McuDecoder:
         self.answered = False
         self._ask = True  # who it is and at which rate
         self._refused_rate: int | None = None
-        self._parser = mcu_protocol.Parser()
+        self._parser = mcu_protocol.LineParser()
         self._gate = Gate(self._follows, NEAR_CODES)
         self._continuity = Continuity()
 
@@ -107,7 +107,9 @@ class McuDecoder:
 class McuTilts:
     """Believed samples to readings; `calibration` makes the sensor's of the parameters' values."""
 
-    def __init__(self, values: Mapping[str, Any], calibration: Callable[[Mapping[str, Any]], Calibration]):
+    def __init__(
+        self, values: Mapping[str, Any], calibration: Callable[[Mapping[str, Any]], Sca100tCalibration]
+    ):
         self.sensor = Sensor()
         self.arrivals = ArrivalFilter()
         self._calibration = calibration
@@ -161,7 +163,7 @@ class McuSource:
         values: Mapping[str, Any],
         clock: HostClock,
         wake: Callable[[], None],
-        calibration: Callable[[Mapping[str, Any]], Calibration],
+        calibration: Callable[[Mapping[str, Any]], Sca100tCalibration],
     ):
         self._decoder = McuDecoder(values["rate"])
         self._link = SerialLink(values["port"], values["baud"], self._decoder, clock, wake)

@@ -8,7 +8,7 @@ fit the samples around it: its number, its time or its tilt is off.
 from collections.abc import Callable
 from dataclasses import replace
 
-from starpos_inclinometer.sources.mcu_protocol import Sample, Status
+from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
 from starpos_inclinometer.sources.source import Arrival
 
 TOLERANCE_OF_CHANGE = 8.0  # times the usual change from sample to sample is still near
@@ -18,7 +18,7 @@ WITNESSES = 3  # samples in a row that are believed though no two are near each 
 PERIOD_TOLERANCE_MS = 2  # both ends are floored to ms
 SHORTEST_MS, LONGEST_MS = 20, 1000  # periods of the rates there are
 TEMPERATURE_TOLERANCE = 3  # counts: 2.8 deg C from one sample to the next
-FAULTS = Status.ADC_TIMEOUT | Status.NO_REFERENCE
+FAULTS = SampleStatus.ADC_TIMEOUT | SampleStatus.NO_REFERENCE
 HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE = 3.0, 0.05  # a stalled host, an MCU's RC oscillator
 
 
@@ -85,7 +85,7 @@ def mcu_follows(a: Arrival, b: Arrival, period_ms: float | None) -> bool:
     """
     ahead = (b.sample.sequence - a.sample.sequence) & 0xFFFF
     elapsed = (b.sample.milliseconds - a.sample.milliseconds) & 0xFFFFFFFF
-    if not ahead or b.sample.status & Status.FIRST:
+    if not ahead or b.sample.status & SampleStatus.FIRST:
         return False
     if _temperature_leaps(a.sample, b.sample) or a.sample.status & FAULTS & ~b.sample.status:
         return False  # that a fault is over has to be said twice
@@ -97,7 +97,7 @@ def mcu_follows(a: Arrival, b: Arrival, period_ms: float | None) -> bool:
 
 
 def _temperature_leaps(a: Sample, b: Sample) -> bool:
-    known = not (a.status | b.status) & Status.NO_TEMPERATURE
+    known = not (a.status | b.status) & SampleStatus.NO_TEMPERATURE
     return known and abs(b.temperature - a.temperature) > TEMPERATURE_TOLERANCE
 
 
@@ -122,7 +122,7 @@ class Continuity:
             elapsed = (sample.milliseconds - last.milliseconds) & 0xFFFFFFFF
             ahead = (sample.sequence - self._last_raw_sequence) & 0xFFFF
             # A serial line does not reorder: a clock that went back, or a first sample, is a reset.
-            restarted = bool(sample.status & Status.FIRST) or elapsed >= 1 << 31
+            restarted = bool(sample.status & SampleStatus.FIRST) or elapsed >= 1 << 31
             if restarted:
                 self.restarts += 1
             else:

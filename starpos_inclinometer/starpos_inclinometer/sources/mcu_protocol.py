@@ -22,7 +22,7 @@ _REFUSAL = re.compile(rb"N,([0-9A-F]{2})")
 _RATE = re.compile(rb"R,([0-9A-F]{2})")
 
 
-class Status(IntFlag):
+class SampleStatus(IntFlag):
     """Status bits of a sample; unknown bits are for later versions and ignored."""
 
     ADC_TIMEOUT = 0x01  # a channel did not convert in time: its code is the one before
@@ -136,7 +136,7 @@ class LineSplitter:
         self._rest = b""
 
 
-class Parser:
+class LineParser:
     """What the MCU sends, out of arbitrary chunks of bytes, counted."""
 
     def __init__(self):
@@ -168,7 +168,7 @@ class Parser:
 def _parse(body: bytes) -> Sample | Identity | Refusal | None:
     if match := _SAMPLE.fullmatch(body):
         sample = Sample(*(int(group, 16) for group in match.groups()))
-        return None if sample.status & Status.FIRST and sample.sequence else sample
+        return None if sample.status & SampleStatus.FIRST and sample.sequence else sample
     if match := _IDENTITY.fullmatch(body):
         identity = Identity(*(int(group, 16) for group in match.groups()))
         return identity if _possible(identity) else None

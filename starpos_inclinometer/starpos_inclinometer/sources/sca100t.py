@@ -14,7 +14,7 @@ from starpos.instrument.inclinometer import (
     SCA100T_SENSITIVITY_V_PER_G,
 )
 from starpos_inclinometer.noise import NoiseTracker
-from starpos_inclinometer.sources.mcu_protocol import Sample, Status
+from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
 from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos_inclinometer.temperature import Temperature
 
@@ -36,7 +36,7 @@ STUCK_SAMPLES, STUCK_PAIRS = 10, 3
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Sca100tCalibration:
     """What lies between the codes and the angles; pairs are (x, y).
 
     The ADC's AIN(-) and the divider's foot lie at half the reference, which is also the sensor's supply; so
@@ -119,7 +119,7 @@ def temperature_counts(celsius: float) -> int:
 class Sensor:
     """Samples of one MCU to tilts; remembers the codes before, the temperature and the noise."""
 
-    def __init__(self, calibration: Calibration = Calibration()):
+    def __init__(self, calibration: Sca100tCalibration = Sca100tCalibration()):
         self.calibration = calibration
         self.noise = NoiseTracker()
         self.temperature = Temperature()
@@ -130,7 +130,7 @@ class Sensor:
         """time_s: the sample's, of a clock that does not step."""
         flags = self._flags(sample)
         measured = math.nan
-        if not sample.status & Status.NO_TEMPERATURE:
+        if not sample.status & SampleStatus.NO_TEMPERATURE:
             measured = temperature_c(sample.temperature)
         self.temperature.add(time_s, measured)
         c, at = self.calibration, self.temperature.celsius(self.calibration.temperature_reference_c)
@@ -151,7 +151,7 @@ class Sensor:
             self._run[axis] = self._run[axis] + 1 if codes[axis] == self._last[axis] else 1
         self._last = codes
         stuck = max(self._run) >= STUCK_SAMPLES or min(self._run) >= STUCK_PAIRS
-        if stuck or sample.status & (Status.ADC_TIMEOUT | Status.NO_REFERENCE):
+        if stuck or sample.status & (SampleStatus.ADC_TIMEOUT | SampleStatus.NO_REFERENCE):
             flags |= STUCK
         if any(code in (0, CODE_MAX) for code in codes):
             flags |= SATURATED

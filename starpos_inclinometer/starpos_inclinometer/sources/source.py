@@ -74,7 +74,7 @@ class Health:
     values: Mapping[str, object] = field(default_factory=dict)
 
 
-class Source(Protocol):
+class TiltSource(Protocol):
     """Where tilts come from. All is called by one thread, the node's; `wake` may be called by any."""
 
     def start(self): ...

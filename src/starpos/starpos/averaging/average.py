@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.filter import Running
+from starpos.averaging.filter import PlaceFilter
 from starpos.averaging.slip import slip_s
 from starpos.errors import FixError
 from starpos.fix.budget import ErrorTerm
@@ -80,7 +80,7 @@ def _time(f: Fix) -> float:
 class _Track:
     """An average in the making; in_pose: its frames since the camera was last touched."""
 
-    running: Running
+    running: PlaceFilter
     frames: int = 0
     poses: int = 0
     in_pose: int = 0
@@ -89,7 +89,7 @@ class _Track:
 
     @classmethod
     def before(cls, f: Fix) -> "_Track":
-        return cls(Running.before(f), began_unix_s=f.utc_unix_s)
+        return cls(PlaceFilter.before(f), began_unix_s=f.utc_unix_s)
 
     def rival(self, f: Fix) -> "_Track":
         """A new one that knows of this one's errors, not of its place."""

@@ -76,7 +76,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Running:
+class PlaceFilter:
     """What the fixes so far say.
 
     state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own; known (3,): which
@@ -94,7 +94,7 @@ class Running:
     utc_unix_s: float  # of the last fix
 
     @classmethod
-    def before(cls, f: Fix) -> "Running":
+    def before(cls, f: Fix) -> "PlaceFilter":
         """Nothing known yet, in a plane at the first fix and ready for fixes with terms like its."""
         columns, n = [], 3
         for t in f.terms:
@@ -113,21 +113,21 @@ class Running:
             f.utc_unix_s,
         )
 
-    def forget(self, unknown: tuple[bool, bool, bool]) -> "Running":
+    def forget(self, unknown: tuple[bool, bool, bool]) -> "PlaceFilter":
         """The same, with east, north or heading unknown."""
         which, sources = np.flatnonzero(unknown), self.sources.copy()
         sources[:, which, :] = sources[:, :, which] = 0.0
         return replace(self, sources=sources, known=self.known & ~np.array(unknown))
 
-    def heading_unknown(self) -> "Running":
+    def heading_unknown(self) -> "PlaceFilter":
         """The same place, the instrument turned."""
         return self.forget((False, False, True))
 
-    def elsewhere(self, f: Fix) -> "Running":
+    def elsewhere(self, f: Fix) -> "PlaceFilter":
         """The same instrument, with all that is known of its errors, at an unknown place in the plane of a fix."""
         return replace(self.forget((True, True, True)), plane=Plane.at(f))
 
-    def add(self, f: Fix, pose: Fix) -> tuple["Running", float]:
+    def add(self, f: Fix, pose: Fix) -> tuple["PlaceFilter", float]:
         """With one more fix, and how many sigma that was from what was expected of it.  pose: the first of its pose."""
         now, own = self._at(f)
         shared, noise = np.zeros((3, len(now.state))), np.zeros((len(own), 3, 3))
@@ -169,7 +169,7 @@ class Running:
         sources = (sources + sources.swapaxes(1, 2)) / 2
         return replace(now, state=state, sources=sources, known=np.ones(3, bool)), sigmas
 
-    def straight_from(self, before: "Running") -> bool:
+    def straight_from(self, before: "PlaceFilter") -> bool:
         """Whether the way from an earlier place to this one is as straight as this one's claim takes it for.
 
         A clock's error goes along the parallel, which leaves the plane with the square of the way: 20 m in 16 km.
@@ -182,7 +182,7 @@ class Running:
         least = np.linalg.eigvalsh(self.sources.sum(0)[:2, :2])[0]
         return bool(bent <= MOST_BENT * np.sqrt(max(least, 0.0)))
 
-    def _at(self, f: Fix) -> tuple["Running", np.ndarray]:
+    def _at(self, f: Fix) -> tuple["PlaceFilter", np.ndarray]:
         """The shared errors as they are at the time of a fix; and which of its terms are all its own (T,)."""
         if tuple(t.name for t in f.terms) != self.names:
             raise ValueError("fixes with other error terms: they are not of one program")
@@ -218,7 +218,7 @@ class Running:
             for t, source in zip(like, self.sources, strict=True)
         )
 
-    def sigmas_apart(self, part: "Running") -> float:
+    def sigmas_apart(self, part: "PlaceFilter") -> float:
         """How far the place of `part`, which had some of these fixes only, is from this one, in sigma."""
         apart = self.plane.across(*part.place[:2]) - self.state[:2]
         # what a part errs beyond the whole is independent of it

@@ -22,7 +22,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.solver import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
 from starpos.frames.stars import Stars
-from starpos.identification import Identification, Pointing, Sky, identify_directions, triangles
+from starpos.identification import Identification, PointingPrior, Sky, identify_directions, triangles
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -43,7 +43,7 @@ class FromSky:
     used: tuple[int, ...]
 
 
-def calibrate(
+def calibrate_camera(
     frames: Sequence[Stars],
     levels: Sequence[np.ndarray | None],
     given: Camera,
@@ -116,7 +116,7 @@ class _Frame:
     ) -> Sighting | None:
         """Its stars as this camera identifies them, first near the attitude where one is known; None: it does not."""
         seen = unbent(camera.directions(self.stars.x, self.stars.y), self.level, atmosphere)
-        priors = () if attitude is None else (Pointing(attitude, camera.fx),)
+        priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
         found = identify_directions(seen, self.stars.sigma, camera, self.sky, priors)
         if found is None:
             return None

@@ -127,13 +127,15 @@ def fit_camera(
         raise CalibrationError(
             f"{count} identified stars are too few for a camera: give frames with {fewest} at least"
         )
-    problem = _Problem.of(sightings, given, atmosphere, free)
+    problem = _CameraAdjustment.of(sightings, given, atmosphere, free)
     fitted = _settled(problem)
     camera = problem.camera(fitted.state.q)
     to_named = problem.named_per_unit()
     keep = fitted.keep
     held = replace(problem, sigma=problem.sigma * _only("scale"))
-    before, _ = held.refined(_State(np.zeros(len(UNKNOWNS)), problem.start), problem.stated + np.eye(2), keep)
+    before, _ = held.refined(
+        _CameraEstimate(np.zeros(len(UNKNOWNS)), problem.start), problem.stated + np.eye(2), keep
+    )
     return Intrinsics(
         camera,
         to_named @ fitted.covariance @ to_named.T,
@@ -216,21 +218,21 @@ def _only(name: str) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _State:
+class _CameraEstimate:
     q: np.ndarray
     attitudes: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Settled:
-    state: _State
+    state: _CameraEstimate
     covariance: np.ndarray  # of q
     keep: np.ndarray
     jitter2: float
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _CameraAdjustment:
     """All stars of all frames, frame by frame: first (F,) is the row where each begins."""
 
     given: Camera
@@ -245,7 +247,9 @@ class _Problem:
     atmosphere: Atmosphere
 
     @classmethod
-    def of(cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free) -> "_Problem":
+    def of(
+        cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free
+    ) -> "_CameraAdjustment":
         sightings = [s for s in sightings if len(s.xy)]
         counts = [len(s.xy) for s in sightings]
         direction2 = np.square(np.concatenate([s.direction_sigma for s in sightings]) * given.fx)
@@ -285,7 +289,7 @@ class _Problem:
     def camera(self, q: np.ndarray) -> Camera:
         return _with_values(self.given, _values(self.given) + self.named_per_unit() @ q)
 
-    def seen(self, state: _State) -> np.ndarray:
+    def seen(self, state: _CameraEstimate) -> np.ndarray:
         """Directions (N, 3) in C from which the light comes."""
         u = np.einsum("nij,nj->ni", state.attitudes[self.frame], self.places)
         strength, *shrink = (state.q * self.sigma)[CAMERA_UNKNOWNS:]
@@ -299,15 +303,15 @@ class _Problem:
             out[on] = np.einsum("nij,ni->nj", g, model.bend(np.einsum("nij,nj->ni", g, u[on])))
         return out
 
-    def residual(self, state: _State) -> np.ndarray:
+    def residual(self, state: _CameraEstimate) -> np.ndarray:
         return self.xy - self.camera(state.q).project(self.seen(state))
 
-    def turned(self, state: _State, turns: np.ndarray) -> _State:
+    def turned(self, state: _CameraEstimate, turns: np.ndarray) -> _CameraEstimate:
         """Each attitude turned by a small rotation (F, 3) about C's axes."""
         new = np.stack([rotation.from_vector(t) @ a for t, a in zip(turns, state.attitudes, strict=True)])
-        return _State(state.q, new)
+        return _CameraEstimate(state.q, new)
 
-    def derivatives(self, state: _State) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(self, state: _CameraEstimate) -> tuple[np.ndarray, np.ndarray]:
         """d predicted / d q (N, 2, U), and for the turns of its own frame (N, 2, 3)."""
         seen, camera = self.seen(state), self.camera(state.q)
         here = camera.project(seen)
@@ -328,7 +332,7 @@ class _Problem:
             of_turn.append((ahead - behind) / (2 * STEP_RAD))
         return of_q, np.stack(of_turn, -1)
 
-    def step(self, state: _State, covariance: np.ndarray, keep: np.ndarray):
+    def step(self, state: _CameraEstimate, covariance: np.ndarray, keep: np.ndarray):
         """One of Gauss and Newton: dq (U,), turns (F, 3), and the covariance of q (U, U)."""
         weight = np.linalg.cholesky(_inverse(covariance)) * keep[:, None, None]
         of_q, of_turn = self.derivatives(state)
@@ -348,12 +352,14 @@ class _Problem:
         dq = inverse @ right
         return dq, pulled - solved @ dq, inverse
 
-    def cost(self, state: _State, covariance: np.ndarray, keep: np.ndarray) -> float:
+    def cost(self, state: _CameraEstimate, covariance: np.ndarray, keep: np.ndarray) -> float:
         d2 = distance2(self.residual(state)[keep], covariance[keep])
         total = d2.sum() + state.q @ state.q
         return float(total) if np.isfinite(total) else np.inf
 
-    def refined(self, state: _State, covariance: np.ndarray, keep: np.ndarray) -> tuple[_State, np.ndarray]:
+    def refined(
+        self, state: _CameraEstimate, covariance: np.ndarray, keep: np.ndarray
+    ) -> tuple[_CameraEstimate, np.ndarray]:
         """The minimum from `state`, and the covariance of q there."""
         cost = self.cost(state, covariance, keep)
         if cost == np.inf:
@@ -363,7 +369,7 @@ class _Problem:
         for _ in range(MAX_STEPS):
             dq, turns, inverse = self.step(state, covariance, keep)
             for shorter in 0.5 ** np.arange(8):
-                new = self.turned(_State(state.q + shorter * dq, state.attitudes), shorter * turns)
+                new = self.turned(_CameraEstimate(state.q + shorter * dq, state.attitudes), shorter * turns)
                 if (lower := self.cost(new, covariance, keep)) <= cost:
                     state, cost = new, lower
                     break
@@ -374,9 +380,9 @@ class _Problem:
         return state, inverse
 
 
-def _settled(problem: _Problem) -> _Settled:
+def _settled(problem: _CameraAdjustment) -> _Settled:
     """The fit with outliers left out and the stars' errors widened to their scatter."""
-    state = _State(np.zeros(len(UNKNOWNS)), problem.start)
+    state = _CameraEstimate(np.zeros(len(UNKNOWNS)), problem.start)
     keep, jitter2, settled = np.ones(len(problem.xy), bool), 0.0, False
     unknowns = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
     for _ in range(MAX_ROUNDS):

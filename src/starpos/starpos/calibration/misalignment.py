@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, Plumb, Readings, hang
+from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, PlumbLine, Readings, hang
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
@@ -70,7 +70,7 @@ def calibrate_at(
     without a fix, or where the frames do not agree.
     """
 
-    def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> Plumb:
+    def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
         common = sum(np.trace(t.covariance[:2, :2]) / 2 for f in fixes for t in f.terms if t.name in OF_PLACE)
         sigma = np.hypot(site_stddev_arcsec * ARCSEC, np.sqrt(common / len(fixes)) / EARTH_RADIUS_M)
         return hang(readings, a3, site.enu[2], float(sigma), np.radians(turn_stddev_deg))
@@ -92,7 +92,7 @@ def calibrate(
     solver: Solver,
     frames: Sequence[Stars],
     tilt: Tilts,
-    find: Callable[[Readings, np.ndarray, list[Fix]], Plumb],
+    find: Callable[[Readings, np.ndarray, list[Fix]], PlumbLine],
     fewest: int,
     progress: Progress = quiet,
 ) -> Calibrated:
@@ -103,7 +103,7 @@ def calibrate(
     plumb, sound = None, []
     for k in range(ROUNDS):
         for n, stars in enumerate(frames):
-            known = solutions[n].standing if solutions[n] else None
+            known = solutions[n].hint if solutions[n] else None
             solutions[n] = solver.solve(stars, tilt, known)
             progress("calibrating", (k + (n + 1) / len(frames)) / ROUNDS)
         solved = [s for s in solutions if s.fix]
@@ -136,7 +136,9 @@ def calibrate(
     return Calibrated(instrument, error, tuple(solutions))
 
 
-def _found(find: Callable, solved: list[Solution], instrument: Instrument) -> tuple[Plumb, list[Solution]]:
+def _found(
+    find: Callable, solved: list[Solution], instrument: Instrument
+) -> tuple[PlumbLine, list[Solution]]:
     """What `find` makes of the frames that agree with each other, and these."""
     a3, errors = instrument.mounting.a3, instrument.inclinometer
     plumb = find(Readings.of(solved, errors), a3, [s.fix for s in solved])
@@ -146,7 +148,7 @@ def _found(find: Callable, solved: list[Solution], instrument: Instrument) -> tu
     return find(Readings.of(sound, errors), a3, [s.fix for s in sound]), sound
 
 
-def _unknown(plumb: Plumb, sound: list[Solution]) -> Calibration:
+def _unknown(plumb: PlumbLine, sound: list[Solution]) -> Calibration:
     """A3 as the fixes hold it: unknown, but for its turn about the plumb line where the leans told it; an unknown one
     makes an error of every lean."""
     tilt_deg = _mean_tilt_deg(sound)
@@ -211,7 +213,7 @@ def _with(solver: Solver, calibration: Calibration) -> Solver:
     return replace(solver, instrument=replace(solver.instrument, calibration=calibration))
 
 
-def _dated(plumb: Plumb, solved: list[Solution]) -> Calibration:
+def _dated(plumb: PlumbLine, solved: list[Solution]) -> Calibration:
     """As of the middle of the frames."""
     found = Calibration(
         covariance_arcsec2=tuple(map(tuple, (plumb.covariance / ARCSEC**2).tolist())),

@@ -100,7 +100,7 @@ def _wandering(solved: Sequence[Solution], plumb: np.ndarray, errors: Inclinomet
 
 
 @dataclass(frozen=True)
-class Plumb:
+class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) rad2 about S's axes, and the zenith (3,) in ITRS with its sigma, rad.
 
     cost: half the robust chi-square; scatter: chi-square a degree of freedom, 1 of frames that have one zenith; off (K,):
@@ -123,7 +123,7 @@ class Plumb:
         return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
 
 
-def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> Plumb:
+def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> PlumbLine:
     """A3 that keeps the zenith still, wherever it is; the nearest to `given` (3, 3) as far as they do not tell.
 
     turn_sigma: how well `given` has the turn about the plumb line, rad.  Beside that only a lean tells it that changes
@@ -163,7 +163,7 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
 
 def hang(
     readings: Readings, given: np.ndarray, zenith: np.ndarray, zenith_sigma: float, turn_sigma: float
-) -> Plumb:
+) -> PlumbLine:
     """A3 under a known zenith (3,), good to zenith_sigma rad; the nearest to `given` as far as they do not tell.
 
     turn_sigma: how well `given` has the turn about the plumb line, rad.
@@ -190,7 +190,7 @@ class _Known:
     turn_sigma: float = np.pi
 
 
-def _cost(plumb: Plumb) -> float:
+def _cost(plumb: PlumbLine) -> float:
     return plumb.cost
 
 
@@ -238,7 +238,7 @@ def _robust(off: np.ndarray) -> np.ndarray:
     return np.where(size > ROBUST_SIGMA, ROBUST_SIGMA * (2 * size - ROBUST_SIGMA), size**2)
 
 
-def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float = 0.0) -> Plumb:
+def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float = 0.0) -> PlumbLine:
     """A3, the zenith and the errors of the inclinometer: robust Gauss-Newton from `start`, which is the given A3 `turned`
     by so many rad about the plumb line.
 
@@ -287,7 +287,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
     whole = turns @ np.linalg.inv(design.T @ design)[:3, :3] @ turns.T
     # without the turn about the plumb line, which may be as good as unknown
     told = np.delete(design, 2, 1)
-    return Plumb(
+    return PlumbLine(
         a3,
         (whole + whole.T) / 2,
         rotation.normalised(up),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from starpos.calibration.misalignment import Calibrated, calibrate
-from starpos.calibration.plumb_line import Plumb, Readings, level
+from starpos.calibration.plumb_line import PlumbLine, Readings, level
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
@@ -28,7 +28,7 @@ def turn(
     leans and the headings leave two places, or the frames have no one zenith.
     """
 
-    def find(readings: Readings, a3: np.ndarray, _) -> Plumb:
+    def find(readings: Readings, a3: np.ndarray, _) -> PlumbLine:
         return level(readings, a3, np.radians(turn_stddev_deg))
 
     return calibrate(solver, frames, tilt, find, fewest=2, progress=progress)

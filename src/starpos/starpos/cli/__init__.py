@@ -24,7 +24,7 @@ COMMANDS = {
 BAD_CALL = 2
 
 
-class Parser(argparse.ArgumentParser):
+class CommandParser(argparse.ArgumentParser):
     """One line for a bad call, as for any other error."""
 
     def error(self, message: str):
@@ -46,7 +46,7 @@ def _one_line_each(command: str):
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
-    parser = Parser(prog="starpos", description="Position and heading from the stars.")
+    parser = CommandParser(prog="starpos", description="Position and heading from the stars.")
     parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     given = sys.argv[1:] if argv is None else argv

@@ -70,7 +70,7 @@ def check(args) -> None:
 
 def run(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> None:
     """Find, write and print it; FixError where the frames do not tell."""
-    solver = Solver(instrument, catalogue.load(), common.atmosphere_of(args))
+    solver = Solver(instrument, catalogue.load_catalogue(), common.atmosphere_of(args))
     site, stddev_arcsec = _site(args)
     found = calibrate_at(
         solver, frames, tilts.average, site, stddev_arcsec, common.turn_of(args), common.ProgressBar()

@@ -44,7 +44,7 @@ def define(parser) -> None:
 
 
 def show(args) -> int:
-    c = catalogue.load(args.path)
+    c = catalogue.load_catalogue(args.path)
     v = c.vmag()
     sigma_mas = c.sigma(slice(None), args.year) / catalogue.MAS
     print(
@@ -80,7 +80,7 @@ def show_triangles(args) -> int:
 def show_paper() -> int:
     from starpos.identification import paper
 
-    c = catalogue.load()
+    c = catalogue.load_catalogue()
     row = paper.stars(c)
     count = paper.count_triangles(c.directions(row), np.radians(paper.LONGEST_SIDE_DEG))
     print(f"Tycho-2's main table, V < {paper.LIMIT_MAG:g} with a HIP number: {len(row)} stars")
@@ -106,7 +106,7 @@ def show_field(camera) -> int:
     from starpos.identification import triangles
     from starpos.instrument.instrument import Instrument
 
-    c = catalogue.load()
+    c = catalogue.load_catalogue()
     Solver(Instrument(camera.fx), c, progress=common.ProgressBar()).prepare(camera.width, camera.height)
     table = triangles.cached(c, camera.half_diagonal_rad)
     used = np.unique(table.corners)

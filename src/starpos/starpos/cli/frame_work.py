@@ -104,7 +104,7 @@ class Identifying:
 
     def __call__(self, path: str) -> tuple[Solution, float]:
         item = self.read(path)
-        solver = Solver(self.instrument, catalogue.load())
+        solver = Solver(self.instrument, catalogue.load_catalogue())
         with suppress(StarposError):  # identify says it
             solver.prepare(item.width, item.height)
         begin = time.process_time()
@@ -128,7 +128,7 @@ class Solving:
 
     def __call__(self, path: str) -> Solution:
         stars = stars_of(self.read(path))
-        solver = Solver(self.instrument, catalogue.load(), self.atmosphere)
+        solver = Solver(self.instrument, catalogue.load_catalogue(), self.atmosphere)
         return solver.solve(stars, tilts(self.tilt, self.instrument.inclinometer.noise_rad).average)
 
 

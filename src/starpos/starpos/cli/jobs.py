@@ -63,6 +63,6 @@ def watched(answers: Iterable, number: int) -> Iterator:
 
 def prepare(instrument: Instrument, about: About) -> None:
     """Have the triangles in the cache, where all processes of a machine find them."""
-    solver = Solver(instrument, catalogue.load(), progress=common.ProgressBar())
+    solver = Solver(instrument, catalogue.load_catalogue(), progress=common.ProgressBar())
     with suppress(StarposError):  # which the frames will say
         solver.prepare(about.width, about.height)

@@ -79,7 +79,7 @@ def define(parser) -> None:
 
 
 def run(args) -> int:
-    stars, camera = catalogue.load(), common.camera_of(args)
+    stars, camera = catalogue.load_catalogue(), common.camera_of(args)
     conditions = _conditions(args, stars, camera)
     solver = Solver(Instrument(camera.fx), stars, progress=common.ProgressBar())
     solver.prepare(camera.width, camera.height)

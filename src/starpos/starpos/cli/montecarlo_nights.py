@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos.cli import common
 from starpos.simulation import montecarlo_nights
-from starpos.simulation.montecarlo_nights import Outcome
+from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos.sky import catalogue
 
 PAPER_ARCSEC = (30.2, 49.0)  # mean absolute errors of latitude and longitude over its 50 nights
@@ -108,7 +108,7 @@ def _target_m(args) -> float:
     return ARCSEC_M * (sca100t if args.tiltmeter is None else min(sca100t, quiet * args.tiltmeter / 0.1))
 
 
-def _nees(solved: list[Outcome]) -> np.ndarray:
+def _nees(solved: list[NightOutcome]) -> np.ndarray:
     """Mean normalised errors squared of position by gravity, on the ground, and heading."""
     if not solved:
         return np.full(3, np.nan)
@@ -122,7 +122,7 @@ def _errors(args) -> montecarlo_nights.InclinometerErrors:
     )
 
 
-def _either(rng: np.random.Generator, stars, errors) -> Outcome:
+def _either(rng: np.random.Generator, stars, errors) -> NightOutcome:
     """A night of either kind; fewer frames than the paper's make more nights."""
     if rng.random() < 0.5:
         headings = int(rng.integers(3, 9))
@@ -130,7 +130,7 @@ def _either(rng: np.random.Generator, stars, errors) -> Outcome:
     return montecarlo_nights.calibrated_night(rng, stars, errors, int(rng.integers(1, 9)))
 
 
-def _all(args, night: Callable) -> list[Outcome]:
+def _all(args, night: Callable) -> list[NightOutcome]:
     """Every night's outcome, the same ones however many processes there are."""
     seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, common.ProgressBar()
     for k, outcome in _each(night, seeds, min(args.jobs, args.nights)):
@@ -151,7 +151,7 @@ def _all(args, night: Callable) -> list[Outcome]:
     return ordered
 
 
-def _each(night: Callable, seeds: list, jobs: int) -> Iterator[tuple[int, Outcome]]:
+def _each(night: Callable, seeds: list, jobs: int) -> Iterator[tuple[int, NightOutcome]]:
     if jobs == 1:
         for k, seed in enumerate(seeds):
             yield k, _one(night, seed)
@@ -164,10 +164,10 @@ def _each(night: Callable, seeds: list, jobs: int) -> Iterator[tuple[int, Outcom
             yield waiting[done], done.result()
 
 
-def _one(night: Callable, seed) -> Outcome:
+def _one(night: Callable, seed) -> NightOutcome:
     return night(np.random.default_rng(seed), _stars())
 
 
 @lru_cache(maxsize=1)
 def _stars():
-    return catalogue.load()
+    return catalogue.load_catalogue()

@@ -51,7 +51,9 @@ def run(args) -> int:
             common.complain("report", f"{night.name}: {sentence}")
     bar, each = common.ProgressBar(), []
     for k, night in enumerate(nights):
-        each.append(list(pictures_of(night, catalogue.load())) if len(nights) <= ALL_FIGURES else [])
+        each.append(
+            list(pictures_of(night, catalogue.load_catalogue())) if len(nights) <= ALL_FIGURES else []
+        )
         bar("figures", (k + 1) / len(nights))
     known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
     overall = [nights_picture(known)] if len(nights) > 1 and known else []
@@ -72,7 +74,7 @@ def _night(path: Path, args) -> Night:
 
     shop = Workshop(
         _once_a_size(lambda stars: common.instrument_of(args, stars)),
-        catalogue.load(),
+        catalogue.load_catalogue(),
         common.atmosphere_of(args),
         common.vertical_of(args),
         common.turn_of(args) if args.self_calibrate else None,

@@ -84,7 +84,7 @@ def run(args) -> int:
     write_night(
         args.out,
         scene,
-        catalogue.load(),
+        catalogue.load_catalogue(),
         start_utc=args.start,
         frames=args.frames,
         cadence_s=args.cadence,

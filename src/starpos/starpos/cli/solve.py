@@ -10,7 +10,7 @@ import numpy as np
 from starpos.averaging.average import Average, average
 from starpos.calibration.turning import turn
 from starpos.cli import common, jobs
-from starpos.cli.archive import Night, nights_of
+from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
@@ -50,7 +50,7 @@ def define(parser) -> None:
 class Plan:
     """How a night is worked: what is done with each frame, and what is known for all."""
 
-    night: Night
+    night: NightFolder
     work: Solving | Listing
     solver: Solver | None = None  # None where no frame can be read
     tilts: TiltLog | None = None
@@ -80,8 +80,8 @@ def run(args) -> int:
     given = nights_of(args.frames, args.tilt)
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
-    nights = [night for night in given if isinstance(night, Night)]
-    statuses = [_refused(why, given) for why in given if not isinstance(why, Night)]
+    nights = [night for night in given if isinstance(night, NightFolder)]
+    statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
     number = sum(len(night.frames) for night in nights)
     with jobs.workers_of(args, number) as workers:
         plans = []
@@ -109,13 +109,13 @@ def _refused(why: StarposError, given: list) -> int:
     return common.UNREADABLE
 
 
-def _plan(args, night: Night, about: About | None, read: Reader) -> Plan:
+def _plan(args, night: NightFolder, about: About | None, read: Reader) -> Plan:
     if about is None:
         return Plan(night, Listing(read))  # each frame says why it cannot be read
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
     table = tilts(night.tilt, instrument.inclinometer.noise_rad)
     jobs.prepare(instrument, about)
-    solver = Solver(instrument, catalogue.load(), air, progress=common.ProgressBar())
+    solver = Solver(instrument, catalogue.load_catalogue(), air, progress=common.ProgressBar())
     return Plan(
         night,
         Listing(read) if args.self_calibrate else Solving(read, instrument, air, night.tilt),
@@ -124,7 +124,7 @@ def _plan(args, night: Night, about: About | None, read: Reader) -> Plan:
     )
 
 
-def _tell(args, night: Night, rows: Iterable, vertical: Vertical) -> int:
+def _tell(args, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
     """Print (path, Solution or FrameError) of each frame and what they make together; the exit status."""
     solved, unreadable = [], False
     for path, answer in rows:
@@ -174,12 +174,12 @@ def _of_turn(args, plan: Plan, frames: list[Stars]) -> Sequence[Solution]:
     return turned.solutions
 
 
-def _say(night: Night, text: StarposError | str) -> None:
+def _say(night: NightFolder, text: StarposError | str) -> None:
     """A line on standard error about a whole night."""
     common.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
 
 
-def _combine(night: Night, solved: list[Solved]) -> Average | None:
+def _combine(night: NightFolder, solved: list[Solved]) -> Average | None:
     """All fixes as one; None, with a sentence, where they do not belong together."""
     if not solved:
         return None
@@ -264,7 +264,7 @@ def _where(fix: Fix | Average) -> str:
 
 
 def _print_combined(
-    night: Night, all_together: Average | None, solved: list[Solved], args, vertical: Vertical
+    night: NightFolder, all_together: Average | None, solved: list[Solved], args, vertical: Vertical
 ) -> None:
     name = {} if night.folder is None else {"night": night.folder}
     if args.json:

@@ -95,7 +95,7 @@ def solve_fix(
     derivatives hardly change over the arcseconds that are left.  Raises FixError where the stars are too few or do not
     agree.
     """
-    problem = _Problem(
+    problem = _Adjustment(
         stars.xy,
         camera,
         a2_matrix(tilt.theta_x, tilt.theta_y) @ mounting.a3,
@@ -161,42 +161,42 @@ def _share_free(keep: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class _State:
+class _Estimate:
     a4: np.ndarray  # ITRS into L
     scale: float  # of the focal length
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _Adjustment:
     xy: np.ndarray
     camera: Camera
     g: np.ndarray  # A2 A3: C into L
     itrs: np.ndarray  # geocentric apparent directions
     refraction: Refraction
 
-    def closed_form(self) -> _State:
+    def closed_form(self) -> _Estimate:
         local = self.refraction.unbend(self.camera.directions(*self.xy.T) @ self.g.T)
         a4 = rotation.best_rotation(self.itrs, local)
         for _ in range(2):  # the diurnal aberration needs the place it helps to find
             a4 = rotation.best_rotation(self.itrs + station_velocity(a4[2]), local)
-        return _State(a4, 1.0)
+        return _Estimate(a4, 1.0)
 
-    def predict(self, state: _State, refraction: Refraction | None = None) -> np.ndarray:
+    def predict(self, state: _Estimate, refraction: Refraction | None = None) -> np.ndarray:
         """Pixels (N, 2) where the stars should be."""
         v = rotation.normalised(self.itrs + station_velocity(state.a4[2]))
         observed = (refraction or self.refraction).bend(v @ state.a4.T)
         return self.camera.scaled(state.scale).project(observed @ self.g)
 
-    def residual(self, state: _State) -> np.ndarray:
+    def residual(self, state: _Estimate) -> np.ndarray:
         return self.predict(state) - self.xy
 
-    def moved(self, state: _State, p: np.ndarray) -> _State:
+    def moved(self, state: _Estimate, p: np.ndarray) -> _Estimate:
         """The state after a small rotation p[:3] about L's axes and a relative change p[3] of the scale."""
-        return _State(rotation.from_vector(p[:3]) @ state.a4, state.scale * (1 + p[3]))
+        return _Estimate(rotation.from_vector(p[:3]) @ state.a4, state.scale * (1 + p[3]))
 
     def refine(
-        self, state: _State, slope: np.ndarray, covariance_px2: np.ndarray, keep: np.ndarray
-    ) -> _State:
+        self, state: _Estimate, slope: np.ndarray, covariance_px2: np.ndarray, keep: np.ndarray
+    ) -> _Estimate:
         """Gauss-Newton from `state` over the stars to keep, with the derivatives (N, 2, 4) of its neighbourhood."""
         slope = slope[keep]
         weighted = np.linalg.solve(covariance_px2[keep], slope)
@@ -210,7 +210,7 @@ class _Problem:
                 return state
         raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
 
-    def jacobian(self, state: _State) -> np.ndarray:
+    def jacobian(self, state: _Estimate) -> np.ndarray:
         """d predict / d p, (N, 2, 4), central differences."""
         columns = []
         for i in range(4):

@@ -17,7 +17,7 @@ from starpos.fix.fix import Fix, MatchedStars, solve_fix
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
 from starpos.identification import triangles
-from starpos.identification.hint import Standing
+from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Instrument
@@ -63,7 +63,7 @@ class Solution:
     """What became of one frame: status and a sentence, and as much of the answer as there is.
 
     extrapolated_days: how far beyond the end of the IERS table the fix carried the Earth's rotation on; 0 within it.
-    standing: what helps to identify the next frame.
+    hint: what helps to identify the next frame.
     """
 
     status: Status
@@ -80,7 +80,7 @@ class Solution:
     identify_s: float = 0.0
     fix_s: float = 0.0
     extrapolated_days: float = 0.0
-    standing: Standing | None = None
+    hint: Hint | None = None
 
     @classmethod
     def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
@@ -134,15 +134,15 @@ class Solver:
         )
 
     def solve(
-        self, stars: Stars, tilt: Tilt | Callable[[float, float], Tilt], standing: Standing | None = None
+        self, stars: Stars, tilt: Tilt | Callable[[float, float], Tilt], hint: Hint | None = None
     ) -> Solution:
         """The fix of one frame; never raises for what the frame, the tilt or the time does wrong.
 
-        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.  standing: of an
+        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.  hint: of an
         earlier solution; where it no longer holds nothing is lost but its half millisecond.
         """
         if (inside := _inside(stars)) is not None:
-            return _of_all(stars, inside, self.solve(stars.take(inside), tilt, standing))
+            return _of_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
         try:
             if stars.mid_unix_s is None:
                 place = stars.source or "the frame"
@@ -155,7 +155,7 @@ class Solver:
             g = a2_matrix(tilt.theta_x, tilt.theta_y) @ self.instrument.mounting.a3
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(camera.directions(stars.x, stars.y) @ g.T) @ g
-            priors = standing.priors(state, g[2]) if standing else ()
+            priors = hint.priors(state, g[2]) if hint else ()
             found, sky = self._identify(stars, camera, directions, state.year, tuple(state.velocity), priors)
         except StarposError as e:
             return _failure(stars, e)
@@ -179,7 +179,7 @@ class Solver:
             fix=fix,
             fix_s=time.perf_counter() - identified,
             extrapolated_days=state.orientation.extrapolated_days,
-            standing=Standing.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
+            hint=Hint.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
             **known
             | {
                 "names": tuple(known["names"][k] for k in fix.used),

@@ -10,8 +10,8 @@ from starpos.errors import FrameError
 from starpos.frames import exif
 from starpos.frames.frame import MAX_PIXELS, Frame, to_unsigned
 
-PNG = b"\x89PNG\r\n\x1a\n"
-JPEG = b"\xff\xd8\xff"
+PNG_START = b"\x89PNG\r\n\x1a\n"
+JPEG_START = b"\xff\xd8\xff"
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG: the segments that tell the size
 SCAN = 0xDA
 
@@ -28,7 +28,7 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
         raise FrameError(
             f"{place}: its header claims {size[0]} x {size[1]} pixels; a frame has 1 to {MAX_PIXELS}."
         )
-    pixels = decode_picture(_png_image(data) if data.startswith(PNG) else data)
+    pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else data)
     if pixels is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; take or copy it again.")
     if pixels.ndim == 3:
@@ -60,9 +60,9 @@ def decode_picture(data: bytes) -> np.ndarray | None:
 def _size(data):
     """(width, height) that its header claims, before a decoder makes room for it; None: no picture."""
     try:
-        if data.startswith(PNG):
+        if data.startswith(PNG_START):
             return struct.unpack_from(">II", data, 16)
-        return _jpeg_size(data) if data.startswith(JPEG) else _tiff_size(data)
+        return _jpeg_size(data) if data.startswith(JPEG_START) else _tiff_size(data)
     except struct.error:  # it ends before
         return None
 
@@ -102,7 +102,7 @@ def _png_image(data):
 
     libpng prints on standard error about damage, and about such things as colour profiles: it gets neither.
     """
-    kept, at = [PNG], len(PNG)
+    kept, at = [PNG_START], len(PNG_START)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
         chunk = data[at : at + 12 + length]

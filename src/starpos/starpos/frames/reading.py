@@ -13,9 +13,7 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.fits import read_fits
 from starpos.frames.frame import Frame
 from starpos.frames.header import focal_px, times
-from starpos.frames.pictures import JPEG as JPEG_START
-from starpos.frames.pictures import PNG as PNG_START
-from starpos.frames.pictures import picture_frame
+from starpos.frames.pictures import JPEG_START, PNG_START, picture_frame
 from starpos.frames.raw import raw_frame
 from starpos.frames.stars import Stars
 

@@ -7,15 +7,15 @@ is accepted by its probability and never by a count, and then carried to the fai
 """
 
 from starpos.identification.full import Identification
-from starpos.identification.prior import Plumb, Pointing
+from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.search import FEWEST_STARS, identify, identify_directions
 from starpos.identification.sky import Sky
 
 __all__ = [
     "FEWEST_STARS",
     "Identification",
-    "Plumb",
-    "Pointing",
+    "PlumbPrior",
+    "PointingPrior",
     "Sky",
     "identify",
     "identify_directions",

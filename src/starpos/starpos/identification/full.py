@@ -8,7 +8,7 @@ import numpy as np
 from starpos import rotation
 from starpos.identification.evidence import TEST_STARS, Prior, log_evidence
 from starpos.identification.pairs import close_pairs, mutual_nearest
-from starpos.identification.pose import Field, Pose, directions
+from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.sky import Sky
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import rows_near
@@ -53,7 +53,7 @@ class OnFrame:
     blend_px: np.ndarray
 
     @classmethod
-    def of(cls, field: Field, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
+    def of(cls, field: FrameStars, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
         """As many as the brightest of the field's detections may be."""
         catalogue, stars = sky.catalogue, min(len(field), most_detections)
         axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
@@ -73,7 +73,7 @@ class OnFrame:
 
 
 def identified(
-    field: Field, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior
+    field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior
 ) -> Identification | None:
     """The stars within radius_px (N,) of where a pose has them, fitted, weighed, and carried to the faintest ones.
 
@@ -110,7 +110,7 @@ def identified(
     )
 
 
-def _settled(field: Field, xy, sigma, stars: OnFrame, pose: Pose, pair):
+def _settled(field: FrameStars, xy, sigma, stars: OnFrame, pose: Pose, pair):
     """The pose fitted to its own pairs, these, their residuals (M, 2) px; None where they are fewer than FEWEST_STARS."""
     for _ in range(ROUNDS):
         star, near = pair

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from starpos.identification.evidence import SCALE_TOLERANCE
-from starpos.identification.pose import Field, directions
+from starpos.identification.pose import FrameStars, directions
 from starpos.identification.triangles import TriangleCatalogue, angles, counter_clockwise, opposite_sides
 
 LOOSE_PX = 1.0  # above it a candidate must be supported by another
@@ -35,7 +35,7 @@ class Candidates:
 class Lookup:
     """One frame's triangles: which were looked up already, at which error."""
 
-    def __init__(self, field: Field, table: TriangleCatalogue):
+    def __init__(self, field: FrameStars, table: TriangleCatalogue):
         self.field, self.table = field, table
         self.v = directions(field.xy[:1], np.array([field.focal_px]))[0]
         self._done: dict[float, int] = {}

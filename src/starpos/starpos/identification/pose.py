@@ -13,7 +13,7 @@ LEAST_SIGMA_PX = 1e-3  # no centroid is better, whatever is said
 
 
 @dataclass(frozen=True)
-class Field:
+class FrameStars:
     """A frame's stars, brightest first.
 
     xy (2, N, 2): px from the principal point, as they are and with the frame's rows flipped; sigma (N,): their errors;
@@ -29,7 +29,7 @@ class Field:
     area_px2: float
 
     @classmethod
-    def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera, margin_px: int = 0) -> "Field":
+    def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera, margin_px: int = 0) -> "FrameStars":
         """From pixels (N, 2) of an ideal camera, whose frame has margins that few detections lie on.
 
         ValueError where a pixel or an error is no finite number.

@@ -10,7 +10,7 @@ import numpy as np
 from starpos import rotation
 from starpos.identification.evidence import SCALE_TOLERANCE, TEST_STARS, Prior
 from starpos.identification.full import OnFrame
-from starpos.identification.pose import Field, Pose, directions
+from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.screen import MATCH_SIGMA
 from starpos.identification.sky import Sky
 
@@ -31,7 +31,7 @@ Attempt = tuple[Pose, np.ndarray, Prior]
 
 
 @dataclass(frozen=True)
-class Pointing:
+class PointingPrior:
     """The attitude (3, 3), `Sky`'s directions into C, is about this, the focal length focal_px."""
 
     attitude: np.ndarray
@@ -44,7 +44,7 @@ class Pointing:
         if not 0 < self.focal_px < np.inf:
             raise ValueError("a Pointing's focal length must be positive and finite")
 
-    def attempts(self, field: Field, sky: Sky, log_share: float) -> Iterator[Attempt]:
+    def attempts(self, field: FrameStars, sky: Sky, log_share: float) -> Iterator[Attempt]:
         """That nothing has moved; then the shifts that most stars agree on."""
         pose = Pose(self.attitude, self.focal_px, False)
         radius_px = np.hypot(MATCH_SIGMA * field.sigma, ERROR_PX)
@@ -60,7 +60,7 @@ class Pointing:
             turned = rotation.from_vector([-y, x, 0.0]) @ self.attitude
             yield replace(pose, attitude=turned), radius_px, prior
 
-    def _known(self, field: Field, reach_px: float, log_share: float) -> Prior:
+    def _known(self, field: FrameStars, reach_px: float, log_share: float) -> Prior:
         """Poses that shift the frame by reach_px at most, and turn and stretch it by STILL_PX at its corners."""
         shift, turn = reach_px / self.focal_px, STILL_PX / np.hypot(*field.half)
         most = np.array([shift, shift, turn, turn])
@@ -75,7 +75,7 @@ class Pointing:
 
 
 @dataclass(frozen=True)
-class Plumb:
+class PlumbPrior:
     """The zenith is known, zenith_sky (3,) among `Sky`'s directions and zenith_camera (3,) in C, to tolerance_rad; which
     way the camera faces is not."""
 
@@ -89,8 +89,8 @@ class Plumb:
         if not 0 <= self.tolerance_rad <= WIDEST_RAD:
             raise ValueError(f"a Plumb's tolerance must be from 0 to {WIDEST_RAD:g} rad")
 
-    def attempts(self, field: Field, sky: Sky, log_share: float) -> Iterator[Attempt]:
-        """`Pointing`s to the azimuths at which most stars are as far from the zenith as the catalogue's."""
+    def attempts(self, field: FrameStars, sky: Sky, log_share: float) -> Iterator[Attempt]:
+        """`PointingPrior`s to the azimuths at which most stars are as far from the zenith as the catalogue's."""
         camera, world = _frame_about(self.zenith_camera), _frame_about(self.zenith_sky)
         seen = directions(field.xy[:1, :RING_STARS], np.array([field.focal_px]))[0] @ camera.T
         distance = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
@@ -113,10 +113,10 @@ class Plumb:
         for k in pick:
             middle = np.median(turn[k : k + votes[k]])
             attitude = camera.T @ rotation.about_axis(2, middle) @ world
-            for pose, radius_px, _ in Pointing(attitude, field.focal_px).attempts(field, sky, log_share):
+            for pose, radius_px, _ in PointingPrior(attitude, field.focal_px).attempts(field, sky, log_share):
                 yield pose, radius_px, prior
 
-    def _known(self, field: Field, log_share: float) -> Prior:
+    def _known(self, field: FrameStars, log_share: float) -> Prior:
         """Poses that have the zenith near where it should be, at any azimuth."""
         reach = self.tolerance_rad + J2000_RAD + 2 * REACH * field.half[0] / field.focal_px
         rotations = np.pi * reach**2 * 2 * np.pi

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from starpos.identification.pose import Field, Poses
+from starpos.identification.pose import FrameStars, Poses
 from starpos.identification.sky import Sky
 from starpos.sky.zones import rows_near
 
@@ -14,7 +14,7 @@ MOST_STARS = 440  # of the catalogue, the brightest on the frame
 FAR = 1e7  # px, where no star is
 
 
-def promising(field: Field, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: np.ndarray) -> list[int]:
+def promising(field: FrameStars, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: np.ndarray) -> list[int]:
     """Rows of the K poses that are worth a fit, best first.
 
     They were made from the field's stars star (K, 3), and put the n = min(N, TEST_STARS) brightest to sigma_px (K, n).
@@ -38,7 +38,7 @@ def promising(field: Field, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: 
     return [k for k in np.argsort(-worth, kind="stable").tolist() if worth[k] > WORTH_A_FIT]
 
 
-def _expected(field: Field, sky: Sky, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+def _expected(field: FrameStars, sky: Sky, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Bright catalogue stars on K frames: pixels (K, S, 2), FAR beyond each frame's count (K,)."""
     axis = np.append(field.middle / field.focal_px, 1.0)
     rows = [rows_near(sky.triangles.cell_start, axis @ a, field.radius_rad) for a in poses.attitude]

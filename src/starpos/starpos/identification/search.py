@@ -9,8 +9,8 @@ import numpy as np
 from starpos.identification.evidence import TEST_STARS, anywhere
 from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
-from starpos.identification.pose import Field, Pose, Poses
-from starpos.identification.prior import Attempt, Plumb, Pointing
+from starpos.identification.pose import FrameStars, Pose, Poses
+from starpos.identification.prior import Attempt, PlumbPrior, PointingPrior
 from starpos.identification.screen import MATCH_SIGMA, promising
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
@@ -28,14 +28,14 @@ def identify(
     sigma_px: np.ndarray,
     camera: Camera,
     sky: Sky,
-    priors: Sequence[Pointing | Plumb] = (),
+    priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
     """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction taken off).
 
     sigma_px (N,): their errors, one axis.  The focal length may be off by SCALE_TOLERANCE.  Priors only say where to look
     first.  None: no part of the sky is these stars beyond doubt.  ValueError where a pixel or an error is no number.
     """
-    return _identify(Field.of(xy, sigma_px, camera), sky, priors)
+    return _identify(FrameStars.of(xy, sigma_px, camera), sky, priors)
 
 
 def identify_directions(
@@ -43,7 +43,7 @@ def identify_directions(
     sigma_px: np.ndarray,
     camera: Camera,
     sky: Sky,
-    priors: Sequence[Pointing | Plumb] = (),
+    priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
     """`identify` from unit vectors (N, 3) in C, refraction taken off, as any `camera` gave them."""
     # of square pixels, which is what identify fits
@@ -56,10 +56,10 @@ def identify_directions(
     widest = WIDEST_MARGIN * max(width, height)
     margin = math.ceil(min(beyond - EDGE_PX, widest)) if beyond > EDGE_PX else 0
     ideal = Camera(width + 2 * margin, height + 2 * margin, camera.fx, camera.fx, cx + margin, cy + margin)
-    return _identify(Field.of(xy + margin, sigma_px, ideal, margin), sky, priors)
+    return _identify(FrameStars.of(xy + margin, sigma_px, ideal, margin), sky, priors)
 
 
-def _identify(field: Field, sky: Sky, priors) -> Identification | None:
+def _identify(field: FrameStars, sky: Sky, priors) -> Identification | None:
     if len(field) < FEWEST_STARS:
         return None
     for pose, radius_px, prior in _attempts(field, sky, priors):
@@ -68,7 +68,7 @@ def _identify(field: Field, sky: Sky, priors) -> Identification | None:
     return None
 
 
-def _attempts(field: Field, sky: Sky, priors) -> Iterator[Attempt]:
+def _attempts(field: FrameStars, sky: Sky, priors) -> Iterator[Attempt]:
     """What to try, in this order.  Half of the probability is the priors' where there are any."""
     for prior in priors:
         yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
@@ -77,7 +77,7 @@ def _attempts(field: Field, sky: Sky, priors) -> Iterator[Attempt]:
         yield pose, radius_px, lost
 
 
-def _lost_in_space(field: Field, sky: Sky) -> Iterator[tuple[Pose, np.ndarray]]:
+def _lost_in_space(field: FrameStars, sky: Sky) -> Iterator[tuple[Pose, np.ndarray]]:
     lookup = Lookup(field, sky.triangles)
     for stars, error_px in STAGES:
         candidates = lookup.candidates(min(stars, len(field)), error_px)
@@ -92,7 +92,7 @@ def _lost_in_space(field: Field, sky: Sky) -> Iterator[tuple[Pose, np.ndarray]]:
                 yield poses[k], radius_px[k]
 
 
-def _of_triangles(field: Field, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
+def _of_triangles(field: FrameStars, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
     """The poses that K triangles make, and how far off the field's brightest stars may be (K, n) px."""
     xy = field.xy[c.mirrored.astype(int), : min(len(field), TEST_STARS)]
     each = np.arange(len(c))[:, None]

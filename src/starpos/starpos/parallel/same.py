@@ -21,7 +21,7 @@ def same_here() -> Same:
         digest.update(str(source.relative_to(root)).encode() + b"\0" + source.read_bytes())
     return {
         "starpos": f"{starpos.__version__} ({digest.hexdigest()[:8]})",
-        "star catalogue": catalogue.load().fingerprint,
+        "star catalogue": catalogue.load_catalogue().fingerprint,
         "astropy-iers-data": metadata.version("astropy-iers-data"),
     }
 

@@ -11,8 +11,8 @@ from starpos.fix.solver import Attitude, Status
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import LIMIT_RAD
-from starpos.report.folder import Exposure
-from starpos.report.night import NO_TILT, Place, Shot
+from starpos.report.folder import StarList
+from starpos.report.night import NO_TILT, ReportedPlace, Shot
 from starpos.rotation import full_turn
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
@@ -43,7 +43,7 @@ def unix_of_stamp(stamp) -> float | None:
     return stamp.sec + stamp.nanosec * 1e-9 if stamp.sec or stamp.nanosec else None
 
 
-def exposure_of(m) -> Exposure:
+def exposure_of(m) -> StarList:
     """Of a StarArray."""
     at = unix_of_stamp(m.header.stamp)
     name = "stars " + ("of unknown time" if at is None else utc_text(at))
@@ -64,8 +64,8 @@ def exposure_of(m) -> Exposure:
             clock_stddev_s=getattr(m, "clock_stddev", 0.0),  # bags from before it was told
         )
     except FrameError as error:
-        return Exposure(name, error)
-    return Exposure(name, stars)
+        return StarList(name, error)
+    return StarList(name, stars)
 
 
 def camera_of(m) -> Camera:
@@ -101,7 +101,7 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
             for t in m.budget
             if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
         )
-        place = Place(utc, float(angles[0]), float(angles[1]), full_turn(heading), covariance, terms)
+        place = ReportedPlace(utc, float(angles[0]), float(angles[1]), full_turn(heading), covariance, terms)
     elif status is Status.OK:
         status = Status.BAD_INPUT
     looking = np.radians([m.right_ascension, m.declination, m.roll])

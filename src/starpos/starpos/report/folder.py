@@ -20,7 +20,7 @@ TRUTH_LIMIT = 1 << 26
 
 
 @dataclass(frozen=True)
-class Exposure:
+class StarList:
     """A frame's stars, or why there are none."""
 
     name: str
@@ -28,7 +28,7 @@ class Exposure:
 
 
 @dataclass(frozen=True)
-class Exposures:
+class StarLists:
     """What is to be solved: `read` goes through the `count` exposures one at a time, as often as it is called.
 
     tilt: of (mid_unix_s, exposure_s), raises TiltError.
@@ -37,12 +37,12 @@ class Exposures:
     name: str
     origin: str
     count: int
-    read: Callable[[], Iterator[Exposure]]
+    read: Callable[[], Iterator[StarList]]
     tilt: Callable[[float, float], Tilt]
     truth: Truth | None = None
 
 
-def exposures(folder: Path, tilt_noise_rad: float) -> Exposures:
+def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
     """The frames of a folder by name; FrameError where there are none, or truth.json is no truth.
 
     FITS where there are any, else CSV: a picture without a time gives no place.  Where tilt.csv is missing each frame
@@ -54,16 +54,16 @@ def exposures(folder: Path, tilt_noise_rad: float) -> Exposures:
     except TiltError as error:
         tilt = _no_tilt(str(error))
 
-    def read() -> Iterator[Exposure]:
+    def read() -> Iterator[StarList]:
         for path in frames:
             try:
                 item = read_frame(path)
-                yield Exposure(path.name, item if isinstance(item, Stars) else detect(item).stars)
+                yield StarList(path.name, item if isinstance(item, Stars) else detect(item).stars)
             except FrameError as error:
-                yield Exposure(path.name, error)
+                yield StarList(path.name, error)
 
     origin = f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}"
-    return Exposures(folder.name or str(folder), origin, len(frames), read, tilt, truth_in(folder))
+    return StarLists(folder.name or str(folder), origin, len(frames), read, tilt, truth_in(folder))
 
 
 def frames_in(folder: Path) -> list[Path]:

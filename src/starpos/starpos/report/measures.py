@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.report.night import Night, Place, Truth
+from starpos.report.night import Night, ReportedPlace, Truth
 from starpos.units import ARCSEC
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
@@ -84,7 +84,7 @@ def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
     return np.array([offset_m(s.place, latitude, longitude) for _, s in night.fixed])
 
 
-def offset_m(place: Place | Truth, latitude: float, longitude: float) -> tuple[float, float]:
+def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
     """East, north in m of a place from another (rad)."""
     prime, meridian = curvature_radii_m(latitude)
     east = turn(place.longitude - longitude) * prime * np.cos(latitude)
@@ -113,7 +113,7 @@ def error_arcsec(night: Night) -> np.ndarray:
     return turn(np.array([c.latitude - t.latitude, c.longitude - t.longitude])) / ARCSEC
 
 
-def sigma_arcsec(place: Place) -> np.ndarray:
+def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
     """1 sigma of latitude and longitude (2,) in arcsec."""
     return _angles(place.covariance, place.latitude)[:2] / ARCSEC
 
@@ -128,7 +128,7 @@ def _from_mean(seen: np.ndarray) -> np.ndarray:
     return away - away.mean(0)
 
 
-def _own_sigma(place: Place, without: str = "none") -> np.ndarray:
+def _own_sigma(place: ReportedPlace, without: str = "none") -> np.ndarray:
     """Latitude, longitude, heading in rad, of what is new in each frame."""
     own = [t.covariance[:3, :3] for t in place.terms if not t.common and not t.name.startswith(without)]
     return _angles(sum(own, np.zeros((3, 3))), place.latitude)

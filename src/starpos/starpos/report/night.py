@@ -18,7 +18,7 @@ NO_STARS = np.zeros((0, 2))
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class ReportedPlace:
     """Astronomic latitude, longitude and heading (rad; NaN: no one heading), and what is wrong with them.
 
     covariance (3, 3) of east m, north m, heading rad; terms: what it is the sum of.  poses: how often the instrument was
@@ -34,7 +34,7 @@ class Place:
     poses: int = 1
 
     @classmethod
-    def of(cls, fix: Fix | Average) -> "Place":
+    def of(cls, fix: Fix | Average) -> "ReportedPlace":
         poses = fix.poses if isinstance(fix, Average) else 1
         return cls(fix.utc_unix_s, fix.latitude, fix.longitude, fix.heading, fix.covariance, fix.terms, poses)
 
@@ -65,7 +65,7 @@ class Shot:
     status: Status
     message: str
     utc_unix_s: float = float("nan")
-    place: Place | None = None
+    place: ReportedPlace | None = None
     pointing: Attitude | None = None
     size: tuple[int, int] | None = None
     xy: np.ndarray = field(default_factory=lambda: NO_STARS)
@@ -100,7 +100,7 @@ class Night:
     name: str
     origin: str
     shots: Sequence[Shot]
-    combined: Place | None
+    combined: ReportedPlace | None
     why_not: str
     vertical: Vertical
     atmosphere: Atmosphere

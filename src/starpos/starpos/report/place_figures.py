@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.report import measures
 from starpos.report.measures import Stability
-from starpos.report.night import Night, Place
+from starpos.report.night import Night, ReportedPlace
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, RED, SKY, figures_of, number_axis, plain
 
 MANY = 150  # points beyond which they are small and their bars a band
@@ -143,7 +143,7 @@ def _short(value: float) -> str:
     return "0" if value == 0 else figures_of(value, 2) if value >= SMALLEST_SHOWN else f"< {SMALLEST_SHOWN:g}"
 
 
-def _shares(place: Place, night: Night) -> dict[str, np.ndarray]:
+def _shares(place: ReportedPlace, night: Night) -> dict[str, np.ndarray]:
     """1 sigma (3,) of each source: east m, north m, heading arcsec; NaN where there is no heading."""
     unit = np.array([1, 1, 1 / measures.ARCSEC])
     shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}

@@ -11,9 +11,9 @@ from starpos.fix.budget import ErrorTerm
 from starpos.instrument.inclinometer import Tilt
 from starpos.recording.messages import exposure_of
 from starpos.report.bag import Recorded, star_lists
-from starpos.report.folder import Exposure, Exposures
+from starpos.report.folder import StarList, StarLists
 from starpos.report.measures import offset_m, turn
-from starpos.report.night import Night, Place
+from starpos.report.night import Night, ReportedPlace
 from starpos.report.working import Workshop, why_none, worked
 from starpos.rotation import full_turn
 
@@ -31,8 +31,8 @@ def night(recorded: Recorded, shop: Workshop) -> Night:
     return _as_recorded(r, shop)
 
 
-def _exposures(r: Recorded) -> Exposures:
-    def read_stars() -> Iterator[Exposure]:
+def _exposures(r: Recorded) -> StarLists:
+    def read_stars() -> Iterator[StarList]:
         return map(exposure_of, star_lists(r))
 
     def no_tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
@@ -40,7 +40,7 @@ def _exposures(r: Recorded) -> Exposures:
 
     tilt = r.tilts.average if r.tilts else no_tilt
     origin = f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}"
-    return Exposures(r.name, origin, r.star_count, read_stars, tilt, r.truth)
+    return StarLists(r.name, origin, r.star_count, read_stars, tilt, r.truth)
 
 
 def _against_recorded(solved: Night, r: Recorded) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ def _as_recorded(r: Recorded, shop: Workshop) -> Night:
     )
 
 
-def _bound(places: list[Place]) -> Place:
+def _bound(places: list[ReportedPlace]) -> ReportedPlace:
     """The plain mean; its covariance is never more than the mean of theirs, however they go together."""
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
     away = turn(seen - seen[0])
@@ -88,7 +88,7 @@ def _bound(places: list[Place]) -> Place:
         for k, t in enumerate(places[0].terms)
         if all([u.name for u in p.terms] == names for p in places)
     ]
-    return Place(
+    return ReportedPlace(
         float(np.mean([p.utc_unix_s for p in places])),
         float(mean[0]),
         float(turn(mean[1])),

@@ -19,9 +19,9 @@ from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import a2_matrix
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
-from starpos.report.folder import Exposure, Exposures
+from starpos.report.folder import StarList, StarLists
 from starpos.report.measures import turn as wrapped
-from starpos.report.night import NO_TILT, Night, Place, Shot
+from starpos.report.night import NO_TILT, Night, ReportedPlace, Shot
 from starpos.sky.catalogue import Catalogue
 from starpos.utc import utc_text
 
@@ -43,7 +43,7 @@ class Workshop:
         return Solver(self.instrument_for(stars), self.catalogue, self.atmosphere, progress=self.progress)
 
 
-def worked(exposures: Exposures, shop: Workshop) -> Night:
+def worked(exposures: StarLists, shop: Workshop) -> Night:
     """The night of these exposures; InstrumentError where no frame can have one."""
     solve = _one_by_one if shop.turn_stddev_deg is None else _turned
     shots, fixes, instrument, remarks, extrapolated_days = [], [], None, [], 0.0
@@ -76,9 +76,9 @@ def worked(exposures: Exposures, shop: Workshop) -> Night:
     return replace(night, steady=_steady(night, instrument)) if combined else night
 
 
-def _one_by_one(exposures: Exposures, shop: Workshop) -> Iterator:
+def _one_by_one(exposures: StarLists, shop: Workshop) -> Iterator:
     """(Exposure, Solution, Instrument, remarks) of each frame."""
-    standing, prepared = None, set()
+    hint, prepared = None, set()
     for exposure in exposures.read():
         if not isinstance(exposure.stars, Stars):
             yield exposure, _unreadable(exposure), None, ()
@@ -89,12 +89,12 @@ def _one_by_one(exposures: Exposures, shop: Workshop) -> Iterator:
             prepared.add(size)
             with suppress(StarposError):  # which the frame itself will say
                 solver.prepare(*size)
-        solution = solver.solve(exposure.stars, exposures.tilt, standing)
-        standing = solution.standing or standing
+        solution = solver.solve(exposure.stars, exposures.tilt, hint)
+        hint = solution.hint or hint
         yield exposure, solution, solver.instrument, ()
 
 
-def _turned(exposures: Exposures, shop: Workshop) -> Iterator:
+def _turned(exposures: StarLists, shop: Workshop) -> Iterator:
     """The same of all frames together, with the A3 that they tell."""
     rows = list(exposures.read())
     good = [e for e in rows if isinstance(e.stars, Stars)]
@@ -119,11 +119,11 @@ def _turned(exposures: Exposures, shop: Workshop) -> Iterator:
         yield exposure, solution, instrument, said if k == 0 else ()
 
 
-def _unreadable(exposure: Exposure) -> Solution:
+def _unreadable(exposure: StarList) -> Solution:
     return Solution(Status.BAD_INPUT, str(exposure.stars), exposure.name, None, 0)
 
 
-def _shot(exposure: Exposure, s: Solution) -> Shot:
+def _shot(exposure: StarList, s: Solution) -> Shot:
     """What the report keeps of a solution."""
     stars, fix = exposure.stars, s.fix
     seen = {}
@@ -132,7 +132,7 @@ def _shot(exposure: Exposure, s: Solution) -> Shot:
         seen["magnitudes"] = s.magnitudes
     if fix:
         seen |= {
-            "place": Place.of(fix),
+            "place": ReportedPlace.of(fix),
             "residual_px": -fix.residual_px,
             "residual_arcsec": fix.residual_arcsec,
             "camera_to_itrs": fix.camera_to_itrs,
@@ -155,7 +155,7 @@ def _shot(exposure: Exposure, s: Solution) -> Shot:
     )
 
 
-def _combined(fixes: Sequence[Fix], shots: Sequence[Shot]) -> tuple[Place | None, str, list[str]]:
+def _combined(fixes: Sequence[Fix], shots: Sequence[Shot]) -> tuple[ReportedPlace | None, str, list[str]]:
     """The average; else a sentence why not; and what there is to say of it."""
     if not fixes:
         return None, why_none(shots), []
@@ -173,7 +173,7 @@ def _combined(fixes: Sequence[Fix], shots: Sequence[Shot]) -> tuple[Place | None
         said.append(
             f"the instrument was moved: the average is of its last place, {whole.frames} frames since {since}"
         )
-    return Place.of(whole), "", said
+    return ReportedPlace.of(whole), "", said
 
 
 def why_none(shots: Sequence[Shot]) -> str:

@@ -45,7 +45,7 @@ def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
 
 
 @dataclass(frozen=True)
-class World:
+class NightWorld:
     """What is so, and what the instrument is told of it.
 
     scene: the instrument at its place, by the catalogue `sky`, its errors included; site: where it stands by gravity;
@@ -62,7 +62,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class NightOutcome:
     """One night: east, north (m) and heading (rad) off, by gravity and on the ground, with what was claimed of them."""
 
     kind: str
@@ -112,7 +112,7 @@ def draw(
     errors: InclinometerErrors,
     clock_stddev_s: float,
     camera: Camera,
-) -> tuple[World, float]:
+) -> tuple[NightWorld, float]:
     """A World at a random time and place, and that time."""
     begin = rng.uniform(FIRST_UNIX_S, LAST_UNIX_S)
     year = EPOCH + (begin - 946728000.0) / (365.25 * DAY_S)
@@ -135,7 +135,7 @@ def draw(
             quantum=errors.quantum_rad,
         ),
     )
-    world = World(
+    world = NightWorld(
         scene,
         Site(0.0, 0.0),
         _with_errors(catalogue, year, rng),
@@ -147,7 +147,7 @@ def draw(
     return at_place(world, rng, begin), begin
 
 
-def at_place(world: World, rng: np.random.Generator, unix_s: float) -> World:
+def at_place(world: NightWorld, rng: np.random.Generator, unix_s: float) -> NightWorld:
     """The same instrument at another place, in other air, the Earth turned by what the tables err."""
     latitude = np.degrees(np.arcsin(rng.uniform(np.sin(np.radians(-66)), np.sin(np.radians(66)))))
     longitude = rng.uniform(-180, 180)
@@ -186,7 +186,12 @@ def _with_errors(catalogue: Catalogue, year: float, rng: np.random.Generator) ->
 
 
 def photograph(
-    world: World, zero: Zero, begin: float, turns_deg: Sequence[float], frames: int, rng: np.random.Generator
+    world: NightWorld,
+    zero: Zero,
+    begin: float,
+    turns_deg: Sequence[float],
+    frames: int,
+    rng: np.random.Generator,
 ) -> tuple[list[Stars], TiltLog, float]:
     """Frames at each heading, turned by hand in between; the inclinometer's readings; the last heading (rad)."""
     stars, rows, now = [], [], begin
@@ -222,7 +227,7 @@ def turned_night(
     frames: int = 25,
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,
-) -> Outcome:
+) -> NightOutcome:
     """Re-mounted somewhere and turned on the spot, A3 unknown."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     turns = np.arange(headings) * 360 / headings
@@ -242,7 +247,7 @@ def calibrated_night(
     frames: int = 6,
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,
-) -> Outcome:
+) -> NightOutcome:
     """Calibrated at a known place at two leans, then days later at another, in other air, leaning otherwise."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     zero = Zero(errors, rng, begin)
@@ -270,19 +275,19 @@ def calibrated_night(
     return _outcome("calibrated", answer, there.site, heading, rng)
 
 
-def _outcome(kind: str, answer, site: Site, heading: float, rng: np.random.Generator) -> Outcome:
+def _outcome(kind: str, answer, site: Site, heading: float, rng: np.random.Generator) -> NightOutcome:
     """What came of it, against the truth."""
     try:
         a: Average = answer()
     except StarposError as e:
         nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
-        return Outcome(kind, *nothing, *nothing, str(e))
+        return NightOutcome(kind, *nothing, *nothing, str(e))
     unknown = Deflection()
     xi, eta = rng.normal(0, unknown.stddev_arcsec, 2)
     phi, lam = np.radians([site.latitude_deg, site.longitude_deg])
     true = geodetic(phi, lam, heading, np.zeros((3, 3)), Deflection(xi, eta, 0.0))
     said = geodetic(a.latitude, a.longitude, a.heading, a.covariance, unknown)
-    return Outcome(
+    return NightOutcome(
         kind,
         _apart(a.latitude - phi, a.longitude - lam, a.heading - heading, phi),
         a.covariance,

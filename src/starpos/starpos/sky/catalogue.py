@@ -217,6 +217,6 @@ def read(path) -> Catalogue:
 
 
 @lru_cache(maxsize=2)
-def load(path: str | None = None) -> Catalogue:
+def load_catalogue(path: str | None = None) -> Catalogue:
     """The catalogue in use: `path`, else the file STARPOS_CATALOGUE names, else the committed one; read once."""
     return read(path or os.environ.get("STARPOS_CATALOGUE") or COMMITTED)

@@ -6,9 +6,9 @@ import pytest
 from test_identification import random_attitude, seen, sky_for
 
 from starpos import rotation
-from starpos.identification import Plumb, Pointing, full, identify, identify_directions, search
+from starpos.identification import PlumbPrior, PointingPrior, full, identify, identify_directions, search
 from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, Prior, anywhere, log_evidence
-from starpos.identification.pose import Field, Pose, directions, slopes
+from starpos.identification.pose import FrameStars, Pose, directions, slopes
 from starpos.instrument.camera import Camera
 from starpos.simulation.montecarlo_fields import Conditions, draw
 
@@ -54,7 +54,9 @@ def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rn
 
 def test_a_prior_raises_it_no_further(catalogue, rng, weighed):
     def priors():
-        return Pointing(random_attitude(rng), SMALL.fx), Plumb(random_attitude(rng)[2], np.eye(3)[2], 4e-4)
+        return PointingPrior(random_attitude(rng), SMALL.fx), PlumbPrior(
+            random_attitude(rng)[2], np.eye(3)[2], 4e-4
+        )
 
     best = largest(60, rng, catalogue, weighed, priors)
     for x in (1, 2, 3, 4):
@@ -126,8 +128,8 @@ def test_a_detection_upon_another_says_nothing(rng):
 
 def test_the_priors_share_half_of_the_probability(catalogue, rng):
     sky, attitude = sky_for(catalogue, SMALL), random_attitude(rng)
-    field = Field.of(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL)
-    priors = Pointing(attitude, SMALL.fx), Plumb(attitude[2], np.eye(3)[2], 1e-3)
+    field = FrameStars.of(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL)
+    priors = PointingPrior(attitude, SMALL.fx), PlumbPrior(attitude[2], np.eye(3)[2], 1e-3)
     expected = Pose(attitude, SMALL.fx, False)
     tried = {id(prior): prior for _, _, prior in search._attempts(field, sky, priors)}
     *led, lost = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
@@ -161,11 +163,11 @@ def integral(prior, made, zenith, reach_rad, rng):
 
 def test_a_prior_is_a_probability(rng):
     """The density of each over all poses makes its share, and its widths leave room for no more."""
-    field = Field.of(np.zeros((0, 2)), np.zeros(0), SMALL)
+    field = FrameStars.of(np.zeros((0, 2)), np.zeros(0), SMALL)
     made = Pose(random_attitude(rng), SMALL.fx, False)
     zenith = random_attitude(rng)[2]
-    plumb = Plumb(zenith, made.attitude @ zenith, 0.01)._known(field, 0.0)
-    pointing = Pointing(made.attitude, SMALL.fx)._known(field, 300.0, 0.0)
+    plumb = PlumbPrior(zenith, made.attitude @ zenith, 0.01)._known(field, 0.0)
+    pointing = PointingPrior(made.attitude, SMALL.fx)._known(field, 300.0, 0.0)
     lost = anywhere(SMALL.fx)
     assert integral(plumb, made, zenith, 0.03, rng) == pytest.approx(1, abs=0.15)
     assert integral(lost, made, zenith, np.pi, rng) == pytest.approx(0.9, abs=0.05)

@@ -6,7 +6,7 @@ import pytest
 from test_identification import FIELDS, check, random_attitude, seen, sky_for
 
 from starpos import rotation
-from starpos.identification import Plumb, Pointing, identify, search
+from starpos.identification import PlumbPrior, PointingPrior, identify, search
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import START, solver_of, stars_of, tilt_of, wide_scene
 
@@ -34,13 +34,15 @@ def turned(attitude, rng, angle_rad):
 
 def test_a_camera_that_stands_is_not_lost(field, not_lost):
     sky, camera, attitude, xy, sigma, index = field
-    check(identify(xy, sigma, camera, sky, [Pointing(attitude, camera.fx)]), attitude, index, camera, sky)
+    check(
+        identify(xy, sigma, camera, sky, [PointingPrior(attitude, camera.fx)]), attitude, index, camera, sky
+    )
 
 
 def test_one_that_was_knocked_is_not_lost(field, rng, not_lost):
     sky, camera, attitude, xy, sigma, index = field
     for arcmin in (3, 10, 20):
-        prior = Pointing(turned(attitude, rng, arcmin * 60 * ARCSEC), camera.fx)
+        prior = PointingPrior(turned(attitude, rng, arcmin * 60 * ARCSEC), camera.fx)
         check(identify(xy, sigma, camera, sky, [prior]), attitude, index, camera, sky)
 
 
@@ -48,13 +50,15 @@ def test_one_that_was_turned_about_the_plumb_line_is_not_lost(field, rng, not_lo
     sky, camera, attitude, xy, sigma, index = field
     for zenith_distance in (0.2, 0.7, 1.4):
         zenith = turned(attitude, rng, zenith_distance)[2]
-        prior = Plumb(zenith, turned(np.eye(3), rng, 60 * ARCSEC) @ attitude @ zenith, 90 * ARCSEC)
+        prior = PlumbPrior(zenith, turned(np.eye(3), rng, 60 * ARCSEC) @ attitude @ zenith, 90 * ARCSEC)
         check(identify(xy, sigma, camera, sky, [prior]), attitude, index, camera, sky)
 
 
 def test_a_prior_gives_the_same_answer_as_none(field):
     sky, camera, attitude, xy, sigma, _ = field
-    lost, led = (identify(xy, sigma, camera, sky, priors) for priors in ([], [Pointing(attitude, camera.fx)]))
+    lost, led = (
+        identify(xy, sigma, camera, sky, priors) for priors in ([], [PointingPrior(attitude, camera.fx)])
+    )
     np.testing.assert_array_equal(lost.star, led.star)
     np.testing.assert_array_equal(lost.catalogue, led.catalogue)
     np.testing.assert_array_equal(lost.attitude, led.attitude)
@@ -78,14 +82,14 @@ def test_a_prior_gives_the_same_answer_as_none(field):
 def test_a_wrong_prior_falls_back_to_the_whole_sky(field, rng, kind):
     sky, camera, attitude, xy, sigma, index = field
     wrong = {
-        "elsewhere": Pointing(random_attitude(rng), camera.fx),
-        "beside": Pointing(turned(attitude, rng, 0.05), camera.fx),
-        "rolled": Pointing(rotation.about_axis(2, 0.3) @ attitude, camera.fx),
-        "behind": Pointing(np.diag([1.0, -1.0, -1.0]) @ attitude, camera.fx),
-        "a speck of sky": Pointing(attitude, 1e300),
-        "a drop": Pointing(attitude, 1e-300),
-        "another zenith": Plumb(random_attitude(rng)[2], np.array([0.0, 0.6, 0.8]), 90 * ARCSEC),
-        "no star there": Plumb(random_attitude(rng)[2], np.array([0.0, 0.0, 1.0]), 1e-9),
+        "elsewhere": PointingPrior(random_attitude(rng), camera.fx),
+        "beside": PointingPrior(turned(attitude, rng, 0.05), camera.fx),
+        "rolled": PointingPrior(rotation.about_axis(2, 0.3) @ attitude, camera.fx),
+        "behind": PointingPrior(np.diag([1.0, -1.0, -1.0]) @ attitude, camera.fx),
+        "a speck of sky": PointingPrior(attitude, 1e300),
+        "a drop": PointingPrior(attitude, 1e-300),
+        "another zenith": PlumbPrior(random_attitude(rng)[2], np.array([0.0, 0.6, 0.8]), 90 * ARCSEC),
+        "no star there": PlumbPrior(random_attitude(rng)[2], np.array([0.0, 0.0, 1.0]), 1e-9),
     }[kind]
     check(identify(xy, sigma, camera, sky, [wrong, wrong]), attitude, index, camera, sky)
 
@@ -94,36 +98,39 @@ def test_what_is_no_rotation_is_no_prior():
     one = np.eye(3)
     for wrong in (0 * one, -one, np.nan * one, 1e200 * one, np.ones((3, 3)) / 3**0.5):
         with pytest.raises(ValueError, match="rotation"):
-            Pointing(wrong, 1000.0)
+            PointingPrior(wrong, 1000.0)
 
 
 @pytest.mark.parametrize("focal_px", [0.0, -1.0, np.nan, np.inf])
 def test_what_is_no_focal_length_is_no_prior(focal_px):
     with pytest.raises(ValueError, match="focal length"):
-        Pointing(np.eye(3), focal_px)
+        PointingPrior(np.eye(3), focal_px)
 
 
 def test_what_is_no_zenith_is_no_prior():
     up, down = np.eye(3)[2], -np.eye(3)[2]
     for zeniths in ((0 * up, up), (up, 2 * up), (np.nan * up, up), (up, 1e200 * up)):
         with pytest.raises(ValueError, match="unit vectors"):
-            Plumb(*zeniths, 1e-3)
+            PlumbPrior(*zeniths, 1e-3)
     for tolerance_rad in (-1e-3, 0.2, np.nan, np.inf):
         with pytest.raises(ValueError, match="tolerance"):
-            Plumb(up, down, tolerance_rad)
+            PlumbPrior(up, down, tolerance_rad)
 
 
 def test_with_a_prior_four_stars_are_enough(field):
     sky, camera, attitude, xy, sigma, index = field
     few = [0, 5, 9, 14]
     assert identify(xy[few], sigma[few], camera, sky) is None
-    answer = identify(xy[few], sigma[few], camera, sky, [Pointing(attitude, camera.fx)])
+    answer = identify(xy[few], sigma[few], camera, sky, [PointingPrior(attitude, camera.fx)])
     check(answer, attitude, index[few], camera, sky)
 
 
 def test_random_points_stay_nothing_whatever_the_prior_says(field, rng):
     sky, camera, attitude, *_ = field
-    priors = [Pointing(attitude, camera.fx), Plumb(attitude[0], np.array([0.6, 0.0, 0.8]), 90 * ARCSEC)]
+    priors = [
+        PointingPrior(attitude, camera.fx),
+        PlumbPrior(attitude[0], np.array([0.6, 0.0, 0.8]), 90 * ARCSEC),
+    ]
     for n in (4, 5, 6, 8, 15, 40):
         for _ in range(5):
             xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
@@ -139,7 +146,7 @@ def test_the_next_frame_of_a_fix_is_not_lost(catalogue, rng, monkeypatch):
     later = START + 2.5 * 3600
     moved = wide_scene(pointing_deg=(210.0, 78.0, 15.0))
     for now in (scene, moved):
-        answer = solver.solve(stars_of(now, catalogue, rng, later), tilt_of(now, rng, later), first.standing)
+        answer = solver.solve(stars_of(now, catalogue, rng, later), tilt_of(now, rng, later), first.hint)
         assert answer.ok
         north = abs(answer.fix.latitude - np.radians(scene.site.latitude_deg))
         assert north < 5 * np.sqrt(answer.fix.covariance[1, 1]) / 6.36e6

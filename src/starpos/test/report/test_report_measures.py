@@ -16,7 +16,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Instrument
 from starpos.report import folder, measures, sky_figure
-from starpos.report.night import Night, Place, Shot, Truth
+from starpos.report.night import Night, ReportedPlace, Shot, Truth
 from starpos.report.working import Workshop, worked
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
@@ -46,7 +46,7 @@ def night(latitudes, longitudes, headings, truth=None, own_m=100.0, common_m=50.
     )
     covariance = scale * (own_m**2 + common_m**2)
     shots = [
-        Shot(str(k), Status.OK, "", 1.8e9 + k, Place(1.8e9 + k, *angles, covariance, terms))
+        Shot(str(k), Status.OK, "", 1.8e9 + k, ReportedPlace(1.8e9 + k, *angles, covariance, terms))
         for k, angles in enumerate(zip(latitudes, longitudes, headings, strict=True))
     ]
     middle = replace(shots[0].place, latitude=float(np.mean(latitudes)))

@@ -4,7 +4,7 @@ import pytest
 
 from starpos.errors import CatalogueError
 from starpos.sky import catalogue as module
-from starpos.sky.catalogue import Catalogue, load, pack, read, save
+from starpos.sky.catalogue import Catalogue, load_catalogue, pack, read, save
 from starpos.units import ARCSEC, MAS
 
 
@@ -192,15 +192,15 @@ def test_a_bad_file_gives_one_sentence_with_its_path(kind, tmp_path, rng):
 
 
 def test_the_environment_names_another_catalogue(tmp_path, rng, monkeypatch):
-    load.cache_clear()
+    load_catalogue.cache_clear()
     save(random_catalogue(rng, 100), tmp_path / "mine.npz")
     monkeypatch.setenv("STARPOS_CATALOGUE", str(tmp_path / "mine.npz"))
-    assert len(load()) == 100
-    load.cache_clear()
+    assert len(load_catalogue()) == 100
+    load_catalogue.cache_clear()
 
 
 def test_it_is_read_once(monkeypatch):
-    load.cache_clear()
-    once = load()
+    load_catalogue.cache_clear()
+    once = load_catalogue()
     monkeypatch.setattr(module, "read", lambda path: pytest.fail("read again"))
-    assert load() is once
+    assert load_catalogue() is once

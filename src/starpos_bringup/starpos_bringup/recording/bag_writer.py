@@ -7,7 +7,7 @@ from pathlib import Path
 from ament_index_python.packages import get_package_share_directory
 
 
-class BagError(Exception):
+class BagWriteError(Exception):
     """One sentence: what, where, what to do."""
 
 
@@ -22,7 +22,7 @@ class BagWriter:
             from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
-            raise BagError("rosbags, which writes bags, is not installed: pip install rosbags") from None
+            raise BagWriteError("rosbags, which writes bags, is not installed: pip install rosbags") from None
         self.folder, self.count = folder, 0
         self.store = get_typestore(Stores.ROS2_JAZZY)
         self._known: set[str] = set()
@@ -32,9 +32,9 @@ class BagWriter:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except WriterError:
-            raise BagError(f"{folder}: there is something of that name: give another one") from None
+            raise BagWriteError(f"{folder}: there is something of that name: give another one") from None
         except OSError as error:
-            raise BagError(f"{folder}: no bag can be made there ({error.strerror})") from None
+            raise BagWriteError(f"{folder}: no bag can be made there ({error.strerror})") from None
 
     def add_topic(self, topic: str, type_name: str, latched: bool = False):
         """Declare a topic before its first message; type_name as 'sensor_msgs/msg/Imu'."""
@@ -49,7 +49,7 @@ class BagWriter:
         try:
             self._writer.write(self._connections[topic], log_ns, data)
         except OSError as error:
-            raise BagError(
+            raise BagWriteError(
                 f"{self.folder}: it cannot be written ({error.strerror}): the recording ends"
             ) from None
         self.count += 1
@@ -59,7 +59,7 @@ class BagWriter:
         try:
             self._writer.close()
         except OSError as error:
-            raise BagError(
+            raise BagWriteError(
                 f"{self.folder}: its end cannot be written ({error.strerror}): `mcap recover` gets back what is in it"
             ) from None
 

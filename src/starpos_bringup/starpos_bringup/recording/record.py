@@ -8,7 +8,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from starpos_bringup.recording.bag_writer import BagError, BagWriter
+from starpos_bringup.recording.bag_writer import BagWriteError, BagWriter
 
 TOPICS = {  # relative name: type
     "camera/camera_info": "sensor_msgs/msg/CameraInfo",
@@ -34,7 +34,7 @@ def record() -> int:
     topics = TOPICS | (IMAGES if options.images else {})
     try:
         writer = BagWriter(options.bag)
-    except BagError as error:
+    except BagWriteError as error:
         say(str(error))
         return REFUSED
     recorders = []

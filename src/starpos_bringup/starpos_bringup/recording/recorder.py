@@ -9,8 +9,8 @@ from importlib import import_module
 import rclpy
 from rclpy.node import Node
 
-from starpos_bringup.recording.bag_writer import BagError, BagWriter
-from starpos_common.diagnostics import Diagnostics, Level, Status
+from starpos_bringup.recording.bag_writer import BagWriteError, BagWriter
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.topics import subscription
 
 LITTLE_BYTES = 1_000_000_000  # left on the disk
@@ -43,7 +43,7 @@ class Recorder(Node):
         try:
             self._writer.close()
             self._say(f"{self._writer.folder}: {self._writer.count} messages")
-        except BagError as error:
+        except BagWriteError as error:
             self.trouble = str(error)
             self._say(self.trouble)
 
@@ -53,18 +53,18 @@ class Recorder(Node):
         try:
             self._writer.write(topic, self.get_clock().now().nanoseconds, data)
             self._counts[name] += 1
-        except BagError as error:
+        except BagWriteError as error:
             self.trouble = str(error)
             self._say(self.trouble)
             rclpy.shutdown()
 
-    def _report(self) -> Status:
+    def _report(self) -> Diagnosis:
         free_bytes = shutil.disk_usage(self._writer.folder).free
         values = {"messages": self._writer.count, "free (MB)": free_bytes // 10**6, **self._counts}
         if free_bytes < LITTLE_BYTES:
-            return Status(
+            return Diagnosis(
                 Level.WARN,
                 f"the disk has {free_bytes // 10**6} MB left: make room or end the recording.",
                 values,
             )
-        return Status(Level.OK, f"recording to {self._writer.folder}.", values)
+        return Diagnosis(Level.OK, f"recording to {self._writer.folder}.", values)

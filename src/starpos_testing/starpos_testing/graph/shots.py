@@ -10,10 +10,9 @@ from starpos.earth.refraction import Atmosphere
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, render, scene_of
-from starpos.sky.catalogue import load as load_catalogue
+from starpos.sky.catalogue import load_catalogue
 from starpos_common.messages import camera_to_message, frame_to_message, stars_to_message, tilt_to_message
-from starpos_interfaces.msg import Capture, StarArray
-from starpos_interfaces.msg import Tilt as TiltMessage
+from starpos_interfaces import msg
 
 START_S = 1730656800.0  # 2024-11-03T18:00:00Z: what lies in the future is refused
 EXPOSURE_S, CADENCE_S, SAMPLES = 0.5, 10.0, 5
@@ -44,8 +43,8 @@ class Shot:
     """One exposure as messages, for tests to spoil, and the truth about it."""
 
     info: CameraInfo
-    stars: StarArray
-    tilts: list[TiltMessage]
+    stars: msg.StarArray
+    tilts: list[msg.Tilt]
     scene: Scene
 
     @property
@@ -94,7 +93,7 @@ def shot_of(scene: Scene, start: float, rng) -> Shot:
     )
 
 
-def tilts_of(scene: Scene, start: float, rng) -> list[TiltMessage]:
+def tilts_of(scene: Scene, start: float, rng) -> list[msg.Tilt]:
     covariance = np.eye(2) * np.radians(NOISE_DEG) ** 2
     return [
         tilt_to_message(
@@ -112,18 +111,18 @@ def tilts_of(scene: Scene, start: float, rng) -> list[TiltMessage]:
     ]
 
 
-def photograph(azimuth_deg=40.0) -> tuple[Shot, Image, Capture]:
+def photograph(azimuth_deg=40.0) -> tuple[Shot, Image, msg.Capture]:
     """A shot of the small camera whose stars are still in the image."""
     k = next(_count)
     return photograph_of(scene_at(azimuth_deg, SMALL), START_S + k * CADENCE_S, np.random.default_rng(k))
 
 
-def photograph_of(scene: Scene, start: float, rng) -> tuple[Shot, Image, Capture]:
+def photograph_of(scene: Scene, start: float, rng) -> tuple[Shot, Image, msg.Capture]:
     """The same of any scene and time; its frame is drawn, so a small one is quick."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     image = frame_to_message(render(scene, light, start, EXPOSURE_S, rng), FRAME)
     info = camera_to_message(scene.camera, FRAME, start + EXPOSURE_S / 2)
     size = scene.camera.width, scene.camera.height
     empty = stars_to_message(no_stars(*size, start + EXPOSURE_S / 2), FRAME)
-    capture = Capture(header=image.header, exposure=EXPOSURE_S, stamp_source=Capture.SIMULATED)
+    capture = msg.Capture(header=image.header, exposure=EXPOSURE_S, stamp_source=msg.Capture.SIMULATED)
     return Shot(info, empty, tilts_of(scene, start, rng), scene), image, capture
