@@ -100,7 +100,14 @@ def make(folder: Path) -> None:
     for n in range(round((END_S - START_S) / TILT_PERIOD_S)):
         moment = START_S + 0.05 + n * TILT_PERIOD_S + rng.uniform(-0.004, 0.004)
         x, y = read_tilt(still, 0.0, rng)
-        tilt = Tilt(x, y, np.eye(2) * np.radians(TILT_NOISE_DEG) ** 2, moment, 1, AIR["temperature_c"])
+        tilt = Tilt(
+            x,
+            y,
+            np.eye(2) * np.radians(TILT_NOISE_DEG) ** 2,
+            utc_unix_s=moment,
+            samples=1,
+            temperature_c=AIR["temperature_c"],
+        )
         bag.add(moment + 0.03, "/tilt", tilt_to_message(tilt, TILT_FRAME, n))
     bag.write()
     about = {"latitude_deg": LATITUDE_DEG, "longitude_deg": LONGITUDE_DEG, **AIR, "misalignment_deg": MISALIGNMENT_DEG,

@@ -83,7 +83,8 @@ def test_it_converges_and_its_sigma_falls_as_noise_does(graph, solver, averaged,
     path = tmp_path / "instrument.yaml"
     known = Calibration.of((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
     instrument_file.write(
-        path, Instrument(FULL_FOCAL_PX, None, known, inclinometer=InclinometerErrors(scale=0.0))
+        path,
+        Instrument(FULL_FOCAL_PX, camera=None, calibration=known, inclinometer=InclinometerErrors(scale=0.0)),
     )
     assert graph.set("solver", calibration_url=str(path)) == (True, "")
     one = average_after(graph, averaged, noisy(rng))

@@ -36,7 +36,7 @@ def instrument(graph, tmp_path_factory):
 
     folder, count = tmp_path_factory.mktemp("instrument"), iter(range(1000))
     port = folder / "port"
-    air = Atmosphere(*map(float, AIR))
+    air = Atmosphere(**dict(zip(("pressure_pa", "temperature_c", "humidity"), map(float, AIR), strict=True)))
     tilt = scene_of(SMALL, focal_of(SMALL), LATITUDE_DEG, LONGITUDE_DEG, air).tilt
     texts = [f"{math.degrees(t):.9f}" for t in tilt]
     emulated = ("--link", str(port), "--tilt-x", texts[0], "--tilt-y", texts[1])

@@ -40,7 +40,7 @@ def read_tilts(path) -> list[msg.Tilt]:
     tilts = []
     for n, row in enumerate(rows):
         angles = (math.radians(row[name]) for name in ("theta_x_deg", "theta_y_deg"))
-        tilt = tilt_to_message(Tilt(*angles, [[1, 0], [0, 1]], row["utc_unix_s"]), "tilt", n)
+        tilt = tilt_to_message(Tilt(*angles, [[1, 0], [0, 1]], utc_unix_s=row["utc_unix_s"]), "tilt", n)
         tilt.covariance = [0.0] * 4
         tilts.append(tilt)
     return tilts

@@ -40,7 +40,7 @@ IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Taken:
     """A frame with its Capture, the intrinsics and the remark of its source, and how long it took.
 
@@ -179,7 +179,14 @@ class CameraNode(Node):
         )
         heard = self._images.get_subscription_count()  # a message is a copy of the frame
         image = frame_to_message(frame, header.frame_id) if heard else None
-        return Taken(frame, capture, image, exposure.camera, exposure.remark, time.monotonic() - begin)
+        return Taken(
+            frame=frame,
+            capture=capture,
+            image=image,
+            camera=exposure.camera,
+            remark=exposure.remark,
+            seconds=time.monotonic() - begin,
+        )
 
     def _on_wake(self):
         for result in self._worker.fetch():

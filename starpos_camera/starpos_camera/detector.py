@@ -260,5 +260,7 @@ def _warm_up():
     light = np.random.default_rng(0).normal(500.0, 10.0, x.shape)
     for cx, cy in ((30.2, 40.7), (80.5, 30.1), (60.9, 95.4), (100.3, 101.8)):
         light += 3000.0 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 2.0)
-    detection = detect(Frame(light.astype(np.uint16), "", 0.0, 1.0, "warm-up"))
+    detection = detect(
+        Frame(light.astype(np.uint16), pattern="", mid_unix_s=0.0, exposure_s=1.0, source="warm-up")
+    )
     stars_to_message(detection.stars, "")

@@ -96,7 +96,7 @@ class Simulator:
         """Another program that uses the camera."""
         from alpaca.camera import Camera
 
-        return Camera(self.address, number)
+        return Camera(width=self.address, height=number)
 
 
 def image_bytes(pixels: np.ndarray, sent_as: int, **changes) -> bytes:

@@ -168,7 +168,15 @@ def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, list
     _, infos, _ = hear_all(listener)
     node = start("camera", *options)
     listener.wait(lambda: infos)
-    camera = Camera(640, 480, 7800.0, 7801.0, 320.5, 239.5, (0.1, -0.2, 1e-4, 2e-4, 0.0))
+    camera = Camera(
+        width=640,
+        height=480,
+        fx=7800.0,
+        fy=7801.0,
+        cx=320.5,
+        cy=239.5,
+        distortion=(0.1, -0.2, 1e-4, 2e-4, 0.0),
+    )
     other_size = Camera.from_focal(320, 240, 7800.0)
     crooked = camera_to_message(camera, "")
     crooked.k[0] = math.nan

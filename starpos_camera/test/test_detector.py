@@ -158,7 +158,7 @@ def test_every_encoding_gives_the_same_places(feed, frame):
     feed.images.publish(swapped)
     assert feed.wait_for(swapped).stars == feed.wait_for(feed_again(feed, frame)).stars
     grey = np.clip((frame.pixels.astype(float) - 400) / 8, 0, 255).astype(np.uint8)
-    for other in (Frame(grey), Frame(np.dstack([grey] * 3)), Frame(frame.pixels, "rggb")):
+    for other in (Frame(grey), Frame(np.dstack([grey] * 3)), Frame(frame.pixels, pattern="rggb")):
         got = message_to_stars(feed.show(other))
         away = np.hypot(want.x[bright, None] - got.x, want.y[bright, None] - got.y).min(1)
         assert away.max() < 0.3

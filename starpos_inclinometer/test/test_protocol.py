@@ -42,7 +42,9 @@ def test_checksum_gives_the_published_check_values():
 def test_the_documents_example_is_a_line_of_this_protocol():
     example = re.search(r"\$T,[0-9A-F,]+\*[0-9A-F]{4}", PROTOCOL.read_text())[0].encode() + b"\r\n"
     (sample,) = LineParser().feed(example)
-    assert sample == Sample(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
+    assert sample == Sample(
+        sequence=0x12, milliseconds=0x70A, x=0x800000, y=0xA8C9C5, temperature=0xAF, status=0
+    )
     assert example == mcu_protocol.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
     assert len(example) == mcu_protocol.SAMPLE_LINE
 
@@ -51,7 +53,11 @@ def test_messages_round_trip():
     identity = Identity(1, 0x0102, 0xDEADBEEF, 10, 20)
     stream = mcu_protocol.identity_line(identity) + lines(1)[0] + mcu_protocol.refusal_line(Reason.UNKNOWN)
     messages = LineParser().feed(stream)
-    assert messages == [identity, Sample(0, 0, 0x800000, 0x7F0000, 0xAF, 0), Refusal(Reason.UNKNOWN)]
+    assert messages == [
+        identity,
+        Sample(sequence=0, milliseconds=0, x=0x800000, y=0x7F0000, temperature=0xAF, status=0),
+        Refusal(Reason.UNKNOWN),
+    ]
     assert max(map(len, stream.splitlines(keepends=True))) <= mcu_protocol.MAX_LINE
 
 

@@ -27,7 +27,7 @@ VALUES = {p.name: p.default for p in PARAMETERS}
 
 
 def health(phase=Phase.RECEIVING, **more):
-    return Health(phase, "as it is", **more)
+    return Health(phase=phase, sentence="as it is", **more)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,15 @@ def test_a_flag_is_urgent_until_it_was_told():
 
 
 def arrival(k, at_s, identity=None, **more):
-    sample = Sample(k, 20 * k, 0x800000 + 37 * k % 1009, 0x800000 + k, 175, 0, **more)
+    sample = Sample(
+        sequence=k,
+        milliseconds=20 * k,
+        x=0x800000 + 37 * k % 1009,
+        y=0x800000 + k,
+        temperature=175,
+        status=0,
+        **more,
+    )
     return Arrival(sample, Moment(at_s, round(at_s * 1e9)), identity)
 
 

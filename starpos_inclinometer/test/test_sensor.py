@@ -16,7 +16,7 @@ def measure(sample, *calibration):
 
 
 def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):
-    return Sample(0, 0, x, y, temperature, status, **more)
+    return Sample(sequence=0, milliseconds=0, x=x, y=y, temperature=temperature, status=status, **more)
 
 
 def test_codes_by_hand():
@@ -32,7 +32,9 @@ def test_codes_by_hand():
 
 
 def test_offset_sensitivity_divider_and_reference_of_each_axis():
-    c = Sca100tCalibration((2.4, 2.6), (3.9, 4.1), 40.0, 5.2)
+    c = Sca100tCalibration(
+        offset_volts=(2.4, 2.6), sensitivity_volts_per_g=(3.9, 4.1), divider=40.0, reference_volts=5.2
+    )
     reading = measure(sample(c.code(2.4 + 3.9 * 0.1), c.code(2.6 - 4.1 * 0.2)), c)
     assert math.sin(reading.x) == pytest.approx(0.1, abs=1e-6)
     assert math.sin(reading.y) == pytest.approx(-0.2, abs=1e-6)

@@ -197,7 +197,14 @@ class SolverNode(Node):
                 stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             self._publish(
-                message.header, Solution(Status.BAD_INPUT, str(e), "stars", None, len(message.stars))
+                message.header,
+                Solution(
+                    Status.BAD_INPUT,
+                    str(e),
+                    source="stars",
+                    utc_unix_s=None,
+                    stars_detected=len(message.stars),
+                ),
             )
             return
         ahead_s = self._ahead_s(stars.mid_unix_s)

@@ -20,7 +20,9 @@ NOISE = math.radians(0.0035)
 
 def tilt_at(seconds: float, x_deg=1.0, y_deg=-2.0, sigma=NOISE, samples=5) -> Tilt:
     covariance = np.eye(2) * sigma**2 / samples
-    return Tilt(math.radians(x_deg), math.radians(y_deg), covariance, T0 + seconds, samples)
+    return Tilt(
+        math.radians(x_deg), math.radians(y_deg), covariance, utc_unix_s=T0 + seconds, samples=samples
+    )
 
 
 def seen_at(seconds: float, stars=3, **tilt) -> Seen:
@@ -28,7 +30,19 @@ def seen_at(seconds: float, stars=3, **tilt) -> Seen:
     xy = np.arange(stars, dtype=float)
     covariance = np.tile(np.eye(2) * 0.01, (stars, 1, 1))
     flux = np.arange(stars, 0, -1.0)
-    made = Stars(xy, xy, flux, flux, covariance, np.zeros(stars), 100, 80, T0 + seconds, 0.5, "stars")
+    made = Stars(
+        x=xy,
+        y=xy,
+        flux=flux,
+        snr=flux,
+        covariance=covariance,
+        flags=np.zeros(stars),
+        width=100,
+        height=80,
+        mid_unix_s=T0 + seconds,
+        exposure_s=0.5,
+        source="stars",
+    )
     return Seen(made, tilt_at(seconds, **tilt))
 
 
@@ -43,10 +57,26 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
     ]  # a slip of the mount turns with the instrument
     slip = np.zeros((6, 2))
     slip[:2] = turn * calibration_m
-    terms = (ErrorTerm("tilt", np.diag(rows * noise_m)), ErrorTerm("calibration", slip, ALWAYS))
-    return Fix(T0 + seconds, math.radians(latitude_deg), math.radians(10.0), heading_of(link), link, terms,
-               np.arange(3), np.zeros((3, 2)), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05, site.enu.T @ attitude,
-               np.eye(3) * 1e-12)  # fmt: skip
+    terms = (ErrorTerm("tilt", np.diag(rows * noise_m)), ErrorTerm("calibration", slip, shared=ALWAYS))
+    return Fix(
+        utc_unix_s=T0 + seconds,
+        latitude=math.radians(latitude_deg),
+        longitude=math.radians(10.0),
+        heading=heading_of(link),
+        link_to_enu=link,
+        terms=terms,
+        used=np.arange(3),
+        residual_px=np.zeros((3, 2)),
+        residual_arcsec=0.2,
+        jitter_px=0.1,
+        focal_scale=1.0,
+        zenith_distance=0.2,
+        refraction_arcsec=12.0,
+        diurnal_aberration_arcsec=0.3,
+        ut1_minus_utc_s=-0.05,
+        camera_to_itrs=site.enu.T @ attitude,
+        camera_covariance=np.eye(3) * 1e-12,
+    )
 
 
 def north_of(fix: Fix, metres: float) -> Fix:

@@ -25,20 +25,37 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
     forward, up = np.array([math.sin(a), math.cos(a), 0.0]), np.array([0.0, 0.0, 1.0])
     link = np.stack([forward, np.cross(up, forward), up], 1)
     factor = np.diag([100.0, 50.0, 1e-4, 2e-4, 3e-4, 1e-4])
-    return Fix(1.8e9, math.radians(latitude_deg), 1.0, heading_of(link), link, (ErrorTerm("all", factor),),
-               np.arange(3), np.zeros((3, 2)), 0.2, 0.1, 1.0, 0.2, 12.0, 0.3, -0.05, np.eye(3), 1e-6)  # fmt: skip
+    return Fix(
+        utc_unix_s=1.8e9,
+        latitude=math.radians(latitude_deg),
+        longitude=1.0,
+        heading=heading_of(link),
+        link_to_enu=link,
+        terms=(ErrorTerm("all", factor),),
+        used=np.arange(3),
+        residual_px=np.zeros((3, 2)),
+        residual_arcsec=0.2,
+        jitter_px=0.1,
+        focal_scale=1.0,
+        zenith_distance=0.2,
+        refraction_arcsec=12.0,
+        diurnal_aberration_arcsec=0.3,
+        ut1_minus_utc_s=-0.05,
+        camera_to_itrs=np.eye(3),
+        camera_covariance=1e-6,
+    )
 
 
 def answer_facing(azimuth_deg: float) -> Solution:
     return Solution(
         Status.OK,
         "fix",
-        "stars",
-        1.8e9,
-        5,
-        ("a", "b", "c"),
-        np.array([0, 2, 4]),
-        np.array([5.25, 7.5, 10.0]),
+        source="stars",
+        utc_unix_s=1.8e9,
+        stars_detected=5,
+        names=("a", "b", "c"),
+        star=np.array([0, 2, 4]),
+        magnitudes=np.array([5.25, 7.5, 10.0]),
         fix=fix_facing(azimuth_deg),
     )
 

@@ -21,7 +21,7 @@ PATIENCE_S = 75.0
 ACCEPTED_SIGMA = 4.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Place:
     """Where the instrument stands, what it looks at, and how its parts are mounted; deg, Pa, deg C."""
 
@@ -38,16 +38,19 @@ class Place:
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> "Place":
         latitude = math.degrees(math.asin(rng.uniform(-0.94, 0.94)))
-        pointing = (rng.uniform(0, 360), rng.uniform(72, 84), rng.uniform(0, 360))
-        return cls(
-            latitude, rng.uniform(-180, 180), *pointing, (*rng.uniform(-1, 1, 2), rng.uniform(-180, 180))
-        )
+        pointing = {
+            "azimuth": rng.uniform(0, 360),
+            "altitude": rng.uniform(72, 84),
+            "roll": rng.uniform(0, 360),
+        }
+        misalignment = (*rng.uniform(-1, 1, 2), rng.uniform(-180, 180))
+        return cls(latitude=latitude, longitude=rng.uniform(-180, 180), **pointing, misalignment=misalignment)
 
     def scene(self):
         from starpos.earth.refraction import Atmosphere
         from starpos.simulation.scene import scene_of
 
-        air = Atmosphere(self.pressure, self.temperature, self.humidity)
+        air = Atmosphere(pressure_pa=self.pressure, temperature_c=self.temperature, humidity=self.humidity)
         pointing = (self.azimuth, self.altitude, self.roll)
         return scene_of(
             latitude_deg=self.latitude,

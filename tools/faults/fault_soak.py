@@ -31,7 +31,7 @@ FEWEST_FOR_MEMORY = 2000  # faults; the first of each kind takes memory for good
 GROWN_MB = 12.0  # of a node: the allocator's arenas wander by ten, up and down, however long it runs
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Row:
     """What became of one kind of fault."""
 
@@ -57,7 +57,7 @@ class Soak:
         self.parameters = parameters_of(folder)
         self.world = World(self.graph, seed, self.parameters)
         self.kinds = KINDS
-        self.rows = {k.name: Row(k.about) for k in KINDS}
+        self.rows = {k.name: Row(about=k.about) for k in KINDS}
         self.crashes: list[str] = []
         self.stuck: list[str] = []
         self.nodes, self.starts = {}, 0
@@ -115,7 +115,7 @@ class Soak:
         self._judge("turning and driving")
 
     def _judge(self, name: str) -> Row:
-        row = self.rows.setdefault(name, Row("no fault"))
+        row = self.rows.setdefault(name, Row(about="no fault"))
         right, wrong = self.world.right.total(), len(self.world.wrong)
         row.statuses += self.world.judge()
         row.right += self.world.right.total() - right
@@ -126,7 +126,7 @@ class Soak:
 
     def inject(self, name: str, about: str, fault, image: bool = False):
         """One fault, and the good frames after it."""
-        row = self.rows.setdefault(name, Row(about))
+        row = self.rows.setdefault(name, Row(about=about))
         row.injected += 1
         fault()
         frames, seconds = self.settle(image)

@@ -44,7 +44,9 @@ def tilt_deg(place: dict[str, float], roll_deg: float):
     scene = scene_of(
         latitude_deg=place["latitude"],
         longitude_deg=place["longitude"],
-        atmosphere=Atmosphere(AIR["pressure"], AIR["temperature"], AIR["humidity"]),
+        atmosphere=Atmosphere(
+            pressure_pa=AIR["pressure"], temperature_c=AIR["temperature"], humidity=AIR["humidity"]
+        ),
         pointing_deg=(place["azimuth"], place["altitude"], roll_deg),
         misalignment_deg=MISALIGNMENT_DEG,
     )

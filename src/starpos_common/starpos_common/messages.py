@@ -131,7 +131,7 @@ def message_to_tilt(message: msg.Tilt, unknown_stddev_rad: float = SCA100T_NOISE
         if max(xx, yy) > MOST_TILT_VARIANCE:
             raise TiltError("a tilt message's covariance is beyond 1 rad2: send zeros where it is unknown.")
     celsius = message.temperature if abs(message.temperature) <= MOST_CELSIUS else math.nan
-    return Tilt(message.x, message.y, covariance, unix_s, 1, celsius)
+    return Tilt(message.x, message.y, covariance, utc_unix_s=unix_s, samples=1, temperature_c=celsius)
 
 
 def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None) -> CameraInfo:
@@ -177,7 +177,10 @@ def message_to_camera(message: CameraInfo, source: str = "camera_info") -> Camer
             f"{source}: the frame is binned or cropped; send whole frames, or calibrate it as it is sent."
         )
     distortion = tuple(d.tolist()) or (0.0,) * 5
-    return Camera(message.width, message.height, *k[[0, 4, 2, 5]].tolist(), distortion)
+    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
+    return Camera(
+        width=message.width, height=message.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
+    )
 
 
 def encoding_of(frame: Frame) -> str:
@@ -232,4 +235,4 @@ def message_to_frame(message: Image, source: str = "image_raw") -> Frame:
     pixels = np.ndarray(shape, dtype, message.data, strides=strides)
     if not pixels.dtype.isnative or not pixels.flags.aligned:
         pixels = pixels.astype(kind)
-    return Frame(pixels, pattern, stamp_to_unix(message.header.stamp), source=source)
+    return Frame(pixels, pattern=pattern, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)

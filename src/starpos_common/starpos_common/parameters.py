@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -50,6 +50,7 @@ class Parameter:
     name: str
     default: Any
     description: str
+    _: KW_ONLY
     unit: str = ""
     minimum: float | None = None
     maximum: float | None = None

@@ -42,16 +42,16 @@ def stars(n=5):
     covariance = np.tile([[0.01, 0.002], [0.002, 0.02]], (n, 1, 1))
     x, y = RNG.uniform(0, 100, (2, n))
     return Stars(
-        x,
-        y,
-        flux,
-        np.sqrt(flux),
-        covariance,
-        np.full(n, EDGE),
-        200,
-        100,
-        MID,
-        0.5,
+        x=x,
+        y=y,
+        flux=flux,
+        snr=np.sqrt(flux),
+        covariance=covariance,
+        flags=np.full(n, EDGE),
+        width=200,
+        height=100,
+        mid_unix_s=MID,
+        exposure_s=0.5,
         stamp_stddev_s=1e-3,
         clock_stddev_s=0.02,
     )
@@ -91,7 +91,9 @@ def test_empty_star_message_is_refused():
 
 
 def test_tilt_round_trip_and_unknown_covariance():
-    tilt = Tilt(0.1, -0.2, np.array([[4e-9, 1e-9], [1e-9, 5e-9]]), MID, 1, 21.5)
+    tilt = Tilt(
+        0.1, -0.2, np.array([[4e-9, 1e-9], [1e-9, 5e-9]]), utc_unix_s=MID, samples=1, temperature_c=21.5
+    )
     message = messages.tilt_to_message(tilt, "s", 7, 8)
     assert (message.sequence, message.flags, message.header.frame_id) == (7, 8, "s")
     got = messages.message_to_tilt(message)
@@ -116,21 +118,29 @@ def test_tilt_round_trip_and_unknown_covariance():
     ],
 )
 def test_bad_tilts_are_refused(field, value):
-    message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), MID), "s")
+    message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), utc_unix_s=MID), "s")
     setattr(message, field, value)
     with pytest.raises(TiltError):
         messages.message_to_tilt(message)
 
 
 def test_tilt_without_a_stamp_is_refused():
-    message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), MID), "s")
+    message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), utc_unix_s=MID), "s")
     message.header.stamp = Time()
     with pytest.raises(TiltError, match="stamp"):
         messages.message_to_tilt(message)
 
 
 def test_camera_round_trip():
-    camera = Camera(5616, 3744, 93750.0, 93751.0, 2807.5, 1871.5, (0.1, -0.2, 1e-4, 2e-4, 0.3))
+    camera = Camera(
+        width=5616,
+        height=3744,
+        fx=93750.0,
+        fy=93751.0,
+        cx=2807.5,
+        cy=1871.5,
+        distortion=(0.1, -0.2, 1e-4, 2e-4, 0.3),
+    )
     assert messages.message_to_camera(messages.camera_to_message(camera, "c", MID)) == camera
     message = messages.camera_to_message(camera, "c")
     message.d = []
@@ -179,7 +189,7 @@ def pixels(kind, channels=1):
 @pytest.mark.parametrize("encoding", messages.ENCODINGS)
 def test_frames_round_trip_without_a_copy_on_arrival(encoding):
     kind, channels, pattern = messages.ENCODINGS[encoding]
-    frame = Frame(pixels(kind, channels), pattern, MID, 0.5)
+    frame = Frame(pixels(kind, channels), pattern=pattern, mid_unix_s=MID, exposure_s=0.5)
     message = messages.frame_to_message(frame, "c")
     assert message.encoding == encoding and isinstance(message.data, array.array)
     got = messages.message_to_frame(message)

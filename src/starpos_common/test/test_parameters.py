@@ -19,12 +19,19 @@ from starpos_common.parameters import (
 from starpos_testing.nodes import take_domain
 
 TABLE = (
-    Parameter("rate", 10, "Samples a second.", "Hz", 1, 50),
-    Parameter("noise", 0.5, "White noise.", "deg", 0.0, 10.0),
-    Parameter("cadence", 1.0, "Time between frames.", "s", minimum=0.0),
-    Parameter("altitude", math.nan, "Height; wrong by 1 km is wrong by 1 km.", "m", -500.0, 9000.0),
-    Parameter("refraction.pressure", 1.0e5, "Air pressure.", "Pa"),
-    Parameter("offsets", (2.5, 2.5), "Of x and y.", "V", 0.0, 5.0),
+    Parameter("rate", 10, "Samples a second.", unit="Hz", minimum=1, maximum=50),
+    Parameter("noise", 0.5, "White noise.", unit="deg", minimum=0.0, maximum=10.0),
+    Parameter("cadence", 1.0, "Time between frames.", unit="s", minimum=0.0),
+    Parameter(
+        "altitude",
+        math.nan,
+        "Height; wrong by 1 km is wrong by 1 km.",
+        unit="m",
+        minimum=-500.0,
+        maximum=9000.0,
+    ),
+    Parameter("refraction.pressure", 1.0e5, "Air pressure.", unit="Pa"),
+    Parameter("offsets", (2.5, 2.5), "Of x and y.", unit="V", minimum=0.0, maximum=5.0),
     Parameter("source", "files", "Where frames come from.", choices=("files", "simulated")),
     Parameter("loop", False, "Begin anew at the end."),
     Parameter("frame_id", "starpos_link", "Frame of the fix.", form=FRAME_NAME),

@@ -31,9 +31,9 @@ PARAMETERS = (
         "alpaca.device",
         0,
         "Number of the camera on this server; no other program may use it meanwhile.",
-        "",
-        0,
-        2**32 - 1,
+        unit="",
+        minimum=0,
+        maximum=2**32 - 1,
         read_only=True,
     ),
     server_clock("alpaca"),
@@ -93,7 +93,7 @@ class Alpaca:
 
         from starpos_camera.sources.alpaca_http import Session
 
-        camera = Camera(self._address, self._number)
+        camera = Camera(width=self._address, height=self._number)
         camera.rqs = Session()
         if not camera.Connected:
             camera.Connected = True
@@ -126,10 +126,10 @@ class Alpaca:
         stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
         frame = Frame(
             _unsigned(pixels),
-            self._pattern,
-            stamp.mid_s,
-            exposure_s,
-            self.hardware_id,
+            pattern=self._pattern,
+            mid_unix_s=stamp.mid_s,
+            exposure_s=exposure_s,
+            source=self.hardware_id,
             stamp_stddev_s=stamp.stddev_s,
             clock_stddev_s=stamp.clock_stddev_s,
         )

@@ -45,9 +45,9 @@ PARAMETERS = (
         2.0,
         "A file that comes is whole once it has not changed for so long; one that cannot be read then is given up after "
         "ten times that. Too short and frames are lost that are written with pauses.",
-        "s",
-        0.01,
-        600.0,
+        unit="s",
+        minimum=0.01,
+        maximum=600.0,
         read_only=True,
     ),
     Parameter(
@@ -69,18 +69,18 @@ PARAMETERS = (
         math.nan,
         "By how much the camera's clock is ahead of UTC, summer time included; nan: as each file says, which those of "
         "older cameras do not. An hour wrong is 15 deg of longitude.",
-        "h",
-        -ZONES_H,
-        ZONES_H,
+        unit="h",
+        minimum=-ZONES_H,
+        maximum=ZONES_H,
         read_only=True,
     ),
     Parameter(
         "files.exif_clock_stddev",
         UNTENDED_STDDEV_S,
         "How far the camera's clock may be off; its whole seconds come on top.",
-        "s",
-        0.0,
-        86400.0,
+        unit="s",
+        minimum=0.0,
+        maximum=86400.0,
         read_only=True,
     ),
 )

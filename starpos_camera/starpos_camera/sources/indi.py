@@ -23,7 +23,7 @@ PARAMETERS = (
         "Where indiserver runs, in a trusted network: it knows no passwords.",
         read_only=True,
     ),
-    Parameter("indi.port", 7624, "Its port.", "", 1, 65535, read_only=True),
+    Parameter("indi.port", 7624, "Its port.", unit="", minimum=1, maximum=65535, read_only=True),
     Parameter(
         "indi.device",
         "",
@@ -34,18 +34,18 @@ PARAMETERS = (
         "indi.binning",
         1,
         "Pixels that become one, each way. A calibration and pixel_um hold for one binning only.",
-        "px",
-        1,
-        16,
+        unit="px",
+        minimum=1,
+        maximum=16,
     ),
     Parameter(
         "indi.readout",
         15.0,
         "The frame has to be here so long after its exposure; too short for the camera or the network, none ever comes, "
         "too long, and a camera that hangs is noticed late.",
-        "s",
-        0.5,
-        600.0,
+        unit="s",
+        minimum=0.5,
+        maximum=600.0,
     ),
     server_clock("indi"),
 )

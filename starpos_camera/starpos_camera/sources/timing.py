@@ -21,9 +21,9 @@ def server_clock(source: str) -> Parameter:
         math.nan,
         "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
         "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
-        "s",
-        1e-9,  # 0 says that it is this machine's
-        60.0,
+        unit="s",
+        minimum=1e-9,  # 0 says that it is this machine's
+        maximum=60.0,
     )
 
 

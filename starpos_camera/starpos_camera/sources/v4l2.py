@@ -72,7 +72,14 @@ class V4l2Device:
             self.close()
             text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
             raise CaptureError(f"{self._path}: {' '.join(text.split())}") from error
-        frame = Frame(pixels, pattern, mid_s, exposure_s, self._path, stamp_stddev_s=stddev_s)
+        frame = Frame(
+            pixels,
+            pattern=pattern,
+            mid_unix_s=mid_s,
+            exposure_s=exposure_s,
+            source=self._path,
+            stamp_stddev_s=stddev_s,
+        )
         return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
 
     def close(self):

@@ -31,18 +31,18 @@ PARAMETERS = (
         "video.width",
         0,
         "Width of a V4L2 camera's frames; it must be one that the camera has. 0: 640.",
-        "px",
-        0,
-        20000,
+        unit="px",
+        minimum=0,
+        maximum=20000,
         read_only=True,
     ),
     Parameter(
         "video.height",
         0,
         "Height of a V4L2 camera's frames; it must be one that the camera has. 0: 480.",
-        "px",
-        0,
-        20000,
+        unit="px",
+        minimum=0,
+        maximum=20000,
         read_only=True,
     ),
     Parameter(
@@ -51,9 +51,9 @@ PARAMETERS = (
         "From the middle of an exposure to the time that the kernel gives the frame; command_lag_stddev says how well it "
         "is known. Unset: nothing is assumed, and a stamp is as wide as the exposure and the frame's period. Longitudes "
         "come out 15 arcsec off for each second it is wrong.",
-        "s",
-        -10.0,
-        60.0,
+        unit="s",
+        minimum=-10.0,
+        maximum=60.0,
     ),
     Parameter(
         "video.start",

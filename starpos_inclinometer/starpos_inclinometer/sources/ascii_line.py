@@ -34,7 +34,7 @@ UNITS = (*ANGLES_RAD, *SINES)
 _END = re.compile(rb"[\r\n]+")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
     """What one line says: rad, the step of its last digit in rad, deg C or NaN; None for what it does not tell."""
 
@@ -94,7 +94,7 @@ class LineDecoder:
     @property
     def counts(self) -> Counts:
         return Counts(
-            self._good,
+            good=self._good,
             malformed=self._malformed,
             garbage_bytes=self._lines.garbage_bytes,
             lost=self._lost,
@@ -144,7 +144,15 @@ class LineDecoder:
         if not (abs(x) <= math.pi and abs(y) <= math.pi) or math.isinf(temperature):
             return None
         number = self._good if sequence is None and milliseconds is None else 0
-        return Line(x, y, max(step_x, step_y), temperature, sequence, milliseconds, number)
+        return Line(
+            x=x,
+            y=y,
+            step=max(step_x, step_y),
+            temperature_c=temperature,
+            sequence=sequence,
+            milliseconds=milliseconds,
+            number=number,
+        )
 
     def _angle(self, text: str) -> tuple[float, float]:
         """rad of a value and of its last digit."""
@@ -268,7 +276,13 @@ class AsciiSource:
         stamp_ns = moment.host_ns - round((late + self._latency) * 1e9)
         covariance = (variances[0], 0.0, 0.0, variances[1])
         return Reading(
-            max(stamp_ns, 0), line.x, line.y, covariance, line.temperature_c, self._sequence, flags
+            stamp_ns=max(stamp_ns, 0),
+            x=line.x,
+            y=line.y,
+            covariance=covariance,
+            temperature_c=line.temperature_c,
+            sequence=self._sequence,
+            flags=flags,
         )
 
     def _flags(self, line: Line) -> int:
@@ -289,4 +303,12 @@ class AsciiSource:
             "clock rate error (ppm)": self._arrivals.rate_ppm,
             "noise x, y (arcsec)": noise_text(self._noise.sigma),
         }
-        return Health(state.phase, state.sentence, state.rate_hz, state.counts, "", state.step, values)
+        return Health(
+            phase=state.phase,
+            sentence=state.sentence,
+            rate_hz=state.rate_hz,
+            counts=state.counts,
+            complaint="",
+            step=state.step,
+            values=values,
+        )

@@ -223,13 +223,13 @@ class ImuSource:
             self._noise.add(average.mid_ns * 1e-9, x, y)
         self._sequence += 1
         return Reading(
-            max(average.mid_ns - self._latency_ns, 0),
-            x,
-            y,
-            tuple(self._covariance(average).ravel().tolist()),
-            math.nan,
-            (self._sequence - 1) & 0xFFFFFFFF,
-            flags,
+            stamp_ns=max(average.mid_ns - self._latency_ns, 0),
+            x=x,
+            y=y,
+            covariance=tuple(self._covariance(average).ravel().tolist()),
+            temperature_c=math.nan,
+            sequence=(self._sequence - 1) & 0xFFFFFFFF,
+            flags=flags,
         )
 
     def _flags(self, average: MeanForce, x: float, y: float) -> int:
@@ -256,7 +256,7 @@ class ImuSource:
         recent = [t for t in self._recent if now_s - t < RATE_WINDOW_S]
         rate_hz = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
         averager = self._averager
-        counts = Counts(self._good, malformed=self._malformed, duplicates=averager.duplicates)
+        counts = Counts(good=self._good, malformed=self._malformed, duplicates=averager.duplicates)
         values = {
             "messages from the future": self._future,
             "messages out of order": averager.disordered,
@@ -264,7 +264,15 @@ class ImuSource:
             "noise x, y (arcsec)": noise_text(self._noise.sigma),
         }
         phase, sentence = self._phase(now_s)
-        return Health(phase, sentence, rate_hz, counts, "", self._clock.step, values)
+        return Health(
+            phase=phase,
+            sentence=sentence,
+            rate_hz=rate_hz,
+            counts=counts,
+            complaint="",
+            step=self._clock.step,
+            values=values,
+        )
 
     def _phase(self, now_s: float) -> tuple[Phase, str]:
         if now_s - self._heard_s > max(PATIENCE_S, self._averager.seconds):

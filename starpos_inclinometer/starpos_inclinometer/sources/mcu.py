@@ -40,14 +40,14 @@ class McuDecoder:
     def counts(self) -> Counts:
         parser, gate, continuity = self._parser, self._gate, self._continuity
         return Counts(
-            parser.good,
-            parser.crc_errors,
-            parser.malformed,
-            parser.garbage_bytes,
-            continuity.lost,
-            gate.duplicates,
-            continuity.restarts,
-            gate.rejected,
+            good=parser.good,
+            crc_errors=parser.crc_errors,
+            malformed=parser.malformed,
+            garbage_bytes=parser.garbage_bytes,
+            lost=continuity.lost,
+            duplicates=gate.duplicates,
+            restarts=continuity.restarts,
+            implausible=gate.rejected,
         )
 
     @property
@@ -145,13 +145,13 @@ class McuTilts:
         delay_s = self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s
         measured = self.sensor.measure(sample, moment.monotonic_s - late_s)
         return Reading(
-            max(moment.host_ns - round((late_s + delay_s + self._line_s) * 1e9), 0),
-            measured.x,
-            measured.y,
-            measured.covariance,
-            measured.temperature_c,
-            sample.sequence,
-            measured.flags,
+            stamp_ns=max(moment.host_ns - round((late_s + delay_s + self._line_s) * 1e9), 0),
+            x=measured.x,
+            y=measured.y,
+            covariance=measured.covariance,
+            temperature_c=measured.temperature_c,
+            sequence=sample.sequence,
+            flags=measured.flags,
         )
 
 
@@ -199,4 +199,12 @@ class McuSource:
             "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
             "unit": f"{identity.unit:08X}" if identity else "unknown",
         }
-        return Health(state.phase, state.sentence, state.rate_hz, state.counts, complaint, state.step, values)
+        return Health(
+            phase=state.phase,
+            sentence=state.sentence,
+            rate_hz=state.rate_hz,
+            counts=state.counts,
+            complaint=complaint,
+            step=state.step,
+            values=values,
+        )

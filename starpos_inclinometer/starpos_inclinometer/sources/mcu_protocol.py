@@ -14,6 +14,7 @@ SAMPLE_LINE = 43  # bytes of a `$T` line
 MAX_SENDING_MS = 50  # a line is sent within its sample's period and that
 
 _LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
+SAMPLE_FIELDS = ("sequence", "milliseconds", "x", "y", "temperature", "status")
 _SAMPLE = re.compile(
     rb"T,([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{6}),([0-9A-F]{6}),([0-9A-F]{2}),([0-9A-F]{2})"
 )
@@ -41,7 +42,7 @@ class Reason(IntEnum):
     OUT_OF_RANGE = 3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
     """One `$T` line, and what `Continuity` knows of the lines before it."""
 
@@ -50,7 +51,7 @@ class Sample:
     x: int  # AD7730 codes, 24-bit offset binary: 0x800000 is no input
     y: int
     temperature: int  # the SCA100T's temperature counts, 8 bits
-    status: int  # of Status
+    status: int  # of SampleStatus
     lost: int = 0  # samples lost just before this one
     restarted: bool = False  # the MCU was reset since the sample before
     resumed: bool = False  # the first one after the connection was opened anew
@@ -167,7 +168,8 @@ class LineParser:
 
 def _parse(body: bytes) -> Sample | Identity | Refusal | None:
     if match := _SAMPLE.fullmatch(body):
-        sample = Sample(*(int(group, 16) for group in match.groups()))
+        values = (int(group, 16) for group in match.groups())
+        sample = Sample(**dict(zip(SAMPLE_FIELDS, values, strict=True)))
         return None if sample.status & SampleStatus.FIRST and sample.sequence else sample
     if match := _IDENTITY.fullmatch(body):
         identity = Identity(*(int(group, 16) for group in match.groups()))

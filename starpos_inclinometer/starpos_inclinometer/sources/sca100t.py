@@ -35,7 +35,7 @@ TEMPERATURE_COUNTS_PER_C = -1.083
 STUCK_SAMPLES, STUCK_PAIRS = 10, 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sca100tCalibration:
     """What lies between the codes and the angles; pairs are (x, y).
 

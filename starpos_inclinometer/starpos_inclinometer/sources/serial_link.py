@@ -60,7 +60,7 @@ class Decoder(Protocol):
         """Whether a command was answered with the last bytes: the next need not wait."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LinkState:
     """The link as a person wants to know it."""
 
@@ -127,13 +127,13 @@ class SerialLink:
             recent = [t for t in self._recent if t >= horizon]
             span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
             return LinkState(
-                self._phase,
-                self._sentence,
-                self._decoder.counts,
-                self._connections,
-                self._dropped,
-                (len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
-                self._clock.step,
+                phase=self._phase,
+                sentence=self._sentence,
+                counts=self._decoder.counts,
+                connections=self._connections,
+                dropped=self._dropped,
+                rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
+                step=self._clock.step,
             )
 
     # The rest runs in the thread.

@@ -25,7 +25,7 @@ class Phase(Enum):
     RECEIVING = "receiving"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
     """What has come in since the source was made; lines, or messages of a topic."""
 
@@ -48,7 +48,7 @@ class Arrival:
     identity: Any = None  # what the device had said of itself when it sent this
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
     """A tilt as it is published: ns of the host's time, rad (always finite), rad2 (xx, xy, yx, yy), deg C or NaN."""
 
@@ -61,7 +61,7 @@ class Reading:
     flags: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Health:
     """How a source stands, as a person wants to know it."""
 

@@ -21,7 +21,7 @@ MOVED_FIXES, MOVED_SIGMA = 3, 4.5  # so many fixes of a turned camera, so far of
 RIVAL_FIXES = 10  # a rival is replaced by a newer one no sooner
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Average:
     """The combined position and the heading of the last pose (rad), with the budget of its errors.
 
@@ -76,7 +76,7 @@ def _time(f: Fix) -> float:
     return f.utc_unix_s
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Track:
     """An average in the making; in_pose: its frames since the camera was last touched."""
 
@@ -89,11 +89,11 @@ class _Track:
 
     @classmethod
     def before(cls, f: Fix) -> "_Track":
-        return cls(PlaceFilter.before(f), began_unix_s=f.utc_unix_s)
+        return cls(running=PlaceFilter.before(f), began_unix_s=f.utc_unix_s)
 
     def rival(self, f: Fix) -> "_Track":
         """A new one that knows of this one's errors, not of its place."""
-        return _Track(self.running.elsewhere(f), began_unix_s=f.utc_unix_s)
+        return _Track(running=self.running.elsewhere(f), began_unix_s=f.utc_unix_s)
 
     def touched(self) -> "_Track":
         return replace(self, running=self.running.heading_unknown(), in_pose=0)
@@ -131,10 +131,19 @@ class Averager:
         t = self._track
         if t is None:
             return None
+        latitude, longitude, heading = t.running.place
         return Average(
-            t.mean_unix_s, *t.running.place, t.running.terms(self._last.terms), t.frames, t.poses, self._left_out,
-            t.began_unix_s, self._moved,
-        )  # fmt: skip
+            utc_unix_s=t.mean_unix_s,
+            latitude=latitude,
+            longitude=longitude,
+            heading=heading,
+            terms=t.running.terms(self._last.terms),
+            frames=t.frames,
+            poses=t.poses,
+            left_out=self._left_out,
+            began_unix_s=t.began_unix_s,
+            moved=self._moved,
+        )
 
     def add(self, f: Fix) -> None:
         """One more fix, later than those before."""

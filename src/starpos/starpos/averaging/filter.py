@@ -75,7 +75,7 @@ class Plane:
         return float(np.arctan2(zenith[2], np.hypot(*zenith[:2]))), float(np.arctan2(zenith[1], zenith[0]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlaceFilter:
     """What the fixes so far say.
 
@@ -103,14 +103,14 @@ class PlaceFilter:
             n += width
         names, sources = tuple(t.name for t in f.terms), np.zeros((len(f.terms), n, n))
         return cls(
-            Plane.at(f),
-            names,
-            tuple(columns),
-            ((),) * len(names),
-            np.zeros(n),
-            np.zeros(3, bool),
-            sources,
-            f.utc_unix_s,
+            plane=Plane.at(f),
+            names=names,
+            columns=tuple(columns),
+            keys=((),) * len(names),
+            state=np.zeros(n),
+            known=np.zeros(3, bool),
+            sources=sources,
+            utc_unix_s=f.utc_unix_s,
         )
 
     def forget(self, unknown: tuple[bool, bool, bool]) -> "PlaceFilter":
@@ -214,7 +214,7 @@ class PlaceFilter:
         """The budget of `place`, with factors (3, 3)."""
         latitude, _ = self.plane.place(self.state[:2] * UNIT[:2])
         return tuple(
-            ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), t.shared)
+            ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), shared=t.shared)
             for t, source in zip(like, self.sources, strict=True)
         )
 

@@ -17,10 +17,10 @@ from starpos.calibration.intrinsics import (
     fit_camera,
     unbent,
 )
-from starpos.earth.orientation import earth_motion
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
-from starpos.fix.solver import EDGE_PX, ENOUGH_SOUND, J2000, UNSOUND
+from starpos.fix.fix import sound_matches
+from starpos.fix.solver import ENOUGH_SOUND
 from starpos.frames.stars import Stars
 from starpos.identification import Identification, PointingPrior, Sky, identify_directions, triangles
 from starpos.instrument.camera import Camera
@@ -104,12 +104,7 @@ class _Frame:
 
     @classmethod
     def of(cls, stars: Stars, level, catalogue: Catalogue, table: triangles.TriangleCatalogue) -> "_Frame":
-        year, velocity = J2000, (0.0, 0.0, 0.0)
-        if stars.mid_unix_s is not None:
-            year, velocity = earth_motion(stars.mid_unix_s)
-        on = (stars.x > -EDGE_PX) & (stars.x < stars.width - 1 + EDGE_PX)
-        on &= (stars.y > -EDGE_PX) & (stars.y < stars.height - 1 + EDGE_PX)
-        return cls(stars.take(on), level, Sky(catalogue, table, year, tuple(velocity)))
+        return cls(stars.take(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s))
 
     def sighting(
         self, camera: Camera, atmosphere: Atmosphere, attitude: np.ndarray | None
@@ -127,16 +122,16 @@ class _Frame:
         return self._of(found, camera)
 
     def _of(self, found: Identification, camera: Camera) -> Sighting:
-        # a saturated, cut or blended image has its centroid elsewhere; such stars serve where there are no others
-        sound = (self.stars.flags[found.star] & UNSOUND) == 0
-        use = sound if sound.sum() >= ENOUGH_SOUND else np.ones(len(sound), bool)
+        use = sound_matches(self.stars, found, ENOUGH_SOUND)
         star, index = found.star[use], found.catalogue[use]
         return Sighting(
-            np.stack([self.stars.x, self.stars.y], -1)[star],
-            self.stars.covariance[star],
-            self.sky.directions(index),
-            np.hypot(self.sky.catalogue.sigma(index, self.sky.year), found.blend_px[use] / camera.fx),
-            found.attitude,
-            self.level,
-            self.stars.mid_unix_s is not None,
+            xy=np.stack([self.stars.x, self.stars.y], -1)[star],
+            covariance_px2=self.stars.covariance[star],
+            directions=self.sky.directions(index),
+            direction_sigma=np.hypot(
+                self.sky.catalogue.sigma(index, self.sky.year), found.blend_px[use] / camera.fx
+            ),
+            attitude=found.attitude,
+            level=self.level,
+            timed=self.stars.mid_unix_s is not None,
         )

@@ -35,7 +35,7 @@ STEP_RAD = 1e-6  # of the numerical derivatives for the attitudes
 BORDER = 25  # points a side at which a camera is checked and its error told
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sighting:
     """One frame's identified stars.
 
@@ -53,7 +53,7 @@ class Sighting:
     timed: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Intrinsics:
     """A camera that the sky told.
 
@@ -137,16 +137,16 @@ def fit_camera(
         _CameraEstimate(np.zeros(len(UNKNOWNS)), problem.start), problem.stated + np.eye(2), keep
     )
     return Intrinsics(
-        camera,
-        to_named @ fitted.covariance @ to_named.T,
-        np.sqrt(np.square(to_named).sum(1)),
-        fitted.state.attitudes,
-        problem.xy[keep],
-        problem.frame[keep],
-        problem.residual(fitted.state)[keep],
-        held.residual(before)[keep],
-        float(np.sqrt(fitted.jitter2)),
-        int((~keep).sum()),
+        camera=camera,
+        covariance=to_named @ fitted.covariance @ to_named.T,
+        prior_sigma=np.sqrt(np.square(to_named).sum(1)),
+        attitudes=fitted.state.attitudes,
+        xy=problem.xy[keep],
+        frame=problem.frame[keep],
+        residual=problem.residual(fitted.state)[keep],
+        before=held.residual(before)[keep],
+        scatter_px=float(np.sqrt(fitted.jitter2)),
+        rejected=int((~keep).sum()),
     )
 
 
@@ -204,7 +204,9 @@ def _values(camera: Camera) -> np.ndarray:
 
 def _with_values(camera: Camera, values) -> Camera:
     fx, fy, cx, cy, *distortion = (float(v) for v in values)
-    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
+    return Camera(
+        width=camera.width, height=camera.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion)
+    )
 
 
 # The unknowns q, in sigma of their priors: scale, squareness, seven of the camera, then what the air may do beyond what
@@ -231,7 +233,7 @@ class _Settled:
     jitter2: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _CameraAdjustment:
     """All stars of all frames, frame by frame: first (F,) is the row where each begins."""
 
@@ -262,16 +264,17 @@ class _CameraAdjustment:
         held = np.array([name in free for name in PARAMETERS])
         camera = np.array([FOCAL, SQUARE, side, side, *shift]) * held
         return cls(
-            given,
-            np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
-            np.concatenate([s.xy for s in sightings]),
-            np.concatenate([s.covariance_px2 for s in sightings]) + np.eye(2) * direction2[:, None, None],
-            np.concatenate([s.directions for s in sightings]),
-            np.repeat(np.arange(len(counts)), counts),
-            np.cumsum([0, *counts[:-1]]),
-            np.stack([s.attitude for s in sightings]),
-            np.stack([np.zeros((3, 3)) if s.level is None else s.level for s in sightings]),
-            atmosphere,
+            given=given,
+            sigma=np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
+            xy=np.concatenate([s.xy for s in sightings]),
+            stated=np.concatenate([s.covariance_px2 for s in sightings])
+            + np.eye(2) * direction2[:, None, None],
+            places=np.concatenate([s.directions for s in sightings]),
+            frame=np.repeat(np.arange(len(counts)), counts),
+            first=np.cumsum([0, *counts[:-1]]),
+            start=np.stack([s.attitude for s in sightings]),
+            level=np.stack([np.zeros((3, 3)) if s.level is None else s.level for s in sightings]),
+            atmosphere=atmosphere,
         )
 
     @cached_property

@@ -200,7 +200,7 @@ def _strayed(fix: Fix, astray: float) -> Fix:
         there = here + np.array(metre) * step * prime
         turned = heading_of(Site(*np.degrees(there)).enu @ link) - fix.heading
         columns.append([*np.eye(2)[len(columns)], rotation.half_turn(turned) / (step * prime), *attitude])
-    term = ErrorTerm("turn", np.array(columns).T * astray * EARTH_RADIUS_M, ALWAYS)
+    term = ErrorTerm("turn", np.array(columns).T * astray * EARTH_RADIUS_M, shared=ALWAYS)
     return replace(fix, terms=(*fix.terms, term))
 
 

@@ -99,7 +99,7 @@ def _wandering(solved: Sequence[Solution], plumb: np.ndarray, errors: Inclinomet
     return np.stack(columns, -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) rad2 about S's axes, and the zenith (3,) in ITRS with its sigma, rad.
 
@@ -288,13 +288,13 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
     # without the turn about the plumb line, which may be as good as unknown
     told = np.delete(design, 2, 1)
     return PlumbLine(
-        a3,
-        (whole + whole.T) / 2,
-        rotation.normalised(up),
-        float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
-        best,
-        2 * best / max(2 * len(readings.sigma) - 5, 1),
-        np.hypot(*off.T),
+        a3=a3,
+        covariance=(whole + whole.T) / 2,
+        zenith=rotation.normalised(up),
+        zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
+        cost=best,
+        scatter=2 * best / max(2 * len(readings.sigma) - 5, 1),
+        off=np.hypot(*off.T),
     )
 
 

@@ -209,7 +209,7 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
             "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
         )
     return instrument.Instrument(
-        focal_px, calibration=instrument.Calibration(tuple(misalignment or (0.0, 0.0, 0.0)))
+        focal_px, calibration=instrument.Calibration(misalignment_deg=tuple(misalignment or (0.0, 0.0, 0.0)))
     )
 
 

@@ -30,7 +30,10 @@ def run(args) -> int:
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
                 unreadable = True
-                answer = Solution(Status.BAD_INPUT, str(answer), path, None, 0), 0.0
+                answer = (
+                    Solution(Status.BAD_INPUT, str(answer), source=path, utc_unix_s=None, stars_detected=0),
+                    0.0,
+                )
             found, cpu_ms = answer
             any_found |= found.ok
             if not found.ok:

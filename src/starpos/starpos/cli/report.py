@@ -73,12 +73,12 @@ def _night(path: Path, args) -> Night:
     from starpos.report.working import Workshop, worked
 
     shop = Workshop(
-        _once_a_size(lambda stars: common.instrument_of(args, stars)),
-        catalogue.load_catalogue(),
-        common.atmosphere_of(args),
-        common.vertical_of(args),
-        common.turn_of(args) if args.self_calibrate else None,
-        common.ProgressBar(),
+        instrument_for=_once_a_size(lambda stars: common.instrument_of(args, stars)),
+        catalogue=catalogue.load_catalogue(),
+        atmosphere=common.atmosphere_of(args),
+        vertical=common.vertical_of(args),
+        turn_stddev_deg=common.turn_of(args) if args.self_calibrate else None,
+        progress=common.ProgressBar(),
     )
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")

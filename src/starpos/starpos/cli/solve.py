@@ -130,7 +130,7 @@ def _tell(args, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
     for path, answer in rows:
         if isinstance(answer, FrameError):
             unreadable = True
-            answer = Solution(Status.BAD_INPUT, str(answer), path, None, 0)
+            answer = Solution(Status.BAD_INPUT, str(answer), source=path, utc_unix_s=None, stars_detected=0)
         if answer.fix:
             solved.append(Solved.of(answer))
         else:

@@ -10,7 +10,7 @@ STEEP = 5  # times a cell's error: a step between cells, no gradient of the sky
 QUANTISATION = 12**-0.5  # DN rms of rounding to whole numbers: no pixel is quieter
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Background:
     """The sky's level and noise, DN, in cells spread evenly over a frame of width x height px and one beyond each edge.
 
@@ -90,7 +90,7 @@ def measure_background(plane, cell_px=64, mosaic=None) -> Background:
     )
     noise = np.maximum(noise, QUANTISATION)
     level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
-    return Background(level, noise, plane.shape[1], plane.shape[0])
+    return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
 
 
 def _sample(length, cell_px):

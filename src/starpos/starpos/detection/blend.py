@@ -148,7 +148,7 @@ def _fluxes(stamps, used, a, b):
 
 
 def _rows(fit, index):
-    return Fit(*(getattr(fit, f.name)[index] for f in fields(Fit)))
+    return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
 
 
 def _with_rows(old, index, new):
@@ -161,4 +161,5 @@ def _with_rows(old, index, new):
 
 
 def _joined(kind, first, second):
-    return kind(*(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(kind)))
+    pairs = {f.name: [getattr(first, f.name), getattr(second, f.name)] for f in fields(kind)}
+    return kind(**{name: np.concatenate(pair) for name, pair in pairs.items()})

@@ -51,7 +51,7 @@ class Response:
         return noise**2 + np.float32(self.dn_per_photon) * light + np.float32(self.misfit**2) * light**2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit:
     """N fitted stars: x, y px; flux DN and its sigma; covariance (N, 2, 2) px2 of x, y; chi2 per degree of freedom.
 
@@ -135,18 +135,18 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         # lies in memory, numpy 1.26's power is not, and the answers of several processes are to be the same
         flux_sigma = 1 / np.sqrt(normal[:, 2, 2])
     return Fit(
-        x,
-        y,
-        flux,
-        flux_sigma,
-        covariance[:, :2, :2],
-        response.gain * (1 + colour),
-        chi2,
-        residual,
-        amount * unit,
-        used,
-        outlier & stamps.good & inside,
-        leverage,
+        x=x,
+        y=y,
+        flux=flux,
+        flux_sigma=flux_sigma,
+        covariance=covariance[:, :2, :2],
+        gains=response.gain * (1 + colour),
+        chi2=chi2,
+        residual=residual,
+        model=amount * unit,
+        used=used,
+        outlier=outlier & stamps.good & inside,
+        leverage=leverage,
     )
 
 

@@ -14,11 +14,6 @@ from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.frames.stars import Stars, no_stars
 
-# fmt: off
-ABOUT = (
-    "width", "height", "mid_unix_s", "exposure_s", "source", "focal_px", "stamp_stddev_s", "clock_stddev_s",
-)
-# fmt: on
 CHUNK_PIXELS = 12_000, 60_000  # of stars fitted at once, of a small frame and of a large one: 1 and 5 MB
 PEAKS = 10_000  # looked at; at least twice as many as stars are wanted, as hot pixels are peaks too
 
@@ -79,7 +74,7 @@ class Detection:
 def detect(frame, settings=DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. A frame without any gives none; fwhm_px is NaN then."""
     plane, mosaic = plane_of(frame)
-    about = {name: getattr(frame, name) for name in ABOUT}
+    about = {"width": frame.width, "height": frame.height} | frame.about
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
     background = measure_background(plane, settings.mesh_px, mosaic)

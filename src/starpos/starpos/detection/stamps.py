@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pixels around each star, all stars at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -16,7 +16,7 @@ UNEVEN = (
 ALONE, NOTHING = 0.25, 3.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Stamps:
     """Squares of S x S px around N stars, S odd.
 
@@ -41,7 +41,7 @@ class Stamps:
         return self.signal.shape[1] // 2
 
     def take(self, index) -> "Stamps":
-        return Stamps(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def offsets(self, x, y):
         """Column and row of every pixel relative to the points x, y (N,): two float32 (N, S, S) broadcastables."""
@@ -62,7 +62,7 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     level, noise = background.of_pixels(x, y, rows, columns)
     phase = phase_of(rows, columns) if background.is_mosaic else np.zeros(pixels.shape, np.int8)
     full = on & (pixels >= saturation)
-    return Stamps(x, y, pixels - level, noise, on & ~full, full, phase)
+    return Stamps(x=x, y=y, signal=pixels - level, noise=noise, good=on & ~full, full=full, phase=phase)
 
 
 def are_dots(plane, background, x, y):

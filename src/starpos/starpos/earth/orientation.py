@@ -31,7 +31,7 @@ EXTRAPOLATION_SIGMA_S = (0.001, 0.013, 0.033, 0.053, 0.092, 0.25, 0.46)
 POLE_SIGMA_RAD = 0.2 * ARCSEC
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EarthOrientation:
     """UT1-UTC (s) and the pole (rad) at an instant, with 1 sigma each; `extrapolated_days` beyond the table's end."""
 
@@ -124,21 +124,27 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
         ut1_minus_tai = table.ut1_minus_tai[-1] + beyond * table.slope
         sigma = np.hypot(table.ut1_sigma[-1], np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S))
         return EarthOrientation(
-            float(ut1_minus_tai + leap),
-            float(sigma),
-            table.pole_x[-1],
-            table.pole_y[-1],
-            POLE_SIGMA_RAD,
-            float(beyond),
+            ut1_minus_utc_s=float(ut1_minus_tai + leap),
+            ut1_sigma_s=float(sigma),
+            pole_x=table.pole_x[-1],
+            pole_y=table.pole_y[-1],
+            pole_sigma=POLE_SIGMA_RAD,
+            extrapolated_days=float(beyond),
         )
-    at = [float(np.interp(mjd, table.mjd, column)) for column in (table.ut1_minus_tai, table.ut1_sigma)]
-    pole = [
-        float(np.interp(mjd, table.mjd, column)) for column in (table.pole_x, table.pole_y, table.pole_sigma)
-    ]
-    return EarthOrientation(at[0] + leap, at[1], *pole)
+
+    def at(column: np.ndarray) -> float:
+        return float(np.interp(mjd, table.mjd, column))
+
+    return EarthOrientation(
+        ut1_minus_utc_s=at(table.ut1_minus_tai) + leap,
+        ut1_sigma_s=at(table.ut1_sigma),
+        pole_x=at(table.pole_x),
+        pole_y=at(table.pole_y),
+        pole_sigma=at(table.pole_sigma),
+    )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Table:
     """Daily values (N,): mjd, TAI-UTC (s), UT1-TAI (s; free of leap seconds: it can be interpolated), pole (rad)."""
 
@@ -179,14 +185,14 @@ def _table() -> _Table:
     ut1 = filled(59, 68) - leap
     pole_sigma = np.hypot(filled(28, 36), filled(47, 55)) * ARCSEC
     return _Table(
-        mjd,
-        leap,
-        ut1,
-        np.maximum(filled(69, 78), 1e-5),
-        filled(19, 27) * ARCSEC,
-        filled(38, 46) * ARCSEC,
-        np.maximum(pole_sigma, 1e-10),
-        float((ut1[-1] - ut1[-366]) / 365),
+        mjd=mjd,
+        tai_minus_utc=leap,
+        ut1_minus_tai=ut1,
+        ut1_sigma=np.maximum(filled(69, 78), 1e-5),
+        pole_x=filled(19, 27) * ARCSEC,
+        pole_y=filled(38, 46) * ARCSEC,
+        pole_sigma=np.maximum(pole_sigma, 1e-10),
+        slope=float((ut1[-1] - ut1[-366]) / 365),
     )
 
 

@@ -13,7 +13,7 @@ STANDARD_TEMPERATURE_C = 15.0
 MIN_COS_ZENITH = 0.05  # ERFA's own floor: below 3 deg of altitude the two-constant model has no meaning
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Atmosphere:
     """The air at the instrument and how well it is known (1 sigma)."""
 
@@ -44,9 +44,9 @@ class Atmosphere:
         """The air as far as it was measured; None takes a middle of sea level to 3000 m, or of frost to summer, and a
         sigma that covers them."""
         return cls(
-            90_000.0 if pressure_pa is None else pressure_pa,
-            10.0 if temperature_c is None else temperature_c,
-            humidity,
+            pressure_pa=90_000.0 if pressure_pa is None else pressure_pa,
+            temperature_c=10.0 if temperature_c is None else temperature_c,
+            humidity=humidity,
             pressure_stddev_pa=9_000.0 if pressure_pa is None else 200.0,
             temperature_stddev_c=12.0 if temperature_c is None else 2.0,
         )

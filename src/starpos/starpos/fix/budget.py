@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error budget of a fix: each source of error as what it does to place, heading and attitude."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class ErrorTerm:
 
     name: str
     factor: np.ndarray
+    _: KW_ONLY
     shared: tuple | None = None
     variance: float = 1.0
     walk_s: float = 0.0
@@ -183,14 +184,16 @@ def error_terms(
     )
     return (
         ErrorTerm("centroids", of_stars(stars.centroids)),
-        ErrorTerm("catalogue", of_stars(stars.catalogue), stars.same_stars),
-        ErrorTerm("calibration", sensitivity.level @ calibration, ALWAYS, posed=True),
+        ErrorTerm("catalogue", of_stars(stars.catalogue), shared=stars.same_stars),
+        ErrorTerm("calibration", sensitivity.level @ calibration, shared=ALWAYS, posed=True),
         *_of_inclinometer(sensitivity.level @ levelling, tilt, mounting, earth.utc_unix_s),
-        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], ALWAYS),
-        ErrorTerm("clock", second_of_time * clock_stddev_s, ALWAYS),
-        ErrorTerm("time stamp", second_of_time * stamp_stddev_s, ALWAYS),  # lags are: nobody may count on it
-        ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, ALWAYS),
-        ErrorTerm("pole", pole, ALWAYS),
+        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
+        ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
+        ErrorTerm(
+            "time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS
+        ),  # lags are: nobody may count on it
+        ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, shared=ALWAYS),
+        ErrorTerm("pole", pole, shared=ALWAYS),
     )
 
 
@@ -221,12 +224,12 @@ def _of_inclinometer(
     warmer = tilt.temperature_c - mounting.calibrated_temperature_c
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
     return (
-        ErrorTerm("tilt", level @ symmetric_root(tilt.covariance), tilt.times),
-        ErrorTerm("tilt quantisation", level * errors.undithered_rad(tilt), errors.steps(tilt)),
+        ErrorTerm("tilt", level @ symmetric_root(tilt.covariance), shared=tilt.times),
+        ErrorTerm("tilt quantisation", level * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
         ErrorTerm(
             "tilt drift",
             level * errors.drift_rad_per_sqrt_hour / np.sqrt(HOUR_S),
-            ALWAYS,
+            shared=ALWAYS,
             variance=since_s if np.isfinite(since_s) else 0.0,
             walk_s=1.0,
             posed=True,
@@ -234,9 +237,9 @@ def _of_inclinometer(
         ErrorTerm(
             "tilt temperature",
             level * errors.temperature_rad_per_c * (warmer if np.isfinite(warmer) else 0.0),
-            ALWAYS,
+            shared=ALWAYS,
         ),
         ErrorTerm(
-            "tilt scale", level * (theta - mounting.calibrated_tilt) * errors.scale, ALWAYS, posed=True
+            "tilt scale", level * (theta - mounting.calibrated_tilt) * errors.scale, shared=ALWAYS, posed=True
         ),
     )

@@ -15,6 +15,8 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
 from starpos.fix.outliers import expected_extra, judged
+from starpos.frames.stars import Stars
+from starpos.identification import Identification
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.mounting import Mounting
@@ -40,7 +42,13 @@ class MatchedStars:
     index: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
+def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:
+    """(M,) which matches of `found` to use: stars without a flag, or all where fewer than `enough` have none."""
+    sound = stars.sound[found.star]
+    return sound if sound.sum() >= enough else np.ones(len(sound), bool)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 

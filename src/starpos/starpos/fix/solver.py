@@ -3,20 +3,19 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Enum
 
 import erfa
 import numpy as np
 
-from starpos import identification as ident
-from starpos.earth.orientation import EarthState, earth_motion, earth_state
+from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
-from starpos.fix.fix import Fix, MatchedStars, solve_fix
+from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.frames.reading import why_no_time
-from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED, Stars
-from starpos.identification import triangles
+from starpos.frames.stars import SATURATED, Stars
+from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangles
 from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, a2_matrix
@@ -25,10 +24,7 @@ from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
 
-J2000 = 2000.0
-UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED
 ENOUGH_SOUND = 8
-EDGE_PX = 2.0  # a star whose centroid is further outside its frame is none
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
 
 
@@ -45,7 +41,7 @@ class Status(str, Enum):
     POOR_FIT = "poor fit"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Attitude:
     """Where the camera looks: ICRS of the frame's centre pixel, and the position angle of its top (rad)."""
 
@@ -68,6 +64,7 @@ class Solution:
 
     status: Status
     message: str
+    _: KW_ONLY
     source: str
     utc_unix_s: float | None
     stars_detected: int
@@ -85,7 +82,9 @@ class Solution:
     @classmethod
     def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
         """Nothing but the reason."""
-        return cls(status, message, stars.source, stars.mid_unix_s, len(stars))
+        return cls(
+            status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=len(stars)
+        )
 
     @property
     def ok(self) -> bool:
@@ -104,7 +103,7 @@ class Solver:
 
     def prepare(self, width: int, height: int) -> None:
         """Have the triangles of this frame size at hand, building them if need be; raises StarposError."""
-        triangles.cached(self.catalogue, self._camera(width, height).half_diagonal_rad, self.progress)
+        self._triangles(self._camera(width, height))
 
     def identify(self, stars: Stars) -> Solution:
         """Which stars these are and where the camera looked.  Without a time: J2000 places, no aberration."""
@@ -113,12 +112,8 @@ class Solver:
         begin = time.perf_counter()
         try:
             camera = self._camera(stars.width, stars.height)
-            year, velocity = J2000, (0.0, 0.0, 0.0)
-            if stars.mid_unix_s is not None:
-                year, velocity = earth_motion(stars.mid_unix_s)
-            found, sky = self._identify(
-                stars, camera, camera.directions(stars.x, stars.y), year, tuple(velocity)
-            )
+            sky = Sky.at(self.catalogue, self._triangles(camera), stars.mid_unix_s)
+            found = identify_directions(camera.directions(stars.x, stars.y), stars.sigma, camera, sky)
         except StarposError as e:
             return _failure(stars, e)
         spent = time.perf_counter() - begin
@@ -156,7 +151,8 @@ class Solver:
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(camera.directions(stars.x, stars.y) @ g.T) @ g
             priors = hint.priors(state, g[2]) if hint else ()
-            found, sky = self._identify(stars, camera, directions, state.year, tuple(state.velocity), priors)
+            sky = Sky(self.catalogue, self._triangles(camera), state.year, tuple(state.velocity))
+            found = identify_directions(directions, stars.sigma, camera, sky, priors)
         except StarposError as e:
             return _failure(stars, e)
         identified = time.perf_counter()
@@ -188,18 +184,14 @@ class Solver:
             },
         )
 
-    def _fix(
-        self, stars: Stars, found: ident.Identification, camera: Camera, tilt: Tilt, state: EarthState
-    ) -> Fix:
+    def _fix(self, stars: Stars, found: Identification, camera: Camera, tilt: Tilt, state: EarthState) -> Fix:
         if len(found.star) < self.min_stars:
             raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
         if found.mirrored:
             raise InstrumentError(
                 "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
             )
-        # a saturated, cut or blended image has its centroid elsewhere; such stars serve where there are no others
-        sound = (stars.flags[found.star] & UNSOUND) == 0
-        use = sound if sound.sum() >= max(self.min_stars, ENOUGH_SOUND) else np.ones(len(sound), bool)
+        use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
         star, index = found.star[use], found.catalogue[use]
         matched = MatchedStars(
             np.stack([stars.x, stars.y], -1)[star],
@@ -234,17 +226,15 @@ class Solver:
             )
         return camera
 
-    def _identify(self, stars: Stars, camera: Camera, directions, year, velocity, priors=()):
-        table = triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
-        sky = ident.Sky(self.catalogue, table, year, velocity)
-        return ident.identify_directions(directions, stars.sigma, camera, sky, priors), sky
+    def _triangles(self, camera: Camera) -> triangles.TriangleCatalogue:
+        return triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
 
     def _unidentified(self, stars: Stars) -> Solution:
         place, n = stars.source or "the frame", len(stars)
-        if n < ident.FEWEST_STARS:
+        if n < FEWEST_STARS:
             saturated = int(np.sum((stars.flags & SATURATED) != 0))
             hint = f" ({saturated} saturated)" if saturated else ""
-            needed = f"at least {ident.FEWEST_STARS} are needed: check clouds, focus and exposure"
+            needed = f"at least {FEWEST_STARS} are needed: check clouds, focus and exposure"
             message = f"{place}: {n} stars detected{hint}, {needed}"
             return Solution.failed(stars, Status.TOO_FEW_STARS, message)
         message = (
@@ -256,8 +246,7 @@ class Solver:
 
 def _inside(stars: Stars) -> np.ndarray | None:
     """Rows of the stars that are on their frame; None where all are, as is usual."""
-    on = (stars.x > -EDGE_PX) & (stars.x < stars.width - 1 + EDGE_PX)
-    on &= (stars.y > -EDGE_PX) & (stars.y < stars.height - 1 + EDGE_PX)
+    on = stars.on_frame
     return None if on.all() else np.flatnonzero(on)
 
 
@@ -278,7 +267,7 @@ def _failure(stars: Stars, error: StarposError) -> Solution:
     return Solution.failed(stars, status, str(error))
 
 
-def _attitude(found: ident.Identification, sky: ident.Sky, camera: Camera) -> Attitude:
+def _attitude(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """The pointing of the frame's centre; for a mirrored frame, of the frame turned the right way up."""
     seen = camera.scaled(found.focal_scale)
     x, y = camera.centre_px
@@ -290,11 +279,11 @@ def _attitude(found: ident.Identification, sky: ident.Sky, camera: Camera) -> At
     if found.mirrored:
         up = -up
     return Attitude(
-        full_turn(ra),
-        float(dec),
-        full_turn(np.arctan2(up @ east, up @ north)),
-        float(seen.fx),
-        float(found.residual_px * seen.scale_arcsec),
-        found.log_odds,
-        found.mirrored,
+        ra=full_turn(ra),
+        dec=float(dec),
+        roll=full_turn(np.arctan2(up @ east, up @ north)),
+        focal_px=float(seen.fx),
+        residual_arcsec=float(found.residual_px * seen.scale_arcsec),
+        log_odds=found.log_odds,
+        mirrored=found.mirrored,
     )

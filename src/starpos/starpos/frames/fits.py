@@ -41,11 +41,11 @@ def _read(file, place):
     mid, exposure, rounding = times(header, place)
     frame = Frame(
         to_unsigned(values, place),
-        _pattern(header, place),
-        mid,
-        exposure,
-        place,
-        focal_px(header),
+        pattern=_pattern(header, place),
+        mid_unix_s=mid,
+        exposure_s=exposure,
+        source=place,
+        focal_px=focal_px(header),
         stamp_stddev_s=rounding,
     )
     return frame, header

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frames.stars import check_focal, check_size, check_times
+from starpos.frames.exposure import Exposure, check_size
 
 MAX_PIXELS = 200_000_000  # a header may claim anything; this much fits a small robot's memory
 LOUDEST = 30_000  # times the noise above the sky or below it: further off is no light, as no sensor reaches that far
@@ -14,33 +14,21 @@ PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(Exposure):
     """The pixels of one exposure, row 0 on top.
 
     pixels      (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
     pattern     the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
-    mid_unix_s  middle of the exposure, UTC as a Unix time; None: unknown
-    exposure_s  None: unknown
-    source      where it came from, for messages: a path or a topic
-    focal_px    focal length the file's header claims (FOCALLEN / XPIXSZ), px; a hint only; None: unknown
-    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, common to all frames, s; 0: unknown
-    clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common, s; 0: unknown
 
     Raises FrameError on anything else.
     """
 
     pixels: np.ndarray
     pattern: str = ""
-    mid_unix_s: float | None = None
-    exposure_s: float | None = None
-    source: str = ""
-    focal_px: float | None = None
-    stamp_stddev_s: float = 0.0
-    clock_stddev_s: float = 0.0
 
-    def __post_init__(self):
-        place = self.source or "the frame"
-        pixels = self.pixels
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        place, pixels = self.place, self.pixels
         if not isinstance(pixels, np.ndarray):
             raise FrameError(f"{place}: the pixels are a {type(pixels).__name__}; give a numpy array.")
         colour = pixels.ndim == 3 and pixels.shape[2] == 3
@@ -55,8 +43,6 @@ class Frame:
         if self.pattern not in PATTERNS or (colour and self.pattern):
             allowed = "''" if colour else ", ".join(map(repr, PATTERNS))
             raise FrameError(f"{place}: the colour pattern is {self.pattern!r}; it must be {allowed}.")
-        check_times(self, place)
-        check_focal(self.focal_px, place)
 
     @property
     def width(self) -> int:

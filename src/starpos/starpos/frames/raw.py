@@ -48,7 +48,7 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
         raise FrameError(
             f"{place}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
         )
-    return Frame(to_unsigned(pixels, place), pattern, source=place, **exif.told(data, place, clock))
+    return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **exif.told(data, place, clock))
 
 
 def _words(error):

@@ -23,7 +23,7 @@ FLOOR_PX = 0.05  # what a centroid's own error does not tell: the catalogue, the
 BLEND_PX = 2.5  # closer stars make one image
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Identification:
     """Matched stars and the attitude they give.
 
@@ -99,14 +99,14 @@ def identified(
             return None
         pose, (star, near), residual = match
     return Identification(
-        star,
-        stars.index[near],
-        stars.blend_px[near],
-        pose.attitude,
-        pose.focal_px / field.focal_px,
-        _rms(residual, np.hypot(sigma[star], FLOOR_PX)),
-        log_odds,
-        pose.mirrored,
+        star=star,
+        catalogue=stars.index[near],
+        blend_px=stars.blend_px[near],
+        attitude=pose.attitude,
+        focal_scale=pose.focal_px / field.focal_px,
+        residual_px=_rms(residual, np.hypot(sigma[star], FLOOR_PX)),
+        log_odds=log_odds,
+        mirrored=pose.mirrored,
     )
 
 

@@ -12,7 +12,7 @@ STEPS, SMALL_STEP = 2, 3e-5  # of a fit; rad
 LEAST_SIGMA_PX = 1e-3  # no centroid is better, whatever is said
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrameStars:
     """A frame's stars, brightest first.
 
@@ -39,12 +39,12 @@ class FrameStars:
         principal = np.array([camera.cx, camera.cy])
         flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
         return cls(
-            np.stack([xy, flipped]) - principal,
-            np.maximum(sigma, LEAST_SIGMA_PX),
-            np.array(camera.centre_px) - principal,
-            np.array([camera.width, camera.height]) / 2,
-            camera.fx,
-            float((camera.width - 2 * margin_px) * (camera.height - 2 * margin_px)),
+            xy=np.stack([xy, flipped]) - principal,
+            sigma=np.maximum(sigma, LEAST_SIGMA_PX),
+            middle=np.array(camera.centre_px) - principal,
+            half=np.array([camera.width, camera.height]) / 2,
+            focal_px=camera.fx,
+            area_px2=float((camera.width - 2 * margin_px) * (camera.height - 2 * margin_px)),
         )
 
     def __len__(self) -> int:

@@ -50,12 +50,19 @@ def identify_directions(
     squeeze = camera.fx / camera.fy
     width, height = camera.width, max(1, round(camera.height * squeeze))
     cx, cy = camera.cx, camera.cy * squeeze
-    xy = Camera(width, height, camera.fx, camera.fx, cx, cy).project(directions)
+    xy = Camera(width=width, height=height, fx=camera.fx, fy=camera.fx, cx=cx, cy=cy).project(directions)
     # what a lens has drawn in from the sides lies beyond them without its distortion, and so do the catalogue's stars
     beyond = float(np.maximum(-xy, xy - (width - 1, height - 1)).max(initial=0.0))
     widest = WIDEST_MARGIN * max(width, height)
     margin = math.ceil(min(beyond - EDGE_PX, widest)) if beyond > EDGE_PX else 0
-    ideal = Camera(width + 2 * margin, height + 2 * margin, camera.fx, camera.fx, cx + margin, cy + margin)
+    ideal = Camera(
+        width=width + 2 * margin,
+        height=height + 2 * margin,
+        fx=camera.fx,
+        fy=camera.fx,
+        cx=cx + margin,
+        cy=cy + margin,
+    )
     return _identify(FrameStars.of(xy + margin, sigma_px, ideal, margin), sky, priors)
 
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.earth.orientation import earth_motion
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.rotation import normalised
-from starpos.sky.catalogue import Catalogue
+from starpos.sky.catalogue import EPOCH, Catalogue
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,16 @@ class Sky:
 
     catalogue: Catalogue
     triangles: TriangleCatalogue
-    year: float = 2000.0
+    year: float = EPOCH
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def at(cls, catalogue: Catalogue, triangles: TriangleCatalogue, utc_unix_s: float | None) -> "Sky":
+        """The sky of a time; of None, an unknown one, at J2000 without aberration."""
+        if utc_unix_s is None:
+            return cls(catalogue, triangles)
+        year, velocity = earth_motion(utc_unix_s)
+        return cls(catalogue, triangles, year, tuple(velocity))
 
     def directions(self, index: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of the catalogue's stars."""

@@ -66,7 +66,7 @@ def angles(side: np.ndarray) -> np.ndarray:
     return 2 * np.arctan2(np.sqrt(rest[..., [1, 0, 0]] * rest[..., [2, 2, 1]]), np.sqrt(np.sin(s) * rest))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TriangleCatalogue:
     """Triangles of the sky's brightest stars in bins of their shape.
 
@@ -158,15 +158,19 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         key = np.union1d(key, _triples_of_circles(tree, radius * half_diagonal, spacing, most))
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
     del tree
-    triangles = _in_bins(v, apart, key, 2 * half_diagonal)
+    corners, counter_clockwise, shape, bin_start = _in_bins(v, apart, key, 2 * half_diagonal)
     progress("star triangles", 1.0)
     return TriangleCatalogue(
-        pool.astype(np.int32),
-        cell_starts(np.searchsorted(pool, catalogue.zone_start), catalogue.ra_mas[pool] / 3.6e6),
-        rank.astype(np.int32),
-        beacon.astype(np.int32),
-        v[beacon],
-        *triangles,
+        star=pool.astype(np.int32),
+        cell_start=cell_starts(np.searchsorted(pool, catalogue.zone_start), catalogue.ra_mas[pool] / 3.6e6),
+        rank=rank.astype(np.int32),
+        beacon=beacon.astype(np.int32),
+        beacons=v[beacon],
+        corners=corners,
+        counter_clockwise=counter_clockwise,
+        shape=shape,
+        longest_allowed=2 * half_diagonal,
+        bin_start=bin_start,
     )
 
 

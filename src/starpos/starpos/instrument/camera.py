@@ -14,7 +14,7 @@ from starpos.errors import InstrumentError
 MAX_NEWTON_STEPS = 30
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Camera:
     """Intrinsics as sensor_msgs/CameraInfo has them: sizes and focal lengths in px, `plumb_bob` distortion."""
 
@@ -42,7 +42,9 @@ class Camera:
     @classmethod
     def from_focal(cls, width: int, height: int, focal_px: float) -> "Camera":
         """An ideal camera: square pixels, principal point at the frame's centre, no distortion."""
-        return cls(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+        return cls(
+            width=width, height=height, fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2
+        )
 
     @property
     def scale_arcsec(self) -> float:

@@ -39,7 +39,7 @@ def read(path: Path) -> Camera:
             f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
         )
     try:
-        return Camera(width, height, k[0], k[4], k[2], k[5], d)
+        return Camera(width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=d)
     except InstrumentError as error:
         raise InstrumentError(f"{path}: {error}") from None
 

@@ -2,7 +2,7 @@
 """The inclinometer: its readings, its transfer function, and A2, which takes its frame S into the local level L."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -34,6 +34,7 @@ class Tilt:
     theta_x: float
     theta_y: float
     covariance: np.ndarray
+    _: KW_ONLY
     utc_unix_s: float
     samples: int = 1
     temperature_c: float = float("nan")
@@ -195,13 +196,15 @@ class TiltLog:
             scatter = theta.var(0, ddof=1) / np.diag(covariance)
             widen = np.sqrt(np.where(scatter > 1 + 2 * np.sqrt(2 / (n - 1)), scatter * (1 + 2 / n), 1.0))
             covariance = covariance * np.outer(widen, widen)
+        theta_x, theta_y = theta.mean(0).tolist()
         return Tilt(
-            *theta.mean(0).tolist(),
+            theta_x,
+            theta_y,
             covariance / n,
-            float(self.utc_unix_s[use].mean()),
-            n,
-            float(self.temperature_c[use].mean()),
-            tuple(self.utc_unix_s[use].tolist()),
+            utc_unix_s=float(self.utc_unix_s[use].mean()),
+            samples=n,
+            temperature_c=float(self.temperature_c[use].mean()),
+            times=tuple(self.utc_unix_s[use].tolist()),
         )
 
     def _of_exposure(self, mid_unix_s: float, exposure_s: float) -> np.ndarray:

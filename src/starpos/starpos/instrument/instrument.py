@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the instrument is: optics, how its parts are fixed to each other, and how well that is known."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ MOST_ARCSEC, MOST_C = (
 MOST_CLOCK_S = 86400.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Calibration:
     """A3, how well it is known, and as of when.
 
@@ -85,7 +85,10 @@ class Calibration:
                 f"calibration_stddev_arcsec must be finite numbers of 0 or more, at most {MOST_ARCSEC:g}"
             )
         covariance = np.diag(np.square(np.asarray(stddev_arcsec, float)))
-        return cls(tuple(misalignment_deg), tuple(map(tuple, covariance.tolist())))
+        return cls(
+            misalignment_deg=tuple(misalignment_deg),
+            covariance_arcsec2=tuple(map(tuple, covariance.tolist())),
+        )
 
     @property
     def a3(self) -> np.ndarray:
@@ -130,6 +133,7 @@ class Instrument:
     """
 
     focal_px: float
+    _: KW_ONLY
     camera: Camera | None = None
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
@@ -182,13 +186,13 @@ class Instrument:
         """A3 and the base link as matrices, with their errors."""
         c = self.calibration
         return Mounting(
-            c.a3,
-            np.asarray(self.link_to_camera, float),
-            np.asarray(c.covariance_arcsec2, float) * ARCSEC**2,
-            self.inclinometer,
-            c.utc_unix_s,
-            c.temperature_c,
-            tuple(np.radians(c.tilt_deg)),
+            a3=c.a3,
+            link_to_camera=np.asarray(self.link_to_camera, float),
+            calibration_covariance=np.asarray(c.covariance_arcsec2, float) * ARCSEC**2,
+            inclinometer=self.inclinometer,
+            calibrated_unix_s=c.utc_unix_s,
+            calibrated_temperature_c=c.temperature_c,
+            calibrated_tilt=tuple(np.radians(c.tilt_deg)),
         )
 
 

@@ -95,7 +95,7 @@ def write(path, instrument: Instrument, comment: str = "") -> None:
 def _from_mapping(content: dict, folder: Path) -> Instrument:
     _refuse_others(content, KEYS)
     camera, focal_px = _camera(content.get("camera"), folder)
-    instrument = Instrument(focal_px, camera, _calibration(content))
+    instrument = Instrument(focal_px, camera=camera, calibration=_calibration(content))
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
@@ -136,7 +136,8 @@ def _camera(camera, folder: Path) -> tuple[Camera | None, float]:
                 f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
             )
     distortion = _row(camera.get("distortion", [0.0] * 5), "distortion")
-    full = Camera(camera["width"], camera["height"], *(_number(camera, k) for k in axes), distortion)
+    sides = {side: camera[side] for side in ("width", "height")}
+    full = Camera(**sides, **{axis: _number(camera, axis) for axis in axes}, distortion=distortion)
     return full, full.fx
 
 
@@ -145,11 +146,13 @@ def _calibration(content: dict) -> Calibration:
     if all(key in content for key in keys):
         raise InstrumentError(f"{keys[0]} and {keys[1]} say the same thing: give one of them")
     angles = _row(content.get("misalignment_deg", [0.0] * 3), "misalignment_deg")
-    calibration = Calibration(angles)
+    calibration = Calibration(misalignment_deg=angles)
     if keys[0] in content:
         calibration = Calibration.of(angles, _row(content[keys[0]], keys[0]))
     if keys[1] in content:
-        calibration = Calibration(angles, _matrix(content[keys[1]], keys[1]))
+        calibration = Calibration(
+            misalignment_deg=angles, covariance_arcsec2=_matrix(content[keys[1]], keys[1])
+        )
     about = content.get("calibrated")
     if about is None:
         return calibration

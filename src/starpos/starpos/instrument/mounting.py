@@ -8,7 +8,7 @@ import numpy as np
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Mounting:
     """How the parts are fixed to each other: A3 (camera C into inclinometer S) and base link into C, (3, 3) each.
 

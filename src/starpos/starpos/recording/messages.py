@@ -76,7 +76,9 @@ def camera_of(m) -> Camera:
     whole &= (region.width, region.height) in ((0, 0), (m.width, m.height))
     if len(d) not in (0, 5) or m.distortion_model not in ("plumb_bob", "") or not k[0] or not whole:
         raise InstrumentError("its camera_info is not of a calibrated plumb_bob camera with whole frames")
-    return Camera(m.width, m.height, *k[[0, 4, 2, 5]].tolist(), tuple(d.tolist()) or (0.0,) * 5)
+    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
+    distortion = tuple(d.tolist()) or (0.0,) * 5
+    return Camera(width=m.width, height=m.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion)
 
 
 def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
@@ -96,22 +98,38 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
             ErrorTerm(
                 t.name,
                 np.vstack([np.diag([t.east, t.north, np.radians(t.heading)]), np.zeros((3, 3))]),
-                ALWAYS if t.common else None,
+                shared=ALWAYS if t.common else None,
             )
             for t in m.budget
             if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
         )
-        place = ReportedPlace(utc, float(angles[0]), float(angles[1]), full_turn(heading), covariance, terms)
+        place = ReportedPlace(
+            utc_unix_s=utc,
+            latitude=float(angles[0]),
+            longitude=float(angles[1]),
+            heading=full_turn(heading),
+            covariance=covariance,
+            terms=terms,
+        )
     elif status is Status.OK:
         status = Status.BAD_INPUT
     looking = np.radians([m.right_ascension, m.declination, m.roll])
     if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
-        pointing = Attitude(*looking.tolist(), m.focal_px, m.residual, m.log_odds, bool(m.mirrored))
+        ra, dec, roll = looking.tolist()
+        pointing = Attitude(
+            ra=ra,
+            dec=dec,
+            roll=roll,
+            focal_px=m.focal_px,
+            residual_arcsec=m.residual,
+            log_odds=m.log_odds,
+            mirrored=bool(m.mirrored),
+        )
     return Shot(
-        "solution " + ("of unknown time" if at is None else utc_text(at)),
-        status,
-        m.status_text,
-        utc,
+        name="solution " + ("of unknown time" if at is None else utc_text(at)),
+        status=status,
+        message=m.status_text,
+        utc_unix_s=utc,
         place=place,
         pointing=pointing,
         size=next(iter(cameras)) if len(cameras) == 1 else None,

@@ -25,7 +25,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TOPICS = {"stars": STARS, "tilt": TILT, "solver/solution": SOLUTION, "camera/camera_info": CAMERA_INFO}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Recorded:
     """One instrument's part of a bag; cameras by (width, height) of their frames; solutions: as the solver made them."""
 
@@ -63,15 +63,15 @@ def read(path: Path, namespace: str | None, tilt_noise_rad: float, progress: Pro
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
         return Recorded(
-            path,
-            chosen,
-            reading.cameras,
-            reading.tilt_log(),
-            sum(c.msgcount for c in connections if c.msgtype == STARS),
-            tuple(reading.solutions),
-            reading.deflection,
-            truth_in(path) if path.is_dir() else None,
-            reading.remarks(path),
+            path=path,
+            namespace=chosen,
+            cameras=reading.cameras,
+            tilts=reading.tilt_log(),
+            star_count=sum(c.msgcount for c in connections if c.msgtype == STARS),
+            solutions=tuple(reading.solutions),
+            deflection=reading.deflection,
+            truth=truth_in(path) if path.is_dir() else None,
+            remarks=reading.remarks(path),
         )
 
 

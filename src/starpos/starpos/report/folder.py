@@ -27,7 +27,7 @@ class StarList:
     stars: Stars | FrameError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StarLists:
     """What is to be solved: `read` goes through the `count` exposures one at a time, as often as it is called.
 
@@ -63,7 +63,14 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
                 yield StarList(path.name, error)
 
     origin = f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}"
-    return StarLists(folder.name or str(folder), origin, len(frames), read, tilt, truth_in(folder))
+    return StarLists(
+        name=folder.name or str(folder),
+        origin=origin,
+        count=len(frames),
+        read=read,
+        tilt=tilt,
+        truth=truth_in(folder),
+    )
 
 
 def frames_in(folder: Path) -> list[Path]:

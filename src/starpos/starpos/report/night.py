@@ -17,7 +17,7 @@ NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ReportedPlace:
     """Astronomic latitude, longitude and heading (rad; NaN: no one heading), and what is wrong with them.
 
@@ -36,7 +36,15 @@ class ReportedPlace:
     @classmethod
     def of(cls, fix: Fix | Average) -> "ReportedPlace":
         poses = fix.poses if isinstance(fix, Average) else 1
-        return cls(fix.utc_unix_s, fix.latitude, fix.longitude, fix.heading, fix.covariance, fix.terms, poses)
+        return cls(
+            utc_unix_s=fix.utc_unix_s,
+            latitude=fix.latitude,
+            longitude=fix.longitude,
+            heading=fix.heading,
+            covariance=fix.covariance,
+            terms=fix.terms,
+            poses=poses,
+        )
 
     @property
     def own(self) -> np.ndarray:
@@ -52,7 +60,7 @@ class ReportedPlace:
         return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Shot:
     """One frame: how it ended, and as much of its answer as there is.
 
@@ -89,7 +97,7 @@ class Truth:
     headings: tuple[tuple[float, float], ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Night:
     """All frames of one place.
 

@@ -40,7 +40,9 @@ def _exposures(r: Recorded) -> StarLists:
 
     tilt = r.tilts.average if r.tilts else no_tilt
     origin = f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}"
-    return StarLists(r.name, origin, r.star_count, read_stars, tilt, r.truth)
+    return StarLists(
+        name=r.name, origin=origin, count=r.star_count, read=read_stars, tilt=tilt, truth=r.truth
+    )
 
 
 def _against_recorded(solved: Night, r: Recorded) -> tuple[str, ...]:
@@ -64,14 +66,14 @@ def _as_recorded(r: Recorded, shop: Workshop) -> Night:
         "with those of others"
     )
     return Night(
-        r.name,
-        f"as the solver recorded it in the bag {r.path.name}, namespace {r.namespace}",
-        r.solutions,
-        _bound(places) if places else None,
-        "" if places else why_none(r.solutions),
-        r.deflection or shop.vertical,
-        shop.atmosphere,
-        r.truth,
+        name=r.name,
+        origin=f"as the solver recorded it in the bag {r.path.name}, namespace {r.namespace}",
+        shots=r.solutions,
+        combined=_bound(places) if places else None,
+        why_not="" if places else why_none(r.solutions),
+        vertical=r.deflection or shop.vertical,
+        atmosphere=shop.atmosphere,
+        truth=r.truth,
         remarks=(*r.remarks, remark) if len(places) > 1 else r.remarks,
     )
 
@@ -84,15 +86,15 @@ def _bound(places: list[ReportedPlace]) -> ReportedPlace:
     still = np.ptp(away[:, 2]) < 10 * np.median([p.sigma[2] for p in places]) or len(places) == 1
     names = [t.name for t in places[0].terms]
     terms = [
-        ErrorTerm(t.name, np.sqrt(np.mean([p.terms[k].factor ** 2 for p in places], axis=0)), t.shared)
+        ErrorTerm(t.name, np.sqrt(np.mean([p.terms[k].factor ** 2 for p in places], axis=0)), shared=t.shared)
         for k, t in enumerate(places[0].terms)
         if all([u.name for u in p.terms] == names for p in places)
     ]
     return ReportedPlace(
-        float(np.mean([p.utc_unix_s for p in places])),
-        float(mean[0]),
-        float(turn(mean[1])),
-        full_turn(mean[2]) if still else float("nan"),
-        np.mean([p.covariance for p in places], axis=0),
-        tuple(terms),
+        utc_unix_s=float(np.mean([p.utc_unix_s for p in places])),
+        latitude=float(mean[0]),
+        longitude=float(turn(mean[1])),
+        heading=full_turn(mean[2]) if still else float("nan"),
+        covariance=np.mean([p.covariance for p in places], axis=0),
+        terms=tuple(terms),
     )

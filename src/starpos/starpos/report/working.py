@@ -28,7 +28,7 @@ from starpos.utc import utc_text
 STILL_SIGMA = 8.0  # readings further than this from their mean say that the camera was moved
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Workshop:
     """What solving needs besides the exposures; instrument_for: of a frame's stars, raises InstrumentError."""
 
@@ -63,14 +63,14 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
             "holds as ut1: upgrade astropy-iers-data"
         )
     night = Night(
-        exposures.name,
-        exposures.origin,
-        shots,
-        combined,
-        why_not,
-        shop.vertical,
-        shop.atmosphere,
-        exposures.truth,
+        name=exposures.name,
+        origin=exposures.origin,
+        shots=shots,
+        combined=combined,
+        why_not=why_not,
+        vertical=shop.vertical,
+        atmosphere=shop.atmosphere,
+        truth=exposures.truth,
         remarks=tuple(remarks),
     )
     return replace(night, steady=_steady(night, instrument)) if combined else night
@@ -120,7 +120,9 @@ def _turned(exposures: StarLists, shop: Workshop) -> Iterator:
 
 
 def _unreadable(exposure: StarList) -> Solution:
-    return Solution(Status.BAD_INPUT, str(exposure.stars), exposure.name, None, 0)
+    return Solution(
+        Status.BAD_INPUT, str(exposure.stars), source=exposure.name, utc_unix_s=None, stars_detected=0
+    )
 
 
 def _shot(exposure: StarList, s: Solution) -> Shot:
@@ -140,10 +142,10 @@ def _shot(exposure: StarList, s: Solution) -> Shot:
     elif s.attitude:
         seen["residual_arcsec"] = s.attitude.residual_arcsec
     return Shot(
-        exposure.name,
-        s.status,
-        s.message,
-        float("nan") if s.utc_unix_s is None else s.utc_unix_s,
+        name=exposure.name,
+        status=s.status,
+        message=s.message,
+        utc_unix_s=float("nan") if s.utc_unix_s is None else s.utc_unix_s,
         pointing=s.attitude,
         size=(stars.width, stars.height) if isinstance(stars, Stars) else None,
         stars_detected=s.stars_detected,

@@ -25,7 +25,7 @@ POINTS = (5, 60)  # fewest and most of a field of random points
 Answer = Callable[[Stars], np.ndarray | None]  # where the frame's centre looks, ICRS (3,)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Conditions:
     """What a camera sees of the stars brighter than limit_mag.
 
@@ -49,7 +49,7 @@ class Conditions:
 
 def ideal(camera: Camera, limit_mag: float = 9.0, **more) -> Conditions:
     """The paper's: every star is seen with its catalogue brightness, however close to the next."""
-    return Conditions(camera, limit_mag, scatter_mag=0.0, missing=0.0, blend_px=0.0, **more)
+    return Conditions(camera=camera, limit_mag=limit_mag, scatter_mag=0.0, missing=0.0, blend_px=0.0, **more)
 
 
 def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:
@@ -95,13 +95,14 @@ class Field:
         flux = 10 ** (-0.4 * (self.mag - 15))
         flags = np.zeros(n, np.uint8)
         return Stars(
-            *self.xy.T,
-            flux,
-            np.full(n, 100.0),
-            covariance,
-            flags,
-            camera.width,
-            camera.height,
+            x=self.xy[:, 0],
+            y=self.xy[:, 1],
+            flux=flux,
+            snr=np.full(n, 100.0),
+            covariance=covariance,
+            flags=flags,
+            width=camera.width,
+            height=camera.height,
             source=self.name,
         )
 

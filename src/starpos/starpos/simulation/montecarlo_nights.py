@@ -44,7 +44,7 @@ def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
     return InclinometerErrors(noise, noise / 8, noise, noise, SCA100T.scale)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NightWorld:
     """What is so, and what the instrument is told of it.
 
@@ -61,7 +61,7 @@ class NightWorld:
     air: Atmosphere
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NightOutcome:
     """One night: east, north (m) and heading (rad) off, by gravity and on the ground, with what was claimed of them."""
 
@@ -120,14 +120,16 @@ def draw(
     azimuth = rng.uniform(0, 360)
     truth = Calibration().turned_to(_mounted(rng, camera_to_enu(azimuth, altitude, roll)[2]))
     told = Instrument(camera.fx, inclinometer=errors, clock_stddev_s=clock_stddev_s)
-    air = rng.choice([Atmosphere(88000.0, 12.0, 0.3), Atmosphere.measured(None, None)])
+    air = rng.choice(
+        [Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3), Atmosphere.measured(None, None)]
+    )
     scene = Scene(
-        camera,
-        replace(told, calibration=truth),
-        Site(0.0, 0.0),
-        azimuth,
-        altitude,
-        roll,
+        camera=camera,
+        instrument=replace(told, calibration=truth),
+        site=Site(0.0, 0.0),
+        azimuth_deg=azimuth,
+        altitude_deg=altitude,
+        roll_deg=roll,
         tilt_errors=TiltErrors(
             errors.noise_rad,
             tuple(rng.normal(0, np.radians(0.1), 2)),
@@ -136,13 +138,13 @@ def draw(
         ),
     )
     world = NightWorld(
-        scene,
-        Site(0.0, 0.0),
-        _with_errors(catalogue, year, rng),
-        float(rng.normal(0, clock_stddev_s)),
-        rng.normal(0, errors.temperature_rad_per_c, 2),
-        told,
-        air,
+        scene=scene,
+        site=Site(0.0, 0.0),
+        sky=_with_errors(catalogue, year, rng),
+        clock_s=float(rng.normal(0, clock_stddev_s)),
+        per_c=rng.normal(0, errors.temperature_rad_per_c, 2),
+        told=told,
+        air=air,
     )
     return at_place(world, rng, begin), begin
 
@@ -280,21 +282,28 @@ def _outcome(kind: str, answer, site: Site, heading: float, rng: np.random.Gener
     try:
         a: Average = answer()
     except StarposError as e:
-        nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
-        return NightOutcome(kind, *nothing, *nothing, str(e))
+        nothing, unknown = np.full(3, np.nan), np.full((3, 3), np.nan)
+        return NightOutcome(
+            kind=kind,
+            off=nothing,
+            covariance=unknown,
+            off_ground=nothing,
+            covariance_ground=unknown,
+            trouble=str(e),
+        )
     unknown = Deflection()
     xi, eta = rng.normal(0, unknown.stddev_arcsec, 2)
     phi, lam = np.radians([site.latitude_deg, site.longitude_deg])
     true = geodetic(phi, lam, heading, np.zeros((3, 3)), Deflection(xi, eta, 0.0))
     said = geodetic(a.latitude, a.longitude, a.heading, a.covariance, unknown)
     return NightOutcome(
-        kind,
-        _apart(a.latitude - phi, a.longitude - lam, a.heading - heading, phi),
-        a.covariance,
-        _apart(
+        kind=kind,
+        off=_apart(a.latitude - phi, a.longitude - lam, a.heading - heading, phi),
+        covariance=a.covariance,
+        off_ground=_apart(
             said.latitude - true.latitude, said.longitude - true.longitude, said.heading - true.heading, phi
         ),
-        said.covariance,
+        covariance_ground=said.covariance,
     )
 
 

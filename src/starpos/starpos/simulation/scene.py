@@ -25,7 +25,7 @@ STRIP_PX = 1 << 20
 CENTROID_FLOOR_PX, DETECTED_SNR = 0.02, 6.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Optics:
     """What reaches the pixels: the paper's telescope and camera by default."""
 
@@ -54,7 +54,7 @@ class TiltErrors:
     quantum: float = np.radians(0.0035 / 8)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scene:
     """An instrument standing at a site and looking somewhere."""
 
@@ -136,7 +136,14 @@ def render(
         np.clip(part, 0, optics.full_well_dn, out=part)
         pixels[begin : begin + STRIP_PX] = part
     pixels = pixels.reshape(camera.height, camera.width)
-    return Frame(pixels, "", start_unix_s + exposure_s / 2, exposure_s, source, camera.fx)
+    return Frame(
+        pixels,
+        pattern="",
+        mid_unix_s=start_unix_s + exposure_s / 2,
+        exposure_s=exposure_s,
+        source=source,
+        focal_px=camera.fx,
+    )
 
 
 def _star_light(camera: Camera, optics: Optics, stars: Exposed) -> tuple[np.ndarray, np.ndarray]:
@@ -183,11 +190,14 @@ def scene_of(
     tilt_zero_deg: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
     """The paper's instrument at a place, with what is usually varied as plain numbers."""
+    azimuth_deg, altitude_deg, roll_deg = pointing_deg
     return Scene(
-        Camera.from_focal(*size, focal_px),
-        Instrument(focal_px, calibration=Calibration(misalignment_deg)),
-        Site(latitude_deg, longitude_deg, atmosphere),
-        *pointing_deg,
+        camera=Camera.from_focal(*size, focal_px),
+        instrument=Instrument(focal_px, calibration=Calibration(misalignment_deg=misalignment_deg)),
+        site=Site(latitude_deg, longitude_deg, atmosphere),
+        azimuth_deg=azimuth_deg,
+        altitude_deg=altitude_deg,
+        roll_deg=roll_deg,
         tilt_errors=TiltErrors(
             np.radians(tilt_noise_deg),
             tuple(np.radians(tilt_zero_deg)),
@@ -209,15 +219,16 @@ def detected(
     seen = (snr > DETECTED_SNR) & (xy >= 0).all(1) & (xy <= [camera.width - 1, camera.height - 1]).all(1)
     order = np.flatnonzero(seen)[np.argsort(-stars.electrons[seen], kind="stable")]
     return Stars(
-        *xy[order].T,
-        stars.electrons[order],
-        snr[order],
-        np.eye(2) * (sigma[order] ** 2)[:, None, None],
-        np.zeros(len(order), np.uint8),
-        camera.width,
-        camera.height,
-        mid_unix_s,
-        exposure_s,
-        source,
-        camera.fx,
+        x=xy[order, 0],
+        y=xy[order, 1],
+        flux=stars.electrons[order],
+        snr=snr[order],
+        covariance=np.eye(2) * (sigma[order] ** 2)[:, None, None],
+        flags=np.zeros(len(order), np.uint8),
+        width=camera.width,
+        height=camera.height,
+        mid_unix_s=mid_unix_s,
+        exposure_s=exposure_s,
+        source=source,
+        focal_px=camera.fx,
     )

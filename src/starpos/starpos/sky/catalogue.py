@@ -29,7 +29,7 @@ SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = (
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Catalogue:
     """Stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
 
@@ -122,17 +122,17 @@ def pack(tyc, hip, vmag, ra_deg, dec_deg, pm_ra, pm_dec, sigma_mas, sigma_pm, ep
         return np.clip(np.round(values), limits.min, limits.max).astype(dtype)[order]
 
     return Catalogue(
-        ra_mas[order],
-        dec_mas[order],
-        column(pm_ra, np.int16),
-        column(pm_dec, np.int16),
-        column(np.asarray(vmag) * 100, np.int16),
-        column(_code(sigma_mas, SMALLEST_MAS), np.uint8),
-        column(_code(sigma_pm, SMALLEST_MAS_YEAR), np.uint8),
-        column(np.asarray(epoch) - EPOCH_ZERO, np.uint8),
-        np.asarray(tyc, np.int16)[order],
-        np.asarray(hip, np.int32)[order],
-        np.searchsorted(zone[order], np.arange(ZONES + 1)),
+        ra_mas=ra_mas[order],
+        dec_mas=dec_mas[order],
+        pm_ra=column(pm_ra, np.int16),
+        pm_dec=column(pm_dec, np.int16),
+        vmag_centi=column(np.asarray(vmag) * 100, np.int16),
+        sigma_code=column(_code(sigma_mas, SMALLEST_MAS), np.uint8),
+        pm_sigma_code=column(_code(sigma_pm, SMALLEST_MAS_YEAR), np.uint8),
+        epoch_code=column(np.asarray(epoch) - EPOCH_ZERO, np.uint8),
+        tyc=np.asarray(tyc, np.int16)[order],
+        hip=np.asarray(hip, np.int32)[order],
+        zone_start=np.searchsorted(zone[order], np.arange(ZONES + 1)),
     )
 
 
@@ -194,17 +194,17 @@ def read(path) -> Catalogue:
             hip[np.cumsum(_join(f["hip_step"], np.uint16), dtype=np.int64)] = _join(f["hip"], np.int32)
             tyc1 = np.cumsum(_join(f["tyc1"], np.int16), dtype=np.int16)
             return Catalogue(
-                np.cumsum(_join(f["ra_step"], np.uint32), dtype=np.uint32),
-                _join(f["dec_within"], np.uint32).astype(np.int32) + (zone - 90) * 3_600_000,
-                _join(f["pm_ra"], np.int16),
-                _join(f["pm_dec"], np.int16),
-                _join(f["vmag_centi"], np.int16),
-                f["sigma_code"],
-                f["pm_sigma_code"],
-                f["epoch_code"],
-                np.stack([tyc1, _join(f["tyc2"], np.int16), f["tyc3"].astype(np.int16)], -1),
-                hip,
-                zone_start,
+                ra_mas=np.cumsum(_join(f["ra_step"], np.uint32), dtype=np.uint32),
+                dec_mas=_join(f["dec_within"], np.uint32).astype(np.int32) + (zone - 90) * 3_600_000,
+                pm_ra=_join(f["pm_ra"], np.int16),
+                pm_dec=_join(f["pm_dec"], np.int16),
+                vmag_centi=_join(f["vmag_centi"], np.int16),
+                sigma_code=f["sigma_code"],
+                pm_sigma_code=f["pm_sigma_code"],
+                epoch_code=f["epoch_code"],
+                tyc=np.stack([tyc1, _join(f["tyc2"], np.int16), f["tyc3"].astype(np.int16)], -1),
+                hip=hip,
+                zone_start=zone_start,
             )
     except FileNotFoundError:
         raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None

@@ -32,7 +32,7 @@ def fixes(field, rng, headings, tilt=12.6, calibration=0.0, slip=None):
         xy, places = here.places(STATE, rng)
         made.append(here.solve(
             xy + rng.normal(0, 0.05, xy.shape), places, STATE,
-            tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, UTC), mounting=here.mounting(calibration),
+            tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, utc_unix_s=UTC), mounting=here.mounting(calibration),
         ))  # fmt: skip
     return made
 
@@ -200,7 +200,7 @@ def dense(made):
 def wandering(f, rad_per_s=3e-7):
     """A fix whose zero wanders, after an hour since its calibration."""
     (tilt,) = (t for t in f.terms if t.name == "calibration")
-    walk = ErrorTerm("tilt drift", tilt.factor / 5e-5 * rad_per_s, ALWAYS, variance=3600.0, walk_s=1.0)
+    walk = ErrorTerm("tilt drift", tilt.factor / 5e-5 * rad_per_s, shared=ALWAYS, variance=3600.0, walk_s=1.0)
     return replace(f, terms=tuple(walk if t.name == walk.name else t for t in f.terms))
 
 

@@ -177,7 +177,7 @@ def clean(camera, frames, stars, rng):
 
 
 def test_refraction_is_undone_where_the_level_is_known(rng):
-    true, air = random_camera(11, rng), Atmosphere(88000.0, 12.0, 0.3)
+    true, air = random_camera(11, rng), Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
     seen = bent(clean(true, 8, 60, rng), air)
     fit = fit_camera(seen, ideal(11), air)
     assert np.abs(fit.values - values(true))[:2].max() < 0.02
@@ -204,7 +204,7 @@ def test_air_that_is_stronger_than_said_is_in_the_sigma(rng):
 
 
 def test_without_levels_refraction_is_in_the_sigma(rng):
-    true, air = random_camera(11, rng), Atmosphere(88000.0, 12.0, 0.3)
+    true, air = random_camera(11, rng), Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
     seen = [replace(s, level=None) for s in bent(clean(true, 8, 60, rng), air)]
     fit = fit_camera(seen, ideal(11), air)
     assert (np.abs(fit.values - values(true)) < 3 * fit.sigma)[:2].all()
@@ -214,7 +214,7 @@ def test_without_levels_refraction_is_in_the_sigma(rng):
 
 
 def test_unbent_is_the_inverse_of_what_the_fit_does(rng):
-    air = Atmosphere(88000.0, 12.0, 0.3)
+    air = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
     (s,) = bent(clean(ideal(11), 1, 20, rng), air)
     back = unbent(ideal(11).directions(*s.xy.T), s.level, air)
     np.testing.assert_allclose(back, s.directions @ s.attitude.T, atol=2e-4)  # the attitude is 20 arcsec off
@@ -278,5 +278,11 @@ def test_another_camera_to_begin_with_gives_the_same(rng):
     true = random_camera(25, rng)
     frames = sightings(true, 10, 80, rng)
     a = fit_camera(frames, ideal(25), VACUUM)
-    b = fit_camera(frames, Camera(1000, 700, 2700.0, 2710.0, 505.0, 345.0, (0.01, 0, 0, 0, 0)), VACUUM)
+    b = fit_camera(
+        frames,
+        Camera(
+            width=1000, height=700, fx=2700.0, fy=2710.0, cx=505.0, cy=345.0, distortion=(0.01, 0, 0, 0, 0)
+        ),
+        VACUUM,
+    )
     assert (np.abs(a.values - b.values) < 0.2 * a.sigma).all()

@@ -150,14 +150,14 @@ def test_without_a_fix_there_is_no_calibration(catalogue, rng):
     solver = shot.solver(catalogue)
     with pytest.raises(FixError, match="there is no frame"):
         calibrate_at(solver, [], shot.tilt, shot.scene.site)
-    shot.frames = [no_stars(1000, 700, START, 0.5)]
+    shot.frames = [no_stars(1000, 700, mid_unix_s=START, exposure_s=0.5)]
     with pytest.raises(FixError, match=r"no frame has a fix to calibrate from: .*0 stars detected"):
         calibrate_at(solver, shot.frames, lambda *_: next(iter(shot.tilts.values())), shot.scene.site)
 
 
 def test_frames_without_a_fix_are_left_out(catalogue, rng):
     shot = shots(catalogue, rng, [0.0] * 3)
-    empty = no_stars(1000, 700, START + 7, 0.5)
+    empty = no_stars(1000, 700, mid_unix_s=START + 7, exposure_s=0.5)
     shot.tilts[START + 7] = shot.tilts[shot.frames[0].mid_unix_s]
     shot.frames.insert(1, empty)
     found = found_at(shot, catalogue)
@@ -285,7 +285,9 @@ def test_a_stale_calibration_is_refused_in_words(catalogue, rng):
 
 def test_an_old_calibration_does_not_stop_a_new_one(catalogue, rng):
     shot = shots(catalogue, rng)
-    stale = replace(Calibration(TRUE_A3_DEG), utc_unix_s=START - 900 * DAY_S, valid_days=10.0)
+    stale = replace(
+        Calibration(misalignment_deg=TRUE_A3_DEG), utc_unix_s=START - 900 * DAY_S, valid_days=10.0
+    )
     solver = shot.solver(catalogue)
     solver = replace(solver, instrument=replace(solver.instrument, calibration=stale))
     found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site)

@@ -26,14 +26,14 @@ def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(
     frames, tilts = [], {}
     for n, azimuth in enumerate(headings):
         scene = wide_scene(pointing_deg=(azimuth, 78.0 + lean * np.cos(np.radians(azimuth)), 15.0))
-        instrument = replace(scene.instrument, calibration=Calibration(misalignment))
+        instrument = replace(scene.instrument, calibration=Calibration(misalignment_deg=misalignment))
         scene = replace(scene, instrument=instrument)
         begin = START + 60.0 * n
         stars, tilt = stars_of(scene, catalogue, rng, begin), tilt_of(scene, rng, begin)
         frames.append(stars)
         zero = np.radians(zero_deg)
         tilts[stars.mid_unix_s] = Tilt(
-            tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, stars.mid_unix_s
+            tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, utc_unix_s=stars.mid_unix_s
         )
     solver = Solver(Instrument(FOCAL_PX), catalogue, scene.site.atmosphere)
     return turn(solver, frames, lambda mid, _: tilts[mid]), scene
@@ -43,7 +43,10 @@ def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
     """The same of an instrument that is turned about one axis, which leans; A3's turn given to turn_stddev_deg."""
     toward = rng.uniform(0, 2 * np.pi)
     flat = np.sin(np.radians(lean_deg)) * np.array([np.cos(toward), np.sin(toward)])
-    axis, misalignment = np.array([*flat, np.cos(np.radians(lean_deg))]), Calibration((1.5, -2.0, 130.0))
+    axis, misalignment = (
+        np.array([*flat, np.cos(np.radians(lean_deg))]),
+        Calibration(misalignment_deg=(1.5, -2.0, 130.0)),
+    )
     frames, tilts, begin = [], {}, START
     for heading in np.repeat(headings, 3):
         attitude = rotation.from_vector(-axis * np.radians(heading)) @ camera_to_enu(20.0, 78.0, 15.0)
@@ -112,7 +115,9 @@ def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
     s = answer.solutions[-1].tilt  # what the inclinometer says, its zero off, and what is so
     read = a2_matrix(s.theta_x, s.theta_y)[2]
     true = a2_matrix(*(np.array([s.theta_x, s.theta_y]) - np.radians(zero)))[2]
-    truth = replace(scene.instrument, calibration=Calibration(misalignment)).mounting.a3.T @ true
+    truth = (
+        replace(scene.instrument, calibration=Calibration(misalignment_deg=misalignment)).mounting.a3.T @ true
+    )
     found = answer.instrument.mounting.a3.T @ read
     off_arcsec = np.degrees(np.arccos(np.clip(truth @ found, -1, 1))) * 3600
     assert off_arcsec < 4 * 12.6  # one reading's noise is in both
@@ -137,8 +142,8 @@ def test_a_small_turn_tells_little_and_says_so(catalogue, rng):
 
 def test_frames_without_stars_stay_without_a_fix(catalogue):
     solver = Solver(Instrument(FOCAL_PX), catalogue)
-    empty = no_stars(1000, 700, START, 0.5)
-    answer = turn(solver, [empty, empty], lambda *_: Tilt(0.0, 0.0, np.eye(2) * 1e-10, START))
+    empty = no_stars(1000, 700, mid_unix_s=START, exposure_s=0.5)
+    answer = turn(solver, [empty, empty], lambda *_: Tilt(0.0, 0.0, np.eye(2) * 1e-10, utc_unix_s=START))
     assert [s.status for s in answer.solutions] == [Status.TOO_FEW_STARS] * 2
     assert answer.instrument.calibration.misalignment_deg == (0.0, 0.0, 0.0)
 

@@ -30,7 +30,7 @@ def skies(tmp_path_factory, catalogue):
     rng = np.random.default_rng(26)
     true = random_camera(25, rng)
     lists, levels = night(true, 4, catalogue, rng, FIELDS[25][2], altitude=(43, 47), roll=(-5, 5))
-    a3 = Calibration((-45.0, 0.0, 0.0)).a3
+    a3 = Calibration(misalignment_deg=(-45.0, 0.0, 0.0)).a3
     folder = tmp_path_factory.mktemp("skies")
     tilts = ["utc_unix_s,theta_x_deg,theta_y_deg"]
     for k, (stars, level) in enumerate(zip(lists, levels, strict=True)):

@@ -19,7 +19,7 @@ def errors(size, frames, electrons, seed, pattern="", gains=None, **shape):
     for _ in range(frames):
         stars = grid(size, 30, electrons, rng)
         pixels = noisy(field(size, stars, gains=gains and gains(len(stars), rng), **shape), rng)
-        found = detect(Frame(pixels, pattern)).stars
+        found = detect(Frame(pixels, pattern=pattern)).stars
         index = match(found, stars)
         missed += np.count_nonzero(index < 0)
         invented += len(found) - len(set(index[index >= 0]))
@@ -244,7 +244,16 @@ def test_chi_square_tells_the_star_that_is_not_like_the_others():
 def test_time_size_and_source_reach_the_stars_brightest_first():
     rng = np.random.default_rng(13)
     stars = grid((200, 300), 50, lambda n: np.geomspace(2000, 50000, n), rng)
-    found = detect(Frame(noisy(field((200, 300), stars), rng), "", 1.75e9, 0.5, "night 1", 1000.0)).stars
+    found = detect(
+        Frame(
+            noisy(field((200, 300), stars), rng),
+            pattern="",
+            mid_unix_s=1.75e9,
+            exposure_s=0.5,
+            source="night 1",
+            focal_px=1000.0,
+        )
+    ).stars
     assert (found.width, found.height, found.mid_unix_s, found.exposure_s) == (300, 200, 1.75e9, 0.5)
     assert (found.source, found.focal_px) == ("night 1", 1000.0)
     assert np.all(np.diff(found.flux) <= 0)

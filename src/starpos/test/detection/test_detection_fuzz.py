@@ -83,7 +83,7 @@ def is_answered(pixels, rng):
     try:
         if pixels.dtype not in (np.uint8, np.uint16) and rng.random() < 0.8:
             pixels = to_unsigned(pixels, "fuzz")
-        detection = detect(Frame(pixels, pattern))
+        detection = detect(Frame(pixels, pattern=pattern))
     except FrameError:
         return None
     found = detection.stars

@@ -58,7 +58,7 @@ def test_hot_pixels_of_an_interpolated_frame_are_no_stars(rng):
 def test_a_sky_cut_off_at_black_hides_no_star_and_makes_none(rng):
     stars, pixels = mosaic(rng, electrons=6000.0, black=-3.0)
     assert np.median(pixels) == 0
-    found = detect(Frame(pixels, "rggb")).stars
+    found = detect(Frame(pixels, pattern="rggb")).stars
     index = match(found, stars)
     assert np.mean(index >= 0) > 0.97
     brightest = set(range(int(0.9 * len(stars))))

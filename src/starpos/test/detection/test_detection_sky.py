@@ -151,7 +151,7 @@ def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, pattern, rng):
     second[:, 2] = 20000 * ratio
     both = np.concatenate([stars, second])
     gains, mean = (coloured(len(both), rng), np.array([[0.65, 1], [1, 0.65]])) if pattern else (None, None)
-    found = detect(Frame(noisy(field(SIZE, both, gains=gains), rng), pattern)).stars
+    found = detect(Frame(noisy(field(SIZE, both, gains=gains), rng), pattern=pattern)).stars
     assert len(found) == len(both)
     for some in (first, second):
         error, pull = errors(found, some)

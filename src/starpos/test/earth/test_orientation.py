@@ -57,9 +57,20 @@ def observed(direction, state, site):
 def test_erfa_atco13():
     """t_atco13 of ERFA's test suite (t_erfa_c.c): catalogue to observed place, 81 deg from the zenith."""
     utc = (2456384.5 - 2440587.5 + 0.969254051) * 86400
-    state = earth_state(utc, EarthOrientation(0.1550675, 0.0, 2.47230737e-7, 1.82640464e-6, 0.0))
+    state = earth_state(
+        utc,
+        EarthOrientation(
+            ut1_minus_utc_s=0.1550675,
+            ut1_sigma_s=0.0,
+            pole_x=2.47230737e-7,
+            pole_y=1.82640464e-6,
+            pole_sigma=0.0,
+        ),
+    )
     site = Site(
-        np.degrees(-1.2345856), np.degrees(-0.527800806), Atmosphere(73100.0, 12.8, 0.59, wavelength_um=0.55)
+        np.degrees(-1.2345856),
+        np.degrees(-0.527800806),
+        Atmosphere(pressure_pa=73100.0, temperature_c=12.8, humidity=0.59, wavelength_um=0.55),
     )
     azimuth, zenith = observed(space_moved((2.71, 0.174, 1e-5, 5e-6, 0.1, 55.0), state), state, site)
     # neglected: the site's 2738 m, 7e-10 rad of diurnal aberration; TT for TDB
@@ -71,7 +82,13 @@ def sofa_star():
     """The fictitious star of the SOFA Astrometry Tools cookbook (section 6), its Earth orientation and UTC."""
     ra, dec = np.radians(15 * (14 + 34 / 60 + 16.81183 / 3600)), -np.radians(12 + 31 / 60 + 10.3965 / 3600)
     star = ra, dec, np.arctan2(-0.35445 * ARCSEC, np.cos(dec)), 0.59535 * ARCSEC, 0.16499, 0.0
-    orientation = EarthOrientation(0.1550675, 0.0, 50.995e-3 * ARCSEC, 376.723e-3 * ARCSEC, 0.0)
+    orientation = EarthOrientation(
+        ut1_minus_utc_s=0.1550675,
+        ut1_sigma_s=0.0,
+        pole_x=50.995e-3 * ARCSEC,
+        pole_y=376.723e-3 * ARCSEC,
+        pole_sigma=0.0,
+    )
     return star, earth_state(unix_of(2013, 4, 2, 23, 15, 43) + 0.55, orientation)
 
 
@@ -88,7 +105,11 @@ def test_sofa_cookbook_observed():
     """Observed 14 34 16.9649106 -12 34 44.643094, turned by hand into azimuth and zenith distance."""
     star, state = sofa_star()
     longitude, latitude = -(5 + 41 / 60 + 54.2 / 3600), -(15 + 57 / 60 + 42.8 / 3600)
-    site = Site(latitude, longitude, Atmosphere(95200.0, 18.5, 0.83, wavelength_um=0.55))
+    site = Site(
+        latitude,
+        longitude,
+        Atmosphere(pressure_pa=95200.0, temperature_c=18.5, humidity=0.83, wavelength_um=0.55),
+    )
     azimuth, zenith = observed(space_moved(star, state), state, site)
     ra = np.radians(15 * (14 + 34 / 60 + 16.9649106 / 3600))
     dec = -np.radians(12 + 34 / 60 + 44.643094 / 3600)
@@ -123,7 +144,7 @@ def test_astropy_altaz(rng):
     from astropy.time import Time
     from astropy.utils import iers
 
-    air = Atmosphere(88000.0, 12.0, 0.3)
+    air = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
     worst = 0.0
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
         for _ in range(12):

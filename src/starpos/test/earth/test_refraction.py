@@ -22,14 +22,14 @@ def lifted_arcsec(refraction, degrees):
 
 def test_constants_are_those_of_erfas_test_suite():
     """t_refco of ERFA's test suite: 800 hPa, 10 deg C, humidity 0.9, 0.4 um."""
-    r = Atmosphere(80000.0, 10.0, 0.9, wavelength_um=0.4).refraction()
+    r = Atmosphere(pressure_pa=80000.0, temperature_c=10.0, humidity=0.9, wavelength_um=0.4).refraction()
     assert r.a == pytest.approx(0.2264949956241415009e-3, abs=1e-15)
     assert r.b == pytest.approx(-0.2598658261729343970e-6, abs=1e-18)
 
 
 def test_bend_is_erfas():
     """eraAtioq on a context with no diurnal aberration: the same bending but for its cos(d) = 1 - d^2 / 2."""
-    air = Atmosphere(101325.0, 15.0, 0.5)
+    air = Atmosphere(pressure_pa=101325.0, temperature_c=15.0, humidity=0.5)
     a = erfa.apio(0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0, *erfa.refco(1013.25, 15.0, 0.5, 0.55))
     z = np.array([0.1, 10, 45, 70, 80, 86])
     zob = erfa.atioq(np.zeros(6), np.pi / 2 - np.radians(z), a)[1]
@@ -40,7 +40,7 @@ def test_bend_is_erfas():
 
 def test_standard_refraction():
     """Explanatory Supplement: 58.3 arcsec times tan z at 1010 hPa, 10 deg C and 45 deg, about 10 arcmin at 85 deg."""
-    r = Atmosphere(101000.0, 10.0, 0.0).refraction()
+    r = Atmosphere(pressure_pa=101000.0, temperature_c=10.0, humidity=0.0).refraction()
     assert lifted_arcsec(r, 45) == pytest.approx(58.2, abs=0.4)
     assert lifted_arcsec(r, 80) == pytest.approx(316, abs=4)
 
@@ -88,9 +88,13 @@ def test_sigma_follows_what_was_measured():
         (70_000, -5),
         (101_300, 30),
     ):  # the air at 3000 m, and of a hot day by the sea
-        true = Atmosphere(pressure, temperature).refraction().a
+        true = Atmosphere(pressure_pa=pressure, temperature_c=temperature).refraction().a
         assert abs(guessed.refraction().a / true - 1) < 3 * guessed.relative_sigma
-    numerical = Atmosphere(100_200.0, 0.0).refraction().a / Atmosphere(100_000.0, 0.0).refraction().a - 1
+    numerical = (
+        Atmosphere(pressure_pa=100_200.0, temperature_c=0.0).refraction().a
+        / Atmosphere(pressure_pa=100_000.0, temperature_c=0.0).refraction().a
+        - 1
+    )
     assert numerical == pytest.approx(200 / 1e5, rel=0.01)
 
 

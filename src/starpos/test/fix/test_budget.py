@@ -22,7 +22,13 @@ def fixed(field, rng, errors=EXACT, turn_sigma=None, **mounting):
     """A fix of a field whose camera is the inclinometer's frame."""
     xy, places = field.places(STATE, rng)
     about = NONE if turn_sigma is None else np.diag([0.0, 0.0, turn_sigma**2])
-    told = Mounting(field.a3, field.mounting().link_to_camera, about, errors, **mounting)
+    told = Mounting(
+        a3=field.a3,
+        link_to_camera=field.mounting().link_to_camera,
+        calibration_covariance=about,
+        inclinometer=errors,
+        **mounting,
+    )
     tilt = replace(field.tilt(), temperature_c=mounting.get("warm", 20.0))
     return field.solve(xy, places, STATE, mounting=told, tilt=tilt)
 
@@ -101,7 +107,9 @@ def test_what_rounding_leaves_in_a_mean(noise, rng):
     read = np.round((true[:, None] + own) / quantum) * quantum
     rounding = np.std(read.mean(1) - true - own.mean(1))
     stated = InclinometerErrors(noise_rad=max(noise, 1e-9) * quantum, quantum_rad=quantum)
-    claimed = stated.undithered_rad(Tilt(0.1, 0.1, np.eye(2) * (noise * quantum) ** 2 / n, UTC, n))
+    claimed = stated.undithered_rad(
+        Tilt(0.1, 0.1, np.eye(2) * (noise * quantum) ** 2 / n, utc_unix_s=UTC, samples=n)
+    )
     # a reading's rounding is noise too, of a share sqrt(1 / 12 n) of a step, which the scatter of the readings tells
     floor = quantum / np.sqrt(12 * n)
     assert rounding < 1.1 * np.hypot(claimed, floor)
@@ -113,9 +121,12 @@ def test_rounding_errs_by_the_same_as_long_as_it_stands_on_a_step():
     errors = InclinometerErrors(quantum_rad=1e-5)
 
     def at(x, y):
-        return errors.steps(Tilt(x, y, np.eye(2) * 1e-12, UTC))
+        return errors.steps(Tilt(x, y, np.eye(2) * 1e-12, utc_unix_s=UTC))
 
     assert at(1.04e-5, -2.0e-5) == at(0.96e-5, -2.4e-5)
     assert at(1.04e-5, 0) != at(1.6e-5, 0)
-    assert replace(errors, quantum_rad=0.0).steps(Tilt(0.1, 0.1, np.eye(2), UTC)) == ()
-    assert replace(errors, quantum_rad=0.0).undithered_rad(Tilt(0.1, 0.1, np.eye(2) * 1e-12, UTC)) == 0
+    assert replace(errors, quantum_rad=0.0).steps(Tilt(0.1, 0.1, np.eye(2), utc_unix_s=UTC)) == ()
+    assert (
+        replace(errors, quantum_rad=0.0).undithered_rad(Tilt(0.1, 0.1, np.eye(2) * 1e-12, utc_unix_s=UTC))
+        == 0
+    )

@@ -73,7 +73,12 @@ def test_the_attitude_is_that_of_the_link(rng):
     np.testing.assert_allclose(plain.link_to_enu[:, 2], field.attitude[:, 2], atol=1e-10)
     np.testing.assert_allclose(plain.link_to_enu[:, 0], -field.attitude[:, 1], atol=1e-10)
     link = rotation.from_vector(rng.normal(size=3))
-    turned = field.solve(xy, places, STATE, mounting=Mounting(field.a3, link, np.zeros((3, 3))))
+    turned = field.solve(
+        xy,
+        places,
+        STATE,
+        mounting=Mounting(a3=field.a3, link_to_camera=link, calibration_covariance=np.zeros((3, 3))),
+    )
     np.testing.assert_allclose(turned.link_to_enu, field.attitude @ link, atol=1e-10)
     forward = turned.link_to_enu[:, 0]
     assert turn(turned.heading - np.arctan2(forward[0], forward[1])) == pytest.approx(0, abs=1e-12)
@@ -98,7 +103,15 @@ def test_a_focal_length_a_percent_off_is_found(rng):
 
 
 def test_distortion_is_taken_off(rng):
-    camera = Camera(1392, 1040, 5200.0, 5200.0, 700.0, 520.0, (-0.15, 0.1, 1e-3, -1e-3, 0.0))
+    camera = Camera(
+        width=1392,
+        height=1040,
+        fx=5200.0,
+        fy=5200.0,
+        cx=700.0,
+        cy=520.0,
+        distortion=(-0.15, 0.1, 1e-3, -1e-3, 0.0),
+    )
     field = random_field(rng, camera=camera)
     xy, places = field.places(STATE, rng)
     assert np.all(np.abs(error_arcsec(field.solve(xy, places, STATE), field)) < 1e-5)
@@ -182,8 +195,13 @@ def drawn(
     """A fix whose every error is drawn from the sigma it was told: px, arcsec, arcsec, arcsec, s, s, s, fraction."""
     state = replace(STATE, orientation=replace(STATE.orientation, ut1_sigma_s=ut1, pole_sigma=0.0))
     true = replace(field, utc=field.utc + rng.normal(0, clock) + rng.normal(0, stamp) + rng.normal(0, ut1))
-    air = Atmosphere(field.air.pressure_pa, field.air.temperature_c, 0.3, temperature_stddev_c=0.0,
-                     pressure_stddev_pa=refraction * field.air.pressure_pa)  # fmt: skip
+    air = Atmosphere(
+        pressure_pa=field.air.pressure_pa,
+        temperature_c=field.air.temperature_c,
+        humidity=0.3,
+        temperature_stddev_c=0.0,
+        pressure_stddev_pa=refraction * field.air.pressure_pa,
+    )
     true_air = replace(air, pressure_pa=air.pressure_pa * (1 + rng.normal(0, refraction)))
     # the true mount is the told one and a little more about the inclinometer's axes
     slip = rotation.from_vector(rng.normal(0, calibration * ARCSEC, 3))
@@ -197,7 +215,7 @@ def drawn(
         state,
         covariance_px2=np.eye(2)[None].repeat(len(xy), 0) * max(centroid, 1e-4) ** 2,
         place_sigma=np.full(len(xy), place * ARCSEC),
-        tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, field.utc),
+        tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, utc_unix_s=field.utc),
         mounting=field.mounting(calibration),
         atmosphere=air,
         clock_stddev_s=clock,
@@ -279,5 +297,15 @@ def test_the_budget_says_which_errors_are_common(rng):
     common = {t.name: t.common for t in field.solve(xy, places, STATE).terms}
     new = {"centroids", "tilt", "tilt quantisation"}
     assert {name for name, is_common in common.items() if not is_common} == new
-    assert set(common) - new == {"catalogue", "calibration", "tilt drift", "tilt temperature", "tilt scale", "refraction",
-                                 "clock", "time stamp", "ut1", "pole"}  # fmt: skip
+    assert set(common) - new == {
+        "catalogue",
+        "calibration",
+        "tilt drift",
+        "tilt temperature",
+        "tilt scale",
+        "refraction",
+        "clock",
+        "time stamp",
+        "ut1",
+        "pole",
+    }

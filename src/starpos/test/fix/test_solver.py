@@ -153,7 +153,10 @@ def test_a_stamp_that_is_too_early_puts_the_place_too_far_east(catalogue, rng):
 
 
 def test_pixels_that_are_not_square_and_a_lens_that_distorts(catalogue, rng):
-    camera = Camera(*SIZE, FOCAL_PX, FOCAL_PX * 1.03, 510.0, 330.0, (-0.3, 0.2, 1e-3, -1e-3, 0.0))
+    camera = Camera(
+        width=SIZE[0], height=SIZE[1], fx=FOCAL_PX, fy=FOCAL_PX * 1.03, cx=510.0, cy=330.0,
+        distortion=(-0.3, 0.2, 1e-3, -1e-3, 0.0),
+    )  # fmt: skip
     scene = wide_scene(tilt_noise_deg=0.0)
     scene = replace(scene, camera=camera, instrument=replace(scene.instrument, camera=camera))
     s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
@@ -219,7 +222,7 @@ def test_too_few_stars(night):
     for n in range(4):
         assert "at least 4" in refused(solver.solve(stars.take(slice(0, n)), tilt), Status.TOO_FEW_STARS)
         assert solver.identify(stars.take(slice(0, n))).status is Status.TOO_FEW_STARS
-    burnt = no_stars(*SIZE, START, EXPOSURE)
+    burnt = no_stars(*SIZE, mid_unix_s=START, exposure_s=EXPOSURE)
     assert "0 stars detected" in refused(solver.solve(burnt, tilt), Status.TOO_FEW_STARS)
     saturated = replace(stars.take(slice(0, 3)), flags=np.full(3, SATURATED))
     assert "3 saturated" in refused(solver.solve(saturated, tilt), Status.TOO_FEW_STARS)
@@ -254,7 +257,7 @@ def test_no_tilt(night):
     assert "no tilt reading" in refused(solver.solve(stars, nan.average), Status.NO_TILT)
 
     def broken(mid, exposure):
-        return Tilt(np.nan, 0.0, np.eye(2), mid)
+        return Tilt(np.nan, 0.0, np.eye(2), utc_unix_s=mid)
 
     assert "not a finite number" in refused(solver.solve(stars, broken), Status.NO_TILT)
 
@@ -263,7 +266,7 @@ def test_tilt_out_of_range(night):
     _, stars, _, solver = night
 
     def leaning(mid, exposure):
-        return Tilt(0.6, 0.0, np.eye(2), mid)
+        return Tilt(0.6, 0.0, np.eye(2), utc_unix_s=mid)
 
     assert "30 deg" in refused(solver.solve(stars, leaning), Status.TILT_OUT_OF_RANGE)
 
@@ -334,15 +337,15 @@ def test_a_frame_of_another_size_than_the_intrinsics(night, catalogue):
     _, stars, tilt, _ = night
     camera = Camera.from_focal(640, 480, FOCAL_PX)
     assert "640 x 480" in refused(
-        Solver(Instrument(FOCAL_PX, camera), catalogue).solve(stars, tilt), Status.BAD_INPUT
+        Solver(Instrument(FOCAL_PX, camera=camera), catalogue).solve(stars, tilt), Status.BAD_INPUT
     )
 
 
 def test_a_distortion_that_cannot_be_inverted(night, catalogue):
     _, stars, tilt, _ = night
-    camera = Camera(*SIZE, FOCAL_PX, FOCAL_PX, 499.5, 349.5, (-90.0, 0.0, 0.0, 0.0, 0.0))
+    camera = replace(Camera.from_focal(*SIZE, FOCAL_PX), distortion=(-90.0, 0.0, 0.0, 0.0, 0.0))
     assert "distortion" in refused(
-        Solver(Instrument(FOCAL_PX, camera), catalogue).solve(stars, tilt), Status.BAD_INPUT
+        Solver(Instrument(FOCAL_PX, camera=camera), catalogue).solve(stars, tilt), Status.BAD_INPUT
     )
 
 
@@ -378,9 +381,10 @@ def test_no_content_of_a_frame_raises(night, rng):
             for n in (1, 4, 5, 12, 300):
                 xy = make(n)
                 hostile = Stars(
-                    xy[:, 0], xy[:, 1], -np.sort(rng.exponential(1, n)), rng.normal(size=n),
-                    np.eye(2)[None].repeat(n, 0) * rng.choice(sigmas) ** 2, rng.integers(0, 16, n),
-                    *SIZE, START, EXPOSURE,
+                    x=xy[:, 0], y=xy[:, 1], flux=-np.sort(rng.exponential(1, n)), snr=rng.normal(size=n),
+                    covariance=np.eye(2)[None].repeat(n, 0) * rng.choice(sigmas) ** 2,
+                    flags=rng.integers(0, 16, n),
+                    width=SIZE[0], height=SIZE[1], mid_unix_s=START, exposure_s=EXPOSURE,
                 )  # fmt: skip
                 assert not solver.solve(hostile, tilt).ok
                 assert not solver.identify(hostile).ok
@@ -421,7 +425,7 @@ def test_a_star_outside_its_frame_costs_nothing_but_itself(catalogue, rng):
     scene = wide_scene()
     stars = stars_of(scene, catalogue, rng)
     camera = replace(Camera.from_focal(*SIZE, FOCAL_PX), distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
-    solver = replace(solver_of(scene, catalogue), instrument=Instrument(FOCAL_PX, camera))
+    solver = replace(solver_of(scene, catalogue), instrument=Instrument(FOCAL_PX, camera=camera))
     inside = solver.identify(stars)
     strange = with_false_stars(stars, np.array([[60000.0, 40000.0], [-900.0, 20.0]]))
     answer = solver.identify(strange)
@@ -436,13 +440,17 @@ def test_pixels_that_are_not_square(catalogue, rng):
     """The corners of a frame whose focal lengths differ hold stars too."""
     scene = wide_scene()
     stars = stars_of(scene, catalogue, rng)
-    half = Stars(
-        stars.x, (stars.y + 0.5) * 0.5 - 0.5, stars.flux, stars.snr, stars.covariance, stars.flags,
-        SIZE[0], SIZE[1] // 2, stars.mid_unix_s, stars.exposure_s,
-    )  # fmt: skip
+    half = replace(stars, y=(stars.y + 0.5) * 0.5 - 0.5, height=SIZE[1] // 2)
     square = solver_of(scene, catalogue).identify(stars)
-    camera = Camera(SIZE[0], SIZE[1] // 2, FOCAL_PX, FOCAL_PX / 2, (SIZE[0] - 1) / 2, (SIZE[1] / 2 - 1) / 2)
-    solver = replace(solver_of(scene, catalogue), instrument=Instrument(FOCAL_PX, camera))
+    camera = Camera(
+        width=SIZE[0],
+        height=SIZE[1] // 2,
+        fx=FOCAL_PX,
+        fy=FOCAL_PX / 2,
+        cx=(SIZE[0] - 1) / 2,
+        cy=(SIZE[1] / 2 - 1) / 2,
+    )
+    solver = replace(solver_of(scene, catalogue), instrument=Instrument(FOCAL_PX, camera=camera))
     answer = solver.identify(half)
     assert answer.ok
     assert len(answer.names) > 0.97 * len(square.names)

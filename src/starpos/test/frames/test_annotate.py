@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The picture for people: things where they belong, whatever the frame."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +20,16 @@ def stars_at(places, size=SIZE, flags=0) -> Stars:
     n = len(x)
     covariance = np.tile(np.eye(2) * 1e-3, (n, 1, 1))
     return Stars(
-        x, y, np.linspace(9e4, 1e4, n), np.full(n, 50.0), covariance, np.full(n, flags), *size, 1.8e9, 0.5
+        x=x,
+        y=y,
+        flux=np.linspace(9e4, 1e4, n),
+        snr=np.full(n, 50.0),
+        covariance=covariance,
+        flags=np.full(n, flags),
+        width=size[0],
+        height=size[1],
+        mid_unix_s=1.8e9,
+        exposure_s=0.5,
     )
 
 
@@ -34,7 +45,7 @@ def frame_of(places, size=SIZE, kind="mono16", sigma=1.5) -> Frame:
         pixels = light.clip(0, 255).astype(np.uint8)
     if kind == "bgr8":
         pixels = np.dstack([pixels] * 3)
-    return Frame(pixels, kind[6:10] if kind.startswith("bayer") else "")
+    return Frame(pixels, pattern=kind[6:10] if kind.startswith("bayer") else "")
 
 
 def sky(picture, frame) -> np.ndarray:
@@ -94,7 +105,7 @@ def test_a_strong_gradient_leaves_its_stars_to_be_seen():
 def test_a_mosaic_leaves_no_chequers(pattern, size):
     pixels = np.zeros((size[1], size[0]), np.uint16)
     pixels[::2, ::2], pixels[::2, 1::2], pixels[1::2, ::2], pixels[1::2, 1::2] = 900, 2000, 2100, 600
-    frame = Frame(pixels, pattern)
+    frame = Frame(pixels, pattern=pattern)
     assert np.ptp(sky(annotate(frame, no_stars(*size)), frame)) == 0
 
 
@@ -102,7 +113,7 @@ def test_each_kind_has_its_colour_in_picture_and_caption():
     places = [(100, 100), (300, 100), (500, 100)]
     stars = stars_at(places)
     flags = np.array([0, 0, SATURATED])
-    stars = Stars(stars.x, stars.y, stars.flux, stars.snr, stars.covariance, flags, *SIZE, 1.8e9)
+    stars = replace(stars, flags=flags)
     frame = frame_of(places)
     picture = annotate(frame, stars, Identified([1], ["HIP 1"], [7.0]))
     for (x, y), colour in zip(places, (DETECTED, IDENTIFIED, FLAGGED), strict=True):
@@ -172,8 +183,8 @@ def test_the_caption_tells_time_counts_and_remarks_and_wraps(monkeypatch):
     frame = frame_of([])
     remark = "none of the sky fits its 27 stars: check the focal length, clouds and exposure " * 2
     one, many = (
-        annotate(frame, no_stars(*SIZE, 1.8e9)),
-        annotate(frame, no_stars(*SIZE, 1.8e9), remarks=[remark]),
+        annotate(frame, no_stars(*SIZE, mid_unix_s=1.8e9)),
+        annotate(frame, no_stars(*SIZE, mid_unix_s=1.8e9), remarks=[remark]),
     )
     words = [text for text, *_ in texts]
     assert " ".join(words[:9]) == "2027-01-15 08:00:00.000 UTC 0 stars 0 identified 0 flagged"
@@ -188,7 +199,7 @@ def test_the_caption_tells_time_counts_and_remarks_and_wraps(monkeypatch):
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 @pytest.mark.parametrize("value", [0, 255])
 def test_frames_that_are_no_frames_make_pictures_too(size, pattern, kind, value):
-    frame = Frame(np.full(size[::-1], value, kind), pattern)
+    frame = Frame(np.full(size[::-1], value, kind), pattern=pattern)
     picture = annotate(frame, stars_at([(0, 0)], size), Identified([0], ["HIP 1"], [3.0]), ["no solver"])
     assert picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[1] <= 1600
 

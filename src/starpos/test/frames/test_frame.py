@@ -8,7 +8,7 @@ from starpos.frames.frame import Frame
 
 def test_depths_and_colours_a_camera_gives_are_accepted():
     assert Frame(np.zeros((2, 3), np.uint8)).width == 3
-    assert Frame(np.zeros((2, 3), np.uint16), "grbg").height == 2
+    assert Frame(np.zeros((2, 3), np.uint16), pattern="grbg").height == 2
     assert Frame(np.zeros((2, 3, 3), np.uint8), mid_unix_s=1.7e9, exposure_s=0.5).width == 3
 
 

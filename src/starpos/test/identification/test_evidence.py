@@ -217,7 +217,7 @@ def test_more_evidence_than_the_prior_leaves_room_for_is_not_claimed(rng):
 def test_four_stars_are_mostly_enough_and_with_a_false_one_often(catalogue):
     """Fields of the paper's camera with four stars, one in a thousand: 0.3 mag of scatter, a star in 20 missing."""
     camera = Camera.from_focal(5616, 3744, 93750.0)
-    conditions = Conditions(camera)
+    conditions = Conditions(camera=camera)
     sky = sky_for(catalogue, camera)
     for false, fewest in ((0, 6), (1, 5)):
         right = 0

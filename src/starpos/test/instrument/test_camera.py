@@ -8,17 +8,18 @@ from starpos.instrument.camera import Camera
 
 SIZE = (5616, 3744)
 STRONG = (-0.28, 0.11, 1.2e-3, -8e-4, -0.02)  # of a wide lens
-WIDE = Camera(1392, 1040, 1300.0, 1305.0, 700.3, 515.8, STRONG)
+WIDE = Camera(width=1392, height=1040, fx=1300.0, fy=1305.0, cx=700.3, cy=515.8, distortion=STRONG)
 PAPER = Camera.from_focal(*SIZE, 93750.0)
+BENT = Camera(
+    width=SIZE[0], height=SIZE[1], fx=93750.0, fy=93800.0, cx=2800, cy=1870, distortion=(0.3, 5.0, 1e-3, 2e-3, 0)
+)  # fmt: skip
 
 
 def pixels(camera, rng, n=500):
     return rng.uniform(0, camera.width - 1, n), rng.uniform(0, camera.height - 1, n)
 
 
-@pytest.mark.parametrize(
-    "camera", [WIDE, PAPER, Camera(*SIZE, 93750.0, 93800.0, 2800, 1870, (0.3, 5.0, 1e-3, 2e-3, 0))]
-)
+@pytest.mark.parametrize("camera", [WIDE, PAPER, BENT])
 def test_projection_is_opencvs(camera, rng):
     """cv2.projectPoints has the same pinhole, the same plumb_bob and the same pixel (0, 0)."""
     v = camera.directions(*pixels(camera, rng))
@@ -66,7 +67,9 @@ def test_no_stars_are_no_error():
 
 
 def test_a_distortion_that_folds_the_frame_is_refused():
-    folded = Camera(1000, 1000, 500.0, 500.0, 499.5, 499.5, (-0.6, 0.0, 0.0, 0.0, 0.0))
+    folded = Camera(
+        width=1000, height=1000, fx=500.0, fy=500.0, cx=499.5, cy=499.5, distortion=(-0.6, 0.0, 0.0, 0.0, 0.0)
+    )
     with pytest.raises(InstrumentError, match="cannot be inverted"):
         folded.directions([0.0, 500.0], [0.0, 500.0])
 

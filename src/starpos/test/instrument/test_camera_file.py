@@ -12,7 +12,15 @@ from starpos.errors import InstrumentError
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 
-CAMERA = Camera(640, 480, 7800.5, 7801.25, 320.1, 239.7, (0.1, -0.2, 1e-4, -2e-4, 0.05))
+CAMERA = Camera(
+    width=640,
+    height=480,
+    fx=7800.5,
+    fy=7801.25,
+    cx=320.1,
+    cy=239.7,
+    distortion=(0.1, -0.2, 1e-4, -2e-4, 0.05),
+)
 # as camera_calibration's `commit` writes it
 WRITTEN_BY_ROS = """\
 image_width: 640
@@ -119,7 +127,7 @@ def test_what_is_no_calibration_at_all(tmp_path, content):
 
 def test_a_reader_never_sees_half_a_file(tmp_path):
     path = tmp_path / "camera.yaml"
-    other = Camera(1234, 567, 1e3, 1e3, 1.0, 2.0)
+    other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=1.0, cy=2.0)
     camera_file.write(path, CAMERA, "camera")
 
     def write():

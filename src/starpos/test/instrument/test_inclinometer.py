@@ -163,7 +163,7 @@ def test_an_instrument_that_moves_during_the_exposure():
 def test_out_of_range_is_a_kind_of_its_own():
     with pytest.raises(TiltRangeError, match=r"beyond \+-30 deg"):
         log([31.0] * 11).average(1000.5, 1.0)
-    assert Tilt(30 * DEG, -30 * DEG, NO_ERROR, 0.0).theta_x == 30 * DEG
+    assert Tilt(30 * DEG, -30 * DEG, NO_ERROR, utc_unix_s=0.0).theta_x == 30 * DEG
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_out_of_range_is_a_kind_of_its_own():
 )  # fmt: skip
 def test_a_tilt_that_is_no_tilt(values):
     with pytest.raises(TiltError):
-        Tilt(*values)
+        Tilt(*values[:3], utc_unix_s=values[3])
 
 
 def test_csv(tmp_path):

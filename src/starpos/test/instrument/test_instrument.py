@@ -17,11 +17,13 @@ from starpos.units import ARCSEC
 
 def test_misalignment_is_r3_r2_r1():
     """DESIGN section 3: A3 = R3(rz) R2(ry) R1(rx), active, C into S."""
-    np.testing.assert_allclose(Calibration((90, 0, 0)).a3 @ [0, 1, 0], [0, 0, 1], atol=1e-15)
-    np.testing.assert_allclose(Calibration((0, 90, 0)).a3 @ [0, 0, 1], [1, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(Calibration((0, 0, 90)).a3 @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(Calibration(misalignment_deg=(90, 0, 0)).a3 @ [0, 1, 0], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(Calibration(misalignment_deg=(0, 90, 0)).a3 @ [0, 0, 1], [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(Calibration(misalignment_deg=(0, 0, 90)).a3 @ [1, 0, 0], [0, 1, 0], atol=1e-15)
     # R1 acts first: y -> z -> (R2) x -> (R3) y
-    np.testing.assert_allclose(Calibration((90, 90, 90)).a3 @ [0, 1, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        Calibration(misalignment_deg=(90, 90, 90)).a3 @ [0, 1, 0], [0, 1, 0], atol=1e-15
+    )
 
 
 def test_the_link_looks_along_the_top_of_the_frame():
@@ -32,10 +34,10 @@ def test_the_link_looks_along_the_top_of_the_frame():
 
 
 def test_intrinsics_of_another_frame_size():
-    camera = Camera(1392, 1040, 5200.5, 5201.5, 700.25, 520.0)
-    assert Instrument(5200.5, camera).camera_for(1392, 1040) is camera
+    camera = Camera(width=1392, height=1040, fx=5200.5, fy=5201.5, cx=700.25, cy=520.0)
+    assert Instrument(5200.5, camera=camera).camera_for(1392, 1040) is camera
     with pytest.raises(InstrumentError, match="1392 x 1040"):
-        Instrument(5200.5, camera).camera_for(1392, 1041)
+        Instrument(5200.5, camera=camera).camera_for(1392, 1041)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +46,7 @@ def test_intrinsics_of_another_frame_size():
 def test_the_covariance_of_the_angles_is_that_of_turned_a3s(angles, rng):
     """Against A3s turned at random about S's axes."""
     root = rng.normal(size=(3, 3)) * [[30.0], [50.0], [400.0]]
-    c = Calibration(angles, tuple(map(tuple, (root @ root.T).tolist())))
+    c = Calibration(misalignment_deg=angles, covariance_arcsec2=tuple(map(tuple, (root @ root.T).tolist())))
     turned = rng.normal(size=(4000, 3)) @ root.T * ARCSEC
     found = np.array([c.turned_to(rotation.from_vector(w) @ c.a3).misalignment_deg for w in turned])
     off = (found - angles + 180) % 360 - 180

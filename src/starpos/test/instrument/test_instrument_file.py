@@ -48,7 +48,15 @@ def test_the_shortest_file(reads):
 
 def test_every_key(reads):
     i = reads(FULL)
-    assert i.camera == Camera(1392, 1040, 5200.5, 5201.5, 700.25, 520.0, (-0.1, 0.01, 1e-3, -2e-3, 0.0))
+    assert i.camera == Camera(
+        width=1392,
+        height=1040,
+        fx=5200.5,
+        fy=5201.5,
+        cx=700.25,
+        cy=520.0,
+        distortion=(-0.1, 0.01, 1e-3, -2e-3, 0.0),
+    )
     assert i.focal_px == 5200.5
     assert i.calibration.misalignment_deg == (0.1, -0.2, 30.0)
     assert i.inclinometer.noise_rad == pytest.approx(np.radians(0.002))
@@ -60,7 +68,15 @@ def test_every_key(reads):
 
 
 def test_the_camera_of_a_calibration_file_beside_it_or_elsewhere(reads, tmp_path):
-    camera = Camera(1392, 1040, 5200.5, 5201.5, 700.25, 520.0, (-0.1, 0.01, 1e-3, -2e-3, 0.0))
+    camera = Camera(
+        width=1392,
+        height=1040,
+        fx=5200.5,
+        fy=5201.5,
+        cx=700.25,
+        cy=520.0,
+        distortion=(-0.1, 0.01, 1e-3, -2e-3, 0.0),
+    )
     camera_file.write(tmp_path / "optics" / "camera.yaml", camera, "camera")
     for name in ("optics/camera.yaml", tmp_path / "optics" / "camera.yaml"):
         i = reads(f"starpos_instrument: 1\ncamera: {{calibration: {name}}}\n")
@@ -78,15 +94,30 @@ REFUSED = {
     "unknown key": (SIMPLE + "misaligment_deg: [0, 0, 0]\n", "unknown key 'misaligment_deg'"),
     "unknown camera key": (SIMPLE.replace("}", ", distorsion: [0, 0, 0, 0, 0]}"), "distorsion"),
     "two cameras": (FULL.replace("width", "focal_mm: 600, pixel_um: 6.4, width"), "unknown key 'width'"),
-    "no calibration": ("starpos_instrument: 1\ncamera: {calibration: none.yaml}\n", "none.yaml: not a readable calib"),
-    "a calibration of nothing": ("starpos_instrument: 1\ncamera: {calibration: }\n", "calibration is missing: give"),
-    "a calibration and more": ("starpos_instrument: 1\ncamera: {calibration: a, width: 5}\n", "unknown key 'width'"),
-    "itself for a calibration": ("starpos_instrument: 1\ncamera: {calibration: instrument.yaml}\n", "image_width"),
+    "no calibration": (
+        "starpos_instrument: 1\ncamera: {calibration: none.yaml}\n",
+        "none.yaml: not a readable calib",
+    ),
+    "a calibration of nothing": (
+        "starpos_instrument: 1\ncamera: {calibration: }\n",
+        "calibration is missing: give",
+    ),
+    "a calibration and more": (
+        "starpos_instrument: 1\ncamera: {calibration: a, width: 5}\n",
+        "unknown key 'width'",
+    ),
+    "itself for a calibration": (
+        "starpos_instrument: 1\ncamera: {calibration: instrument.yaml}\n",
+        "image_width",
+    ),
     "nan": (SIMPLE + "misalignment_deg: [.nan, 0, 0]\n", "finite"),
     "infinite size": (FULL.replace("1392", ".inf"), "width"),
     "fraction of a pixel": (FULL.replace("1392", "1392.5"), "width"),
     "infinite noise": (SIMPLE + "tilt_noise_deg: .inf\n", "tilt_noise_deg is inf: give a finite number"),
-    "a negative clock": (SIMPLE + "clock_stddev_s: -1\n", "clock_stddev_s of the instrument is -1: it must be 0 or more"),
+    "a negative clock": (
+        SIMPLE + "clock_stddev_s: -1\n",
+        "clock_stddev_s of the instrument is -1: it must be 0 or more",
+    ),
     "two angles": (SIMPLE + "misalignment_deg: [0, 0]\n", "three numbers"),
     "text for angles": (SIMPLE + "misalignment_deg: '123'\n", "list of numbers"),
     "one angle": (SIMPLE + "misalignment_deg: 5\n", "list of numbers"),
@@ -100,19 +131,39 @@ REFUSED = {
     "a number beyond floats": (SIMPLE.replace("600", "0x" + "f" * 5000), "focal_mm is a number beyond"),
     "no noise at all": (SIMPLE + "tilt_noise_deg: 0\n", "tilt_noise_deg) is 0 deg: must be positive"),
     "a list for the noise": (SIMPLE + "tilt_noise_deg: [1]\n", "tilt_noise_deg is [1]: give a number"),
-    "one error": (SIMPLE + "calibration_stddev_arcsec: 5\n", "calibration_stddev_arcsec is 5: give a list of numbers"),
-    "an error that is a word": (SIMPLE + "calibration_stddev_arcsec: [1, x, 1]\n", "calibration_stddev_arcsec is 'x'"),
+    "one error": (
+        SIMPLE + "calibration_stddev_arcsec: 5\n",
+        "calibration_stddev_arcsec is 5: give a list of numbers",
+    ),
+    "an error that is a word": (
+        SIMPLE + "calibration_stddev_arcsec: [1, x, 1]\n",
+        "calibration_stddev_arcsec is 'x'",
+    ),
     "a matrix of nothing": (SIMPLE + "link_to_camera:\n", "link_to_camera is missing"),
     "no distortion": (FULL.replace("[-0.1, 0.01, 1e-3, -2e-3, 0]", "none"), "distortion is 'none'"),
-    "a tag that lies": (SIMPLE + "clock_stddev_s: !!timestamp abc\n", "not a readable instrument file (it is no YAML)"),
+    "a tag that lies": (
+        SIMPLE + "clock_stddev_s: !!timestamp abc\n",
+        "not a readable instrument file (it is no YAML)",
+    ),
     "users of a machine": ("root:x:0:0:root:/root:/bin/bash\nbin:x:1:1\n", "first key"),
     "an equals sign": ("a: [=]\n", "not a readable instrument file (it is no YAML, line 1)"),
     "a value that starts with an equals sign": ("root: =\n", "instrument file"),
-    "laughs": ("a: &a [x, x]\n" + "".join(f"{b}: &{b} [{', '.join(f'*{a}' for _ in range(9))}]\n"
-               for a, b in pairwise("abcdefghijkl")) + "starpos_instrument: 1\ncamera: *l\n", "unknown key"),
-    "a camera of laughs": ("starpos_instrument: 1\ncamera:\n" + "".join(
-        ["  - &a [x, x]\n"] + [f"  - &{b} [{', '.join(f'*{a}' for _ in range(9))}]\n"
-                               for a, b in pairwise("abcdefghijkl")]), "camera is [["),
+    "laughs": (
+        "a: &a [x, x]\n"
+        + "".join(
+            f"{b}: &{b} [{', '.join(f'*{a}' for _ in range(9))}]\n" for a, b in pairwise("abcdefghijkl")
+        )
+        + "starpos_instrument: 1\ncamera: *l\n",
+        "unknown key",
+    ),
+    "a camera of laughs": (
+        "starpos_instrument: 1\ncamera:\n"
+        + "".join(
+            ["  - &a [x, x]\n"]
+            + [f"  - &{b} [{', '.join(f'*{a}' for _ in range(9))}]\n" for a, b in pairwise("abcdefghijkl")]
+        ),
+        "camera is [[",
+    ),
     "broken yaml": ("starpos_instrument: 1\ncamera: {focal_mm: [\n", "not a readable"),
     "an empty file of tags": ("!!binary 5\n", "instrument file"),
     "tabs": ("starpos_instrument: 1\n\tcamera: 1\n", "not a readable"),
@@ -122,7 +173,10 @@ REFUSED = {
     "deep": ("starpos_instrument: 1\ncamera: " + "[" * 5000, "not a readable"),
     "five terms": (FULL.replace(", 0]}", "]}"), "plumb_bob"),
     "a date that is none": (SIMPLE + "clock_stddev_s: 2026-99-99\n", "not a readable"),
-    "python object": (SIMPLE + "tilt_noise_deg: !!python/object/apply:os.system ['touch EXECUTED']\n", "not a readable"),
+    "python object": (
+        SIMPLE + "tilt_noise_deg: !!python/object/apply:os.system ['touch EXECUTED']\n",
+        "not a readable",
+    ),
     "python tuple": (SIMPLE + "misalignment_deg: !!python/tuple [0, 0, 0]\n", "not a readable"),
     "a covariance that leans": (COVARIANCE % "[[1, 2, 0], [0, 1, 0], [0, 0, 1]]", "symmetric"),
     "a negative variance": (COVARIANCE % "[[1, 0, 0], [0, -1, 0], [0, 0, 1]]", "negative"),
@@ -131,12 +185,20 @@ REFUSED = {
     "a covariance in a row": (COVARIANCE % "[1, 2, 3]", "give a list of numbers"),
     "a covariance in words": (COVARIANCE % "[[a, 0, 0], [0, 1, 0], [0, 0, 1]]", "is 'a': give a number"),
     "a covariance of nothing": (COVARIANCE % "", "calibration_covariance_arcsec2 is missing"),
-    "a covariance beyond sense": (COVARIANCE % "[[1e300, 0, 0], [0, 1e300, 0], [0, 0, 1]]", "beyond any turn"),
-    "one beyond floats": (COVARIANCE % "[[1e308, 1e308, 0], [1e308, 1e308, 0], [0, 0, 1]]", "beyond any turn"),
+    "a covariance beyond sense": (
+        COVARIANCE % "[[1e300, 0, 0], [0, 1e300, 0], [0, 0, 1]]",
+        "beyond any turn",
+    ),
+    "one beyond floats": (
+        COVARIANCE % "[[1e308, 1e308, 0], [1e308, 1e308, 0], [0, 0, 1]]",
+        "beyond any turn",
+    ),
     "an infinite covariance": (COVARIANCE % "[[1e400, 0, 0], [0, 1, 0], [0, 0, 1]]", "finite"),
     "an error beyond floats": (SIMPLE + "calibration_stddev_arcsec: [1e200, 1, 1]\n", "at most"),
-    "both": (COVARIANCE % "[[1, 0, 0], [0, 1, 0], [0, 0, 1]]" + "calibration_stddev_arcsec: [1, 1, 1]\n",
-             "give one of them"),
+    "both": (
+        COVARIANCE % "[[1, 0, 0], [0, 1, 0], [0, 0, 1]]" + "calibration_stddev_arcsec: [1, 1, 1]\n",
+        "give one of them",
+    ),
     "calibrated at a number": (SIMPLE + "calibrated: 5\n", "calibrated is 5: give {utc"),
     "calibrated at no time": (SIMPLE + "calibrated: {frames: 3}\n", "calibrated: 'None' is no time"),
     "a time that is none": (SIMPLE + "calibrated: {utc: tonight}\n", "calibrated: 'tonight' is no time"),
@@ -156,13 +218,19 @@ REFUSED = {
     "one tilt": (DATED % "tilt_deg: 5", "tilt_deg is 5: give a list"),
     "a tilt beyond range": (DATED % "tilt_deg: [80, 80]", "beyond 30 deg"),
     "as hot as a star": (DATED % "temperature_c: 6000", "temperature_c of the calibration is 6000"),
-    "a drift back": (SIMPLE + "tilt_drift_arcsec_per_sqrt_hour: -1\n", "tilt_drift_arcsec_per_sqrt_hour is -1: give"),
-    "a step of more than a turn": (SIMPLE + "tilt_quantum_deg: 1e300\n", "tilt_quantum_deg is 1e+300: give a finite"),
+    "a drift back": (
+        SIMPLE + "tilt_drift_arcsec_per_sqrt_hour: -1\n",
+        "tilt_drift_arcsec_per_sqrt_hour is -1: give",
+    ),
+    "a step of more than a turn": (
+        SIMPLE + "tilt_quantum_deg: 1e300\n",
+        "tilt_quantum_deg is 1e+300: give a finite",
+    ),
     "a scale of two": (SIMPLE + "tilt_scale: 2\n", "tilt_scale is 2: give a finite number from 0 to 1"),
     "a temperature's words": (SIMPLE + "tilt_temperature_arcsec_per_c: warm\n", "is 'warm': give a number"),
     "many turns": (SIMPLE + "misalignment_deg: [1e300, 0, 0]\n", "beyond 360 deg"),
     "a link beyond floats": (SIMPLE + "link_to_camera: [[1e300, 0, 0], [0, 1, 0], [0, 0, 1]]\n", "rotation"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", REFUSED)
@@ -187,28 +255,53 @@ def random_instrument(rng, full: bool) -> Instrument:
     """Any instrument, with its intrinsics or a focal length alone; its time to the millisecond, as files have it."""
     root = rng.normal(size=(3, 3)) * 10 ** rng.uniform(-3, 4)
     calibration = Calibration(
-        tuple(rng.uniform(-180, 180, 3).tolist()), tuple(map(tuple, (root @ root.T).tolist())),
-        round(float(rng.uniform(0, 2e9)), 3), float(rng.choice([np.nan, rng.uniform(-40, 60)])),
-        tuple(rng.uniform(-30, 30, 2).tolist()), int(rng.integers(0, 1000)),
-        float(rng.choice([np.inf, rng.uniform(0.1, 1e4)])),
-    )  # fmt: skip
+        misalignment_deg=tuple(rng.uniform(-180, 180, 3).tolist()),
+        covariance_arcsec2=tuple(map(tuple, (root @ root.T).tolist())),
+        utc_unix_s=round(float(rng.uniform(0, 2e9)), 3),
+        temperature_c=float(rng.choice([np.nan, rng.uniform(-40, 60)])),
+        tilt_deg=tuple(rng.uniform(-30, 30, 2).tolist()),
+        frames=int(rng.integers(0, 1000)),
+        valid_days=float(rng.choice([np.inf, rng.uniform(0.1, 1e4)])),
+    )
     focal = float(rng.uniform(1e3, 1e5))
     camera = Camera(
-        int(rng.integers(100, 9000)), int(rng.integers(100, 9000)), focal, focal * 1.001,
-        *rng.uniform(50, 4000, 2).tolist(), tuple(rng.normal(0, 0.1, 5).tolist()),
-    )  # fmt: skip
+        width=int(rng.integers(100, 9000)),
+        height=int(rng.integers(100, 9000)),
+        fx=focal,
+        fy=focal * 1.001,
+        cx=rng.uniform(50, 4000),
+        cy=rng.uniform(50, 4000),
+        distortion=tuple(rng.normal(0, 0.1, 5).tolist()),
+    )
     errors = InclinometerErrors(*(10 ** rng.uniform(-8, -3, 5)).tolist())
     link = tuple(map(tuple, from_vector(rng.normal(size=3)).tolist()))
     clock = float(10 ** rng.uniform(-6, 1))
-    return Instrument(focal, camera if full else None, calibration, link, errors, clock)
+    return Instrument(
+        focal,
+        camera=camera if full else None,
+        calibration=calibration,
+        link_to_camera=link,
+        inclinometer=errors,
+        clock_stddev_s=clock,
+    )
 
 
 def numbers(i: Instrument) -> np.ndarray:
     c = i.calibration
-    return np.array([
-        i.focal_px, *c.misalignment_deg, *np.ravel(c.covariance_arcsec2), c.temperature_c, *c.tilt_deg, c.frames,
-        c.valid_days, *np.ravel(i.link_to_camera), *vars(i.inclinometer).values(), i.clock_stddev_s,
-    ])  # fmt: skip
+    return np.array(
+        [
+            i.focal_px,
+            *c.misalignment_deg,
+            *np.ravel(c.covariance_arcsec2),
+            c.temperature_c,
+            *c.tilt_deg,
+            c.frames,
+            c.valid_days,
+            *np.ravel(i.link_to_camera),
+            *vars(i.inclinometer).values(),
+            i.clock_stddev_s,
+        ]
+    )
 
 
 @pytest.mark.parametrize("full", [False, True])
@@ -238,17 +331,24 @@ def test_what_nobody_knows_is_not_written(tmp_path):
 
 @pytest.mark.parametrize(
     "utc",
-    ["2026-11-02T18:00:00Z", "2026-11-02 18:00:00", "'2026-11-02T18:00:00.000Z'", "2026-11-02T20:00:00+02:00",
-     "2026-11-02t18:00:00.0Z"],
-)  # fmt: skip
+    [
+        "2026-11-02T18:00:00Z",
+        "2026-11-02 18:00:00",
+        "'2026-11-02T18:00:00.000Z'",
+        "2026-11-02T20:00:00+02:00",
+        "2026-11-02t18:00:00.0Z",
+    ],
+)
 def test_times_as_people_and_yaml_write_them(utc, reads):
     """Unquoted, YAML makes something of its own of them."""
     assert reads(SIMPLE + f"calibrated: {{utc: {utc}}}\n").calibration.utc_unix_s == 1793642400
 
 
 def test_every_error_of_the_inclinometer_has_its_unit(reads):
-    i = reads(SIMPLE + "tilt_noise_deg: 0.01\ntilt_quantum_deg: 0.02\ntilt_drift_arcsec_per_sqrt_hour: 3\n"
-              "tilt_temperature_arcsec_per_c: 4\ntilt_scale: 5e-4\n")  # fmt: skip
+    i = reads(
+        SIMPLE + "tilt_noise_deg: 0.01\ntilt_quantum_deg: 0.02\ntilt_drift_arcsec_per_sqrt_hour: 3\n"
+        "tilt_temperature_arcsec_per_c: 4\ntilt_scale: 5e-4\n"
+    )
     arcsec = np.pi / 648000
     assert list(vars(i.inclinometer).values()) == pytest.approx(
         [36 * arcsec, 72 * arcsec, 3 * arcsec, 4 * arcsec, 5e-4]

@@ -53,7 +53,10 @@ def report(capsys, night, out, *more):
 
 def shop(catalogue):
     return Workshop(
-        lambda stars: Instrument(29.67e3 / 6.4), catalogue, Atmosphere(100000.0, 5.0, 0.3), Deflection()
+        instrument_for=lambda stars: Instrument(29.67e3 / 6.4),
+        catalogue=catalogue,
+        atmosphere=Atmosphere(pressure_pa=100000.0, temperature_c=5.0, humidity=0.3),
+        vertical=Deflection(),
     )
 
 

@@ -23,7 +23,7 @@ from starpos.units import ARCSEC
 from starpos_testing.skies.reports import simulate
 
 FOCAL_PX = 29.67e3 / 6.4
-AIR = Atmosphere(100000.0, 5.0, 0.3)
+AIR = Atmosphere(pressure_pa=100000.0, temperature_c=5.0, humidity=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,12 @@ def lists(tmp_path_factory):
 
 
 def work(lists, catalogue):
-    shop = Workshop(lambda stars: Instrument(FOCAL_PX), catalogue, AIR, Deflection())
+    shop = Workshop(
+        instrument_for=lambda stars: Instrument(FOCAL_PX),
+        catalogue=catalogue,
+        atmosphere=AIR,
+        vertical=Deflection(),
+    )
     return worked(folder.exposures(lists, SCA100T_NOISE_RAD), shop)
 
 
@@ -42,15 +47,37 @@ def night(latitudes, longitudes, headings, truth=None, own_m=100.0, common_m=50.
     pad = np.zeros((3, 3))
     terms = (
         ErrorTerm("tilt", np.vstack([own_m * scale, pad])),
-        ErrorTerm("calibration", np.vstack([common_m * scale, pad]), ALWAYS),
+        ErrorTerm("calibration", np.vstack([common_m * scale, pad]), shared=ALWAYS),
     )
     covariance = scale * (own_m**2 + common_m**2)
     shots = [
-        Shot(str(k), Status.OK, "", 1.8e9 + k, ReportedPlace(1.8e9 + k, *angles, covariance, terms))
+        Shot(
+            name=str(k),
+            status=Status.OK,
+            message="",
+            utc_unix_s=1.8e9 + k,
+            place=ReportedPlace(
+                utc_unix_s=1.8e9 + k,
+                latitude=angles[0],
+                longitude=angles[1],
+                heading=angles[2],
+                covariance=covariance,
+                terms=terms,
+            ),  # fmt: skip,
+        )
         for k, angles in enumerate(zip(latitudes, longitudes, headings, strict=True))
     ]
     middle = replace(shots[0].place, latitude=float(np.mean(latitudes)))
-    return Night("made", "", shots, middle, "", Deflection(), AIR, truth)
+    return Night(
+        name="made",
+        origin="",
+        shots=shots,
+        combined=middle,
+        why_not="",
+        vertical=Deflection(),
+        atmosphere=AIR,
+        truth=truth,
+    )
 
 
 def test_deviations_are_from_the_mean_in_arcsec():

@@ -21,7 +21,7 @@ FEW = ("--fields", "4", "--false", "0", "3", "--stars", "6", "--points", "3", "-
 
 @pytest.fixture
 def conditions():
-    return mc.Conditions(CAMERA, 6.5)
+    return mc.Conditions(camera=CAMERA, limit_mag=6.5)
 
 
 def test_a_field_is_known_by_seed_and_number(catalogue, conditions):
@@ -32,8 +32,10 @@ def test_a_field_is_known_by_seed_and_number(catalogue, conditions):
 
 
 def test_an_ideal_field_holds_the_catalogues_stars(catalogue):
-    ideal = mc.Conditions(CAMERA, 6.5, sigma_px=1e-9, scatter_mag=0, missing=0, blend_px=0)
-    assert mc.ideal(CAMERA, 6.5) == mc.Conditions(CAMERA, 6.5, scatter_mag=0, missing=0, blend_px=0)
+    ideal = mc.Conditions(camera=CAMERA, limit_mag=6.5, sigma_px=1e-9, scatter_mag=0, missing=0, blend_px=0)
+    assert mc.ideal(CAMERA, 6.5) == mc.Conditions(
+        camera=CAMERA, limit_mag=6.5, scatter_mag=0, missing=0, blend_px=0
+    )
     for number in range(5):
         drawn = mc.draw(catalogue, ideal, 1, number)
         index = catalogue.cone(drawn.centre, CAMERA.half_diagonal_rad * 1.01, 6.5)
@@ -50,7 +52,7 @@ def test_an_ideal_field_holds_the_catalogues_stars(catalogue):
 
 def test_what_is_lost_and_scattered(catalogue):
     full = mc.ideal(CAMERA, 7.0)
-    poor = mc.Conditions(CAMERA, 7.0, scatter_mag=0, missing=0.3, blend_px=0)
+    poor = mc.Conditions(camera=CAMERA, limit_mag=7.0, scatter_mag=0, missing=0.3, blend_px=0)
     counts = [sum(len(mc.draw(catalogue, c, 2, k)) for k in range(30)) for c in (full, poor)]
     assert counts[1] / counts[0] == pytest.approx(0.7, abs=0.05)
 
@@ -82,7 +84,7 @@ def test_fields_of_few_stars(catalogue, conditions):
     for field in islice(mc.few_stars(catalogue, conditions, 1, 6), 5):
         assert len(field) == 6
     with pytest.raises(CatalogueError, match="ask for fewer"):
-        next(mc.few_stars(catalogue, mc.Conditions(CAMERA, 0.0), 1, 50))
+        next(mc.few_stars(catalogue, mc.Conditions(camera=CAMERA, limit_mag=0.0), 1, 50))
 
 
 def test_a_limit_that_gives_so_many_stars(catalogue):

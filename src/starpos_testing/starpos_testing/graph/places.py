@@ -15,7 +15,9 @@ METRES = 6.371e6  # a sphere will do
 
 def misaligned(misalignment_deg=(0.3, -0.2, 0.5), azimuth_deg=40.0):
     """The instrument of the shots with another A3."""
-    return replace(scene_at(azimuth_deg).instrument, calibration=Calibration(misalignment_deg))
+    return replace(
+        scene_at(azimuth_deg).instrument, calibration=Calibration(misalignment_deg=misalignment_deg)
+    )
 
 
 def site_at(latitude_deg, longitude_deg) -> Site:

@@ -61,7 +61,7 @@ class Shot:
 
 
 def scene_at(azimuth_deg=40.0, size=FULL) -> Scene:
-    air = Atmosphere(PRESSURE_PA, TEMPERATURE_C, HUMIDITY)
+    air = Atmosphere(pressure_pa=PRESSURE_PA, temperature_c=TEMPERATURE_C, humidity=HUMIDITY)
     scene = scene_of(size, focal_of(size), LATITUDE_DEG, LONGITUDE_DEG, air, tilt_noise_deg=NOISE_DEG)
     return replace(scene, azimuth_deg=azimuth_deg)
 
@@ -100,9 +100,8 @@ def tilts_of(scene: Scene, start: float, rng) -> list[msg.Tilt]:
             Tilt(
                 *read_tilt(scene, 0.0, rng),
                 covariance,
-                start + (j + 0.5) * EXPOSURE_S / SAMPLES,
-                1,
-                TEMPERATURE_C,
+                utc_unix_s=start + (j + 0.5) * EXPOSURE_S / SAMPLES,
+                temperature_c=TEMPERATURE_C,
             ),
             "starpos_inclinometer_frame",
             j,
@@ -123,6 +122,6 @@ def photograph_of(scene: Scene, start: float, rng) -> tuple[Shot, Image, msg.Cap
     image = frame_to_message(render(scene, light, start, EXPOSURE_S, rng), FRAME)
     info = camera_to_message(scene.camera, FRAME, start + EXPOSURE_S / 2)
     size = scene.camera.width, scene.camera.height
-    empty = stars_to_message(no_stars(*size, start + EXPOSURE_S / 2), FRAME)
+    empty = stars_to_message(no_stars(*size, mid_unix_s=start + EXPOSURE_S / 2), FRAME)
     capture = msg.Capture(header=image.header, exposure=EXPOSURE_S, stamp_source=msg.Capture.SIMULATED)
     return Shot(info, empty, tilts_of(scene, start, rng), scene), image, capture

@@ -20,7 +20,7 @@ PAPER = Camera.from_focal(5616, 3744, 93750.0)
 NO_ERROR = np.zeros((2, 2))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Field:
     """A camera somewhere, with `stars` stars spread over its frame; angles in deg."""
 
@@ -33,7 +33,9 @@ class Field:
     stars: int = 40
     utc: float = UTC
     camera: Camera = PAPER
-    air: Atmosphere = field(default_factory=lambda: Atmosphere(88000.0, 12.0, 0.3))
+    air: Atmosphere = field(
+        default_factory=lambda: Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
+    )
 
     @property
     def attitude(self) -> np.ndarray:
@@ -52,7 +54,7 @@ class Field:
 
     def tilt(self, covariance=NO_ERROR) -> Tilt:
         up = self.a3 @ self.attitude[2]
-        return Tilt(*np.arcsin(up[:2]), covariance, self.utc)
+        return Tilt(*np.arcsin(up[:2]), covariance, utc_unix_s=self.utc)
 
     def places(self, state: EarthState, rng) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (N, 2) of N stars without error and the ICRS directions (N, 3) that a catalogue would have of them."""
@@ -68,7 +70,11 @@ class Field:
 
     def mounting(self, calibration=0.0) -> Mounting:
         """Calibration errors in arcsec, 1 sigma a axis."""
-        return Mounting(self.a3, np.array(TOP_OF_FRAME), np.eye(3) * (calibration * ARCSEC) ** 2)
+        return Mounting(
+            a3=self.a3,
+            link_to_camera=np.array(TOP_OF_FRAME),
+            calibration_covariance=np.eye(3) * (calibration * ARCSEC) ** 2,
+        )
 
     def solve(self, xy, places, state=None, **given) -> Fix:
         """solve_fix with what this field knows, each part replaceable."""

@@ -13,8 +13,8 @@ from starpos.instrument.camera import Camera
 from starpos.simulation.scene import Optics, detected, expose, scene_of
 from starpos_testing.skies.scenes import EXPOSURE, START
 
-AIR = Atmosphere(88000.0, 12.0, 0.3)
-VACUUM = Atmosphere(0.0, 10.0, 0.0)
+AIR = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
+VACUUM = Atmosphere(pressure_pa=0.0, temperature_c=10.0, humidity=0.0)
 # field of view in deg: size, focal length, limit of the stars
 FIELDS = {
     3.4: ((5616, 3744), 93750.0, 10.0),
@@ -41,7 +41,15 @@ def random_camera(field, rng) -> Camera:
     distortion = rng.normal(0, CORNER) / [r**2, r**4, 3 * r, 3 * r, r**6]
     f = c.fx * (1 + rng.uniform(-0.015, 0.015))
     cx, cy = (np.array(c.centre_px) + rng.normal(0, 0.02, 2) * [c.width, c.height]).tolist()
-    return Camera(c.width, c.height, f, f * (1 + rng.normal(0, 5e-4)), cx, cy, tuple(distortion.tolist()))
+    return Camera(
+        width=c.width,
+        height=c.height,
+        fx=f,
+        fy=f * (1 + rng.normal(0, 5e-4)),
+        cx=cx,
+        cy=cy,
+        distortion=tuple(distortion.tolist()),
+    )
 
 
 def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighting]:
@@ -54,7 +62,17 @@ def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighti
         measured = xy + rng.normal(0, sigma, xy.shape)
         covariance = np.eye(2)[None].repeat(stars, 0) * sigma**2
         off = rotation.from_vector(rng.normal(0, 1e-4, 3)) @ attitude
-        made.append(Sighting(measured, covariance, places, np.full(stars, 1e-10), off, level, True))
+        made.append(
+            Sighting(
+                xy=measured,
+                covariance_px2=covariance,
+                directions=places,
+                direction_sigma=np.full(stars, 1e-10),
+                attitude=off,
+                level=level,
+                timed=True,
+            )
+        )
     return made
 
 

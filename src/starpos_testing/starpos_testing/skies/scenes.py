@@ -14,7 +14,7 @@ from starpos.simulation.scene import Optics, Scene, detected, expose, read_tilt,
 START = 1793642400.0  # 2026-11-02T18:00:00
 EXPOSURE = 0.5
 SIZE, FOCAL_PX = (1000, 700), 4636.0  # a diagonal of 15 deg, 44.5 arcsec a pixel
-AIR = Atmosphere(88000.0, 12.0, 0.3)
+AIR = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
 
 
 def wide_scene(limit_mag=7.5, tilt_noise_deg=0.0035, **more) -> Scene:
@@ -31,7 +31,7 @@ def stars_of(scene, catalogue, rng, start=START) -> Stars:
 def tilt_of(scene, rng, start=START) -> Tilt:
     """One reading, with the error it says."""
     sigma = max(scene.tilt_errors.noise, np.radians(1e-6))
-    return Tilt(*read_tilt(scene, 0.0, rng), np.eye(2) * sigma**2, start + EXPOSURE / 2)
+    return Tilt(*read_tilt(scene, 0.0, rng), np.eye(2) * sigma**2, utc_unix_s=start + EXPOSURE / 2)
 
 
 def solver_of(scene, catalogue, **more) -> Solver:
@@ -41,13 +41,12 @@ def solver_of(scene, catalogue, **more) -> Solver:
 def with_false_stars(stars, xy, flux_factor=10.0) -> Stars:
     """The list with stars at xy (N, 2) put before all others in brightness."""
     n = len(xy)
-    return Stars(
-        np.r_[xy[:, 0], stars.x], np.r_[xy[:, 1], stars.y],
-        np.r_[np.linspace(2, 1, n) * flux_factor * max(stars.flux.max(initial=1.0), 1.0), stars.flux],
-        np.r_[np.full(n, 1000.0), stars.snr],
-        np.concatenate([np.eye(2)[None].repeat(n, 0) * 0.02**2, stars.covariance]),
-        np.r_[np.zeros(n, np.uint8), stars.flags], stars.width, stars.height, stars.mid_unix_s, stars.exposure_s,
-        stars.source,
+    return replace(
+        stars, x=np.r_[xy[:, 0], stars.x], y=np.r_[xy[:, 1], stars.y],
+        flux=np.r_[np.linspace(2, 1, n) * flux_factor * max(stars.flux.max(initial=1.0), 1.0), stars.flux],
+        snr=np.r_[np.full(n, 1000.0), stars.snr],
+        covariance=np.concatenate([np.eye(2)[None].repeat(n, 0) * 0.02**2, stars.covariance]),
+        flags=np.r_[np.zeros(n, np.uint8), stars.flags],
     )  # fmt: skip
 
 
@@ -57,5 +56,15 @@ def random_stars(n, rng, width=SIZE[0], height=SIZE[1], mid_unix_s=START) -> Sta
     flux = np.sort(rng.exponential(1e4, n))[::-1]
     covariance = np.eye(2)[None].repeat(n, 0) * 0.05**2
     return Stars(
-        x, y, flux, np.full(n, 50.0), covariance, np.zeros(n), width, height, mid_unix_s, EXPOSURE, "random"
+        x=x,
+        y=y,
+        flux=flux,
+        snr=np.full(n, 50.0),
+        covariance=covariance,
+        flags=np.zeros(n),
+        width=width,
+        height=height,
+        mid_unix_s=mid_unix_s,
+        exposure_s=EXPOSURE,
+        source="random",
     )

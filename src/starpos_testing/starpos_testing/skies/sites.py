@@ -38,7 +38,7 @@ class Shots:
 
     def solver(self, catalogue, given=(0.0, 0.0, 0.0)) -> Solver:
         """That of an instrument whose A3 is said to be as given, without its error."""
-        instrument = Instrument(FOCAL_PX, calibration=Calibration(given))
+        instrument = Instrument(FOCAL_PX, calibration=Calibration(misalignment_deg=given))
         return Solver(instrument, catalogue, self.scene.site.atmosphere)
 
 
@@ -47,7 +47,9 @@ def shots(catalogue, rng, leans=(0.0,), a3_deg=TRUE_A3_DEG, start=START, noise_d
     made = Shots()
     for n, lean in enumerate(leans):
         here = wide_scene(pointing_deg=(40.0, 78.0 + lean, 15.0), tilt_noise_deg=noise_deg, **scene)
-        made.scene = replace(here, instrument=replace(here.instrument, calibration=Calibration(a3_deg)))
+        made.scene = replace(
+            here, instrument=replace(here.instrument, calibration=Calibration(misalignment_deg=a3_deg))
+        )
         stars = stars_of(made.scene, catalogue, rng, start + 20.0 * n)
         made.frames.append(stars)
         made.tilts[stars.mid_unix_s] = tilt_of(made.scene, rng, start + 20.0 * n)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of an exposure beside what it shows: when it was, how long, how well that is known, and of what."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from starpos.errors import FrameError
+
+MOST_EXPOSURE_S = 3600.0  # tilts of more than one pose would be averaged
+MOST_STDDEV_S = 1e9  # of a time: more says nothing, and its square must not overflow
+LARGEST_SIDE_PX = 1_000_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Exposure:
+    """One exposure of a camera; a `Frame` adds its pixels, `Stars` what was found on it.
+
+    mid_unix_s      middle of the exposure, UTC as a Unix time; None: unknown
+    exposure_s      None: unknown
+    source          where it came from, for messages: a path or a topic
+    focal_px        focal length that a file's header claims (FOCALLEN / XPIXSZ), px; a hint only; None: unknown
+    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, common to all frames; 0: unknown
+    clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common; 0: unknown
+
+    FrameError where a time, an error or the focal length is no number that it could be.
+    """
+
+    mid_unix_s: float | None = None
+    exposure_s: float | None = None
+    source: str = ""
+    focal_px: float | None = None
+    stamp_stddev_s: float = 0.0
+    clock_stddev_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        place = self.place
+        if self.mid_unix_s is not None and not np.isfinite(self.mid_unix_s):
+            raise FrameError(
+                f"{place}: the time of the exposure's middle is {self.mid_unix_s}; give a Unix time or None."
+            )
+        if self.exposure_s is not None and not 0 <= self.exposure_s <= MOST_EXPOSURE_S:
+            raise FrameError(
+                f"{place}: the exposure is {self.exposure_s} s; give 0 to {MOST_EXPOSURE_S:g} s, or None where it "
+                "is unknown."
+            )
+        for name in ("stamp_stddev_s", "clock_stddev_s"):
+            value = getattr(self, name)
+            if not 0 <= value <= MOST_STDDEV_S:
+                raise FrameError(
+                    f"{place}: {name} is {value}; it must be from 0 (unknown) to {MOST_STDDEV_S:g} s."
+                )
+        if self.focal_px is not None and not (np.isfinite(self.focal_px) and self.focal_px > 0):
+            raise FrameError(
+                f"{place}: the focal length is {self.focal_px} px; give a positive number or None."
+            )
+
+    @property
+    def place(self) -> str:
+        """What a message calls it."""
+        return self.source or "the frame"
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The fields above by name, for what is made of the same exposure."""
+        return {f.name: getattr(self, f.name) for f in fields(Exposure)}
+
+
+def check_size(width: int, height: int, place: str) -> None:
+    """Raise FrameError unless width and height are whole numbers of 1 to LARGEST_SIDE_PX pixels."""
+    for name, value in (("width", width), ("height", height)):
+        if not isinstance(value, (int, np.integer)) or not 1 <= value <= LARGEST_SIDE_PX:
+            raise FrameError(
+                f"{place}: the frame's {name} is {value!r}; it must be a whole number, 1 to {LARGEST_SIDE_PX} px."
+            )
