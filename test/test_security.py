@@ -12,7 +12,7 @@ from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file, instrument_file
 from starpos.instrument.inclinometer import read_tilt_csv
-from starpos_common.messages import MAX_STARS, message_to_stars
+from starpos.recording.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 
 ROOT = Path(__file__).parents[1]

@@ -20,6 +20,7 @@ from starpos.frames.frame import Frame
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
+from starpos.recording.messages import message_to_camera
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings, FrameSource, NothingYet, SourceEnded
@@ -27,7 +28,7 @@ from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
-from starpos_common.messages import camera_to_message, frame_to_message, message_to_camera, unix_to_stamp
+from starpos_common.messages import camera_to_message, frame_to_message, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_common.paths import path_of
 from starpos_common.topics import publisher

@@ -15,10 +15,11 @@ from std_msgs.msg import Header
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
+from starpos.recording.messages import message_to_frame
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
-from starpos_common.messages import encoding_of, message_to_frame, stars_to_message
+from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
 from starpos_common.troubles import Troubles

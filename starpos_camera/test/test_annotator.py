@@ -14,8 +14,8 @@ from std_msgs.msg import Header
 from test_detector import Feed
 
 from starpos.frames.annotate import DETECTED, IDENTIFIED
+from starpos.recording.messages import message_to_frame
 from starpos_camera.detector import DetectorNode
-from starpos_common.messages import message_to_frame
 from starpos_interfaces.msg import Solution, StarArray
 
 TOPIC = "detector/image_annotated"

@@ -16,9 +16,10 @@ from starpos.detection import detect
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
+from starpos.recording.messages import message_to_camera, message_to_frame, stamp_to_unix
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
-from starpos_common.messages import camera_to_message, message_to_camera, message_to_frame, stamp_to_unix
+from starpos_common.messages import camera_to_message
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 from starpos_testing.lacking import lacks

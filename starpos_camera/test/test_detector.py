@@ -11,7 +11,8 @@ from sensor_msgs.msg import Image
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame
-from starpos_common.messages import frame_to_message, message_to_stars
+from starpos.recording.messages import message_to_stars
+from starpos_common.messages import frame_to_message
 from starpos_interfaces.msg import Capture, StarArray
 
 OK, WARN = 0, 1

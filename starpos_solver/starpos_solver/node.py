@@ -22,10 +22,10 @@ from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
+from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.sky import catalogue
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.job import JobRunner, Outcome
-from starpos_common.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos_common.paths import path_of
 from starpos_common.topics import publisher, subscription
 from starpos_interfaces import msg

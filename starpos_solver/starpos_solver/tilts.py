@@ -7,11 +7,10 @@ import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt, TiltLog
-from starpos_common.messages import message_to_tilt, stamp_to_unix
+from starpos.recording.messages import OUT_OF_RANGE, SATURATED, UNUSABLE, message_to_tilt, stamp_to_unix
 from starpos_interfaces import msg
 
 CAPACITY = 6000  # ten minutes at 10 Hz
-UNUSABLE = msg.Tilt.OUT_OF_RANGE | msg.Tilt.STUCK | msg.Tilt.SATURATED
 TOGETHER = 20  # samples of an exposure have no more others between them
 NEAR_S = 1.0  # how far from an exposure a flagged sample still explains why there is no good one
 USUAL_PERIOD_S, JITTER = 0.1, 0.9  # between samples; how much of it the next one may come early
@@ -40,7 +39,7 @@ class TiltBuffer:
         try:
             sample = message_to_tilt(message, unknown_stddev_rad)
         except TiltRangeError:
-            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, msg.Tilt.OUT_OF_RANGE))
+            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, OUT_OF_RANGE))
             raise
         self._came += 1
         self._good.append((self._came, sample))
@@ -81,21 +80,14 @@ class TiltBuffer:
             self._explain(mid_unix_s, span_s)
         # later ones must not matter: how many have come by now is chance
         near = [s for s in near if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + 1e-6] or near
-        log = TiltLog(
-            np.array([s.utc_unix_s for s in near]),
-            np.array([s.theta_x for s in near]),
-            np.array([s.theta_y for s in near]),
-            np.array([s.temperature_c for s in near]),
-            np.array([s.covariance for s in near]),
-        )
-        return log.average(mid_unix_s, span_s)
+        return TiltLog.of_readings(near).average(mid_unix_s, span_s)
 
     def _explain(self, mid_unix_s: float, span_s: float) -> None:
         flags = 0
         for moment, flag in self._flagged:
             if abs(moment - mid_unix_s) <= span_s / 2 + NEAR_S:
                 flags |= flag
-        if flags & (msg.Tilt.OUT_OF_RANGE | msg.Tilt.SATURATED):
+        if flags & (OUT_OF_RANGE | SATURATED):
             raise TiltRangeError(
                 "tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright"
             )

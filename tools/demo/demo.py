@@ -83,7 +83,7 @@ def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray,
     from picture import draw
 
     from starpos.frames.annotate import Identified, annotate
-    from starpos_common.messages import message_to_frame, message_to_stars
+    from starpos.recording.messages import message_to_frame, message_to_stars
 
     frame, place = watcher.pictured, watcher.place
     if frame is None or stamp_of(frame) not in watcher.stars:

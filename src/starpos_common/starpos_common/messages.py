@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to starpos' types and back. What a message gets wrong raises the type's error, in one sentence."""
+"""starpos' types as messages; `starpos.recording.messages` is the way back."""
 
 import array
-import math
 import sys
 
 import numpy as np
@@ -10,33 +9,15 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
+from starpos.errors import TimeError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
+from starpos.instrument.inclinometer import Tilt
 from starpos_interfaces import msg
 
-# encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
-ENCODINGS = {
-    "mono8": (np.uint8, 1, ""),
-    "mono16": (np.uint16, 1, ""),
-    "bgr8": (np.uint8, 3, ""),
-    **{f"bayer_{p}8": (np.uint8, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
-    **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
-}
 HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
-MOST_TILT_VARIANCE = 1.0  # rad2: more says nothing, and must not overflow
-MOST_CELSIUS = 300.0  # of an inclinometer that still measures
-MAX_STARS = 100_000  # the most a detector publishes
 MAX_UNIX_S = 2**31 - 1e-6  # the end of Time.sec, in January 2038
-
-
-def stamp_to_unix(stamp: Time) -> float | None:
-    """Unix seconds of a stamp, to the microsecond; None for 0, which means that no time is known."""
-    if stamp.sec == 0 and stamp.nanosec == 0:
-        return None
-    return stamp.sec + stamp.nanosec * 1e-9
 
 
 def unix_to_stamp(unix_s: float | None) -> Time:
@@ -75,28 +56,6 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
     )
 
 
-def message_to_stars(message: msg.StarArray, source: str = "stars") -> Stars:
-    """Stars; FrameError where the message does not hold together (sizes, NaN, order, covariance)."""
-    rows = message.stars
-    if len(rows) > MAX_STARS:
-        raise FrameError(f"{source}: {len(rows)} stars are more than {MAX_STARS}: send the brightest.")
-    return Stars(
-        x=np.array([s.x for s in rows]),
-        y=np.array([s.y for s in rows]),
-        flux=np.array([s.flux for s in rows]),
-        snr=np.array([s.snr for s in rows]),
-        covariance=np.array([s.covariance for s in rows], float).reshape(-1, 2, 2),
-        flags=np.array([s.flags for s in rows], np.uint8),
-        width=message.width,
-        height=message.height,
-        mid_unix_s=stamp_to_unix(message.header.stamp),
-        exposure_s=message.exposure or None,
-        source=source,
-        stamp_stddev_s=message.stamp_stddev,
-        clock_stddev_s=message.clock_stddev,
-    )
-
-
 def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0) -> msg.Tilt:
     """A starpos_interfaces/Tilt."""
     return msg.Tilt(
@@ -108,30 +67,6 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
         sequence=sequence,
         flags=flags,
     )
-
-
-def message_to_tilt(message: msg.Tilt, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
-    """A starpos Tilt; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
-
-    The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over
-    30 deg, an impossible covariance.
-    """
-    covariance = np.array(message.covariance, float).reshape(2, 2)
-    unix_s = stamp_to_unix(message.header.stamp)
-    if unix_s is None:
-        raise TiltError("a tilt message has no time stamp: set header.stamp to the time of the sample.")
-    if not covariance.any():
-        covariance = np.eye(2) * unknown_stddev_rad**2
-    elif np.isfinite(covariance).all():
-        (xx, xy), (yx, yy) = covariance
-        if not (xx > 0 and yy > 0 and math.isclose(xy, yx, abs_tol=1e-9 * xx) and xx * yy > xy * yx):
-            raise TiltError(
-                "a tilt message's covariance is not symmetric and positive: send zeros where it is unknown."
-            )
-        if max(xx, yy) > MOST_TILT_VARIANCE:
-            raise TiltError("a tilt message's covariance is beyond 1 rad2: send zeros where it is unknown.")
-    celsius = message.temperature if abs(message.temperature) <= MOST_CELSIUS else math.nan
-    return Tilt(message.x, message.y, covariance, utc_unix_s=unix_s, samples=1, temperature_c=celsius)
 
 
 def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None) -> CameraInfo:
@@ -146,40 +81,6 @@ def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None
         k=[float(v) for v in (fx, 0, cx, 0, fy, cy, 0, 0, 1)],
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p=[float(v) for v in (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)],
-    )
-
-
-def message_to_camera(message: CameraInfo, source: str = "camera_info") -> Camera:
-    """A Camera; InstrumentError where the message is not a calibrated plumb_bob camera of the whole frame."""
-    k = np.array(message.k, float)
-    d = np.array(message.d, float)
-    if not np.isfinite(k).all() or not np.isfinite(d).all():
-        raise InstrumentError(f"{source}: K or D holds NaN or infinity; calibrate the camera.")
-    if not k[0] or not k[4]:
-        raise InstrumentError(
-            f"{source}: the camera is not calibrated (its focal length is 0); give it a calibration file."
-        )
-    if message.distortion_model not in ("plumb_bob", "") or len(d) not in (0, 5):
-        raise InstrumentError(
-            f"{source}: the distortion model is {message.distortion_model!r} with {len(d)} terms; "
-            "only 'plumb_bob' with 5 is understood: calibrate with it."
-        )
-    if np.any(k[[1, 3, 6, 7]]) or k[8] != 1:
-        raise InstrumentError(
-            f"{source}: K is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate the camera without skew."
-        )
-    region = message.roi
-    cropped = (region.x_offset, region.y_offset) != (0, 0) or (
-        (region.width, region.height) not in ((0, 0), (message.width, message.height))
-    )
-    if cropped or message.binning_x > 1 or message.binning_y > 1:
-        raise InstrumentError(
-            f"{source}: the frame is binned or cropped; send whole frames, or calibrate it as it is sent."
-        )
-    distortion = tuple(d.tolist()) or (0.0,) * 5
-    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
-    return Camera(
-        width=message.width, height=message.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
     )
 
 
@@ -203,36 +104,3 @@ def frame_to_message(frame: Frame, frame_id: str) -> Image:
         step=pixels.strides[0],
         data=data,
     )
-
-
-def message_to_frame(message: Image, source: str = "image_raw") -> Frame:
-    """A Frame on the message's own memory where byte order and alignment allow, else on a copy.
-
-    FrameError where encoding, size, step and data do not fit together.
-    """
-    if message.encoding not in ENCODINGS:
-        raise FrameError(
-            f"{source}: the encoding {message.encoding!r} is unknown; send one of {', '.join(ENCODINGS)}."
-        )
-    kind, channels, pattern = ENCODINGS[message.encoding]
-    width, height, step = message.width, message.height, message.step
-    row = width * channels * np.dtype(kind).itemsize
-    if not width or not height:
-        raise FrameError(f"{source}: the frame is {width} x {height} px; it is empty, check the camera.")
-    if step < row:
-        raise FrameError(
-            f"{source}: step is {step} bytes but a row of {width} px needs {row}; check the camera driver."
-        )
-    if len(message.data) != step * height:
-        raise FrameError(
-            f"{source}: {len(message.data)} bytes of pixels for {height} rows of {step} bytes; "
-            "the frame is truncated or its sizes are wrong."
-        )
-    order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(kind).newbyteorder(order)
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    strides = (step, dtype.itemsize) if channels == 1 else (step, channels, 1)
-    pixels = np.ndarray(shape, dtype, message.data, strides=strides)
-    if not pixels.dtype.isnative or not pixels.flags.aligned:
-        pixels = pixels.astype(kind)
-    return Frame(pixels, pattern=pattern, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)

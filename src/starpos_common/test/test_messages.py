@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
@@ -14,22 +15,47 @@ from starpos.frames.frame import Frame
 from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.recording import messages as reading
+from starpos.recording.messages import (
+    message_to_camera,
+    message_to_frame,
+    message_to_stars,
+    message_to_tilt,
+    stamp_to_unix,
+)
 from starpos_common import messages
-from starpos_interfaces.msg import StarArray
+from starpos_interfaces import msg
 
 MID = 1_795_168_800.123456
 RNG = np.random.default_rng(1)
+
+
+@pytest.fixture(params=["node", "bag"])
+def heard(request):
+    """A message as a node hears it, and as `rosbags` reads it from a bag: one reader takes both."""
+    if request.param == "node":
+        return lambda message: message
+    pytest.importorskip("rosbags")
+    from starpos_testing.skies.bags import typestore
+
+    store = typestore()
+
+    def from_bag(message):
+        package, name = type(message).__module__.split(".")[0], type(message).__name__
+        return store.deserialize_cdr(serialize_message(message), f"{package}/msg/{name}")
+
+    return from_bag
 
 
 @pytest.mark.parametrize("microseconds", [0, 1, 123_456, 500_000, 999_999])
 @pytest.mark.parametrize("seconds", [1, 1_000_000_000, 1_795_168_800, 2**31 - 1])
 def test_stamps_are_exact_to_the_microsecond(seconds, microseconds):
     stamp = Time(sec=seconds, nanosec=microseconds * 1000)
-    assert messages.unix_to_stamp(messages.stamp_to_unix(stamp)) == stamp
+    assert messages.unix_to_stamp(stamp_to_unix(stamp)) == stamp
 
 
 def test_stamps_that_are_none_and_that_cannot_be():
-    assert messages.stamp_to_unix(Time()) is None
+    assert stamp_to_unix(Time()) is None
     assert messages.unix_to_stamp(None) == Time()
     assert messages.unix_to_stamp(1.9999999) == Time(sec=2)
     for bad in (math.nan, math.inf, -1.0, 2.0**31):
@@ -57,11 +83,11 @@ def stars(n=5):
     )
 
 
-def test_stars_round_trip():
+def test_stars_round_trip(heard):
     sent = stars()
     message = messages.stars_to_message(sent, "optical")
     assert (message.header.frame_id, message.stamp_stddev, message.exposure) == ("optical", 1e-3, 0.5)
-    got = messages.message_to_stars(message)
+    got = message_to_stars(heard(message))
     for name in ("x", "y", "covariance", "flags"):
         assert np.array_equal(getattr(got, name), getattr(sent, name))
     assert got.flux == pytest.approx(sent.flux, rel=1e-6)
@@ -70,39 +96,39 @@ def test_stars_round_trip():
     assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
 
 
-def test_no_stars_and_no_time_round_trip():
-    got = messages.message_to_stars(messages.stars_to_message(no_stars(10, 10), "c"))
+def test_no_stars_and_no_time_round_trip(heard):
+    got = message_to_stars(heard(messages.stars_to_message(no_stars(10, 10), "c")))
     assert len(got) == 0 and got.mid_unix_s is None and got.exposure_s is None
 
 
 @pytest.mark.parametrize(
     ("field", "value"), [("x", math.nan), ("flux", math.inf), ("covariance", [0.0] * 4), ("flux", 1e9)]
 )
-def test_bad_stars_are_refused(field, value):
+def test_bad_stars_are_refused(field, value, heard):
     message = messages.stars_to_message(stars(), "c")
     setattr(message.stars[-1], field, value)
     with pytest.raises(FrameError, match="stars"):
-        messages.message_to_stars(message)
+        message_to_stars(heard(message))
 
 
-def test_empty_star_message_is_refused():
+def test_empty_star_message_is_refused(heard):
     with pytest.raises(FrameError, match="width"):
-        messages.message_to_stars(StarArray())
+        message_to_stars(heard(msg.StarArray()))
 
 
-def test_tilt_round_trip_and_unknown_covariance():
+def test_tilt_round_trip_and_unknown_covariance(heard):
     tilt = Tilt(
         0.1, -0.2, np.array([[4e-9, 1e-9], [1e-9, 5e-9]]), utc_unix_s=MID, samples=1, temperature_c=21.5
     )
     message = messages.tilt_to_message(tilt, "s", 7, 8)
     assert (message.sequence, message.flags, message.header.frame_id) == (7, 8, "s")
-    got = messages.message_to_tilt(message)
+    got = message_to_tilt(heard(message))
     assert (got.theta_x, got.theta_y, got.temperature_c) == (0.1, -0.2, 21.5)
     assert np.array_equal(got.covariance, tilt.covariance)
     message.temperature = 1e300
-    assert math.isnan(messages.message_to_tilt(message).temperature_c)
+    assert math.isnan(message_to_tilt(heard(message)).temperature_c)
     message.covariance = [0.0] * 4
-    assert np.array_equal(messages.message_to_tilt(message, 1e-4).covariance, np.eye(2) * 1e-8)
+    assert np.array_equal(message_to_tilt(heard(message), 1e-4).covariance, np.eye(2) * 1e-8)
 
 
 @pytest.mark.parametrize(
@@ -117,21 +143,21 @@ def test_tilt_round_trip_and_unknown_covariance():
         ("covariance", [1e-9, 0.0, 0.0, 1e300]),
     ],
 )
-def test_bad_tilts_are_refused(field, value):
+def test_bad_tilts_are_refused(field, value, heard):
     message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), utc_unix_s=MID), "s")
     setattr(message, field, value)
     with pytest.raises(TiltError):
-        messages.message_to_tilt(message)
+        message_to_tilt(heard(message))
 
 
-def test_tilt_without_a_stamp_is_refused():
+def test_tilt_without_a_stamp_is_refused(heard):
     message = messages.tilt_to_message(Tilt(0.0, 0.0, np.eye(2), utc_unix_s=MID), "s")
     message.header.stamp = Time()
     with pytest.raises(TiltError, match="stamp"):
-        messages.message_to_tilt(message)
+        message_to_tilt(heard(message))
 
 
-def test_camera_round_trip():
+def test_camera_round_trip(heard):
     camera = Camera(
         width=5616,
         height=3744,
@@ -141,10 +167,10 @@ def test_camera_round_trip():
         cy=1871.5,
         distortion=(0.1, -0.2, 1e-4, 2e-4, 0.3),
     )
-    assert messages.message_to_camera(messages.camera_to_message(camera, "c", MID)) == camera
+    assert message_to_camera(heard(messages.camera_to_message(camera, "c", MID))) == camera
     message = messages.camera_to_message(camera, "c")
     message.d = []
-    assert messages.message_to_camera(message).distortion == (0.0,) * 5
+    assert message_to_camera(heard(message)).distortion == (0.0,) * 5
 
 
 @pytest.mark.parametrize(
@@ -162,23 +188,23 @@ def test_camera_round_trip():
         ({"width": 0}, "size"),
     ],
 )
-def test_cameras_that_are_not_understood_are_refused(change, word):
+def test_cameras_that_are_not_understood_are_refused(change, word, heard):
     message = messages.camera_to_message(Camera.from_focal(100, 80, 1000.0), "c")
     for name, value in change.items():
         setattr(message, name, [float(v) for v in value] if isinstance(value, list) else value)
     with pytest.raises(InstrumentError, match=word):
-        messages.message_to_camera(message)
+        message_to_camera(heard(message))
     with pytest.raises(InstrumentError, match="not calibrated"):
-        messages.message_to_camera(CameraInfo())
+        message_to_camera(heard(CameraInfo()))
 
 
-def test_region_of_interest():
+def test_region_of_interest(heard):
     message = messages.camera_to_message(Camera.from_focal(100, 80, 1000.0), "c")
     message.roi.width, message.roi.height = 100, 80
-    messages.message_to_camera(message)
+    message_to_camera(heard(message))
     message.roi.x_offset = 1
     with pytest.raises(InstrumentError, match="cropped"):
-        messages.message_to_camera(message)
+        message_to_camera(heard(message))
 
 
 def pixels(kind, channels=1):
@@ -186,34 +212,33 @@ def pixels(kind, channels=1):
     return RNG.integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
 
 
-@pytest.mark.parametrize("encoding", messages.ENCODINGS)
-def test_frames_round_trip_without_a_copy_on_arrival(encoding):
-    kind, channels, pattern = messages.ENCODINGS[encoding]
+@pytest.mark.parametrize("encoding", reading.ENCODINGS)
+def test_frames_round_trip_without_a_copy_on_arrival(encoding, heard):
+    kind, channels, pattern = reading.ENCODINGS[encoding]
     frame = Frame(pixels(kind, channels), pattern=pattern, mid_unix_s=MID, exposure_s=0.5)
-    message = messages.frame_to_message(frame, "c")
-    assert message.encoding == encoding and isinstance(message.data, array.array)
-    got = messages.message_to_frame(message)
+    sent = messages.frame_to_message(frame, "c")
+    assert sent.encoding == encoding and isinstance(sent.data, array.array)
+    message = heard(sent)
+    got = message_to_frame(message)
     assert np.array_equal(got.pixels, frame.pixels) and got.pixels.dtype == kind
     assert got.pattern == pattern
     assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
     assert np.shares_memory(got.pixels, np.frombuffer(message.data, np.uint8))
 
 
-def test_frames_that_are_views_are_sent_whole():
+def test_frames_that_are_views_are_sent_whole(heard):
     frame = Frame(pixels(np.uint16)[::2, ::-1])
-    assert np.array_equal(
-        messages.message_to_frame(messages.frame_to_message(frame, "c")).pixels, frame.pixels
-    )
+    assert np.array_equal(message_to_frame(heard(messages.frame_to_message(frame, "c"))).pixels, frame.pixels)
 
 
 @pytest.mark.parametrize("padding", [0, 2, 3])
-def test_padded_rows_and_the_other_byte_order(padding):
+def test_padded_rows_and_the_other_byte_order(padding, heard):
     truth = pixels(np.uint16)
     rows = np.zeros((6, 8 + padding), np.uint8)
     rows[:, :8] = truth.astype(">u2").view(np.uint8)
     message = Image(width=4, height=6, step=8 + padding, encoding="mono16", is_bigendian=1)
     message.data = array.array("B", rows.tobytes())
-    got = messages.message_to_frame(message).pixels
+    got = message_to_frame(heard(message)).pixels
     assert np.array_equal(got, truth) and got.dtype == np.uint16 and got.dtype.isnative
 
 
@@ -233,9 +258,14 @@ def test_padded_rows_and_the_other_byte_order(padding):
         ({"data": array.array("B")}, "truncated"),
     ],
 )
-def test_images_that_do_not_fit_together_are_refused(change, word):
+def test_images_that_do_not_fit_together_are_refused(change, word, heard):
     message = messages.frame_to_message(Frame(pixels(np.uint16)), "c")
     for name, value in change.items():
         setattr(message, name, value)
     with pytest.raises(FrameError, match=word):
-        messages.message_to_frame(message)
+        message_to_frame(heard(message))
+
+
+def test_the_flags_that_the_reader_knows_are_the_messages():
+    for name in ("OUT_OF_RANGE", "STUCK", "SATURATED"):
+        assert getattr(reading, name) == getattr(msg.Tilt, name)

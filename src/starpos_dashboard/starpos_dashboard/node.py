@@ -10,8 +10,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos.errors import FrameError
+from starpos.recording.messages import stamp_to_unix
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
-from starpos_common.messages import stamp_to_unix
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
 from starpos_dashboard import access, picture

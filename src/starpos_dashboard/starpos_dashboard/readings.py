@@ -11,7 +11,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 
-from starpos_common.messages import stamp_to_unix
+from starpos.recording.messages import stamp_to_unix
 from starpos_interfaces.msg import Solution, Tilt
 
 NAME_LETTERS, SENTENCE_LETTERS = 80, 300  # of a text from outside, at most

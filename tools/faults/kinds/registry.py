@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from accelerated import World
 
-from starpos_common.messages import stamp_to_unix, unix_to_stamp
+from starpos.recording.messages import stamp_to_unix
+from starpos_common.messages import unix_to_stamp
 
 NAN, INF = math.nan, math.inf
 HOSTILE = (NAN, INF, -INF, 1e300, -1e300, 0.0, -1.0)

@@ -2,6 +2,7 @@
 """The inclinometer: its readings, its transfer function, and A2, which takes its frame S into the local level L."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -152,6 +153,17 @@ class TiltLog:
             theta_y,
             temperature_c,
             np.tile(np.eye(2) * noise_rad**2, (len(utc_unix_s), 1, 1)),
+        )
+
+    @classmethod
+    def of_readings(cls, readings: Sequence[Tilt]) -> "TiltLog":
+        """Readings each with the covariance it states."""
+        return cls(
+            np.array([r.utc_unix_s for r in readings]),
+            np.array([r.theta_x for r in readings]),
+            np.array([r.theta_y for r in readings]),
+            np.array([r.temperature_c for r in readings]),
+            np.array([r.covariance for r in readings]),
         )
 
     @cached_property

@@ -1,157 +1,151 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages, as `rosbags` hands them out, to this package's types; what they get wrong raises the type's error."""
+"""Messages as this package's types: of rclpy in a node, of `rosbags` from a bag, which are alike.
+
+What a message gets wrong raises the type's error, in one sentence.
+"""
+
+import math
+from typing import Any
 
 import numpy as np
 
-from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.vertical import Deflection
-from starpos.errors import FrameError, InstrumentError, StarposError
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solver import Attitude, Status
+from starpos.errors import FrameError, InstrumentError, TiltError
+from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import LIMIT_RAD
-from starpos.report.folder import StarList
-from starpos.report.night import NO_TILT, ReportedPlace, Shot
-from starpos.rotation import full_turn
-from starpos.units import ARCSEC
-from starpos.utc import utc_text
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 
-UNUSABLE = 1 | 2 | 4  # of Tilt.flags: out of range, stuck, saturated
-STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT, Status.TILT_OUT_OF_RANGE,
-          Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip  # by Solution.status
+# of Tilt.flags, as starpos_interfaces has them
+OUT_OF_RANGE, STUCK, SATURATED = 1, 2, 4
+UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED
+# encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
+ENCODINGS = {
+    "mono8": (np.uint8, 1, ""),
+    "mono16": (np.uint16, 1, ""),
+    "bgr8": (np.uint8, 3, ""),
+    **{f"bayer_{p}8": (np.uint8, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
+    **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
+}
+MOST_TILT_VARIANCE = 1.0  # rad2: more says nothing, and must not overflow
+MOST_CELSIUS = 300.0  # of an inclinometer that still measures
+MAX_STARS = 100_000  # the most a detector publishes
 
 
-def tilt_row(m, unknown_rad2: np.ndarray) -> tuple[float, ...] | None:
-    """Time, x, y (rad), temperature and the four of the covariance (rad2); None where the reading cannot be used.
-
-    unknown_rad2 (2, 2): covariance of one that states none.
-    """
-    covariance = np.asarray(m.covariance, float).reshape(2, 2)
-    if not covariance.any():
-        covariance = unknown_rad2
-    at = unix_of_stamp(m.header.stamp)
-    inside = max(abs(m.x), abs(m.y)) <= LIMIT_RAD  # NaN is not
-    known = np.isfinite(covariance).all() and (np.linalg.eigvalsh(covariance) > 0).all()
-    if m.flags & UNUSABLE or at is None or not inside or not known:
+def stamp_to_unix(stamp: Any) -> float | None:
+    """Unix seconds of a stamp, to the microsecond; None for 0, which means that no time is known."""
+    if stamp.sec == 0 and stamp.nanosec == 0:
         return None
-    return at, m.x, m.y, m.temperature, *covariance.ravel().tolist()
+    return stamp.sec + stamp.nanosec * 1e-9
 
 
-def unix_of_stamp(stamp) -> float | None:
-    """None for 0, which means that no time is known."""
-    return stamp.sec + stamp.nanosec * 1e-9 if stamp.sec or stamp.nanosec else None
-
-
-def exposure_of(m) -> StarList:
-    """Of a StarArray."""
-    at = unix_of_stamp(m.header.stamp)
-    name = "stars " + ("of unknown time" if at is None else utc_text(at))
-    try:
-        stars = Stars(
-            x=[s.x for s in m.stars],
-            y=[s.y for s in m.stars],
-            flux=[s.flux for s in m.stars],
-            snr=[s.snr for s in m.stars],
-            covariance=np.array([s.covariance for s in m.stars], float).reshape(-1, 2, 2),
-            flags=[s.flags for s in m.stars],
-            width=m.width,
-            height=m.height,
-            mid_unix_s=at,
-            exposure_s=m.exposure or None,
-            source=name,
-            stamp_stddev_s=m.stamp_stddev,
-            clock_stddev_s=getattr(m, "clock_stddev", 0.0),  # bags from before it was told
-        )
-    except FrameError as error:
-        return StarList(name, error)
-    return StarList(name, stars)
-
-
-def camera_of(m) -> Camera:
-    """Of a CameraInfo; InstrumentError where it is not that of a calibrated, whole frame."""
-    k, d = np.asarray(m.k, float), np.asarray(m.d, float)
-    region = m.roi
-    whole = (region.x_offset, region.y_offset) == (0, 0) and max(m.binning_x, m.binning_y) <= 1
-    whole &= (region.width, region.height) in ((0, 0), (m.width, m.height))
-    if len(d) not in (0, 5) or m.distortion_model not in ("plumb_bob", "") or not k[0] or not whole:
-        raise InstrumentError("its camera_info is not of a calibrated plumb_bob camera with whole frames")
-    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
-    distortion = tuple(d.tolist()) or (0.0,) * 5
-    return Camera(width=m.width, height=m.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion)
-
-
-def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
-    """Of a Solution; its heading is geodetic, ours astronomic."""
-    status = STATUS[m.status] if m.status < len(STATUS) else Status.BAD_INPUT
-    at = unix_of_stamp(m.header.stamp)
-    utc = float("nan") if at is None else at
-    place = pointing = None
-    unit = np.array([1.0, 1.0, np.radians(1.0)])
-    covariance = np.asarray(m.covariance, float).reshape(3, 3) * np.outer(unit, unit)
-    angles = np.radians([m.latitude, m.longitude, m.heading])
-    sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and abs(m.eta) < 3600
-    sane &= bool(np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all())
-    if status is Status.OK and sane:
-        heading = angles[2] + m.eta * ARCSEC * np.tan(np.radians(m.latitude_geodetic))
-        terms = tuple(
-            ErrorTerm(
-                t.name,
-                np.vstack([np.diag([t.east, t.north, np.radians(t.heading)]), np.zeros((3, 3))]),
-                shared=ALWAYS if t.common else None,
-            )
-            for t in m.budget
-            if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
-        )
-        place = ReportedPlace(
-            utc_unix_s=utc,
-            latitude=float(angles[0]),
-            longitude=float(angles[1]),
-            heading=full_turn(heading),
-            covariance=covariance,
-            terms=terms,
-        )
-    elif status is Status.OK:
-        status = Status.BAD_INPUT
-    looking = np.radians([m.right_ascension, m.declination, m.roll])
-    if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
-        ra, dec, roll = looking.tolist()
-        pointing = Attitude(
-            ra=ra,
-            dec=dec,
-            roll=roll,
-            focal_px=m.focal_px,
-            residual_arcsec=m.residual,
-            log_odds=m.log_odds,
-            mirrored=bool(m.mirrored),
-        )
-    return Shot(
-        name="solution " + ("of unknown time" if at is None else utc_text(at)),
-        status=status,
-        message=m.status_text,
-        utc_unix_s=utc,
-        place=place,
-        pointing=pointing,
-        size=next(iter(cameras)) if len(cameras) == 1 else None,
-        stars_detected=int(m.stars_detected),
-        stars_matched=int(m.stars_matched),
-        residual_arcsec=_finite(m.residual),
-        tilt=(_finite(m.tilt.x), _finite(m.tilt.y)) if m.tilt_samples else NO_TILT,
-        identify_s=_finite(m.identify_seconds),
-        fix_s=_finite(m.fix_seconds),
+def message_to_stars(message: Any, source: str = "stars") -> Stars:
+    """Stars; FrameError where the message does not hold together (sizes, NaN, order, covariance)."""
+    rows = message.stars
+    if len(rows) > MAX_STARS:
+        raise FrameError(f"{source}: {len(rows)} stars are more than {MAX_STARS}: send the brightest.")
+    return Stars(
+        x=np.array([s.x for s in rows]),
+        y=np.array([s.y for s in rows]),
+        flux=np.array([s.flux for s in rows]),
+        snr=np.array([s.snr for s in rows]),
+        covariance=np.array([s.covariance for s in rows], float).reshape(-1, 2, 2),
+        flags=np.array([s.flags for s in rows], np.uint8),
+        width=message.width,
+        height=message.height,
+        mid_unix_s=stamp_to_unix(message.header.stamp),
+        exposure_s=message.exposure or None,
+        source=source,
+        stamp_stddev_s=message.stamp_stddev,
+        clock_stddev_s=getattr(message, "clock_stddev", 0.0),  # bags from before it was told
     )
 
 
-def _finite(value: float) -> float:
-    """NaN for what no instrument says."""
-    return float(value) if abs(value) < 1e9 else float("nan")
+def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
+    """A starpos Tilt; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
+
+    The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over
+    30 deg, an impossible covariance.
+    """
+    covariance = np.array(message.covariance, float).reshape(2, 2)
+    unix_s = stamp_to_unix(message.header.stamp)
+    if unix_s is None:
+        raise TiltError("a tilt message has no time stamp: set header.stamp to the time of the sample.")
+    if not covariance.any():
+        covariance = np.eye(2) * unknown_stddev_rad**2
+    elif np.isfinite(covariance).all():
+        (xx, xy), (yx, yy) = covariance
+        if not (xx > 0 and yy > 0 and math.isclose(xy, yx, abs_tol=1e-9 * xx) and xx * yy > xy * yx):
+            raise TiltError(
+                "a tilt message's covariance is not symmetric and positive: send zeros where it is unknown."
+            )
+        if max(xx, yy) > MOST_TILT_VARIANCE:
+            raise TiltError("a tilt message's covariance is beyond 1 rad2: send zeros where it is unknown.")
+    celsius = message.temperature if abs(message.temperature) <= MOST_CELSIUS else math.nan
+    return Tilt(message.x, message.y, covariance, utc_unix_s=unix_s, samples=1, temperature_c=celsius)
 
 
-def deflection_of(m) -> Deflection | None:
-    """That the solver applied; its error from what it widened the position by."""
-    _, meridian = curvature_radii_m(np.radians(m.latitude))
-    wider = max(m.covariance_geodetic[4] - m.covariance[4], 0.0)
-    try:
-        return Deflection(m.xi, m.eta, float(np.sqrt(wider) / meridian / ARCSEC))
-    except StarposError:
-        return None
+def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
+    """A Camera; InstrumentError where the message is not a calibrated plumb_bob camera of the whole frame."""
+    k = np.array(message.k, float)
+    d = np.array(message.d, float)
+    if not np.isfinite(k).all() or not np.isfinite(d).all():
+        raise InstrumentError(f"{source}: K or D holds NaN or infinity; calibrate the camera.")
+    if not k[0] or not k[4]:
+        raise InstrumentError(
+            f"{source}: the camera is not calibrated (its focal length is 0); give it a calibration file."
+        )
+    if message.distortion_model not in ("plumb_bob", "") or len(d) not in (0, 5):
+        raise InstrumentError(
+            f"{source}: the distortion model is {message.distortion_model!r} with {len(d)} terms; "
+            "only 'plumb_bob' with 5 is understood: calibrate with it."
+        )
+    if np.any(k[[1, 3, 6, 7]]) or k[8] != 1:
+        raise InstrumentError(
+            f"{source}: K is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate the camera without skew."
+        )
+    region = message.roi
+    cropped = (region.x_offset, region.y_offset) != (0, 0) or (
+        (region.width, region.height) not in ((0, 0), (message.width, message.height))
+    )
+    if cropped or message.binning_x > 1 or message.binning_y > 1:
+        raise InstrumentError(
+            f"{source}: the frame is binned or cropped; send whole frames, or calibrate it as it is sent."
+        )
+    distortion = tuple(d.tolist()) or (0.0,) * 5
+    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
+    return Camera(
+        width=message.width, height=message.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
+    )
+
+
+def message_to_frame(message: Any, source: str = "image_raw") -> Frame:
+    """A Frame on the message's own memory where byte order and alignment allow, else on a copy.
+
+    FrameError where encoding, size, step and data do not fit together.
+    """
+    if message.encoding not in ENCODINGS:
+        raise FrameError(
+            f"{source}: the encoding {message.encoding!r} is unknown; send one of {', '.join(ENCODINGS)}."
+        )
+    kind, channels, pattern = ENCODINGS[message.encoding]
+    width, height, step = message.width, message.height, message.step
+    row = width * channels * np.dtype(kind).itemsize
+    if not width or not height:
+        raise FrameError(f"{source}: the frame is {width} x {height} px; it is empty, check the camera.")
+    if step < row:
+        raise FrameError(
+            f"{source}: step is {step} bytes but a row of {width} px needs {row}; check the camera driver."
+        )
+    if len(message.data) != step * height:
+        raise FrameError(
+            f"{source}: {len(message.data)} bytes of pixels for {height} rows of {step} bytes; "
+            "the frame is truncated or its sizes are wrong."
+        )
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype(kind).newbyteorder(order)
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    strides = (step, dtype.itemsize) if channels == 1 else (step, channels, 1)
+    pixels = np.ndarray(shape, dtype, message.data, strides=strides)
+    if not pixels.dtype.isnative or not pixels.flags.aligned:
+        pixels = pixels.astype(kind)
+    return Frame(pixels, pattern=pattern, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)

@@ -6,17 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from starpos.earth.vertical import Deflection
-from starpos.errors import FrameError, InstrumentError
+from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import TiltLog
+from starpos.instrument.inclinometer import Tilt, TiltLog
 from starpos.progress import Progress
 from starpos.recording import bounds
-from starpos.recording.messages import camera_of, deflection_of, shot_of, tilt_row
+from starpos.recording.messages import UNUSABLE, message_to_camera, message_to_tilt
 from starpos.report.folder import truth_in
 from starpos.report.night import Shot, Truth
+from starpos.report.solutions import deflection_of, shot_of
 
 SUFFIXES = (".mcap", ".db3")
 PACKAGE = "starpos_interfaces"
@@ -178,33 +177,34 @@ class _Reading:
         self.cameras: dict[tuple[int, int], Camera] = {}
         self.solutions: list[Shot] = []
         self.deflection: Deflection | None = None
-        self._unknown = np.eye(2) * tilt_noise_rad**2
-        self._tilts: list[tuple] = []
+        self._unknown_stddev_rad = tilt_noise_rad
+        self._tilts: list[Tilt] = []
         self._unusable = 0
         self._why_no_camera = ""
 
     def take(self, kind: str, message) -> None:
         if kind == TILT:
-            row = tilt_row(message, self._unknown)
-            if row is None:
+            try:
+                tilt = message_to_tilt(message, self._unknown_stddev_rad)
+            except TiltError:
+                tilt = None
+            if tilt is None or message.flags & UNUSABLE:
                 self._unusable += 1
             else:
-                self._tilts.append(row)
+                self._tilts.append(tilt)
         elif kind == SOLUTION:
             self.solutions.append(shot_of(message, self.cameras))
             if self.deflection is None and message.status == 0:
                 self.deflection = deflection_of(message)
         elif (message.width, message.height) not in self.cameras:
             try:
-                self.cameras[message.width, message.height] = camera_of(message)
+                self.cameras[message.width, message.height] = message_to_camera(message, "its camera_info")
             except InstrumentError as error:
                 self._why_no_camera = str(error)
 
     def tilt_log(self) -> TiltLog | None:
-        if not self._tilts:
-            return None
-        t = np.array(sorted(self._tilts))
-        return TiltLog(t[:, 0], t[:, 1], t[:, 2], t[:, 3], t[:, 4:].reshape(-1, 2, 2))
+        in_time = sorted(self._tilts, key=lambda tilt: tilt.utc_unix_s)
+        return TiltLog.of_readings(in_time) if in_time else None
 
     def remarks(self, path: Path) -> tuple[str, ...]:
         said = []

@@ -9,11 +9,11 @@ import numpy as np
 from starpos.errors import InstrumentError, TiltError
 from starpos.fix.budget import ErrorTerm
 from starpos.instrument.inclinometer import Tilt
-from starpos.recording.messages import exposure_of
 from starpos.report.bag import Recorded, star_lists
 from starpos.report.folder import StarList, StarLists
 from starpos.report.measures import offset_m, turn
 from starpos.report.night import Night, ReportedPlace
+from starpos.report.solutions import star_list_of
 from starpos.report.working import Workshop, why_none, worked
 from starpos.rotation import full_turn
 
@@ -33,7 +33,7 @@ def night(recorded: Recorded, shop: Workshop) -> Night:
 
 def _exposures(r: Recorded) -> StarLists:
     def read_stars() -> Iterator[StarList]:
-        return map(exposure_of, star_lists(r))
+        return map(star_list_of, star_lists(r))
 
     def no_tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
         raise TiltError(f"{r.path}: no usable tilt in it: record the topic tilt too")

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solver's messages as the report's types: what was recorded of stars and solutions."""
+
+import numpy as np
+
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.vertical import Deflection
+from starpos.errors import FrameError, StarposError
+from starpos.fix.budget import ALWAYS, ErrorTerm
+from starpos.fix.solver import Attitude, Status
+from starpos.instrument.camera import Camera
+from starpos.recording.messages import message_to_stars, stamp_to_unix
+from starpos.report.folder import StarList
+from starpos.report.night import NO_TILT, ReportedPlace, Shot
+from starpos.rotation import full_turn
+from starpos.units import ARCSEC
+from starpos.utc import utc_text
+
+STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT, Status.TILT_OUT_OF_RANGE,
+          Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip  # by Solution.status
+
+
+def star_list_of(m) -> StarList:
+    """The stars of a StarArray, or what is wrong with it."""
+    name = _name("stars", stamp_to_unix(m.header.stamp))
+    try:
+        return StarList(name, message_to_stars(m, name))
+    except FrameError as error:
+        return StarList(name, error)
+
+
+def _name(what: str, utc_unix_s: float | None) -> str:
+    return f"{what} " + ("of unknown time" if utc_unix_s is None else utc_text(utc_unix_s))
+
+
+def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
+    """Of a Solution; its heading is geodetic, ours astronomic."""
+    status = STATUS[m.status] if m.status < len(STATUS) else Status.BAD_INPUT
+    at = stamp_to_unix(m.header.stamp)
+    utc = float("nan") if at is None else at
+    place = pointing = None
+    unit = np.array([1.0, 1.0, np.radians(1.0)])
+    covariance = np.asarray(m.covariance, float).reshape(3, 3) * np.outer(unit, unit)
+    angles = np.radians([m.latitude, m.longitude, m.heading])
+    sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and abs(m.eta) < 3600
+    sane &= bool(np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all())
+    if status is Status.OK and sane:
+        heading = angles[2] + m.eta * ARCSEC * np.tan(np.radians(m.latitude_geodetic))
+        terms = tuple(
+            ErrorTerm(
+                t.name,
+                np.vstack([np.diag([t.east, t.north, np.radians(t.heading)]), np.zeros((3, 3))]),
+                shared=ALWAYS if t.common else None,
+            )
+            for t in m.budget
+            if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
+        )
+        place = ReportedPlace(
+            utc_unix_s=utc,
+            latitude=float(angles[0]),
+            longitude=float(angles[1]),
+            heading=full_turn(heading),
+            covariance=covariance,
+            terms=terms,
+        )
+    elif status is Status.OK:
+        status = Status.BAD_INPUT
+    looking = np.radians([m.right_ascension, m.declination, m.roll])
+    if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
+        ra, dec, roll = looking.tolist()
+        pointing = Attitude(
+            ra=ra,
+            dec=dec,
+            roll=roll,
+            focal_px=m.focal_px,
+            residual_arcsec=m.residual,
+            log_odds=m.log_odds,
+            mirrored=bool(m.mirrored),
+        )
+    return Shot(
+        name=_name("solution", at),
+        status=status,
+        message=m.status_text,
+        utc_unix_s=utc,
+        place=place,
+        pointing=pointing,
+        size=next(iter(cameras)) if len(cameras) == 1 else None,
+        stars_detected=int(m.stars_detected),
+        stars_matched=int(m.stars_matched),
+        residual_arcsec=_finite(m.residual),
+        tilt=(_finite(m.tilt.x), _finite(m.tilt.y)) if m.tilt_samples else NO_TILT,
+        identify_s=_finite(m.identify_seconds),
+        fix_s=_finite(m.fix_seconds),
+    )
+
+
+def _finite(value: float) -> float:
+    """NaN for what no instrument says."""
+    return float(value) if abs(value) < 1e9 else float("nan")
+
+
+def deflection_of(m) -> Deflection | None:
+    """That the solver applied; its error from what it widened the position by."""
+    _, meridian = curvature_radii_m(np.radians(m.latitude))
+    wider = max(m.covariance_geodetic[4] - m.covariance[4], 0.0)
+    try:
+        return Deflection(m.xi, m.eta, float(np.sqrt(wider) / meridian / ARCSEC))
+    except StarposError:
+        return None
