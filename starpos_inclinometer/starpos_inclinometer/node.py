@@ -10,12 +10,11 @@ from starpos_common.diagnostics import Diagnosis, Diagnostics
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher
 from starpos_inclinometer.host_clock import HostClock
-from starpos_inclinometer.parameters import PARAMETERS, calibration, complaint
+from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.report import Reporter, step_sentence
-from starpos_inclinometer.sources.ascii_line import AsciiSource
-from starpos_inclinometer.sources.imu import TOPIC, ImuSource
-from starpos_inclinometer.sources.mcu import McuSource
-from starpos_inclinometer.sources.source import Health, Phase, Reading, TiltSource
+from starpos_inclinometer.sources.reading import Health, Phase, Reading
+from starpos_inclinometer.sources.registry import SOURCES
+from starpos_inclinometer.sources.source import Host
 from starpos_interfaces.msg import Tilt
 
 
@@ -24,7 +23,7 @@ class InclinometerNode(Node):
 
     def __init__(self):
         super().__init__("inclinometer")
-        self._values = declare(self, PARAMETERS, apply=self._apply, check=lambda values, _: complaint(values))
+        self._values = declare(self, PARAMETERS, apply=self._apply, check=lambda values, _: refusal(values))
         self._publisher = publisher(self, Tilt, "tilt", 100)
         self._logged: tuple[Phase, str] | None = None
         self._logged_step = None
@@ -33,22 +32,14 @@ class InclinometerNode(Node):
         self.host_clock = HostClock(
             lambda: self.get_clock().now().nanoseconds, lambda: self.get_clock().ros_time_is_active
         )
-        self._source = self._make_source()
-        name = TOPIC if self._values["source"] == "imu" else self._values["port"]
-        self._diagnostics = Diagnostics(self, {"Link": self._report}, name)
+        host = Host(self, self.host_clock, self._wake.trigger)
+        self._source = SOURCES[self._values["source"]](host, self._values)
+        self._diagnostics = Diagnostics(self, {"Link": self._report}, self._source.name)
         self._source.start()
 
     def destroy_node(self):
         self._source.stop()
         super().destroy_node()
-
-    def _make_source(self) -> TiltSource:
-        clock, wake = self.host_clock, self._wake.trigger
-        if self._values["source"] == "imu":
-            return ImuSource(self, self._values, clock, wake)
-        if self._values["source"] == "ascii":
-            return AsciiSource(self._values, clock, wake)
-        return McuSource(self._values, clock, wake, calibration)
 
     def _apply(self, names: frozenset[str]):
         self._source.configure(self._values)

@@ -4,7 +4,7 @@
 from collections import Counter
 
 from starpos_common.diagnostics import Diagnosis, Level
-from starpos_inclinometer.sources.source import OUT_OF_RANGE, SATURATED, STUCK, Counts, Health, Phase
+from starpos_inclinometer.sources.reading import OUT_OF_RANGE, SATURATED, STUCK, Counts, Health, Phase
 
 BAD_SHARE = 0.05  # of lines corrupted or lost since the last report, above which the link is worth a warning
 STEP_SHOWN_S = 30.0

@@ -14,9 +14,10 @@ from reader import WAIT_S
 
 from starpos_inclinometer.emulator import Pty
 from starpos_inclinometer.host_clock import HostClock, Moment
-from starpos_inclinometer.parameters import PARAMETERS, complaint
+from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
-from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, Phase
+from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Phase
+from starpos_inclinometer.sources.source import Host
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 PLAIN = rf"(?P<x>{NUMBER}),(?P<y>{NUMBER})"
@@ -192,15 +193,15 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
     ],
 )
 def test_bad_patterns_are_refused_in_one_sentence(pattern, words):
-    sentence = complaint(values(**{"ascii.pattern": pattern}))
+    sentence = refusal(values(**{"ascii.pattern": pattern}))
     assert words in sentence and "\n" not in sentence
-    assert complaint(values(**{"ascii.pattern": pattern, "source": "serial"})) is None
+    assert refusal(values(**{"ascii.pattern": pattern, "source": "serial"})) is None
 
 
 def test_good_patterns_and_requests():
-    assert complaint(values(**{"ascii.pattern": FULL, "ascii.request": "?\r\n"})) is None
-    assert complaint({p.name: p.default for p in PARAMETERS} | {"source": "ascii"}) is None
-    assert "ASCII" in complaint(values(**{"ascii.request": "\xe9"}))
+    assert refusal(values(**{"ascii.pattern": FULL, "ascii.request": "?\r\n"})) is None
+    assert refusal({p.name: p.default for p in PARAMETERS} | {"source": "ascii"}) is None
+    assert "ASCII" in refusal(values(**{"ascii.request": "\xe9"}))
 
 
 class Meter:
@@ -249,7 +250,7 @@ def meter(tmp_path):
 def readings(path, enough, **parameters):
     """At least so many of a source, and its health."""
     come = threading.Event()
-    source = AsciiSource(values(port=path, **parameters), HostClock(), come.set)
+    source = AsciiSource(Host(None, HostClock(), come.set), values(port=path, **parameters))
     source.start()
     got = []
     try:
@@ -323,7 +324,7 @@ def test_a_device_that_says_something_else(tmp_path):
     master, slave = os.openpty()
     tty.setraw(slave)
     come = threading.Event()
-    source = AsciiSource(values(port=os.ttyname(slave)), HostClock(), come.set)
+    source = AsciiSource(Host(None, HostClock(), come.set), values(port=os.ttyname(slave)))
     source.start()
     try:
         end = time.monotonic() + WAIT_S

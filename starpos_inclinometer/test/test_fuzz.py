@@ -10,7 +10,7 @@ import numpy as np
 from corrupted import IDENTITY, RATE_HZ, as_sent, lines
 
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
@@ -24,7 +24,7 @@ class Host:
 
     def __init__(self):
         self.decoder = McuDecoder(RATE_HZ)
-        self.tilts = McuTilts(VALUES, calibration)
+        self.tilts = McuTilts(VALUES)
         self.samples = []
         self.now_s = 0.0
         self.take(IDENTITY)

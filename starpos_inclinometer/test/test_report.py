@@ -8,11 +8,11 @@ import pytest
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.host_clock import Moment, Step
-from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.report import Reporter
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
-from starpos_inclinometer.sources.source import (
+from starpos_inclinometer.sources.reading import (
     GAP,
     OUT_OF_RANGE,
     SATURATED,
@@ -102,7 +102,7 @@ def identity(rate_hz, delay_ms=14):
 
 
 def test_another_rate_is_another_noise():
-    tilts = McuTilts(VALUES, calibration)
+    tilts = McuTilts(VALUES)
     tilts.read([arrival(k, 0.02 * k, identity(50)) for k in range(500)])
     assert tilts.sensor.noise.sigma is not None
     tilts.read([arrival(500, 10.0, identity(50))])
@@ -117,7 +117,7 @@ def played(rates_hz, at_once):
     at_once: the samples are taken when all are there, not each as it comes.
     """
     mcu = Mcu(rate_hz=10, noise_rad=0.0035, seed=1)
-    decoder, tilts = McuDecoder(10), McuTilts(VALUES, calibration)
+    decoder, tilts = McuDecoder(10), McuTilts(VALUES)
     now_s, waiting, errors, arrivals = 0.0, mcu.reset(0.0), [], []
     for rate_hz in rates_hz:
         decoder.wanted_rate_hz = rate_hz
@@ -149,7 +149,7 @@ def test_a_change_of_rate_moves_no_stamp(at_once):
 
 def test_samples_before_the_microcontroller_has_said_its_rate_move_none_after():
     """It had another rate from before, so the delay was a guess until then."""
-    tilts = McuTilts(VALUES, calibration)
+    tilts = McuTilts(VALUES)
     early = tilts.read([arrival(k, 0.02 * k + 0.014) for k in range(5)])
     later = tilts.read([arrival(k, 0.02 * k + 0.014, identity(50)) for k in range(5, 20)])
     line_s = 430 / 38400
@@ -162,7 +162,7 @@ def test_samples_before_the_microcontroller_has_said_its_rate_move_none_after():
 @pytest.mark.parametrize("cause", ["restarted", "resumed"])
 def test_after_a_reset_or_a_new_connection_the_clocks_are_related_anew(cause):
     """The MCU's milliseconds go on by chance where they were, 1 s off: that is no lateness."""
-    tilts = McuTilts(VALUES, calibration)
+    tilts = McuTilts(VALUES)
     tilts.read([arrival(k, 0.02 * k, identity(50)) for k in range(500)])
     (reading,) = tilts.read([arrival(500, 11.0, identity(50), **{cause: True})])
     assert 11.0 - reading.stamp_ns * 1e-9 == pytest.approx(0.014 + 43 * 10 / 38400, abs=1e-6)
@@ -170,8 +170,8 @@ def test_after_a_reset_or_a_new_connection_the_clocks_are_related_anew(cause):
 
 def test_the_latency_is_the_devices_or_the_parameters():
     for latency, delay_ms, expected in ((math.nan, 14, 0.014), (math.nan, 9, 0.009), (0.1, 14, 0.1)):
-        tilts = McuTilts(VALUES | {"latency": latency}, calibration)
+        tilts = McuTilts(VALUES | {"latency": latency})
         (reading,) = tilts.read([arrival(0, 5.0, identity(50, delay_ms))])
         assert 5.0 - reading.stamp_ns * 1e-9 == pytest.approx(expected + 430 / 38400, abs=1e-6)
-    (unknown,) = McuTilts(VALUES, calibration).read([arrival(0, 5.0)])
+    (unknown,) = McuTilts(VALUES).read([arrival(0, 5.0)])
     assert np.isfinite(unknown.x) and unknown.stamp_ns < 5_000_000_000

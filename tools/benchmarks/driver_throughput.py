@@ -11,7 +11,7 @@ import time
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.parameters import PARAMETERS, calibration
+from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
@@ -47,7 +47,7 @@ def serial(samples: int, values) -> float:
     mcu = Mcu(lambda now: (0.1, -0.2), rate_hz=RATE_HZ, seed=1)
     identity = mcu.reset(0.0)
     lines = [mcu.sample() for _ in range(samples)]
-    decoder, tilts = McuDecoder(RATE_HZ), McuTilts(values, calibration)
+    decoder, tilts = McuDecoder(RATE_HZ), McuTilts(values)
     decoder.feed(identity, Moment(0.0, 0))
     readings, began_s = 0, time.process_time()
     for k, line in enumerate(lines):

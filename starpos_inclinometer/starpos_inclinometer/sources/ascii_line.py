@@ -3,19 +3,21 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from typing import Any
 
 from starpos.instrument.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
 from starpos.units import ARCSEC
+from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter
-from starpos_inclinometer.host_clock import HostClock, Moment
+from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
-from starpos_inclinometer.sources.serial_link import SerialLink
-from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
+from starpos_inclinometer.sources.source import Host
 
 MAX_LINE = 256  # bytes
 NEAR_RAD = math.radians(0.05)
@@ -31,6 +33,57 @@ ANGLES_RAD = {
 }
 SINES = {"g": 1.0, "mg": 1e-3, "percent_g": 1e-2}  # what an accelerometer feels: the sine of the tilt
 UNITS = (*ANGLES_RAD, *SINES)
+NUMBER = r"[-+]?\d+\.?\d*"
+MAX_REQUEST = 256
+PARAMETERS = (
+    *SERIAL_PARAMETERS,
+    Parameter(
+        "ascii.pattern",
+        rf"(?P<x>{NUMBER})[,;\s]+(?P<y>{NUMBER})",
+        "Regular expression (Python's) that a whole line must match, with the named groups x, y, and where the device "
+        "tells them temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.unit",
+        "deg",
+        "Unit of x and y; g, mg and percent_g are the sine of the tilt. A wrong one is wrong by its factor.",
+        choices=UNITS,
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.resolution",
+        math.nan,
+        "Step of x and y in ascii.unit; unset takes the last digit a line shows.",
+        unit="",
+        minimum=0.0,
+        maximum=1e6,
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.period",
+        0.1,
+        "From line to line, or from request to request; the device counts as silent after 1.5 of them, at least 1 s.",
+        unit="s",
+        minimum=0.02,
+        maximum=60.0,
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.request",
+        "",
+        "What to send once a period, for a device that speaks when it is asked, with its line end; empty: nothing.",
+        read_only=True,
+    ),
+    Parameter(
+        "ascii.stuck_samples",
+        100,
+        "So many equal lines in a row are a stuck device; 0: never, for one whose steps are coarser than its noise.",
+        unit="",
+        minimum=0,
+        maximum=1_000_000,
+    ),
+)
 _END = re.compile(rb"[\r\n]+")
 
 
@@ -225,7 +278,10 @@ def _follows(a: Arrival, b: Arrival) -> bool:
 class AsciiSource:
     """Lines of a digital tiltmeter as readings."""
 
-    def __init__(self, values: Mapping[str, Any], clock: HostClock, wake: Callable[[], None]):
+    parameters = PARAMETERS
+
+    def __init__(self, host: Host, values: Mapping[str, Any]):
+        self.name = values["port"]
         self._baud = values["baud"]
         self._decoder = LineDecoder(
             values["ascii.pattern"],
@@ -234,13 +290,20 @@ class AsciiSource:
             values["ascii.period"],
             values["ascii.request"],
         )
-        self._link = SerialLink(values["port"], self._baud, self._decoder, clock, wake)
+        self._link = SerialLink(values["port"], self._baud, self._decoder, host.clock, host.wake)
         self._arrivals = ArrivalFilter()
         self._noise = NoiseTracker()
         self._equal = 0
         self._last = (math.nan, math.nan)
         self._sequence = -1
         self.configure(values)
+
+    @staticmethod
+    def refusal(values: Mapping[str, Any]) -> str | None:
+        request = values["ascii.request"]
+        if not request.isascii() or len(request) > MAX_REQUEST:
+            return f"ascii.request must be at most {MAX_REQUEST} ASCII characters."
+        return port_refusal(values) or pattern_error(values["ascii.pattern"])
 
     def start(self):
         self._link.start()

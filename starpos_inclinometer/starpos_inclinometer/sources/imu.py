@@ -3,20 +3,20 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from starpos.instrument.inclinometer import LIMIT_RAD
+from starpos_common.parameters import Parameter
 from starpos_common.topics import subscription
-from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.noise import NoiseTracker, noise_text
-from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
+from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
+from starpos_inclinometer.sources.source import Host
 
 TOPIC = "imu/data"
 STANDARD_GRAVITY = 9.80665  # m/s2; 0.3 % off anywhere on the ground
@@ -29,6 +29,35 @@ MAX_MESSAGES = 10_000  # of an average
 QUEUE = 512
 RATE_WINDOW_S = 5.0
 PATIENCE_S = 0.8  # and a report a second: told within 2 s
+
+
+PARAMETERS = (
+    Parameter(
+        "imu.average",
+        0.5,
+        "Time over which an IMU's accelerations are averaged to one tilt; short ones are noisy, long ones late.",
+        unit="s",
+        minimum=0.02,
+        maximum=60.0,
+    ),
+    Parameter(
+        "imu.max_force_error",
+        0.05,
+        "Share by which the IMU's acceleration may differ from 9.81 m/s2; beyond it is not at rest and tells no tilt. "
+        "Too small refuses an uncalibrated accelerometer, too large takes driving for leaning.",
+        unit="",
+        minimum=0.0001,
+        maximum=0.5,
+    ),
+    Parameter(
+        "imu.max_rotation",
+        2.0,
+        "Rate of rotation beyond which the IMU is not at rest, its gyroscope's own offset included.",
+        unit="deg/s",
+        minimum=0.001,
+        maximum=360.0,
+    ),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,10 +178,12 @@ class ForceAverager:
 class ImuSource:
     """Averages of what a node's subscription to TOPIC brings, as readings."""
 
-    def __init__(self, node: Node, values: Mapping[str, Any], clock: HostClock, wake: Callable[[], None]):
-        self._clock = clock
+    parameters, name = PARAMETERS, TOPIC
+
+    def __init__(self, host: Host, values: Mapping[str, Any]):
+        node = host.node
+        self._clock, self._wake = host.clock, host.wake
         self._now_ns = lambda: node.get_clock().now().nanoseconds
-        self._wake = wake
         self._averager = ForceAverager(values["imu.average"])
         self._noise = NoiseTracker()
         self._readings: deque[Reading] = deque(maxlen=QUEUE)
@@ -164,6 +195,10 @@ class ImuSource:
         self.configure(values)
         self._subscription = subscription(node, Imu, TOPIC, self._hear, 1000, ReliabilityPolicy.BEST_EFFORT)
         self._topic = self._subscription.topic_name
+
+    @staticmethod
+    def refusal(values: Mapping[str, Any]) -> str | None:
+        return None
 
     def start(self):
         pass

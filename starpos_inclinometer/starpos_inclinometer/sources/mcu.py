@@ -2,22 +2,128 @@
 """The source `serial`: the microcontroller's lines to tilts, and what it is told."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
+from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter
-from starpos_inclinometer.host_clock import HostClock, Moment
+from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.noise import noise_text
-from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources import mcu_protocol, sca100t
 from starpos_inclinometer.sources.mcu_continuity import Continuity, Gate, mcu_follows
 from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
+from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
-from starpos_inclinometer.sources.serial_link import SerialLink
-from starpos_inclinometer.sources.source import Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
+from starpos_inclinometer.sources.source import Host
 
 BITS_PER_BYTE = 10  # 8N1
 NEAR_CODES = 11_000  # 0.05 deg, ten times the noise
 DEFAULT_DELAY_MS = 54  # of the firmware at its default rate, until it has said its own
+
+
+SMALLEST_DETERMINANT = 0.5  # of the cross-axis matrix: less, and the axes are no two axes
+PARAMETERS = (
+    *SERIAL_PARAMETERS,
+    Parameter(
+        "rate",
+        10,
+        "Samples a second from the microcontroller; above 18 Hz, the sensor's bandwidth, they add little.",
+        unit="Hz",
+        minimum=mcu_protocol.MIN_RATE_HZ,
+        maximum=mcu_protocol.MAX_RATE_HZ,
+    ),
+    Parameter(
+        "offset_volts",
+        (2.5, 2.5),
+        "Sensor output of x and y at zero tilt; an error of 1 mV is 52 arcsec of tilt, 1.6 km of position.",
+        unit="V",
+        minimum=0.0,
+        maximum=5.5,
+    ),
+    Parameter(
+        "sensitivity",
+        (4.0, 4.0),
+        "Sensor sensitivity of x and y, 4 for the SCA100T-D01; 0.1 % off is 36 arcsec at 10 deg of tilt.",
+        unit="V/g",
+        minimum=0.1,
+        maximum=100.0,
+    ),
+    Parameter(
+        "divider",
+        sca100t.DIVIDER,
+        "Divider between sensor and ADC, (R1 + R2) / R2; 0.1 % off is 36 arcsec at 10 deg of tilt.",
+        unit="",
+        minimum=1.0,
+        maximum=1000.0,
+    ),
+    Parameter(
+        "reference_volts",
+        sca100t.ADC_NOMINAL_REFERENCE_V,
+        "Reference of the ADC and supply of the sensor that offset_volts and sensitivity were measured at; "
+        "the circuit is ratiometric, so what it is at work does not matter.",
+        unit="V",
+        minimum=4.5,
+        maximum=5.5,
+    ),
+    Parameter(
+        "cross_axis",
+        (1.0, 0.0, 0.0, 1.0),
+        "Matrix (xx, xy, yx, yy) that takes what the sensor's two axes feel, in g, into X' and Y' of S; 0.01 off in xy "
+        "is 0.6 deg of x at 90 deg of y, 360 arcsec at 10 deg.",
+        unit="",
+        minimum=-2.0,
+        maximum=2.0,
+    ),
+    Parameter(
+        "temperature.reference",
+        25.0,
+        "Temperature that offset_volts and sensitivity hold at; the four polynomials below are in T less this.",
+        unit="deg C",
+        minimum=-40.0,
+        maximum=125.0,
+    ),
+    *(
+        Parameter(
+            f"temperature.offset_{axis}",
+            (0.0, 0.0, 0.0),
+            f"What is added to the offset of {axis}: linear, square and cubic term; 0.5 mV/deg C left out is 26 arcsec "
+            "a degree. All zeros: no compensation.",
+            unit="V/deg C^n",
+            minimum=-0.1,
+            maximum=0.1,
+        )
+        for axis in "xy"
+    ),
+    *(
+        Parameter(
+            f"temperature.sensitivity_{axis}",
+            (0.0, 0.0, 0.0),
+            f"Share by which the sensitivity of {axis} grows: linear, square and cubic term; 0.0001/deg C left out is "
+            "3.6 arcsec a degree at 10 deg of tilt.",
+            unit="1/deg C^n",
+            minimum=-0.01,
+            maximum=0.01,
+        )
+        for axis in "xy"
+    ),
+)
+
+
+def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
+    """The sensor's calibration that the parameters say."""
+    floor = values["noise_stddev"]
+    return Sca100tCalibration(
+        offset_volts=values["offset_volts"],
+        sensitivity_volts_per_g=values["sensitivity"],
+        divider=values["divider"],
+        reference_volts=values["reference_volts"],
+        cross_axis=values["cross_axis"],
+        temperature_reference_c=values["temperature.reference"],
+        offset_per_c=(values["temperature.offset_x"], values["temperature.offset_y"]),
+        sensitivity_per_c=(values["temperature.sensitivity_x"], values["temperature.sensitivity_y"]),
+        noise_floor_rad=0.0 if math.isnan(floor) else math.radians(floor),
+    )
 
 
 class McuDecoder:
@@ -105,21 +211,18 @@ class McuDecoder:
 
 
 class McuTilts:
-    """Believed samples to readings; `calibration` makes the sensor's of the parameters' values."""
+    """Believed samples to readings."""
 
-    def __init__(
-        self, values: Mapping[str, Any], calibration: Callable[[Mapping[str, Any]], Sca100tCalibration]
-    ):
+    def __init__(self, values: Mapping[str, Any]):
         self.sensor = Sensor()
         self.arrivals = ArrivalFilter()
-        self._calibration = calibration
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
         self._delay_ms = DEFAULT_DELAY_MS
         self._rate_hz = 0
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]):
-        self.sensor.calibration = self._calibration(values)
+        self.sensor.calibration = calibration(values)
         self._latency_s = values["latency"]
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
@@ -158,16 +261,23 @@ class McuTilts:
 class McuSource:
     """The starpos microcontroller on a serial port; see `McuTilts`."""
 
-    def __init__(
-        self,
-        values: Mapping[str, Any],
-        clock: HostClock,
-        wake: Callable[[], None],
-        calibration: Callable[[Mapping[str, Any]], Sca100tCalibration],
-    ):
+    parameters = PARAMETERS
+
+    def __init__(self, host: Host, values: Mapping[str, Any]):
+        self.name = values["port"]
         self._decoder = McuDecoder(values["rate"])
-        self._link = SerialLink(values["port"], values["baud"], self._decoder, clock, wake)
-        self._tilts = McuTilts(values, calibration)
+        self._link = SerialLink(values["port"], values["baud"], self._decoder, host.clock, host.wake)
+        self._tilts = McuTilts(values)
+
+    @staticmethod
+    def refusal(values: Mapping[str, Any]) -> str | None:
+        xx, xy, yx, yy = values["cross_axis"]
+        if abs(xx * yy - xy * yx) < SMALLEST_DETERMINANT:
+            return (
+                "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
+                f"{list(values['cross_axis'])} was given."
+            )
+        return port_refusal(values)
 
     def start(self):
         self._link.start()

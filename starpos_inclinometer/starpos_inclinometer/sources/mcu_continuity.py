@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
-from starpos_inclinometer.sources.source import Arrival
+from starpos_inclinometer.sources.reading import Arrival
 
 TOLERANCE_OF_CHANGE = 8.0  # times the usual change from sample to sample is still near
 CHANGE_SHARE = 1 / 8  # of a sample in the usual change

@@ -15,7 +15,7 @@ from starpos.instrument.inclinometer import (
 )
 from starpos_inclinometer.noise import NoiseTracker
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
-from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, SATURATED, STUCK
+from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos_inclinometer.temperature import Temperature
 
 # Bipolar conversions of the AD7730 are offset binary: 0x000000 at minus full scale, 0x800000 at zero.

@@ -8,14 +8,16 @@ import os
 import termios
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import serial
 
+from starpos_common.parameters import Parameter
 from starpos_inclinometer.host_clock import HostClock, Moment, Step
-from starpos_inclinometer.sources.source import Arrival, Counts, Phase
+from starpos_inclinometer.sources import mcu_protocol
+from starpos_inclinometer.sources.reading import Arrival, Counts, Phase
 
 RETRY_S = 0.4  # so that a device that came back is read again within a second
 READ_TIMEOUT_S = 0.1  # how soon a stop, a command or silence is noticed
@@ -28,6 +30,33 @@ PTY_MAJORS = range(136, 144)  # pseudo-terminals, Linux's devices.txt
 
 # pyserial raises its own error, passes some of the system's through, and a TypeError where its fd has gone.
 PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueError)
+
+
+SERIAL_PARAMETERS = (
+    Parameter(
+        "port",
+        "/dev/ttyUSB0",
+        "Serial port; a stable path such as /dev/serial/by-id/... survives replugging, /dev/ttyUSB0 may "
+        "become another device.",
+        read_only=True,
+    ),
+    Parameter(
+        "baud",
+        mcu_protocol.BAUD,
+        "Speed of the serial line; with a wrong one nothing but garbage comes.",
+        unit="baud",
+        minimum=1200,
+        maximum=1_000_000,
+        read_only=True,
+    ),
+)
+
+
+def port_refusal(values: Mapping[str, Any]) -> str | None:
+    """A sentence where no port is named."""
+    if values["port"].strip():
+        return None
+    return "parameter port must name the serial port, such as /dev/serial/by-id/...; it is empty."
 
 
 class Decoder(Protocol):
