@@ -159,5 +159,7 @@ def is_module(package: str, names: str) -> bool:
         place = place / parts.pop(0)
     if parts and (place / f"{parts[0]}.py").is_file():
         place = place / f"{parts.pop(0)}.py"
-    text = (place / "__init__.py" if place.is_dir() else place).read_text()
-    return all(re.search(rf"\b{part}\b", text) for part in parts)
+    if place.is_dir():  # what a package offers it may have from elsewhere
+        return all(re.search(rf"\b{part}\b", (place / "__init__.py").read_text()) for part in parts)
+    made = r"(?m)^ *(?:(?:def|class) {0}\b|{0}:|[\w, ]*\b{0}\b[\w, ]*(?::[^=\n]+)?=)"
+    return all(re.search(made.format(part), place.read_text()) for part in parts)

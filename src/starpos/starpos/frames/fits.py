@@ -14,7 +14,7 @@ FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, Ari
 
 
 def read_fits(path) -> Frame:
-    """A frame from a FITS file (also .fz and .gz) by the rules of starpos.frames.reading.read_frame; FrameError if it is none."""
+    """A frame from a FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it is none."""
     return _read(path, str(path))[0]
 
 
