@@ -28,7 +28,7 @@ FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglo
 SOURCES = [f for f in FILES if f.suffix in (".py", ".c", ".h")]
 MODULES = {p.name: p / p.name for p in PACKAGES}
 FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
-FOREIGN = {"sys/timex.h", "t_erfa_c.c"}  # of the C library, of ERFA
+FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}  # of the C library, of ERFA, of avr-libc
 SHOUTED = r"\b(?:ARCHITECTURE|CONTRIBUTING|DESIGN|ERRATA|PROTOCOL|README|TUTORIAL)\b(?:\.md)?"
 NAMED = re.compile(rf"{SHOUTED}|(?<![\w./-])[\w./-]*\w\.(?:md|rst|py|c|h|svg)\b(?:#[\w-]+)?")
 DOTTED = re.compile(r"(?<![\w./-])(starpos(?:_[a-z]+)?)((?:\.[A-Za-z]\w*)+)")
@@ -98,8 +98,11 @@ def test_what_comments_and_docstrings_name_is_there(package):
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: str(d.relative_to(ROOT)))
-def test_every_module_that_a_document_names_is_there(document):
-    assert not [name for name in DOTTED.finditer(document.read_text()) if not is_module(*name.groups())]
+def test_every_module_and_source_file_that_a_document_names_is_there(document):
+    text = document.read_text()
+    assert not [m.group() for m in DOTTED.finditer(text) if not is_module(*m.groups())]
+    assert not [f for f in re.findall(r"(?<![\w./-])[\w/]+\.(?:py|c|h)\b", text) if not is_file(f, document)]
+    assert not [f for f in re.findall(r"(?<![\w./-])src/[\w./-]*\w", text) if not (ROOT / f).exists()]
 
 
 @pytest.mark.parametrize(
@@ -134,13 +137,15 @@ def said_beside_the_code(source: Path) -> list[str]:
 
 def not_there(text: str, source: Path) -> list[str]:
     """What a comment of `source` names and the repository does not hold."""
-    files = [name for name in NAMED.findall(text) if name not in FOREIGN and not is_file(name, source)]
+    files = [name for name in NAMED.findall(text) if not is_file(name, source)]
     modules = [m.group() for m in DOTTED.finditer(text) if not is_module(*m.groups())]
     return files + [m for m in modules if m not in files]
 
 
 def is_file(name: str, source: Path) -> bool:
     """Any file of the repository whose path ends so; a README only one of a folder that `source` lies in."""
+    if name in FOREIGN:
+        return True
     path, _, anchor = name.partition("#")
     path = path if "." in path else f"{path}.md"
     if path == "README.md":
