@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the documents name is there: links, headings, files, tools, parameters; changelogs are as bloom reads them."""
 
+import ast
+import io
 import re
+import tokenize
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,6 +23,15 @@ OF_NODES = {
     "inclinometer": "starpos_inclinometer",
     "solver": "starpos_solver",
 }
+ROOMS = (ROOT / "docs", ROOT / "test", ROOT / "tools", *PACKAGES)
+FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglob("*"))) if f.is_file())
+SOURCES = [f for f in FILES if f.suffix in (".py", ".c", ".h")]
+MODULES = {p.name: p / p.name for p in PACKAGES}
+FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
+FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}  # of the C library, of ERFA, of avr-libc
+SHOUTED = r"\b(?:ARCHITECTURE|CONTRIBUTING|DESIGN|ERRATA|PROTOCOL|README|TUTORIAL)\b(?:\.md)?"
+NAMED = re.compile(rf"{SHOUTED}|(?<![\w./-])[\w./-]*\w\.(?:md|rst|py|c|h|svg)\b(?:#[\w-]+)?")
+DOTTED = re.compile(r"(?<![\w./-])(starpos(?:_[a-z]+)?)((?:\.[A-Za-z]\w*)+)")
 
 
 def headings(document: Path) -> set[str]:
@@ -69,3 +81,90 @@ def test_a_package_has_a_changelog_as_catkin_prepare_release_wants_it(package):
         section
     )
     assert entries and all(re.match(r"\* |  \S|-+$|$|\d+\.", entry) for entry in entries)
+
+
+@pytest.mark.parametrize("package", [None, *PACKAGES], ids=lambda p: p.name if p else "test and tools")
+def test_what_comments_and_docstrings_name_is_there(package):
+    """Files, documents with their headings, modules and what is in them; a comment is written once and read for years."""
+    folders = [package] if package else [ROOT / "test", ROOT / "tools"]
+    wrong = [
+        f"{source.relative_to(ROOT)}: {name}"
+        for source in SOURCES
+        if any(folder in source.parents for folder in folders)
+        for text in said_beside_the_code(source)
+        for name in not_there(text, source)
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: str(d.relative_to(ROOT)))
+def test_every_module_and_source_file_that_a_document_names_is_there(document):
+    text = document.read_text()
+    assert not [m.group() for m in DOTTED.finditer(text) if not is_module(*m.groups())]
+    assert not [f for f in re.findall(r"(?<![\w./-])[\w/]+\.(?:py|c|h)\b", text) if not is_file(f, document)]
+    assert not [f for f in re.findall(r"(?<![\w./-])src/[\w./-]*\w", text) if not (ROOT / f).exists()]
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "see DESIGN section 2",
+        "as ARCHITECTURE.md says",
+        "docs/nowhere.md",
+        "docs/the_paper.md#no-such-heading",
+        "see tools/nowhere.py",
+        "turned by nowhere.py",
+        "starpos.nowhere",
+        "starpos.rotation.nowhere",
+    ],
+)
+def test_what_is_not_there_is_found(said):
+    assert not_there(said, ROOT / "src" / "starpos" / "starpos" / "rotation.py")
+
+
+def said_beside_the_code(source: Path) -> list[str]:
+    """Comments and docstrings."""
+    text = source.read_text()
+    if source.suffix != ".py":
+        return re.findall(r"//.*|/\*.*?\*/", text, re.DOTALL if "/*" in text else 0)
+    comments = [
+        t.string for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.COMMENT
+    ]
+    holders = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = (ast.get_docstring(node) for node in ast.walk(ast.parse(text)) if isinstance(node, holders))
+    return [*comments, *filter(None, docstrings)]
+
+
+def not_there(text: str, source: Path) -> list[str]:
+    """What a comment of `source` names and the repository does not hold."""
+    files = [name for name in NAMED.findall(text) if not is_file(name, source)]
+    modules = [m.group() for m in DOTTED.finditer(text) if not is_module(*m.groups())]
+    return files + [m for m in modules if m not in files]
+
+
+def is_file(name: str, source: Path) -> bool:
+    """Any file of the repository whose path ends so; a README only one of a folder that `source` lies in."""
+    if name in FOREIGN:
+        return True
+    path, _, anchor = name.partition("#")
+    path = path if "." in path else f"{path}.md"
+    if path == "README.md":
+        found = [folder / path for folder in source.parents if ROOT in (folder, *folder.parents)]
+    else:
+        found = [f for f in FILES if f.as_posix().endswith(f"/{path.lstrip('./')}")]
+    return any(f.exists() and (not anchor or anchor in headings(f)) for f in found)
+
+
+def is_module(package: str, names: str) -> bool:
+    """Whether `package` has this module, and the module these names; file names and topics have dots too, and pass."""
+    place, parts = MODULES.get(package), names.split(".")[1:]
+    if place is None or not place.is_dir() or parts[-1] in FILE_ENDINGS:
+        return True
+    while parts and (place / parts[0]).is_dir():
+        place = place / parts.pop(0)
+    if parts and (place / f"{parts[0]}.py").is_file():
+        place = place / f"{parts.pop(0)}.py"
+    if place.is_dir():  # what a package offers it may have from elsewhere
+        return all(re.search(rf"\b{part}\b", (place / "__init__.py").read_text()) for part in parts)
+    made = r"(?m)^ *(?:(?:def|class) {0}\b|{0}:|[\w, ]*\b{0}\b[\w, ]*(?::[^=\n]+)?=)"
+    return all(re.search(made.format(part), place.read_text()) for part in parts)

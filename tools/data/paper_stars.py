@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the paper's star list differs from the plain cut V < 7 with a HIP number of the committed catalogue.
 
-`paper_stars.py ORIGINALS > src/starpos/starpos/data/paper_stars.csv` (a folder with tyc2.dat.00 .. 19).  The paper's list
-is rows of Tycho-2's main table: without supplement 1, both components of a pair, V not rounded to 0.01 mag.
+`paper_stars.py ORIGINALS > src/starpos/starpos/identification/data/paper_stars.csv` (a folder with tyc2.dat.00 .. 19).
+The paper's list is rows of Tycho-2's main table: without supplement 1, both components of a pair, V not rounded to
+0.01 mag.
 """
 
 import sys

@@ -148,7 +148,7 @@ class Simulated:
 
 
 def scene_from(values: Mapping):
-    """The starpos.simulate.Scene of the node's parameters."""
+    """The starpos.simulation.scene.Scene of the node's parameters."""
     from starpos.simulation.scene import scene_of
 
     return scene_of(

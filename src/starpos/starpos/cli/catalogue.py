@@ -87,7 +87,7 @@ def show_paper() -> int:
     print(f"triangles with every side below {paper.LONGEST_SIDE_DEG:g} deg: {count}")
     for whose, number in (
         ("printed by the paper", paper.PRINTED_TRIANGLES),
-        ("by its errata", paper.TRIANGLES),
+        ("from the original files", paper.TRIANGLES),
     ):
         print(f"    {number} {whose}: {100 * (count / number - 1):+.2f} %")
     print("angles of its triangle, rad:  here      +-        paper     difference")

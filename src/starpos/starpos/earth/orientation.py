@@ -25,7 +25,7 @@ SPEED_OF_LIGHT = erfa.CMPS
 ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
 FIRST_MJD = 41684.0  # 1973-01-02: the first day of the IERS table
 # Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
-# holding the pole (test_earth.py computes both).
+# holding the pole (test_orientation.py computes both).
 EXTRAPOLATION_DAYS = (0.0, 30.0, 90.0, 180.0, 365.0, 730.0, 1095.0)
 EXTRAPOLATION_SIGMA_S = (0.001, 0.013, 0.033, 0.053, 0.092, 0.25, 0.46)
 POLE_SIGMA_RAD = 0.2 * ARCSEC

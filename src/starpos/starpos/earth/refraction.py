@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refraction in the local level L, where zenith distance is known from the tilt (ERRATA: it acts there, not after A2)."""
+"""Refraction in the local level L, where the tilt tells the zenith distance.
+
+The paper puts aberration beside it; docs/the_paper.md#matrix-a2 says where that is instead.
+"""
 
 from dataclasses import dataclass
 

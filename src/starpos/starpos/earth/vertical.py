@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From astronomic to geodetic: the deflection of the vertical (DESIGN section 2)."""
+"""From astronomic to geodetic: the deflection of the vertical.
+
+Signs and symbols: docs/frames_and_symbols.md#the-vertical.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A4 from one frame: where the instrument stands and which way it faces, with the whole covariance.
 
-The equation is the paper's (15), A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the site; its
-residuals are taken in pixels, where the errors of the stars live.
+The equation is that of the paper's section 4, A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
+site; its residuals are taken in pixels, where the errors of the stars live.
 """
 
 from dataclasses import dataclass

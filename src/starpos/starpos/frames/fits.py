@@ -14,12 +14,12 @@ FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, Ari
 
 
 def read_fits(path) -> Frame:
-    """A frame from a FITS file (also .fz and .gz) by the rules of reading.read_frame; FrameError if it is none."""
+    """A frame from a FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it is none."""
     return _read(path, str(path))[0]
 
 
 def decode_fits(data: bytes, source: str) -> tuple[Frame, dict]:
-    """The same from the bytes of a FITS file (also .fz), and what its header has of starpos.frame_header.KEYS.
+    """The same from the bytes of a FITS file (also .fz), and what its header has of starpos.frames.header.KEYS.
 
     source says where the bytes came from. FrameError where they are no whole frame.
     """

@@ -54,7 +54,7 @@ class Frame(Exposure):
 
 
 def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
-    """uint8 or uint16 (h, w) of any real values by the rule of starpos.reading.read_frame; FrameError of others."""
+    """uint8 or uint16 (h, w) of any real values by the rule of `reading.read_frame`; FrameError of others."""
     if values.dtype.kind not in "uif":
         raise FrameError(f"{place}: its pixels are {values.dtype}; give numbers.")
     if values.size == 0:

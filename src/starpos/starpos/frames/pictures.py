@@ -17,7 +17,7 @@ SCAN = 0xDA
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
-    """A frame from the bytes of a PNG, TIFF or JPEG by the rules of reading.read_frame; FrameError of anything else.
+    """A frame from the bytes of a PNG, TIFF or JPEG by the rules of `reading.read_frame`; FrameError of anything else.
 
     place: where they came from.
     """

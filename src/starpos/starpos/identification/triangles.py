@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spherical triangles: their angles (the paper's equations 3 and 4), and the catalogue of them that is searched.
+"""Spherical triangles: their angles (the paper's section 2.1.1), and the catalogue of them that is searched.
 
 The angles hardly depend on the focal length, which is why the paper keys by them.  Stars are chosen by local density:
 every circle of the field's size gives its own brightest stars, so that every field of the instrument holds enough.
@@ -46,7 +46,7 @@ MAX_TRIANGLES = 6_000_000  # before those that several circles share are counted
 
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
-    """Angular separation in rad of unit vectors (..., 3): equation 3, in the form that keeps small angles exact."""
+    """Angular separation in rad of unit vectors (..., 3): in the form that keeps small ones exact."""
     apart = v1 - v2
     return 2 * np.arcsin(np.minimum(1.0, 0.5 * np.sqrt(np.einsum("...i,...i->...", apart, apart))))
 

@@ -66,7 +66,9 @@ class Camera:
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
     def directions(self, x, y) -> np.ndarray:
-        """Unit vectors (N, 3) in C of pixels x, y (N,): ERRATA's W = (X, Y, f) / norm, after undistortion.
+        """Unit vectors (N, 3) in C of pixels x, y (N,): W = (X, Y, f) / norm, after undistortion.
+
+        The paper prints another third component; docs/the_paper.md#star-vectors says why it is f.
 
         Raises InstrumentError where the distortion cannot be inverted.
         """

@@ -96,7 +96,7 @@ EXACT = InclinometerErrors(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
-    """A2 = R2(b) R1(a) of the paper's equation 17 (3, 3): S into L, from the two elevations in rad.
+    """A2 = R2(b) R1(a) of the paper's section 4.2 (3, 3): S into L, from the two elevations in rad.
 
     b = -theta_x and a = asin(sin theta_y / cos b), so that the third row is up as S sees it.
     """
@@ -112,7 +112,7 @@ def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
 
 
 def sca100t_angle(volts, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_SENSITIVITY_V_PER_G):
-    """Angle in rad from the SCA100T's output: asin((V - offset) / sensitivity); NaN beyond +-1 g (equation 14)."""
+    """Angle in rad from the SCA100T's output: asin((V - offset) / sensitivity); NaN beyond +-1 g (paper, section 3.1)."""
     g = (np.asarray(volts, float) - offset_v) / sensitivity_v_per_g
     return np.arcsin(np.where(np.abs(g) <= 1, g, np.nan))
 

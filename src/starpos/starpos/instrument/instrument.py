@@ -13,7 +13,7 @@ from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC, DAY_S
 from starpos.utc import utc_text
 
-# x of the base link is the top of the frame (-y of C), z the optical axis (DESIGN section 2)
+# x of the base link is the top of the frame (-y of C), z the optical axis (docs/frames_and_symbols.md#frames)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 UNSTATED_CALIBRATION_ARCSEC = 5.0  # 1 sigma a axis of an A3 given without its error
 MOST_ARCSEC, MOST_C = (

@@ -282,7 +282,7 @@ def test_identify(night, lists, capsys):
 
 
 def test_identify_needs_only_the_size_of_a_list(lists, tmp_path, capsys):
-    """DESIGN section 3: `identify` needs only the NAXIS pair; J2000 places then, null where nothing is found."""
+    """`identify` needs only the NAXIS pair; J2000 places then, null where nothing is found."""
     head, *rows = (lists / "stars_0000.csv").read_text().splitlines()
     bare = tmp_path / "bare.csv"
     about = {k: v for k, v in json.loads(head.lstrip("# ")).items() if k.startswith("NAXIS")}

@@ -142,7 +142,7 @@ def found_on(run, night, out, *options):
 
 
 def test_a_geodetic_place_gets_its_deflection(known, run, tmp_path):
-    """DESIGN section 2: Phi = phi + xi, Lambda = lambda + eta / cos(phi): north of the map for xi > 0, east for eta."""
+    """Phi = phi + xi, Lambda = lambda + eta / cos(phi): north of the map for xi > 0, east for eta."""
     out = tmp_path / "mine.yaml"
     plain, sharp = found_on(run, known, out, *PLACE)
     assert plain == pytest.approx([LAT, LON], abs=3 * ARCSEC_DEG)

@@ -10,7 +10,7 @@ NONE = np.zeros((3, 3))
 
 
 def test_signs_by_hand():
-    """DESIGN section 2: phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); here phi 60 deg."""
+    """phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); here phi 60 deg."""
     g = geodetic(np.radians(60.0), np.radians(10.0), np.radians(30.0), NONE, Deflection(10.0, 6.0, 0.0))
     assert (g.latitude - np.radians(60)) / ARCSEC == pytest.approx(-10)
     assert (g.longitude - np.radians(10)) / ARCSEC == pytest.approx(-12, abs=0.01)

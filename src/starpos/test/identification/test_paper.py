@@ -13,7 +13,7 @@ from starpos.sky.catalogue import pack
 
 
 def test_the_papers_stars_and_triangles(catalogue):
-    """ERRATA: 15,236 stars; 952,970 triangles with every side below the field's diagonal."""
+    """15,236 stars; 952,970 triangles with every side below the field's diagonal."""
     row = paper.stars(catalogue)
     assert len(row) == 15_236
     count = paper.count_triangles(catalogue.directions(row), np.radians(paper.LONGEST_SIDE_DEG))
@@ -34,7 +34,7 @@ def test_the_papers_stars_differ_little_from_the_plain_cut(catalogue):
 
 
 def test_the_printed_angles(catalogue):
-    """ERRATA's triangle; 27 mas in the place of HIP 98753's component A are 1.4e-5 rad."""
+    """As docs/the_paper.md#star-vectors says; 27 mas in the place of HIP 98753's component A are 1.4e-5 rad."""
     here, sigma = paper.angles_of_printed(catalogue)
     assert here == pytest.approx(paper.ANGLES, abs=1.5e-5)
     assert np.all(np.abs(here - paper.ANGLES) < 1.5 * sigma + 5e-6)

@@ -125,7 +125,7 @@ def test_no_triangle_is_there_twice(table):
 
 
 def test_every_part_of_the_sky_has_enough(table, places, catalogue, rng):
-    """ERRATA: a limit of one magnitude leaves fields with fewer than three stars; here every frame has at least four of
+    """A limit of one magnitude leaves fields with fewer than three stars; here every frame has at least four of
     the table's, and nearly every one a triangle among its own six brightest."""
     camera = Camera.from_focal(1000, 700, 610.3 / np.tan(WIDE))
     used = np.unique(table.corners)

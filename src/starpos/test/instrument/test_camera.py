@@ -38,7 +38,7 @@ def test_round_trip(camera, rng):
 
 
 def test_axes():
-    """ERRATA: W = (X, Y, f) / norm, X along columns, Y along rows; DESIGN: z along the optical axis."""
+    """W = (X, Y, f) / norm: X along columns, Y along rows, z along the optical axis."""
     cx, cy = PAPER.centre_px
     assert (cx, cy) == (2807.5, 1871.5)
     v = PAPER.directions([cx, cx + 93750, cx], [cy, cy, cy + 93750])
@@ -46,7 +46,7 @@ def test_axes():
 
 
 def test_paper_scale_and_field():
-    """ERRATA: 2.2 arcsec a pixel; 3.43 by 2.29 deg, a diagonal of 4.13."""
+    """2.2 arcsec a pixel, not milliarcsec as the paper prints; 3.43 by 2.29 deg, a diagonal of 4.13."""
     assert 3600 * np.degrees(6.4e-6 / 0.6) == pytest.approx(PAPER.scale_arcsec)
     assert PAPER.scale_arcsec == pytest.approx(2.2, abs=0.01)
     assert 2 * np.degrees(PAPER.half_diagonal_rad) == pytest.approx(4.13, abs=0.01)

@@ -27,7 +27,7 @@ def log(theta_x_deg, rate_hz=10.0, start=1000.0, **more):
 
 
 def test_a2_turns_up_as_the_sensor_feels_it_into_z(rng):
-    """Equation 17: a sensor whose axes rise by theta sees up at (sin theta_x, sin theta_y, rest)."""
+    """The paper, section 4.2: a sensor whose axes rise by theta sees up at (sin theta_x, sin theta_y, rest)."""
     for _ in range(300):
         tx, ty = rng.uniform(-30, 30, 2) * DEG
         a2 = a2_matrix(tx, ty)

@@ -16,7 +16,7 @@ from starpos.units import ARCSEC
 
 
 def test_misalignment_is_r3_r2_r1():
-    """DESIGN section 3: A3 = R3(rz) R2(ry) R1(rx), active, C into S."""
+    """A3 = R3(rz) R2(ry) R1(rx), active, C into S."""
     np.testing.assert_allclose(Calibration(misalignment_deg=(90, 0, 0)).a3 @ [0, 1, 0], [0, 0, 1], atol=1e-15)
     np.testing.assert_allclose(Calibration(misalignment_deg=(0, 90, 0)).a3 @ [0, 0, 1], [1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(Calibration(misalignment_deg=(0, 0, 90)).a3 @ [1, 0, 0], [0, 1, 0], atol=1e-15)

@@ -130,7 +130,7 @@ def test_errors_grow_with_time_as_design_section_5_says(catalogue):
 
 
 def test_bright_stars_come_from_the_supplement(catalogue):
-    """DESIGN section 5: 43 of the 47 stars with V <= 2 are only in supplement 1, epoch 1991.25.
+    """43 of the 47 stars with V <= 2 are only in supplement 1, epoch 1991.25.
 
     Three more here: Algieba, Polaris and Hamal round to 2.00 or blend otherwise; none may be missing.
     """
@@ -153,7 +153,7 @@ def test_names(catalogue):
 
 
 def test_size_of_the_committed_catalogue(catalogue):
-    """ERRATA: 130,343 stars with V < 9 in the main table, 130,737 with the supplement, pairs merged."""
+    """130,343 stars with V < 9 in the main table, 130,737 with the supplement, pairs merged."""
     rounded = catalogue.vmag_centi
     assert np.sum(rounded < 900) + np.sum(rounded == 900) / 2 == pytest.approx(130_737, abs=100)
     assert len(catalogue) > 900_000
