@@ -9,8 +9,8 @@ import urllib.request
 from contextlib import closing
 from importlib.util import find_spec
 
-import dashboard as said
 import pytest
+import said
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, NavSatFix
 

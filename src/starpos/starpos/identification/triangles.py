@@ -158,7 +158,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         key = np.union1d(key, _triples_of_circles(tree, radius * half_diagonal, spacing, most))
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
     del tree
-    corners, counter_clockwise, shape, bin_start = _in_bins(v, apart, key, 2 * half_diagonal)
+    corners, counter_clockwise, shape, longest_allowed, bin_start = _in_bins(v, apart, key, 2 * half_diagonal)
     progress("star triangles", 1.0)
     return TriangleCatalogue(
         star=pool.astype(np.int32),
@@ -169,7 +169,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         corners=corners,
         counter_clockwise=counter_clockwise,
         shape=shape,
-        longest_allowed=2 * half_diagonal,
+        longest_allowed=longest_allowed,
         bin_start=bin_start,
     )
 
