@@ -7,10 +7,10 @@ import time
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import rclpy.parameter
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
@@ -289,7 +289,11 @@ class CameraNode(Node):
         ]
         if wanted["gain"] == 0 and math.isnan(self._values["gain"]):
             unset.append("gain")
-        changes = [RosParameter(name, value=value) for name, value in wanted.items() if name not in unset]
+        changes = [
+            rclpy.parameter.Parameter(name, value=value)
+            for name, value in wanted.items()
+            if name not in unset
+        ]
         refusal = ""
         if changes:  # rclpy refuses to change nothing
             result = self.set_parameters_atomically(changes)

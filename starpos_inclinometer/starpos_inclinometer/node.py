@@ -14,7 +14,7 @@ from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.report import Reporter, step_sentence
 from starpos_inclinometer.sources.reading import Health, Phase, Reading
 from starpos_inclinometer.sources.registry import SOURCES
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 from starpos_interfaces.msg import Tilt
 
 
@@ -32,7 +32,7 @@ class InclinometerNode(Node):
         self.host_clock = HostClock(
             lambda: self.get_clock().now().nanoseconds, lambda: self.get_clock().ros_time_is_active
         )
-        host = Host(self, self.host_clock, self._wake.trigger)
+        host = Surroundings(self, self.host_clock, self._wake.trigger)
         self._source = SOURCES[self._values["source"]](host, self._values)
         self._diagnostics = Diagnostics(self, {"Link": self._report}, self._source.name)
         self._source.start()

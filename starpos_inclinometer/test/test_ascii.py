@@ -17,7 +17,7 @@ from starpos_inclinometer.host_clock import HostClock, Moment
 from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Phase
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 PLAIN = rf"(?P<x>{NUMBER}),(?P<y>{NUMBER})"
@@ -250,7 +250,7 @@ def meter(tmp_path):
 def readings(path, enough, **parameters):
     """At least so many of a source, and its health."""
     come = threading.Event()
-    source = AsciiSource(Host(None, HostClock(), come.set), values(port=path, **parameters))
+    source = AsciiSource(Surroundings(None, HostClock(), come.set), values(port=path, **parameters))
     source.start()
     got = []
     try:
@@ -324,7 +324,7 @@ def test_a_device_that_says_something_else(tmp_path):
     master, slave = os.openpty()
     tty.setraw(slave)
     come = threading.Event()
-    source = AsciiSource(Host(None, HostClock(), come.set), values(port=os.ttyname(slave)))
+    source = AsciiSource(Surroundings(None, HostClock(), come.set), values(port=os.ttyname(slave)))
     source.start()
     try:
         end = time.monotonic() + WAIT_S

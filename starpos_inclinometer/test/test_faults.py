@@ -24,7 +24,7 @@ from starpos_inclinometer.report import Reporter
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
 from starpos_inclinometer.sources.reading import STUCK, Phase
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
@@ -266,7 +266,7 @@ class Taken:
         self.readings = []
         self._come = threading.Event()
         clock = HostClock(now_ns)
-        self.source = McuSource(Host(None, clock, self._come.set), values(port=path, **parameters))
+        self.source = McuSource(Surroundings(None, clock, self._come.set), values(port=path, **parameters))
         self.source.start()
 
     def until(self, condition):

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 QUICK_START = ROOT / "src" / "starpos_bringup" / "config" / "quick_start.xml"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
-START_S, SOLVER_S, FRAME_S, STARS_S = 3.0, 1.0, 0.6, 0.02  # targets, median
+FIRST_FIX_S, SOLVER_S, FRAME_S, STARS_S = 3.0, 1.0, 0.6, 0.02  # targets, median
 FILES = 8  # frames of 42 MB on disk, played round and round
 CADENCE_S = 1.0
 SETTLED = 3  # frames before the clocks run
@@ -124,7 +124,7 @@ def from_start(folder: Path, starts: int) -> Row:
             run.start("starpos_inclinometer", "inclinometer", port)
             run.graph.wait(lambda run=run: run.ears.fixes, "for the first fix")
             seconds.append(min(run.ears.fixes.values()) - begin)
-    return Row("solver, camera_detector and inclinometer started to first fix", seconds, "s", START_S)
+    return Row("solver, camera_detector and inclinometer started to first fix", seconds, "s", FIRST_FIX_S)
 
 
 def from_start_of_solver(folder: Path, starts: int) -> Row:
@@ -171,12 +171,11 @@ def write_frames(folder: Path):
     from starpos.simulation.scene import expose, render, scene_of
     from starpos.sky.catalogue import load_catalogue
     from starpos.utc import utc_text
-    from starpos_testing.graph.shots import EXPOSURE_S, NOISE_DEG, tilts_of
-    from starpos_testing.graph.shots import START_S as BEGIN_S
+    from starpos_testing.graph.shots import EXPOSURE_S, NOISE_DEG, START_S, tilts_of
 
     rng, scene, tilts = np.random.default_rng(1), scene_of(tilt_noise_deg=NOISE_DEG), []
     for k in range(FILES):
-        start = BEGIN_S + 10.0 * k
+        start = START_S + 10.0 * k
         light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
         frame = render(scene, light, start, EXPOSURE_S, rng)
         write_fits(folder / f"{k}.fits", frame, utc_text(start))

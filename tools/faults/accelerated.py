@@ -26,7 +26,7 @@ from starpos_testing.graph.shots import (
     SMALL,
     START_S,
     TEMPERATURE_C,
-    Shot,
+    SimulatedShot,
     focal_of,
     photograph_of,
     scene_at,
@@ -131,7 +131,7 @@ class World:
 
     # what it sends ---------------------------------------------------------------------------------------------------
 
-    def shot(self) -> Shot:
+    def shot(self) -> SimulatedShot:
         """The next exposure."""
         self.now_s += CADENCE_S
         return shot_of(self.scene, self.now_s, self.rng)
@@ -150,22 +150,22 @@ class World:
         """Whatever is answered under the stamp of this message is of the instrument as it stands now."""
         self._truths[stamp_of(message)] = self.truth
 
-    def tilts(self, shot: Shot):
+    def tilts(self, shot: SimulatedShot):
         for tilt in shot.tilts:
             self.graph.tilt.publish(tilt)
 
-    def stars(self, shot: Shot):
+    def stars(self, shot: SimulatedShot):
         self.remember(shot.stars)
         self.graph.stars.publish(shot.stars)
 
-    def send(self, shot: Shot):
+    def send(self, shot: SimulatedShot):
         """All of it in good order."""
         self.tick()
         self.graph.info.publish(shot.info)
         self.tilts(shot)
         self.stars(shot)
 
-    def send_image(self, shot: Shot, image, capture):
+    def send_image(self, shot: SimulatedShot, image, capture):
         self.tick()
         self.remember(image)
         self.graph.send(shot, image, capture)

@@ -18,7 +18,7 @@ from starpos_inclinometer.emulator import Faults, Mcu, Pty
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuSource
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 from starpos_testing.processes import memory_mb
 
 RATE_HZ, ALLOWED_MB, ENOUGH = 50, 1.0, 0.6
@@ -71,7 +71,7 @@ def main() -> int:
         values["port"] = str(Path(folder) / "port")
         device = Device(values["port"], lambda: fast_ns() * 1e-9, stop)
         clock = HostClock(lambda: 1_700_000_000 * 10**9 + fast_ns(), monotonic_ns=fast_ns)
-        source = McuSource(Host(None, clock, woken.set), values)
+        source = McuSource(Surroundings(None, clock, woken.set), values)
         device.start()
         source.start()
         tenths = [samples / RATE_HZ * k / 10 for k in range(1, 11)]

@@ -4,19 +4,19 @@
 python -m starpos_bringup.defaults > config/starpos.yaml
 """
 
-from starpos_camera.camera_parameters import PARAMETERS as CAMERA
-from starpos_camera.detector_parameters import PARAMETERS as DETECTOR
+import starpos_camera.camera_parameters
+import starpos_camera.detector_parameters
+import starpos_dashboard.parameters
+import starpos_inclinometer.parameters
+import starpos_solver.parameters
 from starpos_common.parameters import to_yaml
-from starpos_dashboard.parameters import PARAMETERS as DASHBOARD
-from starpos_inclinometer.node import PARAMETERS as INCLINOMETER
-from starpos_solver.parameters import PARAMETERS as SOLVER
 
 NODES = {
-    "camera": CAMERA,
-    "detector": DETECTOR,
-    "inclinometer": INCLINOMETER,
-    "solver": SOLVER,
-    "dashboard": DASHBOARD,
+    "camera": starpos_camera.camera_parameters.PARAMETERS,
+    "detector": starpos_camera.detector_parameters.PARAMETERS,
+    "inclinometer": starpos_inclinometer.parameters.PARAMETERS,
+    "solver": starpos_solver.parameters.PARAMETERS,
+    "dashboard": starpos_dashboard.parameters.PARAMETERS,
 }
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
+import rclpy.parameter
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
 
 from starpos.errors import StarposError
 
@@ -129,7 +129,7 @@ class Parameter:
         unit = f" [{self.unit}]" if self.unit else ""
         descriptor = ParameterDescriptor(
             name=self.name,
-            type=RosParameter.Type.from_parameter_value(self.ros_value(self.default)).value,
+            type=rclpy.parameter.Parameter.Type.from_parameter_value(self.ros_value(self.default)).value,
             description=self.description + unit,
             additional_constraints=f"must be {self.constraint}",
             read_only=self.read_only,
@@ -187,16 +187,16 @@ def declare(
         # Any type is taken first: rclpy would refuse `5` for a float, and its errors name no constraint.
         node.declare_parameter(p.name, p.ros_value(p.default), ParameterDescriptor(dynamic_typing=True))
         value = p.convert(node.get_parameter(p.name).value)
-        node.set_parameters([RosParameter(p.name, value=p.ros_value(value))])
+        node.set_parameters([rclpy.parameter.Parameter(p.name, value=p.ros_value(value))])
         node.set_descriptor(p.name, p.descriptor())
     complaint = check(values, frozenset(table)) if check else None
     if complaint:
         raise ParameterError(complaint)
 
-    def prepare(changes: list[RosParameter]) -> list[RosParameter]:
+    def prepare(changes: list[rclpy.parameter.Parameter]) -> list[rclpy.parameter.Parameter]:
         return [_prepared(node, table[c.name], c) if c.name in table else c for c in changes]
 
-    def validate(changes: list[RosParameter]) -> SetParametersResult:
+    def validate(changes: list[rclpy.parameter.Parameter]) -> SetParametersResult:
         for change in changes:
             if isinstance(change, _Refused):
                 return SetParametersResult(successful=False, reason=change.reason)
@@ -207,7 +207,7 @@ def declare(
             reason = f"the new values could not be checked ({type(error).__name__}: {str(error)[:200]})"
         return SetParametersResult(successful=not reason, reason=reason or "")
 
-    def applied(changes: list[RosParameter]):
+    def applied(changes: list[rclpy.parameter.Parameter]):
         names = frozenset(c.name for c in changes if c.name in table)
         if names:
             apply(names)
@@ -241,22 +241,26 @@ def _given(node: Node) -> Mapping[str, Any]:
     return node._parameter_overrides  # rclpy has no public way to what was given
 
 
-class _Refused(RosParameter):
+class _Refused(rclpy.parameter.Parameter):
     """Stands for a change that is not allowed, with the present value, until the sentence can be answered.
 
     Between the callbacks rclpy checks types and ranges by itself, in words that name neither the unit nor, where the type
     is wrong, the parameter.
     """
 
-    def __init__(self, present: RosParameter, reason: str):
+    def __init__(self, present: rclpy.parameter.Parameter, reason: str):
         super().__init__(present.name, present.type_, present.value)
         self.reason = reason
 
 
-def _prepared(node: Node, parameter: Parameter, change: RosParameter) -> RosParameter:
+def _prepared(
+    node: Node, parameter: Parameter, change: rclpy.parameter.Parameter
+) -> rclpy.parameter.Parameter:
     """Whole numbers as floats where floats are meant, so that `ros2 param set ... 5` works."""
     try:
-        return RosParameter(change.name, value=parameter.ros_value(parameter.convert(change.value)))
+        return rclpy.parameter.Parameter(
+            change.name, value=parameter.ros_value(parameter.convert(change.value))
+        )
     except ParameterError as error:
         return _Refused(node.get_parameter(change.name), str(error))
 

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import rclpy
+import rclpy.parameter
 import yaml
-from rclpy.parameter import Parameter as RosParameter
 
 from starpos_common.parameters import (
     FRAME_NAME,
@@ -96,7 +96,7 @@ def make(context):
 
 
 def change(node, **values):
-    return node.set_parameters_atomically([RosParameter(k, value=v) for k, v in values.items()])
+    return node.set_parameters_atomically([rclpy.parameter.Parameter(k, value=v) for k, v in values.items()])
 
 
 def test_defaults_and_overrides_have_the_types_of_the_table(make):
@@ -206,7 +206,9 @@ def test_such_names_frames_have(name):
 
 def test_a_parameter_cannot_be_taken_away(make):
     node, values = make()
-    result = node.set_parameters_atomically([RosParameter("noise", RosParameter.Type.NOT_SET)])
+    result = node.set_parameters_atomically(
+        [rclpy.parameter.Parameter("noise", rclpy.parameter.Parameter.Type.NOT_SET)]
+    )
     assert "parameter noise must be a number from 0 to 10 deg" in result.reason and values["noise"] == 0.5
 
 

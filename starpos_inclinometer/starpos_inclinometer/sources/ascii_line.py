@@ -17,7 +17,7 @@ from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 
 MAX_LINE = 256  # bytes
 NEAR_RAD = math.radians(0.05)
@@ -280,7 +280,7 @@ class AsciiSource:
 
     parameters = PARAMETERS
 
-    def __init__(self, host: Host, values: Mapping[str, Any]):
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]):
         self.name = values["port"]
         self._baud = values["baud"]
         self._decoder = LineDecoder(

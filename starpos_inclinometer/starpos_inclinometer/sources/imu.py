@@ -16,7 +16,7 @@ from starpos_common.parameters import Parameter
 from starpos_common.topics import subscription
 from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 
 TOPIC = "imu/data"
 STANDARD_GRAVITY = 9.80665  # m/s2; 0.3 % off anywhere on the ground
@@ -180,7 +180,7 @@ class ImuSource:
 
     parameters, name = PARAMETERS, TOPIC
 
-    def __init__(self, host: Host, values: Mapping[str, Any]):
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]):
         node = host.node
         self._clock, self._wake = host.clock, host.wake
         self._now_ns = lambda: node.get_clock().now().nanoseconds

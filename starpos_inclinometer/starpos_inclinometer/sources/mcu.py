@@ -15,7 +15,7 @@ from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
 from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Host
+from starpos_inclinometer.sources.source import Surroundings
 
 BITS_PER_BYTE = 10  # 8N1
 NEAR_CODES = 11_000  # 0.05 deg, ten times the noise
@@ -263,7 +263,7 @@ class McuSource:
 
     parameters = PARAMETERS
 
-    def __init__(self, host: Host, values: Mapping[str, Any]):
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]):
         self.name = values["port"]
         self._decoder = McuDecoder(values["rate"])
         self._link = SerialLink(values["port"], values["baud"], self._decoder, host.clock, host.wake)

@@ -13,7 +13,7 @@ from starpos_inclinometer.sources.reading import Health, Reading
 
 
 @dataclass(frozen=True)
-class Host:
+class Surroundings:
     """What a source has of its node: the node itself, for its topics; the host's clock; `wake`, called by any thread."""
 
     node: Node
@@ -30,7 +30,7 @@ class TiltSource(Protocol):
     parameters: Sequence[Parameter]
     name: str  # of the device, for diagnostics: its port or topic
 
-    def __init__(self, host: Host, values: Mapping[str, Any]): ...
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]): ...
 
     @staticmethod
     def refusal(values: Mapping[str, Any]) -> str | None:

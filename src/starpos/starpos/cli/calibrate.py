@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.calibration.camera import FromSky
-from starpos.calibration.camera import calibrate_camera as camera_from_sky
+from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
 from starpos.cli import calibrate_site, common
 from starpos.earth.refraction import Atmosphere
@@ -98,7 +97,7 @@ def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | 
         levels = [None] * len(frames)
     else:
         frames, levels = _levelled(frames, instrument, tilts)
-    found = camera_from_sky(frames, levels, given, catalogue.load_catalogue(), air, common.ProgressBar())
+    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, common.ProgressBar())
     for k in sorted(set(range(len(frames))) - set(found.used)):
         common.complain("calibrate", f"{frames[k].source}: none of the sky fits it, it is left out")
     if tilts is None:

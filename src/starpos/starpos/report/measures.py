@@ -55,7 +55,7 @@ def stability(night: Night) -> Stability:
     ):
         true = _true_headings(night)
         heading_from = "truth" if true is not None else ""
-        away[:, 2] = np.nan if true is None else turn(seen[:, 2] - true)
+        away[:, 2] = np.nan if true is None else wrapped(seen[:, 2] - true)
     sigma = np.array([_own_sigma(p) for p in places])
     return Stability(
         np.array([k for k, _ in night.fixed]),
@@ -87,7 +87,7 @@ def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
 def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
     """East, north in m of a place from another (rad)."""
     prime, meridian = curvature_radii_m(latitude)
-    east = turn(place.longitude - longitude) * prime * np.cos(latitude)
+    east = wrapped(place.longitude - longitude) * prime * np.cos(latitude)
     return float(east), float((place.latitude - latitude) * meridian)
 
 
@@ -96,7 +96,7 @@ def middle(night: Night) -> tuple[float, float]:
     if night.combined:
         return night.combined.latitude, night.combined.longitude
     seen = np.array([[s.place.latitude, s.place.longitude] for _, s in night.fixed])
-    latitude, longitude = seen[0] + turn(seen - seen[0]).mean(0)
+    latitude, longitude = seen[0] + wrapped(seen - seen[0]).mean(0)
     return float(latitude), float(longitude)
 
 
@@ -110,7 +110,7 @@ def share_inside(night: Night, squared_distance: float) -> int:
 def error_arcsec(night: Night) -> np.ndarray:
     """Latitude, longitude (2,) of the night less the truth, in arcsec."""
     c, t = night.combined, night.truth
-    return turn(np.array([c.latitude - t.latitude, c.longitude - t.longitude])) / ARCSEC
+    return wrapped(np.array([c.latitude - t.latitude, c.longitude - t.longitude])) / ARCSEC
 
 
 def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
@@ -118,13 +118,13 @@ def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
     return _angles(place.covariance, place.latitude)[:2] / ARCSEC
 
 
-def turn(angle):
+def wrapped(angle):
     """Angles in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _from_mean(seen: np.ndarray) -> np.ndarray:
-    away = turn(seen - seen[0])
+    away = wrapped(seen - seen[0])
     return away - away.mean(0)
 
 

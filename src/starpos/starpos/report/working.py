@@ -20,7 +20,7 @@ from starpos.instrument.inclinometer import a2_matrix
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.report.folder import StarList, StarLists
-from starpos.report.measures import turn as wrapped
+from starpos.report.measures import wrapped
 from starpos.report.night import NO_TILT, Night, ReportedPlace, Shot
 from starpos.sky.catalogue import Catalogue
 from starpos.utc import utc_text

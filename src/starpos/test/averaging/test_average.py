@@ -14,7 +14,7 @@ from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, correlation
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import UTC, Field, random_field, turn
+from starpos_testing.skies.fields import UTC, SkyField, random_field, turn
 
 STATE = earth_state(UTC)
 
@@ -65,7 +65,7 @@ def sigmas(a, name=None):
 
 
 def test_one_fix_is_its_own_average(rng):
-    (only,) = fixes(Field(), rng, [40.0])
+    (only,) = fixes(SkyField(), rng, [40.0])
     a = average([only])
     assert (a.latitude, a.longitude, a.heading, a.utc_unix_s) == pytest.approx(
         (only.latitude, only.longitude, only.heading, UTC), abs=1e-15
@@ -75,7 +75,7 @@ def test_one_fix_is_its_own_average(rng):
 
 
 def test_noise_averages_and_what_is_common_stays(rng):
-    made = fixes(Field(), rng, [40.0] * 16, calibration=20.0)
+    made = fixes(SkyField(), rng, [40.0] * 16, calibration=20.0)
     a = average(made)
     assert sigmas(a, "tilt") == pytest.approx(sigmas(made[0], "tilt") / 4, rel=0.02)
     each = np.array([sigmas(f, "centroids") for f in made])
@@ -86,7 +86,7 @@ def test_noise_averages_and_what_is_common_stays(rng):
 
 def test_half_a_turn_takes_the_calibration_off_the_position(rng):
     """Level: a slip of the mount moves the fix with the instrument, so that opposite headings cancel it."""
-    field = Field(altitude=89.0)
+    field = SkyField(altitude=89.0)
     a = average(
         fixes(field, rng, [10.0, 100.0, 190.0, 280.0], tilt=0.1, calibration=60.0, slip=(50.0, -30.0, 0.0))
     )
@@ -108,7 +108,7 @@ def test_an_average_errs_as_its_covariance_says(calibration, rng):
 
 
 def test_an_instrument_that_turned_has_the_heading_of_its_last_pose(rng):
-    made = fixes(Field(), rng, [10.0, 10.0, 12.0, 12.0])
+    made = fixes(SkyField(), rng, [10.0, 10.0, 12.0, 12.0])
     a, last = average(made), average(made[2:])
     assert a.poses == 2
     assert turn(a.heading - last.heading) == pytest.approx(0, abs=3 * sigmas(last)[2])
@@ -116,7 +116,7 @@ def test_an_instrument_that_turned_has_the_heading_of_its_last_pose(rng):
 
 
 def test_over_the_date_line_and_over_north(rng):
-    field = replace(Field(), longitude=180.0, azimuth=0.0, altitude=75.0, roll=180.0)
+    field = replace(SkyField(), longitude=180.0, azimuth=0.0, altitude=75.0, roll=180.0)
     a = average(fixes(field, rng, [0.0] * 8))
     assert np.all(np.abs(moved_m(a, field)) < 4 * sigmas(a)[:2])
     assert -np.pi <= a.longitude < np.pi
@@ -125,7 +125,7 @@ def test_over_the_date_line_and_over_north(rng):
 
 
 def test_a_better_frame_counts_more(rng):
-    field = Field()
+    field = SkyField()
     poor, good = fixes(field, rng, [40.0], tilt=100.0), fixes(field, rng, [40.0], tilt=1.0)
     a = average(poor + good)
     assert np.all(np.abs(moved_m(a, field) - moved_m(good[0], field)) < 10)
@@ -133,7 +133,7 @@ def test_a_better_frame_counts_more(rng):
 
 
 def test_two_frames_of_two_places_have_no_average(rng):
-    here, there = Field(), replace(Field(), latitude=Field().latitude + 0.5)
+    here, there = SkyField(), replace(SkyField(), latitude=SkyField().latitude + 0.5)
     with pytest.raises(FixError, match="not of one place"):
         average(in_order(fixes(here, rng, [40.0]) + fixes(there, rng, [40.0])))
 
@@ -144,7 +144,7 @@ def test_no_fix_has_no_average():
 
 
 def test_the_same_frame_given_twice_counts_once(rng):
-    made = fixes(Field(), rng, [40.0] * 3)
+    made = fixes(SkyField(), rng, [40.0] * 3)
     once, twice = average(made), average(made + made)
     assert twice.frames == once.frames == 3
     np.testing.assert_array_equal(once.covariance, twice.covariance)
@@ -152,7 +152,7 @@ def test_the_same_frame_given_twice_counts_once(rng):
 
 def test_frames_that_share_a_tilt_reading_share_its_error(rng):
     """One reading served four frames: its noise does not average."""
-    field = Field()
+    field = SkyField()
     made = in_order([read_at(f, UTC) for f in fixes(field, rng, [40.0], tilt=12.6) for _ in range(4)])
     assert sigmas(average(made), "tilt") == pytest.approx(sigmas(made[0], "tilt"), rel=1e-3)
     apart = [read_at(f, UTC + k) for k, f in enumerate(made)]
@@ -161,7 +161,7 @@ def test_frames_that_share_a_tilt_reading_share_its_error(rng):
 
 @pytest.mark.parametrize("latitude", [89.9, 89.999, -90.0])
 def test_near_a_pole_a_common_error_does_not_average_away(latitude, rng):
-    field = replace(Field(), latitude=latitude)
+    field = replace(SkyField(), latitude=latitude)
     made = fixes(field, rng, [40.0] * 10, calibration=5.0)
     assert sigmas(average(made), "calibration")[:2] == pytest.approx(
         sigmas(made[0], "calibration")[:2], rel=0.05
@@ -169,7 +169,7 @@ def test_near_a_pole_a_common_error_does_not_average_away(latitude, rng):
 
 
 def test_a_thousand_frames(rng):
-    made = fixes(Field(), rng, [40.0] * 2)
+    made = fixes(SkyField(), rng, [40.0] * 2)
     many = [replace(made[k % 2], utc_unix_s=UTC + k) for k in range(1000)]
     assert sigmas(average(many), "tilt") == pytest.approx(sigmas(made[0], "tilt") / np.sqrt(1000), rel=0.02)
 
@@ -206,7 +206,7 @@ def wandering(f, rad_per_s=3e-7):
 
 @pytest.mark.parametrize("shared", ["nothing", "a reading", "one reading of three"])
 def test_the_recursion_is_generalised_least_squares_over_all(shared, rng):
-    field = replace(Field(), altitude=80.0)
+    field = replace(SkyField(), altitude=80.0)
     if shared == "a reading":  # of three frames each
         made = [f for f in fixes(field, rng, [40.0] * 3, calibration=10.0) for _ in range(3)]
         made = [read_at(spoiled(f, *rng.normal(0, 3, 2)), UTC + k // 3) for k, f in enumerate(made)]
@@ -218,16 +218,16 @@ def test_the_recursion_is_generalised_least_squares_over_all(shared, rng):
     a, (moved, covariance) = average(made), dense(made)
     plane = Plane.at(made[0])
     latitude, longitude = plane.place(moved[:2])
-    assert moved_m(a, replace(Field(), latitude=np.degrees(latitude), longitude=np.degrees(longitude))) == (
-        pytest.approx([0, 0], abs=1e-3)
-    )
+    assert moved_m(
+        a, replace(SkyField(), latitude=np.degrees(latitude), longitude=np.degrees(longitude))
+    ) == (pytest.approx([0, 0], abs=1e-3))
     np.testing.assert_allclose(a.covariance[:2, :2], covariance[:2, :2], rtol=1e-5)
     heading = moved[2] + plane.heading - plane.convergence(latitude, longitude)
     assert turn(a.heading - heading) == pytest.approx(0, abs=1e-11)
 
 
 def test_as_they_come_or_all_at_once(rng):
-    made = in_order(fixes(Field(), rng, [40.0] * 5 + [90.0] * 5, calibration=10.0))
+    made = in_order(fixes(SkyField(), rng, [40.0] * 5 + [90.0] * 5, calibration=10.0))
     averager = Averager()
     for f in made:
         averager.add(f)
@@ -238,7 +238,7 @@ def test_as_they_come_or_all_at_once(rng):
 
 def test_frames_that_share_a_few_readings_are_believed_and_no_more_than_is_due(rng):
     """Every third frame has lost its own readings: it is told by the last before it and the first after it."""
-    field, off, n = Field(altitude=85.0), [], 30
+    field, off, n = SkyField(altitude=85.0), [], 30
     for _ in range(n):
         readings = rng.normal(0, 5 * ARCSEC, (30, 2))
         averager = Averager()
@@ -280,7 +280,7 @@ def check_not_moved(spoiled_fixes, sound, field):
 @pytest.mark.parametrize("first", [0, 12, 24])
 def test_a_burst_of_bad_tilts_does_not_move_it(first, rng):
     """Ten in a row that agree with each other, 11 km off, at the beginning, in the middle, at the end."""
-    field = Field()
+    field = SkyField()
     made = fixes(field, rng, [40.0] * 25)
     bad = [spoiled(f, 8e3, -8e3) for f in fixes(field, rng, [40.0] * 10)]
     a = check_not_moved(made[:first] + bad + made[first:], made, field)
@@ -288,7 +288,7 @@ def test_a_burst_of_bad_tilts_does_not_move_it(first, rng):
 
 
 def test_single_bad_tilts_do_not_move_it(rng):
-    field = Field()
+    field = SkyField()
     made = fixes(field, rng, [40.0] * 25)
     mixed = [spoiled(f, *rng.normal(0, 3e4, 2)) if k % 6 == 0 else f for k, f in enumerate(made)]
     a = check_not_moved(mixed, [f for k, f in enumerate(made) if k % 6], field)
@@ -306,7 +306,7 @@ def slipped(f, seconds):
 @pytest.mark.parametrize("seconds", [1.0, -1.0, 60.0, 3600.0])
 @pytest.mark.parametrize("at", [0, 7, 24])
 def test_a_wrong_time_stamp_does_not_move_it(seconds, at, rng):
-    field = Field()
+    field = SkyField()
     made = fixes(field, rng, [40.0] * 25, tilt=1.0)
     mixed = [slipped(f, seconds) if k == at else f for k, f in enumerate(made)]
     a = check_not_moved(mixed, made[:at] + made[at + 1 :], field)
@@ -315,7 +315,7 @@ def test_a_wrong_time_stamp_does_not_move_it(seconds, at, rng):
 
 def test_a_knocked_tripod_does_not_move_the_place(rng):
     """Its heading and tilt are others from then on; the frame of the knock itself is far off."""
-    field = Field()
+    field = SkyField()
     before = fixes(field, rng, [40.0] * 12)
     after = fixes(replace(field, altitude=field.altitude - 0.7, roll=field.roll + 0.5), rng, [40.4] * 12)
     during = [spoiled(fixes(field, rng, [40.2])[0], 5e4, 2e4)]
@@ -327,7 +327,7 @@ def test_a_knocked_tripod_does_not_move_the_place(rng):
 @pytest.mark.parametrize(("moved_to_m", "needs"), [(1e6, 3), (2e4, 3), (700.0, 25)])
 def test_a_robot_that_drove_on_begins_a_new_average(moved_to_m, needs, rng):
     """A long way off after three frames; less than two errors of one frame after a few."""
-    here = Field()
+    here = SkyField()
     there = replace(here, latitude=here.latitude - np.degrees(moved_to_m / 6.371e6), azimuth=90.0)
     averager = Averager()
     for f in in_order(fixes(here, rng, [40.0] * 30) + fixes(there, rng, [90.0] * needs)):
@@ -339,7 +339,7 @@ def test_a_robot_that_drove_on_begins_a_new_average(moved_to_m, needs, rng):
 
 def test_a_robot_on_shaking_ground_that_drives_on_is_noticed(rng):
     """Every frame in a pose of its own."""
-    here, there = Field(), replace(Field(), latitude=Field().latitude - 0.1)
+    here, there = SkyField(), replace(SkyField(), latitude=SkyField().latitude - 0.1)
     made = fixes(here, rng, 40 + 0.1 * rng.normal(size=15)) + fixes(there, rng, 40 + 0.1 * rng.normal(size=6))
     a = average(in_order(made))
     assert a.moved == 1 and a.frames == 6
@@ -347,7 +347,7 @@ def test_a_robot_on_shaking_ground_that_drives_on_is_noticed(rng):
 
 
 def test_a_robot_that_turns_on_the_spot_has_not_moved(rng):
-    field = Field()
+    field = SkyField()
     made = in_order(fixes(field, rng, np.repeat(np.arange(0.0, 720.0, 40.0), 4)))
     a = average(made)
     assert (a.frames, a.moved, a.left_out) == (72, 0, 0)
@@ -356,7 +356,7 @@ def test_a_robot_that_turns_on_the_spot_has_not_moved(rng):
 
 def test_a_clock_that_was_far_off_bends_no_average(rng):
     """16 km along the parallel leave the tangent plane by 20 m: frames of the right clock begin anew."""
-    field, averager, worst = Field(latitude=55.0), Averager(), 0.0
+    field, averager, worst = SkyField(latitude=55.0), Averager(), 0.0
     for k in range(8):
         known = k >= 3
         now = replace(
@@ -371,7 +371,7 @@ def test_a_clock_that_was_far_off_bends_no_average(rng):
 
 
 def test_memory_does_not_grow(rng):
-    averager, two = Averager(), fixes(Field(), rng, [40.0] * 2)
+    averager, two = Averager(), fixes(SkyField(), rng, [40.0] * 2)
     sizes = []
     for k in range(300):
         averager.add(read_at(replace(two[k % 2], utc_unix_s=UTC + k), UTC + k, UTC + k + 1))
@@ -381,7 +381,7 @@ def test_memory_does_not_grow(rng):
 
 def test_the_heading_of_a_pose_that_nobody_believed_is_none(rng):
     """The camera was turned, and the tilts since are wrong: it does not face where it did."""
-    field = Field()
+    field = SkyField()
     before = fixes(field, rng, [40.0] * 8)
     wrong = [spoiled(f, 5e4, 0.0) for f in fixes(field, rng, [160.0] * 2)]
     a = average(in_order(before + wrong))

@@ -15,7 +15,7 @@ from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import UTC, Field
+from starpos_testing.skies.fields import UTC, SkyField
 
 STATE = earth_state(UTC)
 NOISE, A3_ERROR = 12.6 * ARCSEC, 5.0 * ARCSEC
@@ -35,7 +35,7 @@ class Walk:
 
 
 def walk(rng, steps, spoil=0.0, drive=0.0, turn=0.2, latitude=None) -> Walk:
-    here = Field(
+    here = SkyField(
         latitude=float(np.degrees(np.arcsin(rng.uniform(-1, 1))) if latitude is None else latitude),
         longitude=float(rng.choice([180.0, rng.uniform(-180, 180)])),
         azimuth=float(rng.uniform(0, 360)), altitude=float(rng.uniform(70, 89.9)), roll=float(rng.uniform(-180, 180)),

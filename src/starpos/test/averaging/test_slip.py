@@ -10,13 +10,13 @@ from starpos import rotation
 from starpos.averaging.slip import slip_s
 from starpos.earth.orientation import ROTATION_RAD_S, earth_state
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import Field
+from starpos_testing.skies.fields import SkyField
 
 
 @pytest.fixture
 def fix(rng):
     """Boresight known to 0.1 arcsec, roll to 5, as of a few stars of a narrow field."""
-    field = Field(stars=12, altitude=60.0)
+    field = SkyField(stars=12, altitude=60.0)
     state = earth_state(field.utc)
     made = field.solve(*field.places(state, rng), state)
     axis = made.camera_to_itrs[:, 2]
@@ -67,7 +67,7 @@ def test_at_a_pole_it_is_a_touch(fix):
 
 
 def test_the_attitude_scatters_as_its_covariance_says(rng):
-    field = Field(stars=25, altitude=70.0)
+    field = SkyField(stars=25, altitude=70.0)
     state = earth_state(field.utc)
     xy, places = field.places(state, rng)
     true = field.solve(xy, places, state).camera_to_itrs

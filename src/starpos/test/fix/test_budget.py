@@ -11,7 +11,7 @@ from starpos.earth.orientation import earth_state
 from starpos.fix.fix import Mounting
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import UTC, Field
+from starpos_testing.skies.fields import UTC, SkyField
 
 STATE = earth_state(UTC)
 ARCSEC_M = (30.95, 30.82)  # east, north at 35.7 deg, radii of WGS 84
@@ -40,7 +40,7 @@ def sigma_m(fix, name) -> np.ndarray:
 
 def test_drift_grows_with_the_root_of_the_hours(rng):
     errors = replace(EXACT, drift_rad_per_sqrt_hour=2 * ARCSEC)
-    field = Field(altitude=89.9)
+    field = SkyField(altitude=89.9)
     for hours in (1.0, 16.0, 240.0, -16.0):
         fix = fixed(field, rng, errors, calibrated_unix_s=UTC - 3600 * hours)
         assert sigma_m(fix, "tilt drift") == pytest.approx(
@@ -51,7 +51,7 @@ def test_drift_grows_with_the_root_of_the_hours(rng):
 
 def test_temperature_by_the_degree(rng):
     errors = replace(EXACT, temperature_rad_per_c=3 * ARCSEC)
-    field = Field(altitude=89.9)
+    field = SkyField(altitude=89.9)
     for told, warmer in ((10.0, 10.0), (25.0, -5.0), (20.0, 0.0)):
         fix = fixed(field, rng, errors, calibrated_temperature_c=told)
         assert sigma_m(fix, "tilt temperature") == pytest.approx(
@@ -63,7 +63,9 @@ def test_temperature_by_the_degree(rng):
 def test_scale_counts_from_the_tilt_it_was_calibrated_at(rng):
     """1e-4 of 10 deg is 3.6 arcsec, 111 m."""
     errors = replace(EXACT, scale=1e-4)
-    field = Field(azimuth=0.0, altitude=80.0, roll=0.0)  # leans to the north, about the camera's x axis alone
+    field = SkyField(
+        azimuth=0.0, altitude=80.0, roll=0.0
+    )  # leans to the north, about the camera's x axis alone
     fix = fixed(field, rng, errors)
     east, north = sigma_m(fix, "tilt scale")
     assert north == pytest.approx(3.6 * ARCSEC_M[1], rel=0.01)
@@ -81,7 +83,7 @@ def test_scale_counts_from_the_tilt_it_was_calibrated_at(rng):
 def test_an_unknown_turn_against_instruments_turned_at_random(turn_deg, rng):
     """Place errors of A3s turned about the plumb line by a Gaussian of that size, used at 5 deg of lean: never claimed
     smaller than they are, and hardly larger as long as the turn is small."""
-    field = Field(azimuth=20.0, altitude=85.0, roll=30.0)
+    field = SkyField(azimuth=20.0, altitude=85.0, roll=30.0)
     sigma = np.radians(turn_deg)
     fix = fixed(field, rng, turn_sigma=sigma)
     claimed = sum(t.covariance for t in fix.terms if t.name == "calibration")[:2, :2]

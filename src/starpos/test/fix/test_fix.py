@@ -15,7 +15,7 @@ from starpos.fix.fix import Mounting
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import PAPER, UTC, Field, random_field, turn
+from starpos_testing.skies.fields import PAPER, UTC, SkyField, random_field, turn
 
 STATE = earth_state(UTC)
 PLACES = {
@@ -50,7 +50,7 @@ def test_a_field_without_errors_gives_back_its_place(where, rng):
 
 
 def test_what_a_fix_reports(rng):
-    field = Field(altitude=90.0, stars=60)
+    field = SkyField(altitude=90.0, stars=60)
     xy, places = field.places(STATE, rng)
     fix = field.solve(xy, places, STATE)
     assert fix.utc_unix_s == UTC
@@ -87,7 +87,7 @@ def test_the_attitude_is_that_of_the_link(rng):
 @pytest.mark.parametrize("azimuth", [0.0, 1e-9, -1e-9, 90.0, 180.0, 270.0])
 def test_heading_is_clockwise_from_north_in_0_to_360(azimuth, rng):
     """A camera at roll 180 with its top away from the zenith faces where it leans."""
-    field = Field(azimuth=azimuth, altitude=75.0, roll=180.0)
+    field = SkyField(azimuth=azimuth, altitude=75.0, roll=180.0)
     xy, places = field.places(STATE, rng)
     heading = np.degrees(field.solve(xy, places, STATE).heading)
     assert 0 <= heading < 360
@@ -166,14 +166,14 @@ def test_a_star_of_absurd_errors_tells_nothing_and_spoils_nothing(rng):
 
 
 def test_too_few_stars(rng):
-    field = Field(stars=2)
+    field = SkyField(stars=2)
     xy, places = field.places(STATE, rng)
     with pytest.raises(FixError, match="only 2 of 2"):
         field.solve(xy, places, STATE)
 
 
 def test_stars_that_agree_on_nothing(rng):
-    field = Field(stars=30)
+    field = SkyField(stars=30)
     xy, places = field.places(STATE, rng)
     for wrong in (places[::-1], rng.permutation(places)):
         with pytest.raises(FixError):
@@ -276,7 +276,7 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
 
 def test_the_tilts_error_is_the_positions(rng):
     """1 arcsec of tilt is 30.9 m; with the paper's 12.6 arcsec a single reading gives 390 m a axis."""
-    field = Field(altitude=88.0)
+    field = SkyField(altitude=88.0)
     xy, places = field.places(STATE, rng)
     fix = field.solve(xy, places, STATE, tilt=field.tilt(np.eye(2) * ARCSEC**2))
     term = {t.name: t for t in fix.terms}["tilt"]
@@ -284,7 +284,7 @@ def test_the_tilts_error_is_the_positions(rng):
 
 
 def test_a_second_of_time_is_464_metres_at_the_equator(rng):
-    field = Field(latitude=0.0)
+    field = SkyField(latitude=0.0)
     xy, places = field.places(STATE, rng)
     terms = {t.name: t for t in field.solve(xy, places, STATE, clock_stddev_s=1.0).terms}
     assert np.sqrt(terms["clock"].covariance[0, 0]) == pytest.approx(465, abs=1)
@@ -292,7 +292,7 @@ def test_a_second_of_time_is_464_metres_at_the_equator(rng):
 
 
 def test_the_budget_says_which_errors_are_common(rng):
-    field = Field()
+    field = SkyField()
     xy, places = field.places(STATE, rng)
     common = {t.name: t.common for t in field.solve(xy, places, STATE).terms}
     new = {"centroids", "tilt", "tilt quantisation"}

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import read_tilt_csv
-from starpos_testing.skies.bags import Recorder, typestore
+from starpos_testing.skies.bags import NightBag, typestore
 
 RECORDED = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 FOCAL_PX = 29.67e3 / 6.4
@@ -43,7 +43,7 @@ def tilts(night):
 
 
 def record(path, lists, tilts, **how):
-    with Recorder(path, **how) as bag:
+    with NightBag(path, **how) as bag:
         bag.camera(FOCAL_PX, 1000, 700)
         for stars in lists:
             bag.stars(stars)
@@ -100,7 +100,7 @@ def test_the_recorded_night_of_the_repository(tmp_path, capsys):
 
 
 def test_of_several_instruments_one_is_chosen(night, lists, tilts, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         for bag.namespace in ("/north", "/far/south"):
             bag.camera(FOCAL_PX, 1000, 700)
             bag.tilts(tilts)
@@ -129,7 +129,7 @@ def said(night, capsys):
 
 
 def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         for stars, one in zip(lists, said, strict=True):
             bag.solution(stars.mid_unix_s, one)
         bag.failure(lists[-1].mid_unix_s + 5.0, NOT_IDENTIFIED, "none of the sky fits <its> stars")
@@ -151,7 +151,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
 
 
 def test_the_mean_of_recorded_solutions_claims_no_more_than_one(said, lists, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         for stars, one in zip(lists, said, strict=True):
             bag.solution(stars.mid_unix_s, one)
     _, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out")
@@ -160,7 +160,7 @@ def test_the_mean_of_recorded_solutions_claims_no_more_than_one(said, lists, tmp
 
 
 def test_a_solver_that_said_something_else_is_remarked(said, lists, tilts, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         bag.camera(FOCAL_PX, 1000, 700)
         bag.tilts(tilts)
         for stars, one in zip(lists, said, strict=True):
@@ -181,7 +181,7 @@ def test_stars_without_tilts_give_no_fix_and_say_why(lists, tmp_path, capsys):
 
 
 def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         bag.camera(FOCAL_PX, 1000, 700)
         for stars in lists:
             bag.stars(stars)
@@ -206,7 +206,7 @@ def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, ca
 
 
 def test_a_bag_without_a_camera_takes_the_options(night, lists, tilts, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         bag.tilts(tilts)
         for stars in lists:
             bag.stars(stars)
@@ -250,7 +250,7 @@ def test_definitions_a_bag_lacks_come_from_the_workspace(night, lists, tilts, tm
 def test_what_is_no_bag_is_refused_in_one_line(damage, lists, tilts, tmp_path, capsys):
     bag = record(tmp_path / "bag", lists, tilts) if damage != "other" else tmp_path / "bag"
     if damage == "other":
-        with Recorder(bag) as other:
+        with NightBag(bag) as other:
             other.camera(FOCAL_PX, 1000, 700)
     elif damage == "metadata":
         (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2\n")
@@ -278,7 +278,7 @@ def test_a_recording_that_was_killed_says_how_to_get_it_back(lists, tilts, tmp_p
 
 
 def test_broken_star_lists_cost_their_frame_only(night, lists, tilts, tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         bag.camera(FOCAL_PX, 1000, 700)
         bag.tilts(tilts)
         for stars in lists:
@@ -306,7 +306,7 @@ def test_solutions_of_nonsense_are_no_fix_and_no_crash(said, lists, tmp_path, ca
     inf, nan = float("inf"), float("nan")
     wrong = [{"latitude": 1e6}, {"longitude": nan}, {"covariance": [[-1.0, 0, 0], [0, 1, 0], [0, 0, 1]]},
              {"heading": inf}, {"residual_arcsec": inf}]  # fmt: skip
-    with Recorder(tmp_path / "bag") as bag:
+    with NightBag(tmp_path / "bag") as bag:
         for k, broken in enumerate(wrong):
             bag.solution(lists[0].mid_unix_s + k, said[0] | broken)
         bag.solution(0.0, said[0])

@@ -25,7 +25,7 @@ def executable(package: str, name: str) -> str:
     return str(Path(get_package_prefix(package)) / "lib" / package / name)
 
 
-class Process:
+class Executable:
     """An executable of this workspace; its output goes to a file, which a pipe nobody reads would block."""
 
     def __init__(self, log: Path, package: str, name: str, arguments=(), parameters=()):
@@ -70,7 +70,7 @@ class Graph:
         self.node = rclpy.create_node("test", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self.processes: list[Process] = []
+        self.processes: list[Executable] = []
         self.info = self._publisher(CameraInfo, "camera/camera_info")
         self.capture = self._publisher(Capture, "camera/capture")
         # a participant of its own, as a camera has: images fill the shared memory, and what is lost comes a second later
@@ -116,8 +116,8 @@ class Graph:
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
-    def start(self, log: Path, package: str, name: str, *parameters, arguments=()) -> Process:
-        self.processes.append(Process(log, package, name, arguments, parameters))
+    def start(self, log: Path, package: str, name: str, *parameters, arguments=()) -> Executable:
+        self.processes.append(Executable(log, package, name, arguments, parameters))
         return self.processes[-1]
 
     def comes(self, condition, seconds: float) -> bool:

@@ -28,7 +28,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import NavSatFix
 
 from starpos_interfaces.msg import Solution
-from starpos_testing.graph.graph import END_S, WAIT_S, Process, executable
+from starpos_testing.graph.graph import END_S, WAIT_S, Executable, executable
 from starpos_testing.lacking import lacks
 
 DEVICE = "link0"
@@ -91,7 +91,7 @@ class Host:
         self._holder.communicate()
 
 
-class Program(Process):
+class Program(Executable):
     """An executable on a host."""
 
     def __init__(self, host: Host, log: Path, package: str, name: str, arguments, parameters):

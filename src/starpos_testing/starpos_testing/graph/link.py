@@ -18,7 +18,7 @@ QUIET_S = 10.0  # without a camera, to see what the tilts take
 
 
 @dataclass(frozen=True)
-class Instrument:
+class LinkedInstrument:
     """Two hosts, their cable, and an ear beside the solver."""
 
     mount: Host
@@ -40,10 +40,12 @@ def two_hosts(**environment):
         Cable(mount, robot) as cable,
         Ear(robot) as ear,
     ):
-        yield Instrument(mount, robot, cable, ear)
+        yield LinkedInstrument(mount, robot, cable, ear)
 
 
-def start(instrument: Instrument, folder: Path, size: tuple[int, int], cadence_s: float, *patience: str):
+def start(
+    instrument: LinkedInstrument, folder: Path, size: tuple[int, int], cadence_s: float, *patience: str
+):
     """Camera and detector in one process and the inclinometer on the mount, the solver on the robot; the camera.
 
     patience: more parameters of the solver.

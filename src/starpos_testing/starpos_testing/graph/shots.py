@@ -39,7 +39,7 @@ def focal_of(size) -> float:
 
 
 @dataclass
-class Shot:
+class SimulatedShot:
     """One exposure as messages, for tests to spoil, and the truth about it."""
 
     info: CameraInfo
@@ -74,18 +74,18 @@ def azimuth_for_heading(heading_deg: float) -> float:
 _count = iter(range(1, 100000))
 
 
-def shoot(azimuth_deg=40.0, **changes) -> Shot:
+def shoot(azimuth_deg=40.0, **changes) -> SimulatedShot:
     """A shot 10 s after the one before, so that every one has a stamp of its own."""
     k = next(_count)
     scene = replace(scene_at(azimuth_deg), **changes)
     return shot_of(scene, START_S + k * CADENCE_S, np.random.default_rng(k))
 
 
-def shot_of(scene: Scene, start: float, rng) -> Shot:
+def shot_of(scene: Scene, start: float, rng) -> SimulatedShot:
     """What the scene's instrument sends of an exposure that begins then (Unix s)."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     stars = detected(scene, light, start + EXPOSURE_S / 2, EXPOSURE_S, rng)
-    return Shot(
+    return SimulatedShot(
         camera_to_message(scene.camera, FRAME, stars.mid_unix_s),
         stars_to_message(stars, FRAME),
         tilts_of(scene, start, rng),
@@ -110,13 +110,13 @@ def tilts_of(scene: Scene, start: float, rng) -> list[msg.Tilt]:
     ]
 
 
-def photograph(azimuth_deg=40.0) -> tuple[Shot, Image, msg.Capture]:
+def photograph(azimuth_deg=40.0) -> tuple[SimulatedShot, Image, msg.Capture]:
     """A shot of the small camera whose stars are still in the image."""
     k = next(_count)
     return photograph_of(scene_at(azimuth_deg, SMALL), START_S + k * CADENCE_S, np.random.default_rng(k))
 
 
-def photograph_of(scene: Scene, start: float, rng) -> tuple[Shot, Image, msg.Capture]:
+def photograph_of(scene: Scene, start: float, rng) -> tuple[SimulatedShot, Image, msg.Capture]:
     """The same of any scene and time; its frame is drawn, so a small one is quick."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     image = frame_to_message(render(scene, light, start, EXPOSURE_S, rng), FRAME)
@@ -124,4 +124,4 @@ def photograph_of(scene: Scene, start: float, rng) -> tuple[Shot, Image, msg.Cap
     size = scene.camera.width, scene.camera.height
     empty = stars_to_message(no_stars(*size, mid_unix_s=start + EXPOSURE_S / 2), FRAME)
     capture = msg.Capture(header=image.header, exposure=EXPOSURE_S, stamp_source=msg.Capture.SIMULATED)
-    return Shot(info, empty, tilts_of(scene, start, rng), scene), image, capture
+    return SimulatedShot(info, empty, tilts_of(scene, start, rng), scene), image, capture

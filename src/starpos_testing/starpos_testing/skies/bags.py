@@ -23,7 +23,7 @@ def typestore():
     return store
 
 
-class Recorder:
+class NightBag:
     """A bag in the making, MCAP unless told otherwise; topics lie in `namespace`."""
 
     def __init__(self, path, namespace="", plugin=StoragePlugin.MCAP):

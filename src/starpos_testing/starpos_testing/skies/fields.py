@@ -21,7 +21,7 @@ NO_ERROR = np.zeros((2, 2))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Field:
+class SkyField:
     """A camera somewhere, with `stars` stars spread over its frame; angles in deg."""
 
     latitude: float = 35.7
@@ -92,7 +92,7 @@ class Field:
         return solve_fix(stars, **parts | given)
 
 
-def random_field(rng, **fixed) -> Field:
+def random_field(rng, **fixed) -> SkyField:
     """Any place on Earth, any heading, leaning up to 25 deg from the zenith, bent by up to 3 deg."""
     drawn = {
         "latitude": float(np.degrees(np.arcsin(rng.uniform(-1, 1)))),
@@ -102,7 +102,7 @@ def random_field(rng, **fixed) -> Field:
         "roll": float(rng.uniform(-180, 180)),
         "misalignment": tuple(rng.uniform(-3, 3, 3).tolist()),
     }
-    return replace(Field(), **drawn | fixed)
+    return replace(SkyField(), **drawn | fixed)
 
 
 def turn(angle):

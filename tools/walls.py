@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hold the house's walls: who may import whom, as the tables of docs/architecture.md say, and a few rules of names.
+
+`walls.py` prints a line for each breach and exits 1 where there is one. `make lint` runs it.
+"""
+
+import ast
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PLAN = ROOT / "docs" / "architecture.md"
+ROS = {
+    "ament_index_python",
+    "builtin_interfaces",
+    "launch",
+    "launch_ros",
+    "rcl_interfaces",
+    "rclpy",
+    "rosgraph_msgs",
+}
+MESSAGES = re.compile(r"\w+_(msgs|srvs|interfaces)$")
+# names that the whole field writes in this way
+USUAL = {("numpy", "np"), ("xml.etree.ElementTree", "ET"), ("matplotlib.pyplot", "plt")}
+DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
+MOST_LINES = 450
+KEYWORD_FIELDS = 6  # a dataclass of so many is made by keyword, after three fields at most
+
+
+@dataclass(frozen=True)
+class Module:
+    """A Python file of the product: its dotted name, its file and what it says."""
+
+    name: str
+    path: Path
+    text: str
+
+    @cached_property
+    def tree(self) -> ast.Module:
+        return ast.parse(self.text)
+
+    @property
+    def package(self) -> str:
+        return self.name.partition(".")[0]
+
+    @property
+    def room(self) -> str:
+        """The folder or the ground's module of `starpos` that it lies in."""
+        return self.name.split(".")[1] if "." in self.name else ""
+
+    def at(self, node: ast.AST, sentence: str) -> str:
+        return f"{self.path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}: {sentence}"
+
+
+def packages() -> dict[str, Path]:
+    """Each package of ours and the folder of its modules."""
+    found = (p.parent for p in (*ROOT.glob("*/package.xml"), *ROOT.glob("src/*/package.xml")))
+    return {folder.name: folder / folder.name for folder in sorted(found) if (folder / "setup.py").is_file()}
+
+
+def modules() -> list[Module]:
+    """All modules of the product."""
+    found = []
+    for package, folder in packages().items():
+        for path in sorted(folder.rglob("*.py")):
+            parts = [package, *path.relative_to(folder).with_suffix("").parts]
+            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            found.append(Module(name, path, path.read_text()))
+    return found
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The cells of the table under a heading of the plan."""
+    section = PLAN.read_text().split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def floors() -> dict[str, int]:
+    """The floor of each folder of `starpos`, 0 for the ground's modules."""
+    return {
+        name: 0 if floor == "ground" else int(floor)
+        for floor, cell, _ in rows("Folders of starpos")
+        for name in re.findall(r"`(\w+)`", cell)
+    }
+
+
+def allowed() -> dict[str, set[str]]:
+    """Which packages of ours each may import, beside itself and the messages."""
+    ours, nodes = (
+        set(packages()),
+        {"starpos_camera", "starpos_inclinometer", "starpos_solver", "starpos_dashboard"},
+    )
+    may = {}
+    for where, _, cell in rows("Packages"):
+        [name] = re.findall(r"`(?:src/)?(\w+)`", where)
+        words = {
+            word if word.startswith("starpos") else f"starpos_{word}" for word in re.findall(r"\w+", cell)
+        }
+        may[name] = nodes | {"starpos", "starpos_common"} if "all nodes" in cell else words & ours
+    return may
+
+
+def imports(module: Module) -> Iterator[tuple[ast.AST, str]]:
+    """The modules that it imports, and where."""
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Import):
+            yield from ((node, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from ((node, f"{node.module}.{alias.name}") for alias in node.names)
+
+
+def layers(house: list[Module]) -> Iterator[str]:
+    """Imports that a wall forbids."""
+    floor, may = floors(), allowed()
+    for module in house:
+        own = floor.get(module.room)
+        if module.package == "starpos" and module.room and module.room != "__main__" and own is None:
+            yield module.at(module.tree, f"{module.room} has no floor in {PLAN.name}: say where it belongs")
+        for node, target in imports(module):
+            package, _, rest = target.partition(".")
+            room = rest.partition(".")[0]
+            if module.package == "starpos" and (package in ROS or MESSAGES.match(package)):
+                yield module.at(node, f"starpos imports {package}, which is ROS")
+            elif package in may and package not in may.get(module.package, set()) | {
+                module.package,
+                "starpos_interfaces",
+            }:
+                yield module.at(node, f"{module.package} imports {package}, which {PLAN.name} does not allow")
+            elif module.package == package == "starpos" and own is not None and room != module.room:
+                above = floor.get(room)
+                if above is not None and above >= own and not (above == own == 0):
+                    yield module.at(node, f"{module.room} (floor {own}) imports {room} (floor {above})")
+
+
+def aliases(house: list[Module]) -> Iterator[str]:
+    """Imports under another name: two things have one name."""
+    for module in house:
+        for node in ast.walk(module.tree):
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                for alias in node.names:
+                    if alias.asname and (alias.name, alias.asname) not in USUAL:
+                        yield module.at(
+                            node, f"{alias.name} is imported as {alias.asname}: give it a name of its own"
+                        )
+
+
+def twins(house: list[Module]) -> Iterator[str]:
+    """Class names that stand for two things."""
+    classes: dict[str, list[str]] = defaultdict(list)
+    for module in house:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                classes[node.name].append(module.at(node, node.name))
+    for name, places in sorted(classes.items()):
+        if len(places) > 1:
+            yield f"{name} stands for {len(places)} things: {', '.join(p.rsplit(': ', 1)[0] for p in places)}"
+
+
+def dataclass_call(node: ast.ClassDef) -> ast.expr | None:
+    """The decorator that makes it a dataclass."""
+    for decorator in node.decorator_list:
+        called = decorator.func if isinstance(decorator, ast.Call) else decorator
+        if isinstance(called, ast.Name) and called.id == "dataclass":
+            return decorator
+    return None
+
+
+def keywords(house: list[Module]) -> Iterator[str]:
+    """Dataclasses of many fields that may be made by position."""
+    for module in house:
+        for node in ast.walk(module.tree):
+            decorator = dataclass_call(node) if isinstance(node, ast.ClassDef) else None
+            if decorator is None:
+                continue
+            fields = [ast.unparse(s.annotation) for s in node.body if isinstance(s, ast.AnnAssign)]
+            named = isinstance(decorator, ast.Call) and any(k.arg == "kw_only" for k in decorator.keywords)
+            before = fields.index("KW_ONLY") if "KW_ONLY" in fields else len(fields)
+            if len(fields) >= KEYWORD_FIELDS and not named and before > 3:
+                yield module.at(node, f"{node.name} has {len(fields)} fields: make it by keyword (kw_only)")
+
+
+def words(house: list[Module]) -> Iterator[str]:
+    """Docstrings that make a reader stop, and files of two topics."""
+    for module in house:
+        for node in ast.walk(module.tree):
+            said = ast.get_docstring(node) if isinstance(node, DOCUMENTED) else None
+            if said and re.match(r"(Of|The same)\b", said):
+                yield module.at(node, "a docstring begins with a verb or a noun")
+        lines = len(module.text.splitlines())
+        if lines > MOST_LINES:
+            yield module.at(module.tree, f"{lines} lines: more than one topic?")
+
+
+def breaches() -> list[str]:
+    """All that is against the rules."""
+    house = modules()
+    return [line for rule in (layers, aliases, twins, keywords, words) for line in rule(house)]
+
+
+if __name__ == "__main__":
+    found = breaches()
+    print("\n".join(found) or "the walls hold")
+    sys.exit(bool(found))
