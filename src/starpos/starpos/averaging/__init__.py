@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many fixes of one place as one."""
+"""Averages of many fixes of one place."""

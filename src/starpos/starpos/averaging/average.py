@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many frames of one place made into one fix, as they come in or all at once: both go through the same recursion.
+"""The average of many fixes of one place, one after the other or all at once: both use the same recursion.
 
-A fix that lies far from the others (a tilt misread, a time stamp off) is left out; a robot that moved on begins anew.
-Which of the two it is, the stars tell: a camera that has not turned against the Earth has not moved.
+A fix that lies far from the others (a wrong tilt or time stamp) is left out.  A robot that moved gets a new average.
+The stars tell the two apart: a camera that has not turned against the Earth has not moved.
 """
 
 from collections.abc import Sequence
@@ -13,22 +13,25 @@ import numpy as np
 from starpos.averaging.filter import PlaceFilter
 from starpos.averaging.slip import slip_s
 from starpos.errors import FixError
-from starpos.fix.budget import ErrorTerm
+from starpos.fix.budget import ErrorTerm, total_covariance
 from starpos.fix.fix import Fix
 
-GATE_SIGMA = 6.0  # further off a fix is not of this place, or wrong
-MOVED_FIXES, MOVED_SIGMA = 3, 4.5  # so many fixes of a turned camera, so far off, are another place
-RIVAL_FIXES = 10  # a rival is replaced by a newer one no sooner
+# a fix further off than this is wrong, or of another place
+GATE_SIGMA = 6.0
+# so many fixes of a turned camera, so far off, are of another place
+MOVED_FIXES, MOVED_SIGMA = 3, 4.5
+# a rival with fewer fixes is kept when the camera is touched again
+RIVAL_FIXES = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class Average:
-    """The combined position and the heading of the last pose (rad), with the budget of its errors.
+    """The averaged place, and the heading of the last pose (rad), with the budget of their errors.
 
-    The heading is NaN where no fix of that pose was believed yet.
-    frames: how many it is of, in how many poses; left_out: how many since its beginning were not believed.
-    began_unix_s, utc_unix_s: of its first fix, and the mean of all.  moved: how many averages of other places there were
-    before it.
+    A pose lasts until somebody touches the camera.  The heading is NaN while no fix of the last pose has been accepted.
+    frames, poses: number of accepted fixes and of their poses; left_out: number of fixes that were not accepted.
+    began_unix_s: time of the first fix; utc_unix_s: mean of the times of all.
+    moved: number of earlier averages, of other places.
     """
 
     utc_unix_s: float
@@ -44,25 +47,25 @@ class Average:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(3, 3) of east m, north m, heading rad; NaN in the heading's row and column where there is none."""
-        covariance = sum(t.covariance for t in self.terms)[:3, :3].copy()
+        """Covariance (3, 3) of east m, north m, heading rad; its last row and column are NaN if the heading is."""
+        covariance = total_covariance(self.terms)[:3, :3]
         if np.isnan(self.heading):
             covariance[2] = covariance[:, 2] = np.nan
         return covariance
 
 
 def average(fixes: Sequence[Fix]) -> Average:
-    """The average of fixes, of the last place in time if there are several; the same frame twice counts once.
+    """The average of fixes in any order, of the last place in time if there are several; a frame counts once.
 
-    Raises FixError where there is none, or where as many were left out as were used, so that it cannot be told which are
-    right.
+    Raises FixError if there is no fix, or if as many were left out as were used: then nobody can say which are right.
     """
-    if not fixes:
-        raise FixError("there is no fix to average: none of the frames has one")
     averager = Averager()
-    for f in sorted({(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values(), key=_time):
+    different = {(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values()
+    for f in sorted(different, key=lambda f: f.utc_unix_s):
         averager.add(f)
     whole = averager.average
+    if whole is None:
+        raise FixError("there is no fix to average: none of the frames has one")
     if whole.left_out >= whole.frames:
         raise FixError(
             f"of {whole.frames + whole.left_out} frames {whole.left_out} lie further from the others than their errors "
@@ -72,15 +75,15 @@ def average(fixes: Sequence[Fix]) -> Average:
     return whole
 
 
-def _time(f: Fix) -> float:
-    return f.utc_unix_s
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Track:
-    """An average in the making; in_pose: its frames since the camera was last touched."""
+    """An average that grows with each fix.
 
-    running: PlaceFilter
+    pose: the first fix since the camera was last touched; in_pose: number of accepted fixes since then.
+    """
+
+    place_filter: PlaceFilter
+    pose: Fix
     frames: int = 0
     poses: int = 0
     in_pose: int = 0
@@ -89,55 +92,67 @@ class _Track:
 
     @classmethod
     def before(cls, f: Fix) -> "_Track":
-        return cls(running=PlaceFilter.before(f), began_unix_s=f.utc_unix_s)
+        """A track without a fix, ready for fixes like `f`."""
+        return cls(place_filter=PlaceFilter.before(f), pose=f, began_unix_s=f.utc_unix_s)
 
     def rival(self, f: Fix) -> "_Track":
-        """A new one that knows of this one's errors, not of its place."""
-        return _Track(running=self.running.elsewhere(f), began_unix_s=f.utc_unix_s)
+        """A track without a fix that knows the errors of this one, but not its place."""
+        return _Track(place_filter=self.place_filter.elsewhere(f), pose=self.pose, began_unix_s=f.utc_unix_s)
 
-    def touched(self) -> "_Track":
-        return replace(self, running=self.running.heading_unknown(), in_pose=0)
+    def touched(self, f: Fix) -> "_Track":
+        """The track after somebody touched the camera; `f` is the first fix since."""
+        return replace(self, place_filter=self.place_filter.heading_unknown(), pose=f, in_pose=0)
 
-    def add(self, f: Fix, pose: Fix) -> "_Track | None":
-        """With one more fix of a pose; None where it is too far off."""
-        running, sigmas = self.running.add(f, pose)
-        if sigmas > GATE_SIGMA or not running.straight_from(self.running):
+    def begin(self, f: Fix) -> "_Track":
+        """The track with its first fix, which nothing can contradict."""
+        return self._extended(f, self.place_filter.add(f, self.pose)[0])
+
+    def add(self, f: Fix) -> "_Track | None":
+        """The track with one more fix; None if the fix lies too far off."""
+        extended, sigmas = self.place_filter.add(f, self.pose)
+        if sigmas > GATE_SIGMA or not extended.straight_from(self.place_filter):
             return None
-        n = self.frames + 1
-        mean = self.mean_unix_s + (f.utc_unix_s - self.mean_unix_s) / n
-        poses = self.poses + (self.in_pose == 0)
+        return self._extended(f, extended)
+
+    def _extended(self, f: Fix, extended: PlaceFilter) -> "_Track":
+        frames = self.frames + 1
         return replace(
-            self, running=running, frames=n, poses=poses, in_pose=self.in_pose + 1, mean_unix_s=mean
+            self,
+            place_filter=extended,
+            frames=frames,
+            poses=self.poses + (self.in_pose == 0),
+            in_pose=self.in_pose + 1,
+            mean_unix_s=self.mean_unix_s + (f.utc_unix_s - self.mean_unix_s) / frames,
         )
 
 
 class Averager:
-    """The recursion: `add` fixes in order of time, `average` is what they say.  Its memory does not grow."""
+    """Averages fixes as they come in: `add` them in order of time and read `average`.  Its memory does not grow."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._track: _Track | None = None
-        self._rival: _Track | None = (
-            None  # of the fixes since the camera was touched, or since one was not believed
-        )
-        self._rival_turned = False  # whether the camera was touched when the rival began
-        self._disbelieved = 0  # fixes in a row
+        # the average of the fixes since the camera was touched, or since one did not agree
+        self._rival: _Track | None = None
+        # whether the camera was touched when the rival began
+        self._rival_turned = False
+        # number of fixes in a row that did not agree
+        self._disbelieved = 0
         self._left_out = self._moved = 0
         self._last: Fix | None = None
-        self._pose: Fix | None = None  # the first of this pose
 
     @property
     def average(self) -> Average | None:
-        """None before the first fix."""
+        """The average so far; None before the first fix."""
         t = self._track
-        if t is None:
+        if t is None or self._last is None:
             return None
-        latitude, longitude, heading = t.running.place
+        latitude, longitude, heading = t.place_filter.place
         return Average(
             utc_unix_s=t.mean_unix_s,
             latitude=latitude,
             longitude=longitude,
             heading=heading,
-            terms=t.running.terms(self._last.terms),
+            terms=t.place_filter.terms(self._last.terms),
             frames=t.frames,
             poses=t.poses,
             left_out=self._left_out,
@@ -146,55 +161,59 @@ class Averager:
         )
 
     def add(self, f: Fix) -> None:
-        """One more fix, later than those before."""
-        if self._track is None:
-            self._track, self._last, self._pose = _Track.before(f).add(f, f), f, f
+        """Take in one more fix, later than all before."""
+        track = self._track
+        if track is None:
+            self._track, self._last = _Track.before(f).begin(f), f
             return
-        slip = slip_s(f, self._pose)
+        slip = slip_s(f, track.pose)
         if slip is None:
-            self._turn(f)
+            track = self._touch(track, f)
         self._last = f
-        before, with_it = self._track, None if slip else self._track.add(f, self._pose)
-        rival = self._rival.add(f, self._pose) if self._rival else None
-        if with_it is not None:
-            self._track, self._disbelieved = with_it, 0
-            if self._rival is not None and rival is None:  # it began with a wrong one
-                rival = before.rival(f).add(f, self._pose) if self._rival_turned else None
+        extended = None if slip else track.add(f)
+        rival = self._rival.add(f) if self._rival else None
+        if extended is not None:
+            self._track, self._disbelieved = extended, 0
+            # a rival that this fix contradicts began with a wrong fix
+            if self._rival is not None and rival is None:
+                rival = track.rival(f).begin(f) if self._rival_turned else None
             self._rival = rival
-            if rival is not None and self._is_elsewhere(rival):
-                self._move(f)
+            if rival is not None and self._is_elsewhere(extended, rival):
+                self._switch(extended, rival, f)
             return
         self._left_out += 1
         self._disbelieved += 1
         if rival is None:
             self._rival_turned &= self._rival is not None
-            rival, self._disbelieved = before.rival(f).add(f, self._pose), 1
+            rival, self._disbelieved = track.rival(f).begin(f), 1
         self._rival = rival
-        # of a camera nobody touched it takes the majority to say that the average is wrong
-        if self._disbelieved >= MOVED_FIXES if self._rival_turned else rival.frames > self._track.in_pose:
-            self._move(f)
+        # while nobody touches the camera, only a majority of its fixes may overrule the average
+        if self._disbelieved >= MOVED_FIXES if self._rival_turned else rival.frames > track.in_pose:
+            self._switch(track, rival, f)
 
-    def _turn(self, f: Fix) -> None:
-        """The camera was touched: its heading is another, and its place may be."""
-        self._pose, self._track = f, self._track.touched()
+    def _touch(self, track: _Track, f: Fix) -> _Track:
+        """The track after the camera was touched: the heading has changed, and the place may have."""
+        self._track = track = track.touched(f)
         if self._rival is not None and (self._disbelieved or self._rival.frames < RIVAL_FIXES):
-            self._rival, self._rival_turned = self._rival.touched(), True
-            return
-        self._rival, self._rival_turned = self._track.rival(f), True
+            self._rival = self._rival.touched(f)
+        else:
+            self._rival = track.rival(f)
+        self._rival_turned = True
+        return track
 
-    def _is_elsewhere(self, rival: _Track) -> bool:
+    def _is_elsewhere(self, track: _Track, rival: _Track) -> bool:
         return (
             self._rival_turned
             and rival.frames >= MOVED_FIXES
-            and self._track.frames > rival.frames
-            and self._track.running.sigmas_apart(rival.running) > MOVED_SIGMA
+            and track.frames > rival.frames
+            and track.place_filter.sigmas_apart(rival.place_filter) > MOVED_SIGMA
         )
 
-    def _move(self, f: Fix) -> None:
-        """The rival is right, with its last fix."""
+    def _switch(self, track: _Track, rival: _Track, f: Fix) -> None:
+        """Go on with the rival, whose last fix is `f`, instead of the track."""
         if self._rival_turned:
             self._moved += 1
             self._left_out = 0
         else:
-            self._left_out += self._track.in_pose - self._rival.frames
-        self._track, self._rival, self._disbelieved, self._pose = self._rival, None, 0, f
+            self._left_out += track.in_pose - rival.frames
+        self._track, self._rival, self._disbelieved = replace(rival, pose=f), None, 0

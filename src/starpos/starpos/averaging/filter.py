@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The place of a standing instrument as its fixes come in: a Kalman filter over place, heading and what the fixes share.
+"""A Kalman filter over the place and heading of an instrument at rest, and over the errors that its fixes share.
 
-A calibration error that turns with the instrument is told apart from the place, one that does not stays in the answer; a
-zero that wanders does so in the filter too.  Its size is constant, and its answer is that of generalised least squares
-over all fixes at once (test_average.py).  The covariance is kept by source, so that the budget of the mean comes with it.
+A calibration error that turns with the instrument is separated from the place; one that does not turn stays in the
+answer.  A zero that wanders also wanders in the filter.  The filter's size is constant, and its answer is that of
+generalised least squares over all fixes at once (test_average.py).  It keeps a covariance per source of error, so that
+the average has a budget.
 """
 
 from collections.abc import Sequence
@@ -16,60 +17,69 @@ from starpos.fix.budget import ErrorTerm, correlation, symmetric_root
 from starpos.fix.fix import Fix
 from starpos.rotation import full_turn, half_turn
 
-UNIT = np.array([1.0, 1.0, 1e-6])  # m and rad, brought to like sizes
-HUBER_SIGMA = 4.0  # a fix further off pulls no harder
-MOST_BENT = 0.2  # of the claim: by how much a step of the place may leave the plane
-STEEPEST = 30.0  # tangent of the latitude from which on parallels count as bent no more
+# of east, north in m and heading in rad: brings them to similar sizes
+UNIT = np.array([1.0, 1.0, 1e-6])
+# a fix further off than this pulls no harder
+HUBER_SIGMA = 4.0
+# a step of the place may leave the plane by this share of the place's sigma
+MOST_BENT = 0.2
+# tangent of the latitude beyond which parallels count as no more curved
+STEEPEST = 30.0
 
 
 @dataclass(frozen=True)
 class Plane:
-    """The tangent plane at a fix, where east and north of its neighbours are made one."""
+    """The tangent plane at a fix, whose east and north are used for all fixes near it.
+
+    zenith (3,), axes (2, 3): up, and east and north, in ITRS.  radii (2,): of the prime vertical and the meridian, m.
+    heading (rad): of the fix; headings count from it.
+    """
 
     zenith: np.ndarray
-    axes: np.ndarray  # (2, 3): east and north in ITRS
-    radii: np.ndarray  # prime vertical, meridian; m
-    heading: float  # of the fix, against these axes
+    axes: np.ndarray
+    radii: np.ndarray
+    heading: float
 
     @classmethod
     def at(cls, f: Fix) -> "Plane":
+        """The plane at a fix."""
         axes = _axes(f.latitude, f.longitude)
         return cls(
             zenith_of(f.latitude, f.longitude), axes, np.array(curvature_radii_m(f.latitude)), f.heading
         )
 
     def convergence(self, latitude: float, longitude: float) -> float:
-        """Azimuth of a place's own north against this plane's."""
+        """Azimuth (rad) in this plane of the north of a place (rad)."""
         return float(np.arctan2(*(self.axes @ _axes(latitude, longitude)[1])))
 
     def across(self, latitude: float, longitude: float) -> np.ndarray:
-        """East, north in m (2,) of a place."""
+        """East, north (2,) in m of a place (rad)."""
         return self.axes @ (zenith_of(latitude, longitude) - self.zenith) * self.radii
 
     def seen(self, f: Fix) -> np.ndarray:
-        """East, north, heading (3,) of a fix against the plane's own, in UNIT."""
+        """East, north, heading (3,) of a fix relative to the plane, in UNIT."""
         moved = self.across(f.latitude, f.longitude)
         heading = f.heading + self.convergence(f.latitude, f.longitude) - self.heading
         return np.array([*moved, half_turn(heading)]) / UNIT
 
     def turned(self, f: Fix, factor: np.ndarray) -> np.ndarray:
-        """The first three rows of an error factor, brought from the fix's axes into these; in UNIT."""
+        """The first three rows of an error factor of a fix, turned from the fix's axes into the plane's; in UNIT."""
         turn = self.convergence(f.latitude, f.longitude)
         c, s = np.cos(turn), np.sin(turn)
         east, north, heading = factor[:3]
-        # the fix's north turns with its longitude, and its heading was taken from there
+        # an error of the longitude turns the north from which the heading counts
         prime, _ = curvature_radii_m(f.latitude)
         heading = heading - np.tan(f.latitude) / prime * east
         return np.stack([c * east + s * north, c * north - s * east, heading]) / UNIT[:, None]
 
     def local(self, latitude: float, factor: np.ndarray) -> np.ndarray:
-        """A factor (3, m) in UNIT as m and rad, with the heading against its place's own north again."""
+        """A factor (3, m) in UNIT, as m and rad, with the heading from the north at its own place; reverses `turned`."""
         prime, _ = curvature_radii_m(latitude)
         factor = factor * UNIT[:, None]
         return factor + np.outer([0.0, 0.0, np.tan(latitude) / prime], factor[0])
 
     def place(self, east_north_m: np.ndarray) -> tuple[float, float]:
-        """Latitude, longitude (rad)."""
+        """Latitude, longitude (rad) of a point of the plane."""
         across = east_north_m / self.radii
         zenith = np.sqrt(max(1 - across @ across, 0.0)) * self.zenith + across @ self.axes
         return float(np.arctan2(zenith[2], np.hypot(*zenith[:2]))), float(np.arctan2(zenith[1], zenith[0]))
@@ -77,11 +87,13 @@ class Plane:
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceFilter:
-    """What the fixes so far say.
+    """State of the filter after the fixes so far.
 
-    state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own; known (3,): which
-    of the first three are; sources (T, n, n): covariance of the state's error by each of the T terms of a fix; keys: of
-    each term's shared error, the frames it holds for; columns: its place in the state.
+    state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own.
+    known (3,): mask of those of east, north, heading that are known.
+    sources (T, n, n): covariance of the state that comes from each of the T terms of a fix.
+    names, columns, keys: name of each term, place of its shared error in the state, and `shared` of its last fix.
+    utc_unix_s: time of the last fix.
     """
 
     plane: Plane
@@ -91,11 +103,11 @@ class PlaceFilter:
     state: np.ndarray
     known: np.ndarray
     sources: np.ndarray
-    utc_unix_s: float  # of the last fix
+    utc_unix_s: float
 
     @classmethod
     def before(cls, f: Fix) -> "PlaceFilter":
-        """Nothing known yet, in a plane at the first fix and ready for fixes with terms like its."""
+        """A filter that knows nothing, in the plane of the first fix and ready for fixes with the same terms."""
         columns, n = [], 3
         for t in f.terms:
             width = 0 if t.shared is None else t.factor.shape[1]
@@ -114,21 +126,24 @@ class PlaceFilter:
         )
 
     def forget(self, unknown: tuple[bool, bool, bool]) -> "PlaceFilter":
-        """The same, with east, north or heading unknown."""
+        """The filter with east, north or heading unknown."""
         which, sources = np.flatnonzero(unknown), self.sources.copy()
         sources[:, which, :] = sources[:, :, which] = 0.0
         return replace(self, sources=sources, known=self.known & ~np.array(unknown))
 
     def heading_unknown(self) -> "PlaceFilter":
-        """The same place, the instrument turned."""
+        """The filter after the instrument was turned at its place."""
         return self.forget((False, False, True))
 
     def elsewhere(self, f: Fix) -> "PlaceFilter":
-        """The same instrument, with all that is known of its errors, at an unknown place in the plane of a fix."""
+        """The filter at an unknown place in the plane of a fix, with all that is known of the instrument's errors."""
         return replace(self.forget((True, True, True)), plane=Plane.at(f))
 
     def add(self, f: Fix, pose: Fix) -> tuple["PlaceFilter", float]:
-        """With one more fix, and how many sigma that was from what was expected of it.  pose: the first of its pose."""
+        """The filter with one more fix, and by how many sigma the fix differed from what was expected.
+
+        pose: the first fix since the camera was touched.  Raises ValueError if the fix has other error terms.
+        """
         now, own = self._at(f)
         shared, noise = np.zeros((3, len(now.state))), np.zeros((len(own), 3, 3))
         for k, t in enumerate(f.terms):
@@ -140,39 +155,37 @@ class PlaceFilter:
                 shared[:, now.columns[k]] = factor
         seen, sigmas = self.plane.seen(f), 0.0
         known, which = self.known, np.flatnonzero(self.known)
-        kept, brought = (
-            np.eye(len(now.state)),
-            np.zeros((len(now.state), 3)),
-        )  # of the state's error, and of the fix's
+        # the state's new error is kept @ its old error + brought @ the fix's own error
+        kept, brought = np.eye(len(now.state)), np.zeros((len(now.state), 3))
         state = now.state
         if known.any():
-            told = shared[known]
-            told[np.arange(len(which)), which] = 1.0
-            across = now.sources.sum(0) @ told.T
-            rest = seen[known] - told @ state
+            design = shared[known]
+            design[np.arange(len(which)), which] = 1.0
+            across = now.sources.sum(0) @ design.T
+            innovation = seen[known] - design @ state
             if known[2]:
-                rest[-1] = half_turn(rest[-1] * UNIT[2]) / UNIT[2]
-            spread, own_spread = told @ across, noise.sum(0)[np.ix_(known, known)]
-            sigmas = float(np.sqrt(rest @ np.linalg.solve(spread + own_spread, rest)))
+                innovation[-1] = half_turn(innovation[-1] * UNIT[2]) / UNIT[2]
+            predicted, own_noise = design @ across, noise.sum(0)[np.ix_(known, known)]
+            sigmas = float(np.sqrt(innovation @ np.linalg.solve(predicted + own_noise, innovation)))
             noise *= max(1.0, sigmas / HUBER_SIGMA)
-            gain = np.linalg.solve(spread + own_spread * max(1.0, sigmas / HUBER_SIGMA), across.T).T
-            kept -= gain @ told
+            gain = np.linalg.solve(predicted + own_noise * max(1.0, sigmas / HUBER_SIGMA), across.T).T
+            kept -= gain @ design
             brought[:, known] = gain
-            state = state + gain @ rest
-        for k in np.flatnonzero(
-            ~known
-        ):  # what was not known is now what the fix says, less the shared errors
-            state[k] = seen[k] - shared[k] @ state
-            kept[k] = -shared[k] @ kept
-            brought[k] = np.eye(3)[k] - shared[k] @ brought
+            state = state + gain @ innovation
+        # an unknown element becomes that of the fix, less the shared errors
+        for row in np.flatnonzero(~known):
+            state[row] = seen[row] - shared[row] @ state
+            kept[row] = -shared[row] @ kept
+            brought[row] = np.eye(3)[row] - shared[row] @ brought
         sources = kept @ now.sources @ kept.T + brought @ noise @ brought.T
         sources = (sources + sources.swapaxes(1, 2)) / 2
         return replace(now, state=state, sources=sources, known=np.ones(3, bool)), sigmas
 
     def straight_from(self, before: "PlaceFilter") -> bool:
-        """Whether the way from an earlier place to this one is as straight as this one's claim takes it for.
+        """Whether the step from an earlier place to this one is short enough for the plane.
 
-        A clock's error goes along the parallel, which leaves the plane with the square of the way: 20 m in 16 km.
+        An error of the clock moves the place along its parallel, which leaves the plane with the square of the step: by
+        20 m in 16 km.  That has to be small beside this place's sigma.
         """
         if not before.known[:2].all():
             return True
@@ -183,13 +196,16 @@ class PlaceFilter:
         return bool(bent <= MOST_BENT * np.sqrt(max(least, 0.0)))
 
     def _at(self, f: Fix) -> tuple["PlaceFilter", np.ndarray]:
-        """The shared errors as they are at the time of a fix; and which of its terms are all its own (T,)."""
+        """The filter at the time of a fix, before it is added; and a mask (T,) of the terms whose error is new in it.
+
+        Raises ValueError if the fix has other terms.
+        """
         if tuple(t.name for t in f.terms) != self.names:
             raise ValueError("fixes with other error terms: they are not of one program")
         state, sources, keys = self.state.copy(), self.sources.copy(), list(self.keys)
         own = np.array([t.shared is None for t in f.terms])
         for k, t in enumerate(f.terms):
-            if own[k]:
+            if t.shared is None:
                 continue
             at, alike = self.columns[k], correlation(keys[k], t.shared)
             state[at] *= alike
@@ -203,7 +219,7 @@ class PlaceFilter:
 
     @property
     def place(self) -> tuple[float, float, float]:
-        """Latitude, longitude, heading (rad; NaN where nothing is known of it since the camera was touched)."""
+        """Latitude, longitude, heading (rad); the heading is NaN if it is unknown since the camera was touched."""
         latitude, longitude = self.plane.place(self.state[:2] * UNIT[:2])
         if not self.known[2]:
             return latitude, longitude, float("nan")
@@ -211,7 +227,7 @@ class PlaceFilter:
         return latitude, longitude, full_turn(heading)
 
     def terms(self, like: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
-        """The budget of `place`, with factors (3, 3)."""
+        """The budget of `place`, with factors (3, 3); names and keys are those of the terms `like`."""
         latitude, _ = self.plane.place(self.state[:2] * UNIT[:2])
         return tuple(
             ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), shared=t.shared)
@@ -219,9 +235,9 @@ class PlaceFilter:
         )
 
     def sigmas_apart(self, part: "PlaceFilter") -> float:
-        """How far the place of `part`, which had some of these fixes only, is from this one, in sigma."""
+        """Distance in sigma between this place and that of `part`, a filter of some of the same fixes."""
         apart = self.plane.across(*part.place[:2]) - self.state[:2]
-        # what a part errs beyond the whole is independent of it
+        # the difference of a part and the whole is independent of the whole, so their covariances subtract
         beyond = (part.sources.sum(0) - self.sources.sum(0))[:2, :2]
         values, vectors = np.linalg.eigh(beyond)
         values = np.maximum(values, 1e-3 * np.trace(part.sources.sum(0)[:2, :2]))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a camera stands against the Earth as it stood, was touched, or only its time stamps contradict each other.
+"""Tells a camera that was touched from one whose time stamps contradict each other.
 
-A camera at rest sees the sky turn about the Earth's axis by its stamps; if by them it has turned about that axis itself,
-as no hand turns it, one of the stamps is wrong.
+For a camera at rest the sky turns about the Earth's axis as its time stamps say.  If by the stamps the camera itself has
+turned about exactly that axis, which no hand does, one of the stamps is wrong.
 """
 
 import numpy as np
@@ -12,16 +12,21 @@ from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.fix.fix import Fix
 from starpos.units import ARCSEC
 
-SIGMAS = 6.0  # that errors may reach
-CREEP_RAD = 10 * ARCSEC  # by which a mount may settle that nobody touches
-HIGHEST_LATITUDE = np.radians(89.0)  # beyond it any turn on the spot is one about the Earth's axis
-LARGE_TRACE = 2.9  # of a rotation by 0.3 rad; larger ones are no error
+# errors may be as large as this
+SIGMAS = 6.0
+# a mount that nobody touches may settle by this
+CREEP_RAD = 10 * ARCSEC
+# beyond it any turn about the plumb line is one about the Earth's axis
+HIGHEST_LATITUDE = np.radians(89.0)
+# trace of a rotation by 0.3 rad; a larger rotation is no error
+LARGE_TRACE = 2.9
 
 
 def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
-    """By how many seconds the stamps of two fixes of one pose contradict each other; None of a camera that was touched.
+    """Seconds by which the time stamps of two fixes contradict each other; None if the camera was touched in between.
 
-    0 within what the errors of both attitudes allow, the mount's creep, and stated_s, 1 sigma of both stamps together.
+    The result is 0 if the errors of both attitudes, the mount's creep and stated_s explain the difference.
+    stated_s: 1 sigma of both stamps together.
     """
     turned = fix.camera_to_itrs @ first.camera_to_itrs.T
     angle = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
@@ -31,7 +36,7 @@ def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
         return None
     covariance = fix.camera_covariance + about_axis @ first.camera_covariance @ about_axis.T
     weight = np.linalg.inv(covariance + np.eye(3) * (CREEP_RAD / SIGMAS) ** 2)
-    # the angle with the least rest: the roll about the optical axis is known worse than where that axis points
+    # choose the angle that leaves the least rest in sigma: the roll is known worse than the optical axis
     rest, variance = rotation.to_small_vector(rest), 1 / weight[2, 2]
     more = variance * weight[2] @ rest
     rest, angle = rest - [0.0, 0.0, more], angle + more

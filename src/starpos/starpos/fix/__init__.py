@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fix: stars and tilt in, place and heading out, with the whole error budget."""
+"""The fix: place and heading from stars and tilt, with the whole error budget."""

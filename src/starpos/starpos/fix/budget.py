@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error budget of a fix: each source of error as what it does to place, heading and attitude."""
 
+from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
@@ -13,20 +14,18 @@ from starpos.instrument.mounting import Mounting
 from starpos.units import HOUR_S
 
 STEP_RAD = 1e-6
-
-
 ALWAYS = ("always",)
 
 
 @dataclass(frozen=True)
 class ErrorTerm:
-    """One source of error: factor (6, m) of the covariance variance * factor @ factor.T.
+    """One source of error: its covariance is variance * factor @ factor.T.
 
-    Rows: east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.  shared: None
-    where the error is new in every frame; else the keys of what it is the mean of, and the m errors of two frames have
-    the `correlation` of their keys: ALWAYS for a calibration or a clock.  walk_s: by how much the variance grows in a
-    second, for an error that wanders.  posed: the factor is the same as long as nobody touches the camera; that it
-    differs is noise.
+    factor (6, m): rows are east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.
+    shared: None if the error is new in every frame.  Otherwise the error is the mean of several readings, and these are
+    their keys: the m errors of two frames have the `correlation` of their keys.  ALWAYS: for a calibration or a clock.
+    walk_s: growth of the variance per second, for an error that wanders.
+    posed: the true factor is constant while nobody touches the camera; differences between frames are noise.
     """
 
     name: str
@@ -39,23 +38,28 @@ class ErrorTerm:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(6, 6)."""
+        """Covariance (6, 6) of the rows of `factor`."""
         return self.variance * self.factor @ self.factor.T
 
     @property
     def common(self) -> bool:
-        """Whether it keeps its sign from frame to frame."""
+        """Whether the error is the same in all frames."""
         return self.shared == ALWAYS
 
 
+def total_covariance(terms: Iterable[ErrorTerm]) -> np.ndarray:
+    """Sum of the covariances of independent terms, (6, 6) if their factors have six rows."""
+    return np.sum([t.covariance for t in terms], axis=0)
+
+
 def correlation(a: tuple, b: tuple) -> float:
-    """Of two means of equally good readings, by the keys of these."""
+    """Correlation of the means of two sets of equally good readings that have the keys `a` and `b`."""
     return len(set(a) & set(b)) / (len(a) * len(b)) ** 0.5 if a and b else 0.0
 
 
 @dataclass(frozen=True)
 class Place:
-    """What A4 says: latitude, longitude (rad); east and north as unit vectors (3,) of L."""
+    """The place that A4 contains: latitude, longitude (rad); east and north as unit vectors (3,) of L."""
 
     latitude: float
     longitude: float
@@ -64,12 +68,12 @@ class Place:
 
     @property
     def local_to_enu(self) -> np.ndarray:
-        """(3, 3)."""
+        """Rotation (3, 3) of L into east, north, up."""
         return np.stack([self.east, self.north, [0.0, 0.0, 1.0]])
 
 
 def place_of(a4: np.ndarray) -> Place:
-    """Zenith and pole of A4 (3, 3), ITRS into L; at a pole, where north is any direction, L's X is taken."""
+    """Place from A4 (3, 3), which takes ITRS into L.  At a pole, where north is undefined, L's X axis is north."""
     zenith, pole = a4[2], a4[:, 2]
     north = np.array([pole[0], pole[1], 0.0])
     length = np.linalg.norm(north)
@@ -82,9 +86,10 @@ def place_of(a4: np.ndarray) -> Place:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How the rows of an ErrorTerm answer to small rotations (6, 3) about L's axes.
+    """Change of the rows of an ErrorTerm for small rotations about L's axes, (6, 3) each.
 
-    stars: of the sky against L (A4 alone); level: of L against sky and instrument (A4 and the attitude together).
+    stars: for a rotation of the sky against L, which changes A4 only.
+    level: for a rotation of L against sky and instrument, which changes A4 and the attitude together.
     """
 
     stars: np.ndarray
@@ -92,12 +97,13 @@ class Sensitivity:
 
     @classmethod
     def of(cls, a4: np.ndarray, link_to_enu: np.ndarray) -> "Sensitivity":
+        """Sensitivity at A4 (3, 3) with the attitude link_to_enu (3, 3)."""
         p = place_of(a4)
         prime, meridian = curvature_radii_m(p.latitude)
-        # the zenith among the stars moves by (-dy, dx) in L
+        # a rotation by (dx, dy) moves the zenith among the stars by (-dy, dx)
         moved = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
         ground = np.stack([p.east @ moved * prime, p.north @ moved * meridian])
-        # north turns in L with the pole, and the attitude against it
+        # when the pole moves, north turns in L, and the attitude turns the other way against north
         px, py, pz = a4[:, 2]
         flat = max(px * px + py * py, 1e-12)
         north_turns = np.array([-px * pz, -py * pz, flat]) / flat
@@ -116,7 +122,7 @@ def heading_of(link_to_enu: np.ndarray) -> float:
 
 
 def _heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:
-    """(1, 3): the heading's answer to rotations that spin (3, 3) the attitude about east, north, up."""
+    """Change (1, 3) of the heading where three small rotations turn the attitude by spin (3, 3) about east, north, up."""
     east, north, up = link_to_enu[:, 0]
     level = max(east * east + north * north, 1e-12)
     # d azimuth = (north d_east - east d_north) / level, with d(forward) = spin x forward
@@ -124,16 +130,21 @@ def _heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:
 
 
 def symmetric_root(covariance: np.ndarray) -> np.ndarray:
-    """The symmetric F with F F = covariance, also of a singular one; it keeps its signs from frame to frame."""
+    """Symmetric F with F F = covariance, which may be singular.
+
+    There is only one such F, so the terms of different frames agree in sign.
+    """
     values, vectors = np.linalg.eigh(covariance)
     return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
 
 
 @dataclass(frozen=True)
 class StarErrors:
-    """Errors of a fix's stars: gain (3, N, 2), rad of A4 for a pixel of each star; covariances (N, 2, 2) in px2.
+    """Errors of the stars of a fix.
 
-    same_stars: keys that frames with the same stars, and so the same errors of the catalogue, have in common.
+    gain (3, N, 2): rotation of A4 in rad for an error of one pixel of each star.
+    centroids, catalogue (N, 2, 2): covariances in px2.
+    same_stars: keys of the stars; frames that share them share the errors of the catalogue.
     """
 
     gain: np.ndarray
@@ -145,7 +156,10 @@ class StarErrors:
     def of(
         cls, slope: np.ndarray, centroids: np.ndarray, catalogue: np.ndarray, same_stars: tuple
     ) -> "StarErrors":
-        """Of weighted least squares; slope (N, 2, P): px for each parameter, of which the first three turn A4."""
+        """Errors after weighted least squares.
+
+        slope (N, 2, P): derivatives in px of the P parameters, of which the first three rotate A4.
+        """
         weighted = np.linalg.solve(centroids + catalogue, slope)
         normal = np.einsum("nki,nkj->ij", slope, weighted)
         return cls(
@@ -153,7 +167,7 @@ class StarErrors:
         )
 
     def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
-        """(3, 3) rad2 of A4 from independent covariances (N, 2, 2)."""
+        """Covariance (3, 3) in rad2 of A4's rotation, from the covariances (N, 2, 2) in px2 of independent stars."""
         return np.einsum("anj,njk,bnk->ab", self.gain, covariance, self.gain)
 
 
@@ -168,9 +182,9 @@ def error_terms(
     clock_stddev_s: float,
     stamp_stddev_s: float,
 ) -> tuple[ErrorTerm, ...]:
-    """All sources that are known.  refraction_rotation (3,) rad: of A4 for 1 sigma of refraction."""
+    """All known sources of error.  refraction_rotation (3,): rotation of A4 in rad for 1 sigma of the refraction."""
 
-    def of_stars(covariance):
+    def factor_from_stars(covariance: np.ndarray) -> np.ndarray:
         return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
 
     prime, _ = curvature_radii_m(latitude)
@@ -180,46 +194,50 @@ def error_terms(
     a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
     levelling = _levelling(tilt, a2)
     calibration = np.hstack(
-        [a2 @ symmetric_root(mounting.calibration_covariance), levelling @ _far_turn(tilt, mounting)]
+        [a2 @ symmetric_root(mounting.calibration_covariance), levelling @ _turn_error(tilt, mounting)]
     )
     return (
-        ErrorTerm("centroids", of_stars(stars.centroids)),
-        ErrorTerm("catalogue", of_stars(stars.catalogue), shared=stars.same_stars),
+        ErrorTerm("centroids", factor_from_stars(stars.centroids)),
+        ErrorTerm("catalogue", factor_from_stars(stars.catalogue), shared=stars.same_stars),
         ErrorTerm("calibration", sensitivity.level @ calibration, shared=ALWAYS, posed=True),
-        *_of_inclinometer(sensitivity.level @ levelling, tilt, mounting, earth.utc_unix_s),
+        *_inclinometer_terms(sensitivity.level @ levelling, tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
         ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
-        ErrorTerm(
-            "time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS
-        ),  # lags are: nobody may count on it
+        # a constant lag does not average away, and nobody can exclude one
+        ErrorTerm("time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS),
         ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, shared=ALWAYS),
         ErrorTerm("pole", pole, shared=ALWAYS),
     )
 
 
-def _far_turn(tilt: Tilt, mounting: Mounting) -> np.ndarray:
-    """(2, 1) rad of theta_x, theta_y: what an A3 that is turned far about the plumb line makes of a lean beside the small
-    rotation, which moves it sideways only: it comes out shorter by the turn's cosine.
+def _turn_error(tilt: Tilt, mounting: Mounting) -> np.ndarray:
+    """Error (2, 1) in rad of theta_x, theta_y that an A3 with a large turn about the plumb line causes.
+
+    To first order a turn moves the lean since the calibration sideways only, which the calibration's own term holds.
+    A large turn also makes that lean shorter, by its cosine.
     """
     up = a2_matrix(*mounting.calibrated_tilt)[2]
     variance = up @ mounting.calibration_covariance @ up
-    # mean of (1 - cos)^2 of a Gaussian turn
+    # the mean of (1 - cos)^2 over a Gaussian turn
     shorter2 = 1.5 - 2 * np.exp(-variance / 2) + np.exp(-2 * variance) / 2
     lean = np.array([tilt.theta_x, tilt.theta_y]) - mounting.calibrated_tilt
     return lean[:, None] * np.sqrt(max(shorter2, 0.0))
 
 
 def _levelling(tilt: Tilt, a2: np.ndarray) -> np.ndarray:
-    """(3, 2): small rotation of L for an error of theta_x, theta_y."""
+    """Derivatives (3, 2) of L's small rotation with respect to theta_x, theta_y."""
     steps = (np.array([STEP_RAD, 0.0]), np.array([0.0, STEP_RAD]))
     turned = [a2_matrix(tilt.theta_x + dx, tilt.theta_y + dy) @ a2.T for dx, dy in steps]
     return np.stack([rotation.to_small_vector(r) / STEP_RAD for r in turned], -1)
 
 
-def _of_inclinometer(
+def _inclinometer_terms(
     level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """Its sources; level (6, 2): what an error of theta_x, theta_y does.  The zero is the calibration's."""
+    """The inclinometer's terms; level (6, 2): rows of an ErrorTerm for an error of theta_x, theta_y.
+
+    Its zero is not among them: the calibration's covariance includes it.
+    """
     errors, theta = mounting.inclinometer, np.array([tilt.theta_x, tilt.theta_y])
     warmer = tilt.temperature_c - mounting.calibrated_temperature_c
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A4 from one frame: where the instrument stands and which way it faces, with the whole covariance.
+"""A4 from one frame: the place and the attitude of the instrument, with their covariance.
 
 The equation is that of the paper's section 4, A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
-site; its residuals are taken in pixels, where the errors of the stars live.
+site.  The residuals are formed in pixels, because the errors of the stars are known there.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,16 @@ from starpos import rotation
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, StarErrors, error_terms, heading_of, place_of
+from starpos.fix.budget import (
+    ALWAYS,
+    ErrorTerm,
+    Sensitivity,
+    StarErrors,
+    error_terms,
+    heading_of,
+    place_of,
+    total_covariance,
+)
 from starpos.fix.outliers import expected_extra, judged
 from starpos.frames.stars import Stars
 from starpos.identification import Identification
@@ -22,18 +31,25 @@ from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.mounting import Mounting
 
 MAX_ROUNDS = 6
-MAX_SCATTER = 0.003  # of the frame's diagonal: identified stars that scatter more are not these stars
+# share of the frame's diagonal; stars that scatter more were not identified rightly
+MAX_SCATTER = 0.003
 MIN_STARS = 3
-STEP_RAD = 1e-6  # of the numerical derivatives; the functions are smooth at 1 rad
+STEP_RAD = 1e-6  # of the numerical derivatives
 STEP_REFRACTION = 0.01
-MARKS = 20  # stars that tell whether two frames have the same ones
-SETTLED, MOST_STEPS = 1e-13, 20  # rad, and share of the scale, below which a step no longer counts
+# so many stars tell whether two frames show the same ones
+MARKS = 20
+# the iteration ends at a step below this, in rad and as a share of the scale
+SETTLED, MOST_STEPS = 1e-13, 20
 
 
 @dataclass(frozen=True)
 class MatchedStars:
-    """Identified stars: xy (N, 2) px and covariance_px2 (N, 2, 2) on the frame; places (N, 3), ICRS directions at the
-    date, and place_sigma (N,) rad, one axis; index (N,): which stars of the catalogue, None where nobody knows."""
+    """N identified stars.
+
+    xy (N, 2) in px and covariance_px2 (N, 2, 2): where they are on the frame.
+    places (N, 3): ICRS directions at the date; place_sigma (N,): their standard deviation per axis in rad.
+    index (N,): their rows in the catalogue; None if unknown.
+    """
 
     xy: np.ndarray
     covariance_px2: np.ndarray
@@ -43,7 +59,7 @@ class MatchedStars:
 
 
 def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:
-    """(M,) which matches of `found` to use: stars without a flag, or all where fewer than `enough` have none."""
+    """Mask (M,) of the matches to use: those of stars without a flag, or all if fewer than `enough` have none."""
     sound = stars.sound[found.star]
     return sound if sound.sum() >= enough else np.ones(len(sound), bool)
 
@@ -52,10 +68,12 @@ def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarra
 class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 
-    link_to_enu (3, 3): attitude of the base link.  used (M,): which of the given stars were kept.  focal_scale: factor
-    on the given focal length.  residual_px (M, 2): where the fit has them less where they were seen.  jitter_px: scatter
-    beyond the centroids' own errors (seeing, optics).  camera_to_itrs (3, 3): how the camera stands on the Earth by the
-    stars alone; camera_covariance (3, 3) rad2, of a small rotation about the Earth's axes.
+    link_to_enu (3, 3): attitude of the base link.
+    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
+    jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
+    focal_scale: factor on the given focal length.
+    camera_to_itrs (3, 3): attitude of the camera against the Earth by the stars alone; camera_covariance (3, 3) in rad2:
+    of its small rotation about the Earth's axes.
     """
 
     utc_unix_s: float
@@ -78,13 +96,13 @@ class Fix:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(3, 3) of east m, north m, heading rad."""
-        return sum(t.covariance for t in self.terms)[:3, :3]
+        """Covariance (3, 3) of east m, north m, heading rad."""
+        return total_covariance(self.terms)[:3, :3]
 
     @property
     def attitude_covariance(self) -> np.ndarray:
-        """(3, 3) rad2 of the base link's orientation about east, north, up."""
-        return sum(t.covariance for t in self.terms)[3:, 3:]
+        """Covariance (3, 3) in rad2 of the base link's orientation about east, north, up."""
+        return total_covariance(self.terms)[3:, 3:]
 
 
 def solve_fix(
@@ -99,9 +117,10 @@ def solve_fix(
 ) -> Fix:
     """The fix of one frame from identified stars.
 
-    The start is closed (singular values), the rest Gauss-Newton over the rotation A4 and the plate scale, whose
-    derivatives hardly change over the arcseconds that are left.  Raises FixError where the stars are too few or do not
-    agree.
+    It starts from a closed solution (singular values) and goes on by Gauss-Newton over the rotation A4 and the plate
+    scale.  The derivatives are computed once: they hardly change over the arcseconds that are left.
+    clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
+    Raises FixError if the stars are too few or do not agree.
     """
     problem = _Adjustment(
         stars.xy,
@@ -164,48 +183,61 @@ def solve_fix(
 
 
 def _share_free(keep: np.ndarray) -> float:
-    """Of the kept stars' 2 N coordinates, those that the four parameters leave free."""
+    """Share of the 2 N coordinates of N kept stars that four parameters leave free."""
     return max(1 - 2 / keep.sum(), 1 / keep.sum())
 
 
 @dataclass(frozen=True)
 class _Estimate:
-    a4: np.ndarray  # ITRS into L
-    scale: float  # of the focal length
+    """A4 (3, 3), ITRS into L, and the factor on the focal length."""
+
+    a4: np.ndarray
+    scale: float
 
 
 @dataclass(frozen=True)
 class _Adjustment:
+    """The least-squares problem of a frame: stars at xy (N, 2) px with geocentric apparent directions itrs (N, 3).
+
+    g (3, 3): A2 A3, which takes C into L.
+    """
+
     xy: np.ndarray
     camera: Camera
-    g: np.ndarray  # A2 A3: C into L
-    itrs: np.ndarray  # geocentric apparent directions
+    g: np.ndarray
+    itrs: np.ndarray
     refraction: Refraction
 
     def closed_form(self) -> _Estimate:
+        """First estimate, by singular values, at the given focal length."""
         local = self.refraction.unbend(self.camera.directions(*self.xy.T) @ self.g.T)
         a4 = rotation.best_rotation(self.itrs, local)
-        for _ in range(2):  # the diurnal aberration needs the place it helps to find
+        # the diurnal aberration depends on the place that is sought
+        for _ in range(2):
             a4 = rotation.best_rotation(self.itrs + station_velocity(a4[2]), local)
         return _Estimate(a4, 1.0)
 
     def predict(self, state: _Estimate, refraction: Refraction | None = None) -> np.ndarray:
-        """Pixels (N, 2) where the stars should be."""
+        """Pixels (N, 2) where the estimate has the stars."""
         v = rotation.normalised(self.itrs + station_velocity(state.a4[2]))
         observed = (refraction or self.refraction).bend(v @ state.a4.T)
         return self.camera.scaled(state.scale).project(observed @ self.g)
 
     def residual(self, state: _Estimate) -> np.ndarray:
+        """Predicted minus seen places (N, 2) in px."""
         return self.predict(state) - self.xy
 
     def moved(self, state: _Estimate, p: np.ndarray) -> _Estimate:
-        """The state after a small rotation p[:3] about L's axes and a relative change p[3] of the scale."""
+        """The estimate after a small rotation p[:3] about L's axes and a relative change p[3] of the scale."""
         return _Estimate(rotation.from_vector(p[:3]) @ state.a4, state.scale * (1 + p[3]))
 
     def refine(
         self, state: _Estimate, slope: np.ndarray, covariance_px2: np.ndarray, keep: np.ndarray
     ) -> _Estimate:
-        """Gauss-Newton from `state` over the stars to keep, with the derivatives (N, 2, 4) of its neighbourhood."""
+        """The best estimate near `state` for the stars to keep (N,), by Gauss-Newton with derivatives slope (N, 2, 4).
+
+        Raises FixError if it does not converge.
+        """
         slope = slope[keep]
         weighted = np.linalg.solve(covariance_px2[keep], slope)
         gain = np.linalg.solve(np.einsum("nki,nkj->ij", slope, weighted), weighted.reshape(-1, 4).T)
@@ -219,7 +251,7 @@ class _Adjustment:
         raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
 
     def jacobian(self, state: _Estimate) -> np.ndarray:
-        """d predict / d p, (N, 2, 4), central differences."""
+        """Derivatives (N, 2, 4) of `predict` by the parameters of `moved`, as central differences."""
         columns = []
         for i in range(4):
             p = np.zeros(4)
@@ -231,9 +263,17 @@ class _Adjustment:
 
 
 def _terms(
-    problem, state, keep, errors, tilt, mounting, atmosphere, earth, clock_and_stamp_stddev_s
+    problem: _Adjustment,
+    state: _Estimate,
+    keep: np.ndarray,
+    errors: StarErrors,
+    tilt: Tilt,
+    mounting: Mounting,
+    atmosphere: Atmosphere,
+    earth: EarthState,
+    clock_and_stamp_stddev_s: tuple[float, float],
 ) -> tuple[ErrorTerm, ...]:
-    """The budget: how the fit passes on the errors of its stars, and what else there is."""
+    """The budget of the fix: the errors of its stars, of the refraction as it acts on them, and all others."""
     place = place_of(state.a4)
     stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
     bending = (

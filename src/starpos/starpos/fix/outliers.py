@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals against their stated errors: which are outliers, and how much more the others scatter."""
+"""Residuals compared with their stated errors: which are outliers, and how much more the others scatter."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 OUTLIER_SIGMA = 5.0
-GRID, GRID_LEAST, GRID_MOST = 128, 1e-3, 1e2  # of variances, in units of the stated and of all residuals
-# of the search for one: parts of the largest, points of a grid, grids; to 1e-3
+# the grid of variances that `expected_extra` integrates over: points, least in units of the stated variance, most in
+# units of the sum of the squared residuals
+GRID, GRID_LEAST, GRID_MOST = 128, 1e-3, 1e2
+# the search of `_extra_variance`: least as a share of the most, points of a grid, grids; good to 1e-3
 LEAST_EXTRA, COARSE, ROUNDS = 1e-12, 24, 4
-MEDIAN_OF_CHI2 = 2 * np.log(2)  # of two degrees of freedom
+MEDIAN_OF_CHI2 = 2 * np.log(2)  # for two degrees of freedom
 
 
 def judged(
     residual: np.ndarray, covariance: np.ndarray, keep: np.ndarray, share: float
 ) -> tuple[float, np.ndarray]:
-    """The isotropic variance (px2) by which residuals (N, 2) px to keep (N,) scatter beyond covariance (N, 2, 2),
-    and which of all of them are to be kept.
+    """Scatter of residuals (N, 2) px beyond their covariance (N, 2, 2) px2, and a mask (N,) of those that are right.
 
-    share: of the 2 N coordinates, those that the parameters of the fit leave free.
+    The scatter is an isotropic variance in px2, of the residuals in the mask `keep` (N,).  share: that part of the 2 N
+    coordinates which the parameters of the fit leave free.
     """
-    # by the median, else an outlier among a dozen stars would widen the gate enough to pass itself
+    # the gate goes by the median: by the mean an outlier among a dozen stars would widen it enough to pass
     typical = _extra_variance(
         residual[keep], covariance[keep], lambda d2: np.median(d2, axis=-1) / MEDIAN_OF_CHI2 - share
     )
@@ -29,11 +31,11 @@ def judged(
 
 
 def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -> float:
-    """The same variance (px2) as a fit's errors have to be claimed with: its mean over all that it may be.
+    """Extra isotropic variance (px2) to use in a covariance: its expectation instead of the likeliest value.
 
     Few stars hardly tell how much they scatter, and the likeliest value is mostly too small: the errors of a fit of N
-    stars go as Student's t.  This is the mean of the posterior under Jeffreys' prior of the whole variance, which for
-    errors that are all alike is that of the inverse gamma distribution.  Of many stars it is what `judged` says.
+    stars follow Student's t.  This is the mean of the posterior under Jeffreys' prior of the whole variance; for errors
+    that are all alike it is the mean of the inverse gamma distribution.  For many stars it is the value of `judged`.
     """
     stated = np.median(np.trace(covariance, axis1=1, axis2=2)) / 2
     most = max(stated, float(np.sum(residual**2)))
@@ -46,21 +48,27 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
 
 
 def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float | np.ndarray = 0.0) -> np.ndarray:
-    """Squared residuals (N,) in units of their covariance and an extra isotropic variance (px2); (G, N) of (G, 1)."""
+    """Squared residuals (N,) in units of their covariance plus an extra isotropic variance (px2).
+
+    For `extra` (G, 1): (G, N).
+    """
     (x, y), (xx, xy, yy, determinant) = residual.T, _widened(covariance, extra)
     return (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant
 
 
 def _widened(covariance: np.ndarray, extra: float | np.ndarray) -> tuple[np.ndarray, ...]:
-    """xx, xy, yy and the determinant of covariances (N, 2, 2) with an extra isotropic variance."""
+    """The elements xx, xy, yy and the determinant of covariances (N, 2, 2) plus an extra isotropic variance."""
     xx, xy, yy = covariance[:, 0, 0] + extra, covariance[:, 0, 1], covariance[:, 1, 1] + extra
     return xx, xy, yy, xx * yy - xy * xy
 
 
-def _extra_variance(residual: np.ndarray, covariance: np.ndarray, excess: Callable) -> float:
-    """The isotropic variance (px2) at which excess(squared distances (..., N)) is 0; 0 where it never is above.
+def _extra_variance(
+    residual: np.ndarray, covariance: np.ndarray, excess: Callable[[np.ndarray], np.ndarray]
+) -> float:
+    """The isotropic variance (px2) at which excess(squared distances (..., N)) falls to 0; 0 if it never exceeds 0.
 
-    By grids, each between two points of the one before: scipy.optimize takes longer to import than a node to start.
+    The search uses grids, each between two points of the last one: to import scipy.optimize takes longer than a node
+    takes to start.
     """
     if excess(distance2(residual, covariance)) <= 0:
         return 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stars and tilt in, a solution out: the chain that the command line and the node share."""
+"""The chain from stars and tilt to a solution, which the command line and the node share."""
 
 import time
 from collections.abc import Callable
@@ -29,7 +29,7 @@ SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
 
 
 class Status(str, Enum):
-    """How a frame ended."""
+    """Result of the work on one frame."""
 
     OK = "ok"
     TOO_FEW_STARS = "too few stars"
@@ -43,7 +43,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Attitude:
-    """Where the camera looks: ICRS of the frame's centre pixel, and the position angle of its top (rad)."""
+    """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad)."""
 
     ra: float
     dec: float
@@ -56,10 +56,12 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Solution:
-    """What became of one frame: status and a sentence, and as much of the answer as there is.
+    """Solution of one frame: a status, a sentence, and as much of the answer as there is.
 
-    extrapolated_days: how far beyond the end of the IERS table the fix carried the Earth's rotation on; 0 within it.
-    hint: what helps to identify the next frame.
+    star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
+    identify_s, fix_s: seconds that the two steps took.
+    extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
+    hint: helps to identify the next frame.
     """
 
     status: Status
@@ -69,8 +71,8 @@ class Solution:
     utc_unix_s: float | None
     stars_detected: int
     names: tuple[str, ...] = ()
-    star: np.ndarray | None = None  # (M,) rows of the input's stars, one per name
-    magnitudes: np.ndarray | None = None  # (M,) V of the catalogue, one per name
+    star: np.ndarray | None = None
+    magnitudes: np.ndarray | None = None
     attitude: Attitude | None = None
     fix: Fix | None = None
     tilt: Tilt | None = None
@@ -81,19 +83,20 @@ class Solution:
 
     @classmethod
     def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
-        """Nothing but the reason."""
+        """A solution that has nothing but its status and message."""
         return cls(
             status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=len(stars)
         )
 
     @property
     def ok(self) -> bool:
+        """Whether all that was asked for is there."""
         return self.status is Status.OK
 
 
 @dataclass(frozen=True)
 class Solver:
-    """The instrument and its surroundings; `solve` for a fix, `identify` for a pointing alone."""
+    """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone."""
 
     instrument: Instrument
     catalogue: Catalogue
@@ -102,13 +105,13 @@ class Solver:
     progress: Progress = quiet
 
     def prepare(self, width: int, height: int) -> None:
-        """Have the triangles of this frame size at hand, building them if need be; raises StarposError."""
+        """Load the triangles for frames of this size in px, or build them; raises StarposError."""
         self._triangles(self._camera(width, height))
 
     def identify(self, stars: Stars) -> Solution:
-        """Which stars these are and where the camera looked.  Without a time: J2000 places, no aberration."""
+        """Names of the stars and pointing of the camera.  Stars without a time: J2000 places, no aberration."""
         if (inside := _inside(stars)) is not None:
-            return _of_all(stars, inside, self.identify(stars.take(inside)))
+            return _for_all(stars, inside, self.identify(stars.take(inside)))
         begin = time.perf_counter()
         try:
             camera = self._camera(stars.width, stars.height)
@@ -131,13 +134,13 @@ class Solver:
     def solve(
         self, stars: Stars, tilt: Tilt | Callable[[float, float], Tilt], hint: Hint | None = None
     ) -> Solution:
-        """The fix of one frame; never raises for what the frame, the tilt or the time does wrong.
+        """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
-        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.  hint: of an
-        earlier solution; where it no longer holds nothing is lost but its half millisecond.
+        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.
+        hint: of an earlier solution; one that no longer holds costs half a millisecond and does no harm.
         """
         if (inside := _inside(stars)) is not None:
-            return _of_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
+            return _for_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
         try:
             if stars.mid_unix_s is None:
                 place = stars.source or "the frame"
@@ -158,30 +161,29 @@ class Solver:
         identified = time.perf_counter()
         if found is None:
             return replace(self._unidentified(stars), tilt=tilt, identify_s=identified - begin)
-        known = {
-            "attitude": _attitude(found, sky, camera),
-            "tilt": tilt,
-            "identify_s": identified - begin,
-            "names": tuple(self.catalogue.names(found.catalogue)),
-            "star": found.star,
-            "magnitudes": self.catalogue.vmag(found.catalogue),
-        }
+        names, magnitudes = self.catalogue.names(found.catalogue), self.catalogue.vmag(found.catalogue)
+        solution = replace(
+            Solution.failed(stars, Status.OK, "fix"),
+            attitude=_attitude(found, sky, camera),
+            tilt=tilt,
+            identify_s=identified - begin,
+            names=tuple(names),
+            star=found.star,
+            magnitudes=magnitudes,
+        )
         try:
             fix = self._fix(stars, found, camera, tilt, state)
         except StarposError as e:
-            return replace(_failure(stars, e), **known)
+            return replace(solution, status=_status(stars, e), message=str(e))
         return replace(
-            Solution.failed(stars, Status.OK, "fix"),
+            solution,
             fix=fix,
             fix_s=time.perf_counter() - identified,
             extrapolated_days=state.orientation.extrapolated_days,
             hint=Hint.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
-            **known
-            | {
-                "names": tuple(known["names"][k] for k in fix.used),
-                "star": found.star[fix.used],
-                "magnitudes": known["magnitudes"][fix.used],
-            },
+            names=tuple(names[k] for k in fix.used),
+            star=found.star[fix.used],
+            magnitudes=magnitudes[fix.used],
         )
 
     def _fix(self, stars: Stars, found: Identification, camera: Camera, tilt: Tilt, state: EarthState) -> Fix:
@@ -213,7 +215,7 @@ class Solver:
         return replace(fix, used=np.flatnonzero(use)[fix.used])
 
     def clock_stddev_s(self, stars: Stars) -> float:
-        """Of the clock that stamped them: as its own host has it, never better than the instrument's."""
+        """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""
         return max(self.instrument.clock_stddev_s, stars.clock_stddev_s)
 
     def _camera(self, width: int, height: int) -> Camera:
@@ -245,30 +247,33 @@ class Solver:
 
 
 def _inside(stars: Stars) -> np.ndarray | None:
-    """Rows of the stars that are on their frame; None where all are, as is usual."""
+    """Rows of the stars that lie on their frame; None if all do, as is usual."""
     on = stars.on_frame
     return None if on.all() else np.flatnonzero(on)
 
 
-def _of_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
-    """What was found of the stars inside, said of all of them."""
+def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
+    """Solution for all stars from that for the rows `inside` of them."""
     star = None if s.star is None else inside[s.star]
     return replace(s, star=star, stars_detected=len(stars))
 
 
 def _failure(stars: Stars, error: StarposError) -> Solution:
+    return Solution.failed(stars, _status(stars, error), str(error))
+
+
+def _status(stars: Stars, error: StarposError) -> Status:
     kinds = (
         (TiltRangeError, Status.TILT_OUT_OF_RANGE),
         (TiltError, Status.NO_TILT),
         (TimeError, Status.BAD_INPUT if stars.mid_unix_s is None else Status.TIME_OUTSIDE_TABLES),
         (FixError, Status.POOR_FIT),
     )
-    status = next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
-    return Solution.failed(stars, status, str(error))
+    return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
 
 
 def _attitude(found: Identification, sky: Sky, camera: Camera) -> Attitude:
-    """The pointing of the frame's centre; for a mirrored frame, of the frame turned the right way up."""
+    """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
     seen = camera.scaled(found.focal_scale)
     x, y = camera.centre_px
     centre, above = sky.unaberrated(seen.directions([x, x], [y, y - 1.0]) @ found.attitude)
