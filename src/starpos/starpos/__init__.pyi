@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+from starpos.averaging.average import Average as Average
+from starpos.averaging.average import average as average
+from starpos.calibration.misalignment import calibrate_at as calibrate_at
+from starpos.calibration.turning import turn as turn
+from starpos.detection import Detection as Detection
+from starpos.detection import detect as detect
+from starpos.earth.refraction import Atmosphere as Atmosphere
+from starpos.earth.vertical import Deflection as Deflection
+from starpos.earth.vertical import geodetic as geodetic
+from starpos.errors import StarposError as StarposError
+from starpos.fix.fix import Fix as Fix
+from starpos.fix.solver import Solution as Solution
+from starpos.fix.solver import Solver as Solver
+from starpos.fix.solver import Status as Status
+from starpos.frames.frame import Frame as Frame
+from starpos.frames.reading import read_frame as read_frame
+from starpos.frames.stars import Stars as Stars
+from starpos.instrument.camera import Camera as Camera
+from starpos.instrument.inclinometer import Tilt as Tilt
+from starpos.instrument.inclinometer import TiltLog as TiltLog
+from starpos.instrument.inclinometer import read_tilt_csv as read_tilt_csv
+from starpos.instrument.instrument import Calibration as Calibration
+from starpos.instrument.instrument import Instrument as Instrument
+from starpos.sky.catalogue import Catalogue as Catalogue
+from starpos.sky.catalogue import load_catalogue as load_catalogue
+from starpos.sky.site import Site as Site
+
+__version__: str
+__all__: list[str]
