@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the tilts come from one inclinometer alone.
+
+ROS lets anybody publish on `tilt`. The readings of two inclinometers, mixed, make confident wrong fixes: so while two
+are heard, neither is believed. A publisher that was killed stays in the graph for a while; so what counts is who is heard,
+not who is there. A publisher is told from another by the frame of its messages and by the numbers that DDS gives them, which
+grow by one from message to message of one publisher.
+"""
+
+from dataclasses import dataclass
+
+# one publisher alone is believed again after so long
+ALONE_S = 1.0
+
+
+@dataclass
+class _Voice:
+    """One publisher as far as its messages tell: their frame, the number of the last one, when it was heard."""
+
+    frame_id: str
+    number: int | None
+    heard_s: float
+
+
+class TiltPublishers:
+    """Hears of every message and says whether its publisher is the only one."""
+
+    def __init__(self) -> None:
+        self._voices: list[_Voice] = []
+
+    def heard(self, frame_id: str, number: int | None, now_s: float) -> None:
+        """Note a message; number: that of its publisher's messages, None where the middleware tells none."""
+        mine = self._voice_of(frame_id, number) or _Voice(frame_id, number, now_s)
+        mine.number, mine.heard_s = number, now_s
+        others = [v for v in self._voices if v is not mine and now_s - v.heard_s <= ALONE_S]
+        self._voices = [*others, mine]
+
+    def _voice_of(self, frame_id: str, number: int | None) -> _Voice | None:
+        """The publisher that this message continues."""
+        of_frame = [v for v in self._voices if v.frame_id == frame_id]
+        if number is None:
+            return of_frame[0] if of_frame else None
+        before = [v for v in of_frame if v.number is not None and v.number < number]
+        return max(before, key=lambda v: v.number or 0, default=None)
+
+    @property
+    def several(self) -> str:
+        """A sentence that names those that are heard at a time; '' where there is but one."""
+        if len(self._voices) < 2:
+            return ""
+        frames = sorted({v.frame_id for v in self._voices})
+        named = " and ".join(map(repr, frames)) if len(frames) > 1 else f"both with the frame {frames[0]!r}"
+        return (
+            f"{len(self._voices)} inclinometers publish on tilt ({named}): stop all but one, or give each instrument a "
+            "namespace of its own"
+        )
