@@ -22,7 +22,7 @@ def read_fits(path: Path | str) -> Frame:
 
 
 def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
-    """Read the bytes of a FITS file (also .fz): the Frame, and those keywords of its header that are in starpos.frames.header.KEYS.
+    """Read the bytes of a FITS file (also .fz): the Frame, and its header's keywords of starpos.frames.header.KEYS.
 
     source says where the bytes came from. FrameError if they are not a whole frame.
     """
