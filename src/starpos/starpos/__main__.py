@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m starpos` is `starpos`."""
+"""Run the command `starpos` as `python -m starpos`."""
 
 import sys
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can go wrong. Every message is one sentence: what happened, where, and what to do about it."""
+"""All errors starpos raises. Every message is one sentence: what happened, where, and what to do about it."""
 
-LETTERS = 120  # of what a library says
+# Longest part of a library's message that a sentence of ours quotes.
+LETTERS = 120
 
 
 class StarposError(Exception):
@@ -44,8 +45,8 @@ class FixError(StarposError):
     """The stars do not support a fix."""
 
 
-def one_line(error) -> str:
-    """What a library says of its trouble, short enough to stand in a sentence of ours."""
+def one_line(error: object) -> str:
+    """The message of an error, or any text, on one line and short enough to be quoted in a sentence."""
     said = " ".join(str(error).split())
     if len(said) > LETTERS:
         said = said[:LETTERS].rsplit(" ", 1)[0] + " ..."

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long work says how far it is."""
+"""Progress reports of work that takes long."""
 
 from collections.abc import Callable
 
-Progress = Callable[[str, float], None]  # what is being done, and the share of it that is
+# Called with a text that says what is being done, and the share of it that is done, 0..1.
+Progress = Callable[[str, float], None]
 
 
 def quiet(what: str, done: float) -> None:
-    """Progress that nobody watches."""
+    """Ignore a progress report."""

@@ -4,27 +4,29 @@
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 
 def full_turn(angle: float) -> float:
-    """An angle in rad from 0 to below 2 pi; a modulo alone takes the smallest negative one to 2 pi."""
+    """The angle in rad, brought to [0, 2 pi)."""
+    # a modulo alone brings the smallest negative angle to 2 pi
     turned = float(angle % (2 * np.pi))
     return 0.0 if turned >= 2 * np.pi else turned
 
 
 def half_turn(angle: float) -> float:
-    """An angle in [-pi, pi)."""
+    """The angle in rad, brought to [-pi, pi)."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
-def unit_vector(longitude, latitude) -> np.ndarray:
-    """Unit vectors (..., 3) at spherical coordinates in rad: right ascension and declination, or a place's."""
-    c = np.cos(latitude)
-    return np.stack([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)], -1)
+def unit_vector(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> np.ndarray:
+    """Unit vectors (..., 3) of longitude and latitude, or of right ascension and declination, in rad."""
+    across = np.cos(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), np.sin(latitude)], -1)
 
 
 def normalised(v: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) at unit length."""
+    """Vectors (..., 3) scaled to unit length."""
     return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
 
@@ -38,9 +40,9 @@ def about_axis(axis: int, angle: float) -> np.ndarray:
     return r
 
 
-def from_vector(v) -> np.ndarray:
+def from_vector(v: npt.ArrayLike) -> np.ndarray:
     """Rotation by |v| rad about v (3,) (Rodrigues)."""
-    x, y, z = (float(c) for c in v)
+    x, y, z = np.asarray(v, float).tolist()
     angle2 = x * x + y * y + z * z
     angle = math.sqrt(angle2)
     s = math.sin(angle) / angle if angle > 1e-8 else 1.0
@@ -55,7 +57,7 @@ def from_vector(v) -> np.ndarray:
 
 
 def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, 3): takes the unit vector a to b."""
+    """Smallest rotation (3, 3) that takes the unit vector a to b, both (3,)."""
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis)
     if sine < 1e-12:
@@ -68,16 +70,16 @@ def to_small_vector(r: np.ndarray) -> np.ndarray:
     return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
 
 
-def cross_matrix(v) -> np.ndarray:
-    """[v]x, so that cross_matrix(v) @ w = v x w."""
-    x, y, z = v
+def cross_matrix(v: npt.ArrayLike) -> np.ndarray:
+    """The matrix (3, 3) [v]x, so that cross_matrix(v) @ w = v x w."""
+    x, y, z = np.asarray(v, float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def best_rotation(source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
-    """The proper rotations R (..., 3, 3) that bring R source nearest to target, both (..., N, 3) unit vectors.
+    """Rotations R (..., 3, 3) that bring R source closest to target, both (..., N, 3) unit vectors.
 
-    Wahba's problem by singular values (Markley 1988, J. Astronaut. Sci. 36, 245).
+    weight (..., N), or 1. This is Wahba's problem, solved by singular values (Markley 1988, J. Astronaut. Sci. 36, 245).
     """
     if weight is not None:
         target = target * weight[..., None]

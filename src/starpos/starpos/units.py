@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units that are not SI, in SI: radians and seconds."""
+"""Sizes of units that are not SI, in radians and seconds."""
 
 import math
 

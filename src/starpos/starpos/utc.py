@@ -7,7 +7,7 @@ from starpos.errors import TimeError
 
 
 def utc_text(utc_unix_s: float) -> str:
-    """ISO 8601 with milliseconds, UTC."""
+    """Unix seconds as ISO 8601 in UTC with milliseconds; in words where no calendar reaches."""
     try:
         moment = datetime.datetime.fromtimestamp(utc_unix_s, datetime.timezone.utc)
     except (OverflowError, ValueError, OSError):
@@ -16,11 +16,12 @@ def utc_text(utc_unix_s: float) -> str:
 
 
 def unix_of(utc: str) -> float:
-    """Unix seconds of an ISO 8601 time, UTC unless it says otherwise; TimeError if it is none."""
+    """Unix seconds of an ISO 8601 time, UTC unless it names another zone; TimeError if it is not a time."""
     try:
         moment = datetime.datetime.fromisoformat(utc.replace("Z", "+00:00"))
         if moment.tzinfo is None:
             moment = moment.replace(tzinfo=datetime.timezone.utc)
         return moment.astimezone(datetime.timezone.utc).timestamp()
-    except (ValueError, OverflowError):  # OverflowError: year 0 or 10000, once its zone is taken off
+    # OverflowError: a time whose year is 0 or 10000 in UTC
+    except (ValueError, OverflowError):
         raise TimeError(f"{utc!r} is no time: write it like 2026-11-02T18:00:00") from None

@@ -2,22 +2,25 @@
 """Background and noise of a frame: clipped means on a coarse mesh, from a sparse sample of the pixels."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy import ndimage
 
-STEEP = 5  # times a cell's error: a step between cells, no gradient of the sky
-QUANTISATION = 12**-0.5  # DN rms of rounding to whole numbers: no pixel is quieter
+# Neighbouring cells that differ by more than so many times their error lie at an edge, a roof's for example.
+STEEP = 5
+# DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
+QUANTISATION = 12**-0.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Background:
-    """The sky's level and noise, DN, in cells spread evenly over a frame of width x height px and one beyond each edge.
+    """The sky's level and noise in cells that cover a frame of width x height px evenly.
 
-    level, noise  (P, rows + 2, columns + 2); P is 1, or 4 on a colour mosaic: the phases (0, 0), (0, 1), (1, 0), (1, 1)
-                  of (row, column) modulo 2, since each colour sees its own sky
-    correlation   how many times noisier than independent pixels a smoothed frame is, 1 or more
-    streaks       Streaks of satellites that lie on it
+    level, noise  (P, rows + 2, columns + 2) DN, with one more cell beyond each edge. P is 1, or 4 on a colour mosaic,
+                  where each colour sees another sky: the phases (0, 0), (0, 1), (1, 0), (1, 1) of (row, column) modulo 2
+    correlation   noise of the smoothed frame, over what independent pixels would give; 1 or more
+    streaks       the satellite trails on the frame, as Streaks
     """
 
     level: np.ndarray
@@ -31,24 +34,28 @@ class Background:
     def is_mosaic(self) -> bool:
         return len(self.level) > 1
 
-    def at(self, x, y):
-        """level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
+    def at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
         place = self.cell(x, y)
-        return tuple(
+        level, noise = (
             np.stack([ndimage.map_coordinates(m, place, order=1, mode="nearest") for m in mesh], -1)
             for mesh in (self.level, self.noise)
         )
+        return level, noise
 
-    def cell(self, x, y):
-        """(row, column), fractions allowed, of pixels in the meshes."""
+    def cell(self, x: np.ndarray | int, y: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column in the meshes, with fractions, of the pixels x, y."""
         row = (np.asarray(y) + 0.5) * (self.level.shape[1] - 2) / self.height + 0.5
         column = (np.asarray(x) + 0.5) * (self.level.shape[2] - 2) / self.width + 0.5
         return row, column
 
-    def of_pixels(self, x, y, rows, columns):
-        """level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
+    def of_pixels(
+        self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
 
-        The noise is as large as sums over neighbouring pixels show it.
+        Level and noise of the sky are taken at x, y. The noise includes the correlation, so it is right for sums over
+        neighbouring pixels.
         """
         shape = np.broadcast_shapes(rows.shape, columns.shape)
         level, noise = (v.astype(np.float32) for v in self.at(x, y))
@@ -67,13 +74,16 @@ class Background:
         return level, noise
 
 
-def phase_of(rows, columns):
-    """Which of a colour mosaic's 2 x 2 pixels, 0..3."""
+def phase_of(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Number 0..3 of a pixel within the 2 x 2 pattern of a colour mosaic."""
     return 2 * (rows & 1) + (columns & 1)
 
 
-def measure_background(plane, cell_px=64, mosaic=None) -> Background:
-    """The Background of plane (h, w; h, w >= 2). mosaic None: decided by whether the four phases differ."""
+def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None) -> Background:
+    """Measure the Background of plane (h, w), h and w >= 2, in cells of about cell_px.
+
+    mosaic says whether the plane is a colour mosaic; None: it is one if the four phases see different skies.
+    """
     rows, columns = (_sample(n, cell_px) for n in plane.shape)
     sample = plane[rows.ravel()][:, columns.ravel()].astype(np.float32)
     (ny, sy), (nx, sx) = rows.shape, columns.shape
@@ -93,8 +103,8 @@ def measure_background(plane, cell_px=64, mosaic=None) -> Background:
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
 
 
-def _sample(length, cell_px):
-    """(cells, samples) row numbers: in each of the cells pairs of neighbours, the first of a pair even."""
+def _sample(length: int, cell_px: int) -> np.ndarray:
+    """Row numbers (cells, samples): each cell's samples are pairs of neighbours, and the first of a pair is even."""
     cells = max(1, round(length / cell_px))
     size = min(cell_px, length) // 2 * 2
     starts = np.round(np.linspace(0, length - size, cells)).astype(int) // 2 * 2
@@ -103,10 +113,10 @@ def _sample(length, cell_px):
     return starts[:, None] + inside
 
 
-def _clipped(sample):
-    """Mean and rms over the last axis of what lies within 3.5 sigma of the median; stars and defects do not.
+def _clipped(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and rms over the last axis without stars and defects: only what lies within 3.5 sigma of the median.
 
-    Where more than half the pixels are equal, as of a sky cut off at 0, the slope of the brighter ones tells sigma.
+    If more than half of the pixels are equal (a sky cut off at 0), sigma comes from the 75 and 90 % quantiles.
     """
     count = sample.shape[-1]
     median = np.partition(sample, count // 2, axis=-1)[..., count // 2, None]
@@ -122,31 +132,34 @@ def _clipped(sample):
     mean = deviation.sum(-1, keepdims=True) / count
     square = np.einsum("...i,...i->...", deviation, deviation)[..., None] / count
     variance = np.maximum(square - mean**2, 0) * (count / np.maximum(count - 1, 1))
-    rms = np.sqrt(variance) / 0.9969  # what clipping at 3.5 sigma leaves of a Gaussian's
+    # clipping at 3.5 sigma leaves 0.9969 of a Gaussian's rms
+    rms = np.sqrt(variance) / 0.9969
     return (median + mean)[..., 0], rms[..., 0]
 
 
-def _phases_differ(level, noise, samples):
-    """Whether the 2 x 2 phases see different skies, as behind a colour mosaic that nobody declared.
+def _phases_differ(level: np.ndarray, noise: np.ndarray, samples: int) -> bool:
+    """Whether the 2 x 2 phases see different skies, as behind a colour mosaic that the file does not declare.
 
-    One diagonal against the other, which a gradient of the sky leaves equal.
+    The two diagonals are compared, because a gradient of the sky leaves them equal.
     """
     contrast = np.median(level[0] + level[3] - level[1] - level[2]) / 2
     error = np.median(noise) / np.sqrt(samples * level[0].size)
     return bool(abs(contrast) > max(0.03 * np.median(noise), 6 * error, 0.1))
 
 
-def _smooth(mesh, error):
-    """A cell mostly covered by something bright takes its neighbours' value; then the cells' noise evens out.
+def _smooth(mesh: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Smooth a mesh: a median replaces cells that something bright covers, then a mean evens out their noise.
 
-    But not across the edge of a roof, where the cells differ by more than their errors tell.
+    The mean is left out across an edge (of a roof), where cells differ by more than their errors explain.
     """
     typical = ndimage.median_filter(_beyond(mesh, 2, "reflect"), 3)
     even, typical = ndimage.uniform_filter(typical, 3)[2:-2, 2:-2], typical[2:-2, 2:-2]
     return np.where(np.abs(even - typical) < STEEP * np.median(error), even, typical)
 
 
-def _beyond(mesh, cells, mode):
-    """A mesh (..., rows, columns) continued beyond its edges: a gradient goes on ("reflect") or ends ("edge")."""
+def _beyond(mesh: np.ndarray, cells: int, mode: Literal["reflect", "edge"]) -> np.ndarray:
+    """Continue a mesh (..., rows, columns) beyond its edges: a gradient goes on ("reflect") or ends ("edge")."""
     around = [(0, 0)] * (mesh.ndim - 2) + [(cells, cells)] * 2
-    return np.pad(mesh, around, mode, **({"reflect_type": "odd"} if mode == "reflect" else {}))
+    if mode == "reflect":
+        return np.pad(mesh, around, mode, reflect_type="odd")
+    return np.pad(mesh, around, mode)

@@ -1,63 +1,104 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two stars in one image: what a single one leaves unexplained is tried as a companion, both fitted at once."""
+"""Two stars in one image: where one star does not explain the light, a companion is tried and both are fitted."""
 
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy import ndimage
 
-from starpos.detection.fit import FIT_WIDTHS, Fit, fit_stars, gains_at, inverse
+from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at, inverse
+from starpos.detection.psf import LocalPsf, Psf
 from starpos.detection.stamps import Stamps
 
-SURPRISING = 4.0  # sigma of chi-square: from here on one star is not enough
-CLOSEST = 1.5  # widths: nearer ones are not told apart
-FAINTEST = 5.0  # sigma of a companion's flux
-GAIN = 30.0  # a companion's three numbers must take so much off the sum of squares, of chi-square per pixel
-DIMMEST = 0.03  # of the other's flux: below it the PSF's own faults look like companions
+# A companion is tried where chi-square is so many sigma above that of a single star.
+SURPRISING = 4.0
+# Widths of the PSF: closer pairs cannot be separated.
+CLOSEST = 1.5
+# SNR a companion must have.
+FAINTEST = 5.0
+# A companion must lower the sum of squares by so many times chi-square per pixel (it brings three parameters).
+GAIN = 30.0
+# Companions fainter than this share of the star may be faults of the PSF.
+DIMMEST = 0.03
 ROUNDS = 10
-LEAST = 0.05  # of a star's flux is left by a step of the fit, whatever it asks for
+# One step of the fit never leaves a star less than this share of its flux.
+LEAST = 0.05
+
+Rows = TypeVar("Rows", Fit, Stamps)
 
 
-def with_companions(stamps, spike, fit, psf, response, cut_at):
-    """stamps, spike and fit with companions as further rows, the light of the other off each.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pairs:
+    """N pairs of stars fitted together; the first axis is the star, 0 or its companion 1.
 
-    cut_at(x, y) gives the stamps around pixels, and which of their pixels are spikes.
+    x, y, flux, flux_sigma  (2, N) px and DN
+    gains                   (2, N, P): gains of the mosaic's phases
+    covariance              (2, N, 2, 2) px2 of x, y
+    models                  (2, N, S, S) DN
+    used                    (N, S, S) bool: pixels that took part
+    chi2                    (N,): the whole chi-square
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+    flux_sigma: np.ndarray
+    gains: np.ndarray
+    covariance: np.ndarray
+    models: np.ndarray
+    used: np.ndarray
+    chi2: np.ndarray
+
+
+def with_companions(
+    stamps: Stamps,
+    spike: np.ndarray,
+    fit: Fit,
+    psf: Psf,
+    response: Response,
+    cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
+) -> tuple[Stamps, np.ndarray, Fit]:
+    """Stamps, spikes and fit with the companions as further rows; each star's stamp is without the other's light.
+
+    cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of their pixels are spikes (N, S, S).
     """
     odd = np.flatnonzero(_surprising(stamps, fit))
     if len(odd) == 0:
         return stamps, spike, fit
     before = (stamps.good * fit.residual**2 / response.variance(stamps.noise, fit.model))[odd]
-    x, y, flux, gains, sigma, covariance, models, used, chi2 = _fit_pairs(
-        stamps.take(odd), _rows(fit, odd), psf, response
-    )
+    pairs = _fit_pairs(stamps.take(odd), _rows(fit, odd), psf, response)
+    x, y, flux, used = pairs.x, pairs.y, pairs.flux, pairs.used
     freedom = np.maximum(used.sum((1, 2)) - 6, 1)
     apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
     away = np.maximum(np.abs(x - stamps.x[odd]), np.abs(y - stamps.y[odd]))
     with np.errstate(invalid="ignore"):
-        real = (flux > FAINTEST * sigma).all(0) & np.isfinite(chi2) & (apart > CLOSEST)
+        real = (flux > FAINTEST * pairs.flux_sigma).all(0) & np.isfinite(pairs.chi2) & (apart > CLOSEST)
         real &= (away[0] < stamps.reach - 1) & (away[1] < stamps.reach + 2)
-        real &= (before * used).sum((1, 2)) - chi2 > GAIN * np.maximum(chi2 / freedom, 1)
+        real &= (before * used).sum((1, 2)) - pairs.chi2 > GAIN * np.maximum(pairs.chi2 / freedom, 1)
         real &= flux[1] > DIMMEST * flux[0]
     if not real.any():
         return stamps, spike, fit
     odd, used, whole = odd[real], used[real], away[1, real] < stamps.reach - 1
     x, y, flux, gains, sigma, covariance, models = (
-        a[:, real] for a in (x, y, flux, gains, sigma, covariance, models)
+        values[:, real]
+        for values in (x, y, flux, pairs.gains, pairs.flux_sigma, pairs.covariance, pairs.models)
     )
-    pair = stamps.take(odd)
+    both = stamps.take(odd)
     first = replace(
         _rows(fit, odd), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
-        chi2=(chi2 / freedom)[real], residual=pair.signal - models.sum(0), model=models[0], used=used,
+        chi2=(pairs.chi2 / freedom)[real], residual=both.signal - models.sum(0), model=models[0], used=used,
         outlier=np.zeros_like(used),
     )  # fmt: skip
-    stamps = _with_rows(stamps, odd, replace(pair, signal=pair.signal - models[1]))
+    stamps = _with_rows(stamps, odd, replace(both, signal=both.signal - models[1]))
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
     light = psf.at(x[0], y[0]).evaluate(*second_stamps.offsets(x[0], y[0]))[0]
     light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
     noise = np.sqrt(response.variance(second_stamps.noise, light))
     second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
     second = fit_stars(second_stamps, psf, x[1], y[1], response, rounds=3)
-    # where the first one's stamp held it whole, the fit of both at once knows best
+    # if the whole companion lies on the first star's stamp, the fit of both together is the better one
     together = {"x": x[1], "y": y[1], "flux": flux[1], "flux_sigma": sigma[1], "covariance": covariance[1]}
     together |= {"gains": gains[1], "chi2": first.chi2}
     for name, value in together.items():
@@ -70,31 +111,31 @@ def with_companions(stamps, spike, fit, psf, response, cut_at):
     )
 
 
-def _surprising(stamps, fit):
+def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
+    """Which stars (N,) bool leave more light unexplained than a single star does."""
     freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
     with np.errstate(invalid="ignore"):
         odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (fit.outlier.sum((1, 2)) > 2)
     return odd & ~stamps.full.any((1, 2)) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
-def _fit_pairs(stamps, fit, psf, response):
-    """x, y, flux (2, N), gains (2, N, P), sigma of flux (2, N), covariance (2, N, 2, 2), models (2, N, S, S), used
-    (N, S, S) and chi2 (N,) of pairs.
+def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
+    """Fit a star and a companion to each stamp by Gauss-Newton on all their parameters.
 
-    Gauss-Newton on all their numbers; the companion starts where the most is left.
+    The companion starts where the single star's fit leaves the most light.
     """
-    n, psf = len(fit.x), psf.at(fit.x, fit.y)
-    x, y = (np.stack(v) for v in zip((fit.x, fit.y), _brightest_left(stamps, fit, psf), strict=True))
+    n, local = len(fit.x), psf.at(fit.x, fit.y)
+    x, y = (np.stack(v) for v in zip((fit.x, fit.y), _brightest_left(stamps, fit, local), strict=True))
     colour = np.zeros((2, n, len(response.gain)))
-    flux = None
+    flux = np.full((2, n), np.nan)
     for round_ in range(ROUNDS + 1):
         places = [stamps.offsets(x[k], y[k]) for k in (0, 1)]
-        shapes = [psf.evaluate(*place) for place in places]
+        shapes = [local.evaluate(*place) for place in places]
         gains = response.gain * (1 + colour)
         own = [gains_at(gains[k], stamps.phase) for k in (0, 1)]
-        inside = psf.within(*places[0], FIT_WIDTHS) | psf.within(*places[1], FIT_WIDTHS)
+        inside = local.within(*places[0], FIT_WIDTHS) | local.within(*places[1], FIT_WIDTHS)
         used = stamps.good & inside
-        if flux is None:
+        if round_ == 0:
             flux = _fluxes(stamps, used, *(shapes[k][0] * own[k] for k in (0, 1)))
             flux = np.maximum(flux, LEAST * fit.flux)
         amount = flux.astype(np.float32)[:, :, None, None]
@@ -116,21 +157,31 @@ def _fit_pairs(stamps, fit, psf, response):
             own_step = step[:, each[k]]
             x[k] += np.clip(own_step[:, 0], -0.5, 0.5)
             y[k] += np.clip(own_step[:, 1], -0.5, 0.5)
-            # a star without light would stay where it is: its place changes nothing
+            # a star without light could not move any more: its place changes nothing
             flux[k] = np.maximum(flux[k] + own_step[:, 2], LEAST * flux[k])
             if response.own_gains:
                 colour[k] = np.clip(colour[k] + own_step[:, 3:], -0.9, 3.0)
-    # as of a single star, at known colours
+    # the flux's sigma at known colours, as for a single star
     grey = np.concatenate([np.arange(s.start, s.start + 3) for s in each])
     known = inverse(normal[:, grey[:, None], grey])
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(np.stack([known[:, 2, 2], known[:, 5, 5]]))
     covariance = np.stack([covariance[:, s, s][:, :2, :2] for s in each])
-    return x, y, flux, gains, sigma, covariance, models, used, (residual**2).sum((1, 2))
+    return Pairs(
+        x=x,
+        y=y,
+        flux=flux,
+        flux_sigma=sigma,
+        gains=gains,
+        covariance=covariance,
+        models=models,
+        used=used,
+        chi2=(residual**2).sum((1, 2)),
+    )
 
 
-def _brightest_left(stamps, fit, psf):
-    """x, y (N,) px: where off a star the most is left."""
+def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel x, y (N,) px, off the star's centre, where the fit leaves the most light."""
     dx, dy = stamps.offsets(fit.x, fit.y)
     left = ndimage.gaussian_filter(stamps.good * fit.residual, (0, 0.8, 0.8))
     left[(dx**2 + dy**2 < 1) | ~psf.within(dx, dy, FIT_WIDTHS + 2)] = -np.inf
@@ -138,8 +189,8 @@ def _brightest_left(stamps, fit, psf):
     return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
 
 
-def _fluxes(stamps, used, a, b):
-    """(2, N) by linear least squares in the sky's noise, of stars whose unit images are a, b (N, S, S)."""
+def _fluxes(stamps: Stamps, used: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Fluxes (2, N) of two stars with unit images a, b (N, S, S): linear least squares, weighted by the sky's noise."""
     weight = used / stamps.noise**2
     aa, ab, bb, sa, sb = (
         (weight * p).sum((1, 2)) for p in (a * a, a * b, b * b, a * stamps.signal, b * stamps.signal)
@@ -147,12 +198,13 @@ def _fluxes(stamps, used, a, b):
     return np.stack([bb * sa - ab * sb, aa * sb - ab * sa]) / np.maximum(aa * bb - ab * ab, 1e-12)
 
 
-def _rows(fit, index):
+def _rows(fit: Fit, index: np.ndarray) -> Fit:
+    """The rows `index` of a Fit."""
     return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
 
 
-def _with_rows(old, index, new):
-    """A copy of a dataclass of arrays with the rows `index` taken from another."""
+def _with_rows(old: Rows, index: np.ndarray, new: Rows) -> Rows:
+    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `new`."""
     changed = {}
     for f in fields(old):
         changed[f.name] = getattr(old, f.name).copy()
@@ -160,6 +212,7 @@ def _with_rows(old, index, new):
     return replace(old, **changed)
 
 
-def _joined(kind, first, second):
+def _joined(kind: type[Rows], first: Rows, second: Rows) -> Rows:
+    """The rows of two dataclasses of arrays one after the other."""
     pairs = {f.name: [getattr(first, f.name), getattr(second, f.name)] for f in fields(kind)}
     return kind(**{name: np.concatenate(pair) for name, pair in pairs.items()})

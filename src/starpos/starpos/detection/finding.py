@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where something starlike stands out of the noise: a smoothed frame's peaks. One pass, strip by strip."""
+"""Peaks of the smoothed frame, where something like a star stands out of the noise. One pass, strip by strip."""
 
 from dataclasses import dataclass, replace
 
@@ -7,19 +7,26 @@ import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
+from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
 
-STRIP = 64  # rows: small enough to stay in the processor's cache
-CHUNK = 4096  # peaks looked at at once
-CROWD = 14  # px: the widest defocused star
-LEADERS = 100  # peaks that tell whether the frame's stars are rings
-NEAREST = 24  # sharp peaks that tell what a wide one is
-OPPOSITE = -0.95  # cosine between the two sides to which a line goes on
+# Rows of a strip: few enough that it stays in the processor's cache.
+STRIP = 64
+# Peaks whose surroundings are looked at together.
+CHUNK = 4096
+# Diameter of the widest defocused star, px.
+CROWD = 14
+# So many of the brightest peaks decide whether the frame's stars are rings,
+LEADERS = 100
+# and so many sharp peaks near a wide one decide what that one is.
+NEAREST = 24
+# Two neighbours lie on opposite sides of a peak, as on a line, if the cosine between their directions is below this.
+OPPOSITE = -0.95
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A Gaussian of sigma px that smooths the frame, cut off at reach px; a peak is the highest within flat px."""
+    """A Gaussian of sigma px, cut off at reach px, that smooths the frame; a peak is the highest pixel within flat px."""
 
     sigma: float
     reach: int
@@ -27,19 +34,21 @@ class Kernel:
 
     @property
     def norm(self) -> float:
-        """What smoothing leaves of white noise."""
+        """Share of white noise that remains after smoothing."""
         return 1 / (4 * np.pi * self.sigma**2) ** 0.5
 
 
-SHARP = Kernel(1.2, 3, 2)  # near the best for FWHM 1.2 to 5 px, within 40 % of it at 8 px
-WIDE = Kernel(4.0, 10, 7)  # fills the hole of a defocused star
+# Near the best for a FWHM of 1.2 to 5 px, within 40 % of it at 8 px.
+SHARP = Kernel(1.2, 3, 2)
+# Fills the hole of a defocused star.
+WIDE = Kernel(4.0, 10, 7)
 
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """x, y (N,) int and height (N,) in sigma of the smoothed noise, highest first.
+    """Peaks of the smoothed frame, highest first: x, y (N,) int px and height (N,) in sigma of the smoothed noise.
 
-    correlation  how many times noisier than independent pixels the smoothed frame is, 1 or more
+    correlation  noise of the smoothed frame, over what independent pixels would give; 1 or more
     """
 
     x: np.ndarray
@@ -48,12 +57,13 @@ class Peaks:
     correlation: float
 
 
-def find_peaks(plane, background, threshold, limit) -> Peaks:
-    """At most `limit` Peaks that stand out by `threshold` sigma.
+def find_peaks(plane: np.ndarray, background: Background, threshold: float, limit: int) -> Peaks:
+    """Find at most `limit` Peaks that stand out of plane (h, w) by `threshold` sigma.
 
-    The light of a telescope out of focus, with an obstruction in its middle, is a ring, on which several peaks crowd:
-    where most bright ones do, the frame is smoothed more widely, if most of what then stands out are rings. A streak
-    or a twig is a crowd too, but goes on to both sides; the two stars of a pair stand out less.
+    A star through a defocused telescope with a central obstruction is a ring, with several peaks close together. If
+    most bright peaks have such neighbours, a wider kernel is tried, and its peaks are taken if most of them are rings.
+    The peaks along a streak or a twig are close together too, but continue to both sides; those of a pair of stars
+    are higher than the wide peak.
     """
     sharp = _peaks_of(plane, background, SHARP, threshold, limit)
     bright = _no_dots(plane, background, sharp)
@@ -63,14 +73,14 @@ def find_peaks(plane, background, threshold, limit) -> Peaks:
     return wide if _are_rings(plane.shape, bright, _no_dots(plane, background, wide)) else sharp
 
 
-def _no_dots(plane, background, peaks):
-    """The Peaks that are no hot pixels."""
+def _no_dots(plane: np.ndarray, background: Background, peaks: Peaks) -> Peaks:
+    """The Peaks without those of hot pixels."""
     keep = ~are_dots(plane, background, peaks.x, peaks.y)
     return replace(peaks, x=peaks.x[keep], y=peaks.y[keep], height=peaks.height[keep])
 
 
-def _crowded(peaks):
-    """Whether most of the brightest have one like them within CROWD px."""
+def _crowded(peaks: Peaks) -> bool:
+    """Whether most of the brightest peaks have a similar one within CROWD px."""
     points = np.stack([peaks.x, peaks.y], 1)
     if len(points) < 2:
         return False
@@ -80,10 +90,10 @@ def _crowded(peaks):
     return bool(np.median(nearest) < CROWD)
 
 
-def _are_rings(size, sharp, wide):
-    """Whether most of the brightest wide peaks, but those on a line, stand for several sharp ones lower than they.
+def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
+    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one.
 
-    A line ends at the edge of the frame, size (height, width) px, so nothing there tells.
+    Peaks on a line do not count. Nor do those at the edge of the frame, size (height, width) px, where a line ends.
     """
     points, centres = (np.stack([peaks.x, peaks.y], 1) for peaks in (sharp, wide))
     apart, near = spatial.cKDTree(points).query(centres, NEAREST, distance_upper_bound=2 * CROWD)
@@ -98,14 +108,16 @@ def _are_rings(size, sharp, wide):
     on_line = np.einsum("nik,njk->nij", way, way).min((1, 2), initial=0) < OPPOSITE
     at_edge = np.minimum(centres, np.array(size[::-1]) - 1 - centres).min(1) < 2 * CROWD
     rings = ring[~on_line & ~at_edge][:LEADERS]
-    return np.count_nonzero(rings) > 0.5 * len(rings)
+    return bool(np.count_nonzero(rings) > 0.5 * len(rings))
 
 
-def _peaks_of(plane, background, kernel, threshold, limit):
+def _peaks_of(
+    plane: np.ndarray, background: Background, kernel: Kernel, threshold: float, limit: int
+) -> Peaks:
     """The Peaks of the frame smoothed by a Kernel.
 
-    Its response vanishes at the Nyquist frequency, so a colour mosaic, a pattern of exactly that frequency, leaves
-    no trace in the smoothed frame; being odd it is centred on its pixel.
+    A colour mosaic leaves no trace in the smoothed frame: it is a pattern at the Nyquist frequency, where the kernel's
+    response vanishes.
     """
     correlation, unevenness = _noise_of_smooth(plane, background, kernel)
     threshold = threshold * unevenness
@@ -118,16 +130,18 @@ def _peaks_of(plane, background, kernel, threshold, limit):
     for top in range(0, plane.shape[0], STRIP):
         bottom = min(top + STRIP, plane.shape[0])
         smooth, offset = _smooth(plane, kernel, top, bottom)
-        # every row of the strip against the lowest threshold of the mesh rows it touches; exactly further down
+        # the strip against the lowest threshold of its mesh rows; the exact threshold follows below
         (first, last), _ = background.cell(0, np.array([top, bottom - 1]))
         above = smooth > lowest[int(first) : int(last) + 2].min(0)
         if not above.any():
             continue
         above &= smooth == cv2.dilate(smooth, neighbours)
-        place = np.flatnonzero(above[offset : offset + bottom - top])  # faster than nonzero in two dimensions
+        # faster than nonzero in two dimensions
+        place = np.flatnonzero(above[offset : offset + bottom - top])
         y, x = np.divmod(place, plane.shape[1])
         value = smooth[y + offset, x]
-        if np.any(np.diff(place) == 1):  # a saturated disc is a plateau of as many peaks as pixels
+        # in a saturated disc every pixel is a peak: one peak for each connected part
+        if np.any(np.diff(place) == 1):
             _, part = cv2.connectedComponents(above[offset : offset + bottom - top].astype(np.uint8))
             x, y, value = _merged(x, y, value, part[y, x] - 1)
         found.append(np.stack([x, y + top, value]))
@@ -152,8 +166,8 @@ def _peaks_of(plane, background, kernel, threshold, limit):
     return Peaks(x[:limit], y[:limit], height[:limit], correlation)
 
 
-def _smooth(plane, kernel, top, bottom):
-    """Rows top-flat .. bottom+flat of the smoothed frame, and the index of row `top` in them."""
+def _smooth(plane: np.ndarray, kernel: Kernel, top: int, bottom: int) -> tuple[np.ndarray, int]:
+    """Rows top - flat to bottom + flat of the smoothed frame, and the index of row `top` in them."""
     around = kernel.flat + kernel.reach
     first, last = max(0, top - around), min(plane.shape[0], bottom + around)
     smooth = cv2.GaussianBlur(
@@ -166,12 +180,11 @@ def _smooth(plane, kernel, top, bottom):
     return smooth[start - first : min(last, bottom + kernel.flat) - first], top - start
 
 
-def _noise_of_smooth(plane, background, kernel):
-    """How many times more noise a smoothed frame has than if its pixels' noise were independent: two factors >= 1.
+def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) -> tuple[float, float]:
+    """Two factors, 1 or more each, by which a smoothed frame is noisier than with independent pixels.
 
-    The first is of pixels tied to their neighbours, by demosaicing, resampling or lossy compression: a star then has
-    less SNR than its pixels claim. The second is of a sky less even than its cells, as with clouds: a peak then means
-    less.
+    The first is the correlation of neighbouring pixels, from demosaicing, resampling or lossy compression: it lowers the
+    SNR of a star. The second is the sky's unevenness within the background's cells, from clouds: it raises the threshold.
     """
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
     strips = [_smooth(plane, kernel, top, min(top + 16, len(plane))) for top in tops]
@@ -180,10 +193,10 @@ def _noise_of_smooth(plane, background, kernel):
     x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
     level, noise = background.at(x.ravel(), y.ravel())
     score = (value - level.mean(1).reshape(x.shape)) / np.sqrt((noise**2).mean(1)).reshape(x.shape)
-    # stars widen the scatter upwards; where they are many, only the far side is free of them
+    # stars widen the scatter upwards; where they are many, only the lowest values are free of them
     low, sigma_below, median = np.quantile(score, (0.0228, 0.1587, 0.5))
     whole = tied = min(median - sigma_below, sigma_below - low) / kernel.norm
-    # clouds hardly change from a pixel to those 4 lag px to its left and right, where smoothed noise is independent
+    # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone
     lag = round(1.7 * kernel.sigma)
     if score.shape[1] > 2 * lag:
         steps = (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])) / 1.5**0.5
@@ -192,10 +205,10 @@ def _noise_of_smooth(plane, background, kernel):
     return tied, max(1.0, float(whole) / tied)
 
 
-def _above_tail(height, threshold):
-    """The threshold, raised where noise has a heavy tail, as clipped or demosaiced 8-bit frames have.
+def _above_tail(height: np.ndarray, threshold: float) -> float:
+    """The threshold, raised if the noise has a heavy tail, as in clipped or demosaiced 8-bit frames.
 
-    Stars thin out slowly, about two thirds of them are half as high again; the peaks of noise end abruptly.
+    Many stars (about two thirds) are 1.5 times higher than the threshold, but few peaks of noise are.
     """
     while (count := np.count_nonzero(height > threshold)) > 30:
         if np.count_nonzero(height > 1.5 * threshold) > 0.3 * count:
@@ -204,14 +217,16 @@ def _above_tail(height, threshold):
     return threshold
 
 
-def _columns(mesh, background):
-    """A mesh (rows, columns) of a background spread over the frame's width: (rows, width), linear between cells."""
+def _columns(mesh: np.ndarray, background: Background) -> np.ndarray:
+    """Spread a background's mesh (rows, columns) over the frame's width: (rows, width), linear between cells."""
     _, place = background.cell(np.arange(background.width), 0)
     return np.stack([np.interp(place, np.arange(mesh.shape[1]), row) for row in mesh]).astype(np.float32)
 
 
-def _join_plateaus(x, y, height, flat):
-    """A saturated star is a plateau of equal peaks: one peak at its middle stands for it."""
+def _join_plateaus(
+    x: np.ndarray, y: np.ndarray, height: np.ndarray, flat: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Peaks x, y, height (N,) with one peak in the middle of each plateau of a saturated star."""
     pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(flat + 0.5, output_type="ndarray")
     if len(pairs) == 0:
         return x.astype(int), y.astype(int), height
@@ -221,8 +236,10 @@ def _join_plateaus(x, y, height, flat):
     return x[order], y[order], height[order]
 
 
-def _merged(x, y, value, group):
-    """The middle of each group of peaks (N,), numbered from 0, and its mean value."""
+def _merged(
+    x: np.ndarray, y: np.ndarray, value: np.ndarray, group: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middle x, y and mean value of each group of peaks; group (N,) numbers them from 0."""
     count = np.bincount(group)
     x, y = (np.rint(np.bincount(group, v) / count).astype(int) for v in (x, y))
     return x, y, np.bincount(group, value) / count

@@ -5,18 +5,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.detection.psf import Psf
+from starpos.detection.stamps import Stamps
+
 OUTLIER = 6.0  # sigma
-FIT_WIDTHS = 4.0  # fit what lies within so many widths of the star: beyond is only noise and neighbours
+# Pixels within so many widths of the star are fitted; farther out there are only noise and neighbours.
+FIT_WIDTHS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """How light becomes DN, and noise.
+    """How light becomes DN, and how noise grows with it: s DN add the variance dn_per_photon s + (misfit s)^2 DN2.
 
-    gain           (P,) what each phase of the colour mosaic passes, mean 1; (1,) without a mosaic
-    colour_spread  how far a star's own gains scatter about these, relative, 1 sigma: stars have colours
-    dn_per_photon  a signal of s DN has the variance dn_per_photon * s + (misfit * s)^2 DN2 on top of the sky's:
-    misfit         photons, and what the frame's one PSF fails to describe
+    gain           (P,) relative sensitivity of each phase of the colour mosaic, mean 1; (1,) without a mosaic
+    colour_spread  relative scatter (1 sigma) of one star's gains about these, because stars have colours
+    dn_per_photon  DN of one photon, for the photon noise
+    misfit         share of the light that the PSF describes wrongly
     """
 
     gain: np.ndarray
@@ -26,40 +30,51 @@ class Response:
 
     @property
     def own_gains(self) -> int:
-        """How many gains a star has of its own: P, or none without a mosaic."""
+        """How many gains are fitted for each star: P, or none without a mosaic."""
         return len(self.gain) if len(self.gain) > 1 else 0
 
-    def columns(self, shape, amount, own, phase):
-        """How pixels (N, S, S) change with a star's x, y, flux and own gains: a list.
+    def columns(
+        self,
+        shape: tuple[np.ndarray, np.ndarray, np.ndarray],
+        amount: np.ndarray,
+        own: np.ndarray,
+        phase: np.ndarray,
+    ) -> list[np.ndarray]:
+        """Derivatives (N, S, S) of the pixels with respect to a star's x, y, flux and own gains, in this order.
 
-        shape, amount, own: what LocalPsf.evaluate tells of them; the star's flux and its gains there.
+        shape: what LocalPsf.evaluate returns; amount: the star's flux; own: its gain at each pixel.
         """
         value, by_x, by_y = shape
         gain = self.gain.astype(np.float32)
         by_gain = [amount * value * np.where(phase == p, gain[p], 0) for p in range(self.own_gains)]
         return [amount * by_x * own, amount * by_y * own, value * own, *by_gain]
 
-    def hold(self, normal, right, colour):
-        """Adds to normal equations of these columns, in place, how near the mean stars' own gains are."""
+    def hold(self, normal: np.ndarray, right: np.ndarray, colour: np.ndarray) -> None:
+        """Add to the normal equations, in place, the prior that a star's own gains are near the frame's."""
         for p in range(self.own_gains):
             normal[:, 3 + p, 3 + p] += self.colour_spread**-2
             right[:, 3 + p] -= colour[:, p] * self.colour_spread**-2
 
-    def variance(self, noise, light):
-        """DN2 of pixels with the sky's noise (DN) and light DN of a star on them."""
+    def variance(self, noise: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """Variance, DN2, of pixels with the sky's noise (DN) and a star's light (DN) on them."""
         light = np.maximum(light, 0)
         return noise**2 + np.float32(self.dn_per_photon) * light + np.float32(self.misfit**2) * light**2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit:
-    """N fitted stars: x, y px; flux DN and its sigma; covariance (N, 2, 2) px2 of x, y; chi2 per degree of freedom.
+    """N fitted stars.
 
-    gains (N, P): what each phase of the mosaic passes of each star's light;
-    residual, model (N, S, S): signal minus model, and the model, DN; used (N, S, S): which pixels took part;
-    outlier (N, S, S): which did not, much too bright for this star;
-    leverage (N, S, S): how much of its own noise each pixel explains, 0..1, so a residual's variance is 1 - leverage
-    of the noise's.
+    x, y              (N,) px
+    flux, flux_sigma  (N,) DN
+    covariance        (N, 2, 2) px2 of x, y
+    gains             (N, P): sensitivity of each phase of the mosaic to each star's light
+    chi2              (N,) per degree of freedom
+    residual          (N, S, S) DN: signal minus model
+    model             (N, S, S) DN
+    used              (N, S, S) bool: pixels that took part in the fit
+    outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
+    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise
     """
 
     x: np.ndarray
@@ -76,18 +91,21 @@ class Fit:
     leverage: np.ndarray
 
 
-def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
-    """Gauss-Newton from the points x, y (N,).
+def fit_stars(
+    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, response: Response, rounds: int = 5
+) -> Fit:
+    """Fit stars by Gauss-Newton, starting at the points x, y (N,) px.
 
     On a mosaic nothing is interpolated: each pixel is compared with the PSF at its own place, times the gain of its
-    colour, and each star's four gains are fitted along, held near the frame's by colour_spread. So a position owes
-    nothing to the mosaic's phase nor to the star's colour. The weights come from the model, not from the pixels,
-    whose noise would otherwise pull the fit.
+    colour. Each star's four gains are fitted too, held near the frame's by colour_spread, so that neither the mosaic's
+    phase nor the star's colour moves the position. The weights come from the model: the pixels' own noise would bias
+    the fit.
     """
     x, y, local = x.copy(), y.copy(), psf.at(x, y)
     n = len(x)
     inverse_noise2 = stamps.good / stamps.noise**2
-    colour = np.zeros((n, len(response.gain)))  # each star's gains over the frame's, minus 1
+    # each star's gains over the frame's, minus 1
+    colour = np.zeros((n, len(response.gain)))
     own = gains_at(response.gain * (1 + colour), stamps.phase)
     flux = np.full(n, np.nan)
     outlier = np.zeros(stamps.signal.shape, bool)
@@ -116,7 +134,7 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
         if last:
             break
         if round_ >= 1:
-            # a hot pixel or a neighbour's light: much too bright for the noise and for an imperfect PSF
+            # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
             outlier = (residual > OUTLIER * np.sqrt(variance)) & (
                 residual > 0.15 * amount * unit.max((1, 2), keepdims=True)
             )
@@ -131,8 +149,8 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
     leverage = ((design @ np.nan_to_num(covariance).astype(np.float32)) * design).sum(2).reshape(used.shape)
     with np.errstate(divide="ignore"):
-        # at known place and colour, of which the star's detection owes nothing; a root is rounded alike wherever an array
-        # lies in memory, numpy 1.26's power is not, and the answers of several processes are to be the same
+        # the sigma at known place and colour, which a detection does not depend on; sqrt, because numpy 1.26 rounds a
+        # power differently by the array's place in memory, and several processes must give the same answers
         flux_sigma = 1 / np.sqrt(normal[:, 2, 2])
     return Fit(
         x=x,
@@ -150,13 +168,13 @@ def fit_stars(stamps, psf, x, y, response, rounds=5) -> Fit:
     )
 
 
-def gains_at(gains, phase):
-    """(N, S, S) float32: of stars' gains (N, P) those of pixels of these phases."""
+def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """The gain (N, S, S) float32 of each pixel: stars' gains (N, P) taken at the pixels' phases (N, S, S)."""
     return gains.astype(np.float32)[np.arange(len(gains))[:, None, None], phase]
 
 
-def inverse(normal):
-    """Inverses of (N, K, K), NaN where singular; scaled first, since fluxes and pixels differ by a millionfold."""
+def inverse(normal: np.ndarray) -> np.ndarray:
+    """Inverses of (N, K, K), NaN where singular; scaled first, because fluxes are a million times larger than pixels."""
     scale = np.sqrt(np.einsum("nii->ni", normal))
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = normal / (scale[:, :, None] * scale[:, None, :])

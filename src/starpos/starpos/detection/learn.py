@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame's own bright stars teach: its PSF, its colour gains and its photon noise."""
+"""Learn a frame's PSF, colour gains and photon noise from its own bright stars."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection.fit import Response, fit_stars, gains_at
+from starpos.detection.background import Background
+from starpos.detection.fit import Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
-from starpos.detection.refine import all_terms, even_terms, refine, widened
+from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
     NARROWEST,
     frame_shape,
@@ -17,38 +18,56 @@ from starpos.detection.shape import (
     relative_widths,
     window_for,
 )
-from starpos.detection.stamps import are_dots, cut
+from starpos.detection.stamps import Stamps, are_dots, cut
 
-DEFAULT_SIGMA = 1.1  # px, of a frame without a star to learn from
-BRIGHT = 20  # sigma of the smoothed noise: from here up a peak can teach
-TEACHERS = 250
-TEACHING_PIXELS = 12000  # of wide stars fewer are enough
-# a star does not teach if the PSF leaves more of its squared light than this, three times what others do, and noise
+# Width of the PSF, px, for a frame without a star to learn from.
+DEFAULT_SIGMA = 1.1
+# Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
+BRIGHT, TEACHERS = 20, 250
+# and of wide stars fewer: together they have so many pixels.
+TEACHING_PIXELS = 12000
+# A star does not teach if the residual's share of its squared light exceeds this, plus noise, plus three times that of
+# other stars.
 UNLIKE = 0.005
-ALIKE, LIKENESS = 5, 0.6  # so many stars are more alike than twigs by chance; log of width, and ellipticity
-ROUNDS, ORDER = 2, 6  # of fits and refinements; of the terms
-# px: on a mosaic the colours of narrower stars look like their shape; at least so many tell them apart in more rounds
+# So many stars agree by more than chance if they differ by less than this (log of width, ellipticity); twigs do not.
+ALIKE, LIKENESS = 5, 0.6
+# Rounds of fitting and refining the PSF, and the order of its terms.
+ROUNDS, ORDER = 2, 6
+# On a mosaic, colour and shape of stars narrower than this FWHM (px) are hard to separate: with at least so many stars,
+# so many more rounds are made.
 FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
-# px: stars at least as wide may be rings, with sharp edges, if the PSF fails to describe more of a pixel's light
-RING_FWHM, POOR = 5.0, 0.05
-RING_ROUNDS, RING_ORDER = 6, 14  # so many more rounds then, and terms of that order
+# Stars of at least this FWHM (px) may be rings with sharp edges if the PSF describes more than this share of the light
+# wrongly: then up to so many more rounds are made, with terms of this order.
+RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
+# Largest distance from a star's centre to its stamp's edge, px.
 MAX_REACH = 20
-LOUDEST = 100  # SNR: the widths of a brighter star tell no more of the field
-SMOOTHING = np.array([0.25, 0.5, 0.25], np.float32)  # null at Nyquist: a mosaic smoothed by it is grey
-SMOOTHING_WIDTH = 0.5  # px2 it adds to a covariance
+# Brighter stars than this SNR get no more weight when the widths over the field are fitted.
+LOUDEST = 100
+# A kernel whose response vanishes at the Nyquist frequency, so that it removes a mosaic; px2 it adds to a covariance.
+SMOOTHING, SMOOTHING_WIDTH = np.array([0.25, 0.5, 0.25], np.float32), 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """A frame's PSF and response, and how far from a star (px) its light is worth using."""
+    """A frame's PSF and response, and the distance from a star (px) out to which its light is used."""
 
     psf: Psf
     response: Response
     reach: int
 
 
-def learn(plane, background, x, y, height, saturation) -> Lesson:
-    """What the peaks x, y (N,) of that height, highest first, teach; defaults where they teach nothing."""
+def learn(
+    plane: np.ndarray,
+    background: Background,
+    x: np.ndarray,
+    y: np.ndarray,
+    height: np.ndarray,
+    saturation: float,
+) -> Lesson:
+    """Learn from the peaks x, y (N,) int px and their height (N,), highest first; defaults where they teach nothing.
+
+    saturation is the DN from which a pixel is saturated.
+    """
     response = Response(np.ones(len(background.level)), 0.3, 0.0, 0.0)
     psf, stamps, x, y = _teachers(plane, background, x, y, height, saturation)
     fine = background.is_mosaic and psf.fwhm_px < FINE_FWHM and len(x) >= FINE_STARS
@@ -61,26 +80,34 @@ def learn(plane, background, x, y, height, saturation) -> Lesson:
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
         if not sound.any():
             break
-        # the best three tenths are the measure: pairs are bright, and may be most of the brightest
+        # compared with the best 30 %, because most of the brightest may be pairs
         strange, error = _strangeness(stamps, fit)
         sound &= strange < 3 * max(0, np.quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = _respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= rounds
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
-            break  # the response was learnt once more: with the last PSF, of the stars that are like it
-        # pairs are still among the stars of the first round, and look like coma
+            # the response has now been learnt with the final PSF
+            break
+        # odd terms only in the last round: the first stars still include pairs, which look like coma
         terms = (
             all_terms(psf, ORDER, len(x))
             if round_ == rounds - 1
             else even_terms(psf, RING_ORDER if ring else ORDER)
         )
-        psf = _shape_up(stamps, psf, fit, sound, response, terms)
+        psf = _refined(stamps, psf, fit, sound, response, terms)
     return Lesson(psf, response, reach_of(psf))
 
 
-def _teachers(plane, background, x, y, height, saturation):
-    """The Gaussians most like the bright stars alone in their surroundings, their Stamps, and x, y (N,) of each."""
+def _teachers(
+    plane: np.ndarray,
+    background: Background,
+    x: np.ndarray,
+    y: np.ndarray,
+    height: np.ndarray,
+    saturation: float,
+) -> tuple[Psf, Stamps, np.ndarray, np.ndarray]:
+    """The isolated bright stars: a Gaussian Psf of their shape, their Stamps and their centroids x, y (N,) px."""
     clear = np.ones(len(x), bool)
     for streak in background.streaks:
         clear &= streak.at(y, x)[0] == 0
@@ -90,8 +117,9 @@ def _teachers(plane, background, x, y, height, saturation):
     bright = bright[_isolated(x, y, height, bright)]
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(~stamps.full.any((1, 2)))
-    if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):  # fainter ones' shapes are noise
+    stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
+    # the shapes of fainter stars are noise
+    if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     if shape is None:
@@ -113,8 +141,11 @@ def _teachers(plane, background, x, y, height, saturation):
     return psf, stamps.take(alike), x[alike], y[alike]
 
 
-def _most_alike(stamps):
-    """Which stamps (N,) bool are somewhat alike, as stars are and twigs are not: most, or those around the most alike."""
+def _most_alike(stamps: Stamps) -> np.ndarray:
+    """Which stamps (N,) bool have similar shapes, as stars have and twigs have not.
+
+    All of them if most lie near the median shape, else those near the shape at which they are densest.
+    """
     shape, widest = np.eye(2) * (stamps.reach / 4) ** 2, (stamps.reach / 2) ** 2
     for _ in range(3):
         window = window_for(shape)
@@ -133,15 +164,16 @@ def _most_alike(stamps):
     return sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
 
 
-def reach_of(psf) -> int:
-    """px from the centre at which a stamp may end: 3.5 widths along the longer axis, where that is longest."""
-    x, y = np.linspace(*psf.box, 5).T
+def reach_of(psf: Psf) -> int:
+    """Distance from a star's centre, px, at which its stamp ends: 3.5 widths of the widest star in the field."""
+    low, high = psf.box
+    x, y = np.linspace(low, high, 5).T
     widest = np.linalg.eigvalsh(psf.at(*(v.ravel() for v in np.meshgrid(x, y))).shape).max()
     return int(np.clip(np.ceil(3.5 * np.sqrt(widest)) + 1, 4, MAX_REACH))
 
 
-def grey(stamps, background):
-    """Stamps without the mosaic's pattern, and how much wider (px2) that made the images."""
+def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
+    """Stamps smoothed so that the mosaic's pattern vanishes, and the px2 which that added to the covariances."""
     if not background.is_mosaic:
         return stamps, 0.0
     signal = ndimage.convolve1d(stamps.signal, SMOOTHING, axis=1, mode="nearest")
@@ -149,11 +181,12 @@ def grey(stamps, background):
     return replace(stamps, signal=signal), SMOOTHING_WIDTH
 
 
-def centroid(stamps, shape, rounds=3):
-    """x, y (N,) px: the windowed centroids of stars of covariance shape, never further than 2 px from the peak."""
+def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Windowed centroids x, y (N,) px of stars of covariance shape px2, at most 2 px from the peak."""
     x, y = stamps.x.astype(float), stamps.y.astype(float)
     window = window_for(shape)
-    gain = np.eye(2) + shape @ np.linalg.inv(window)  # of a displacement the window shows only a part
+    # through the window an offset looks smaller than it is
+    gain = np.eye(2) + shape @ np.linalg.inv(window)
     for _ in range(rounds):
         _, step, _ = moments(stamps, x, y, window)
         step = np.clip(np.nan_to_num((gain @ step[..., None])[..., 0]), -1, 1)
@@ -162,8 +195,8 @@ def centroid(stamps, shape, rounds=3):
     return x, y
 
 
-def _isolated(x, y, height, index):
-    """Which of the peaks `index` have no neighbour within 12 px of more than a fiftieth of their height."""
+def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Which of the peaks `index` have no neighbour within 12 px that is higher than a fiftieth of them."""
     points = np.stack([x, y], 1)
     pairs = spatial.cKDTree(points).query_pairs(12, output_type="ndarray")
     crowded = np.zeros(len(x), bool)
@@ -172,10 +205,10 @@ def _isolated(x, y, height, index):
     return ~crowded[index]
 
 
-def _strangeness(stamps, fit):
-    """(N,) what the PSF leaves of each star, beyond the sky's noise, over what it holds, both squared; and its error.
+def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of squared residuals beyond the sky's noise over that of the model (N,), for each star, and its error (N,).
 
-    Two stars in one image leave much: they would teach a wrong PSF, and what they leave would pass for noise of light.
+    It is large for two stars in one image, which would teach a wrong PSF and too much photon noise.
     """
     noise2 = fit.used * stamps.noise**2
     light2 = np.maximum((fit.used * fit.model**2).sum((1, 2)), 1e-9)
@@ -183,8 +216,10 @@ def _strangeness(stamps, fit):
     return left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
 
 
-def _respond(stamps, psf, x, y, fit, sound, before):
-    """The Response the fitted stars show: gains of the phases, their scatter, and the noise that grows with light."""
+def _respond(
+    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, fit: Fit, sound: np.ndarray, before: Response
+) -> Response:
+    """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
     used = fit.used[sound]
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
@@ -195,15 +230,15 @@ def _respond(stamps, psf, x, y, fit, sound, before):
     photon, misfit2 = before.dn_per_photon, before.misfit**2
     for _ in range(4):
         variance = noise2 + photon * light + misfit2 * light**2
-        keep = square < 25 * variance if photon + misfit2 > 0 else slice(None)
+        keep = square < 25 * variance if photon + misfit2 > 0 else np.ones(len(square), bool)
         photon, misfit2 = _two_terms(light[keep], (square - noise2)[keep], variance[keep])
-    # few stars tell too little as often as too much, and too small errors do the more harm
+    # plus 1 sigma of its error, because errors given too small do more harm than too large ones
     photon += float(np.sqrt(2 / max(((light / variance) ** 2).sum(), 1e-12)))
     return Response(gain, spread, photon, float(np.sqrt(misfit2)))
 
 
-def _two_terms(light, excess, variance):
-    """a, b >= 0 for which a * light + b * light^2 is the least-squares fit of excess, of that variance."""
+def _two_terms(light: np.ndarray, excess: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
+    """Least-squares a, b >= 0 of a * light + b * light^2 = excess, whose variance is given."""
     terms = np.stack([light, light * light]).astype(np.float64) / variance
     normal = np.einsum("ik,jk->ij", terms, terms)
     right = np.einsum("ik,k->i", terms, excess / variance)
@@ -213,17 +248,22 @@ def _two_terms(light, excess, variance):
     if both.min() >= 0:
         return float(both[0]), float(both[1])
     alone = np.maximum(right / np.diag(normal), 0)
-    best = int(np.argmax(right * alone))  # the one that takes more off the sum of squares
+    # the one that lowers the sum of squares more
+    best = int(np.argmax(right * alone))
     return (float(alone[0]), 0.0) if best == 0 else (0.0, float(alone[1]))
 
 
-def _gains(stamps, value, before):
-    """The gains of the mosaic's phases (P,), mean 1, and how far a star's own scatter about them beyond noise."""
+def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndarray, float]:
+    """Gains of the mosaic's phases (P,), mean 1, and the scatter of single stars' gains about them, without noise.
+
+    value (N, S, S): the PSF at the stars' pixels.
+    """
     phases = stamps.phase[..., None] == np.arange(len(before.gain))
     weight = (stamps.good / before.variance(stamps.noise, stamps.signal))[..., None] * phases
     information = (weight * (value * value)[..., None]).sum((1, 2))
     own = (weight * (value * stamps.signal)[..., None]).sum((1, 2)) / np.maximum(information, 1e-12)
-    mean = np.maximum(own.mean(1, keepdims=True), 1e-3)  # DN: far below any star
+    # 1e-3 DN is far below any star
+    mean = np.maximum(own.mean(1, keepdims=True), 1e-3)
     own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
     gain, spread2 = np.median(own, 0), 0.0
     for _ in range(4):
@@ -237,8 +277,8 @@ def _gains(stamps, value, before):
     return gain, float(np.clip(np.sqrt(spread2), 0.01, 0.5))
 
 
-def _shape_up(stamps, psf, fit, sound, response, terms):
-    """One refinement of the PSF by the stars in stamps, the sound ones of a fit."""
+def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Response, terms: Terms) -> Psf:
+    """Refine the PSF once, by the sound stars of a fit, which are those in stamps."""
     x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
     scale = gains_at(fit.gains[sound], stamps.phase) * flux[:, None, None]
     dx, dy = stamps.offsets(x, y)

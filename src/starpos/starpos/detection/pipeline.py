@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame to its stars: background, peaks, what the frame's stars teach, a fit of each, and a selection."""
+"""From a frame to its stars: background, peaks, PSF and noise learnt from bright stars, a fit of each, a selection."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,22 +13,25 @@ from starpos.detection.plane import plane_of
 from starpos.detection.streak import find_streaks
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
+from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars, no_stars
 
-CHUNK_PIXELS = 12_000, 60_000  # of stars fitted at once, of a small frame and of a large one: 1 and 5 MB
-PEAKS = 10_000  # looked at; at least twice as many as stars are wanted, as hot pixels are peaks too
+# Pixels of stars that are fitted together, on a small and on a large frame: 1 and 5 MB.
+CHUNK_PIXELS = 12_000, 60_000
+# Peaks looked at, or twice the stars wanted if that is more: hot pixels are peaks too.
+PEAKS = 10_000
 
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """What may be chosen.
+    """Settings of `detect`; FrameError if one is out of its range.
 
-    threshold       sigma of the smoothed noise a peak must stand out by
-    min_snr         flux over its sigma in the sky's noise a star must have
-    max_stars       the brightest so many are kept
-    mesh_px         size of the background's cells
-    saturation_dn   DN from which a pixel is full; None: the type's largest value, or the frame's largest if several
-                    pixels share it
+    threshold       height of a peak in sigma of the smoothed noise, 3 or more
+    min_snr         flux of a star over its sigma in the sky's noise
+    max_stars       how many stars are kept, brightest first
+    mesh_px         size of the background's cells, 16 or more
+    saturation_dn   DN from which a pixel is saturated; None: the type's largest value, or the frame's largest if several
+                    pixels of a star share it
     """
 
     threshold: float = 5.0
@@ -36,7 +40,7 @@ class DetectionSettings:
     mesh_px: int = 64
     saturation_dn: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, low in (("threshold", 3), ("min_snr", 0), ("max_stars", 1), ("mesh_px", 16)):
             if isinstance(getattr(self, name), str) or not low <= getattr(self, name) < np.inf:
                 raise FrameError(
@@ -54,9 +58,9 @@ class DetectionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The stars of a frame and what else it told: background and noise (DN, medians over the frame), FWHM (px).
+    """The stars of a frame, its background and noise (DN, medians over the frame) and FWHM (px).
 
-    chi2  (N,) of each star's fit, per degree of freedom: about 1 where it is as the frame's PSF and noise say
+    chi2  (N,) of each star's fit, per degree of freedom: about 1 for a star that PSF and noise describe
     """
 
     stars: Stars
@@ -71,8 +75,8 @@ class Detection:
         return float(np.median(self.chi2)) if len(self.chi2) else float("nan")
 
 
-def detect(frame, settings=DetectionSettings()) -> Detection:
-    """Measure the stars of a Frame. A frame without any gives none; fwhm_px is NaN then."""
+def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
+    """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
     plane, mosaic = plane_of(frame)
     about = {"width": frame.width, "height": frame.height} | frame.about
     if min(plane.shape) < 2:
@@ -92,16 +96,25 @@ def detect(frame, settings=DetectionSettings()) -> Detection:
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     columns = {name: column[: settings.max_stars] for name, column in resolve(columns, lesson.psf).items()}
-    chi2 = columns.pop("chi2")
-    stars = Stars(**columns, **about)
-    return Detection(stars, level, noise, lesson.psf.fwhm_px if len(stars) else float("nan"), chi2)
+    stars = Stars(
+        x=columns["x"],
+        y=columns["y"],
+        flux=columns["flux"],
+        snr=columns["snr"],
+        covariance=columns["covariance"],
+        flags=columns["flags"],
+        **about,
+    )
+    fwhm_px = lesson.psf.fwhm_px if len(stars) else float("nan")
+    return Detection(stars, level, noise, fwhm_px, columns["chi2"])
 
 
-def _starless(about, level, noise):
+def _starless(about: dict[str, Any], level: float, noise: float) -> Detection:
+    """The Detection of a frame without stars."""
     return Detection(no_stars(**about), level, noise, float("nan"), np.zeros(0))
 
 
-def _saturation(plane, x, y, settings):
+def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: DetectionSettings) -> float:
     if settings.saturation_dn is not None:
         return settings.saturation_dn
     near = np.arange(-2, 3)
@@ -110,6 +123,6 @@ def _saturation(plane, x, y, settings):
     inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
     patch = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
     patch = np.where(inside, patch, 0).reshape(len(x), -1)
-    # of one star's pixels, since a hot one may exceed what light can reach; noise does not make three of them equal
+    # the third highest pixel of a star, because a hot pixel may exceed saturation; noise does not make three equal
     highest = np.partition(patch, -3, axis=1)[:, -3].max()
     return int(highest) if (patch == highest).sum(1).max() >= 3 else np.iinfo(plane.dtype).max

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one number a pixel that detection works on, and whether a colour mosaic lies over it."""
+"""The plane that detection works on, one number a pixel, and whether it is a colour mosaic."""
 
 import cv2
 import numpy as np
 
-NATIVE = 1.1  # times noisier than interpolated numbers the measured ones must be
+from starpos.frames.frame import Frame
+
+# Measured pixels must be so many times noisier than interpolated ones.
+NATIVE = 1.1
 
 
-def plane_of(frame):
-    """The pixels (h, w) of a Frame as measured, and whether they are a mosaic: True, False, or None where only they
-    can tell, since files often do not say.
+def plane_of(frame: Frame) -> tuple[np.ndarray, bool | None]:
+    """The pixels (h, w) of a Frame as they were measured, and whether they are a mosaic.
 
-    Colours made from a mosaic are interpolated: two thirds of the numbers are averages of the others. That ties
-    neighbours' noise together and spreads a hot pixel to a star's width, so only what was measured is taken.
-    Other colours are added, as uint16.
+    The second value is True, False, or None if the file does not say: then only the pixels can tell. In colours made
+    from a mosaic two thirds of the numbers are interpolated. That correlates the noise of neighbours and spreads a hot
+    pixel to a star's width, so only the measured third is taken. Other colours are added, as uint16.
     """
     pixels = frame.pixels
     if pixels.ndim == 2:
@@ -29,15 +31,16 @@ def plane_of(frame):
     return plane, True
 
 
-def _measured(pixels):
-    """(3, 2, 2) bool: at which (row, column) modulo 2 each colour was measured; None where all were everywhere.
+def _measured(pixels: np.ndarray) -> np.ndarray | None:
+    """At which (row, column) modulo 2 each colour was measured, (3, 2, 2) bool; None if no mosaic is seen.
 
-    An average is less noisy than what it is made of, so each colour is noisiest where it was measured.
+    An average is less noisy than the values it is made of, so each colour is noisiest where it was measured.
     """
     height, width = pixels.shape[:2]
     if min(height, width) < 32:
         return None
-    step = 2 * max(1, height // 400)  # 200 rows of a phase are enough
+    # 200 rows of a phase are enough
+    step = 2 * max(1, height // 400)
     noise = np.empty((3, 2, 2))
     for row, column in np.ndindex(2, 2):
         phase = pixels[row::step, column::2].astype(np.int16)

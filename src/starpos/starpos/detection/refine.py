@@ -1,27 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A better PSF from stars fitted with the last one, and whether it differs from place to place."""
+"""Refine a PSF by stars that were fitted with it, and find whether it varies over the field."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.detection.psf import MONOMIALS, Psf, power
+from starpos.detection.psf import MONOMIALS, LocalPsf, Psf, power
 
-PLACES = 12  # stars at least that may tell the field's corners apart
-SIGNIFICANT = 4.0  # F of widths that go with the field against the same everywhere
-LIKELY = 0.3  # 1 sigma of a coefficient of which no star tells
-# By how much each further coefficient must lower chi-square: Akaike's price, and twice that for those which move all
-# stars of a frame, or of a part of it, by as much as they err
+# A variation over the field needs at least so many stars,
+PLACES = 12
+# and widths that vary over the field must be better than constant ones by this F.
+SIGNIFICANT = 4.0
+# Prior of each coefficient, 1 sigma.
+LIKELY = 0.3
+# So much must each further coefficient lower chi-square: the Akaike criterion, and twice that for coefficients whose
+# errors move all stars of a frame, or of a part of it, together.
 WORTH, DEAR = 2.0, 4.0
-COMA = 3  # order of the odd terms
-FIELD_ORDER = 4  # of the even terms that may go with the field
+# Order of the odd terms.
+COMA = 3
+# Highest order of the even terms that may vary over the field.
+FIELD_ORDER = 4
 
 
-def widened(psf, x, y, ratio, weight) -> Psf:
-    """The Psf whose squared widths go with the field as those of N stars do, if they do.
+def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: np.ndarray) -> Psf:
+    """The Psf with squared widths that vary over the field as those of N stars do; psf itself if they do not.
 
+    psf     the same everywhere
     x, y    (N,) px
-    ratio   (N, 2, 2): the stars' covariances along the axes of psf, which is the same everywhere
+    ratio   (N, 2, 2): the stars' covariances along the axes of psf
     weight  (N,) inverse variances of ratio, in any unit
     """
     if len(x) < PLACES:
@@ -31,7 +37,8 @@ def widened(psf, x, y, ratio, weight) -> Psf:
         scale = np.sqrt(weight * keep)[:, None]
         fitted = np.linalg.lstsq(field * scale, own * scale, rcond=None)[0]
         off = np.sqrt(weight) * np.abs(own - field @ fitted).max(1)
-        keep = off < 6 * np.median(off)  # pairs are wide, and no measure of the optics
+        # pairs are wide but tell nothing of the optics
+        keep = off < 6 * np.median(off)
         if keep.sum() < PLACES:
             return psf
     used = (weight * keep)[:, None]
@@ -44,11 +51,12 @@ def widened(psf, x, y, ratio, weight) -> Psf:
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """Terms of the series, and in which sets of them a better PSF is looked for.
+    """Terms of the series, and the sets of coefficients that are tried one after the other.
 
-    orders      (T, 2): (i, j) of each, without the (0, 0) that all have
-    candidates  (C, T, K) bool: coefficients of the terms in the field's monomials, each set tried besides the best before
-    price       (T, K): what each coefficient must be worth
+    orders      (T, 2): (i, j) of each term, without (0, 0), which is always there
+    candidates  (C, T, K) bool: sets of coefficients, of T terms in K monomials of the field; each is added to those
+                accepted before
+    price       (T, K): what each coefficient must lower chi-square by
     """
 
     orders: np.ndarray
@@ -56,18 +64,19 @@ class Terms:
     price: np.ndarray
 
 
-def even_terms(psf, highest) -> Terms:
-    """Terms of even order, `highest` across the trail; along it more, up to twice as many, as the star is longer."""
+def even_terms(psf: Psf, highest: int) -> Terms:
+    """Terms of even order, up to `highest` across the trail and, for a long star, up to twice that along it."""
     grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
-    orders = np.array([term for term in grid if 0 < _rank(psf, *term) <= highest])
+    orders = np.array(grid[1:])  # without (0, 0)
+    orders = orders[_rank(psf, *orders.T) <= highest]
     steps = np.arange(2, highest + 1, 2)
     return Terms(
         orders, (_rank(psf, *orders.T) <= steps[:, None])[..., None], np.full((len(orders), 1), WORTH)
     )
 
 
-def all_terms(psf, highest, count) -> Terms:
-    """Those, then coma's, and then what goes with the field, if `count` stars are enough to tell."""
+def all_terms(psf: Psf, highest: int, count: int) -> Terms:
+    """The even terms, then coma, then variations over the field if there are enough stars, `count`."""
     even = even_terms(psf, highest)
     odd = np.array([(i, COMA - i) for i in range(COMA + 1)])
     orders = np.concatenate([even.orders, odd])
@@ -80,21 +89,31 @@ def all_terms(psf, highest, count) -> Terms:
     return Terms(orders, np.array(everywhere + field), np.where(coma[:, None] | ~first, DEAR, WORTH))
 
 
-def _rank(psf, i, j):
-    """The order of terms i, j (T,) across the trail."""
+def _rank(psf: Psf, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """The order that terms i, j (T,) count as: along the trail of a long star orders count less, down to half."""
     long, short = 1 / np.linalg.norm(psf.axes, axis=1)
     return i / float(np.clip(long / short, 1, 2)) + j
 
 
-def refine(psf, x, y, dx, dy, brightness, weight, phase, terms) -> Psf:
-    """The Psf whose series fits N stars best, by weighted linear least squares; their positions and gains may follow.
+def refine(
+    psf: Psf,
+    x: np.ndarray,
+    y: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    brightness: np.ndarray,
+    weight: np.ndarray,
+    phase: np.ndarray,
+    terms: Terms,
+) -> Psf:
+    """The Psf whose series fits N stars best, by weighted linear least squares with free positions and gains.
 
     x, y        (N,) px: the stars' places
-    dx, dy      (N, S, S) px, broadcastable: offsets of S x S pixels from their stars' centres
-    brightness  (N, S, S): those pixels over their stars' fluxes and gains
-    weight      (N, S, S): inverse variances of brightness; 0: not used
-    phase       (N, S, S): which of the mosaic's gains is theirs
-    terms       Terms, of which as many are taken as are worth their price
+    dx, dy      (N, S, S) px, or shapes that broadcast to it: offsets of the pixels from their stars' centres
+    brightness  (N, S, S): the pixels over their stars' fluxes and gains
+    weight      (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
+    phase       (N, S, S): the pixels' numbers in the mosaic
+    terms       the terms that are tried; they are taken if they are worth their price
     """
     normal, right = _marginal(psf.at(x, y), dx, dy, brightness, weight, phase, terms.orders)
     count, places = terms.candidates.shape[1:]
@@ -111,13 +130,22 @@ def refine(psf, x, y, dx, dy, brightness, weight, phase, terms) -> Psf:
     used = np.any(found, axis=1)
     i, j = np.concatenate([[(0, 0)], terms.orders[used]]).T
     series = np.zeros((places if np.any(found[:, 1:]) else 1, i.max() + 1, j.max() + 1))
-    series[0, 0, 0] = 1  # unit flux: the other terms integrate to zero
+    # unit flux: the other terms integrate to zero
+    series[0, 0, 0] = 1
     series[:, i[1:], j[1:]] = found[used, : len(series)].T
     return replace(psf, series=series)
 
 
-def _marginal(local, dx, dy, brightness, weight, phase, orders):
-    """(N, T, T) and (N, T): the normal equations of each star for the terms, whatever its position and gains are."""
+def _marginal(
+    local: LocalPsf,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    brightness: np.ndarray,
+    weight: np.ndarray,
+    phase: np.ndarray,
+    orders: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations (N, T, T) and (N, T) of each star for the terms, with its position and gains eliminated."""
     n, count = len(brightness), len(orders)
     weight = weight.reshape(n, 1, -1)
     value, by_x, by_y = (a.reshape(n, 1, -1) for a in local.evaluate(dx, dy))
@@ -135,8 +163,8 @@ def _marginal(local, dx, dy, brightness, weight, phase, orders):
     return normal, right[:, :count] - np.einsum("ntk,nk->nt", share, right[:, count:])
 
 
-def _chosen(normal, right, candidates, price):
-    """The coefficients with which chi-square and their price are lowest; 0 where not worth it."""
+def _chosen(normal: np.ndarray, right: np.ndarray, candidates: np.ndarray, price: np.ndarray) -> np.ndarray:
+    """The coefficients that minimise chi-square plus price; 0 for those not worth their price."""
     found, taken, most = np.zeros(len(right)), np.zeros(len(right), bool), 0.0
     for candidate in candidates:
         index = np.flatnonzero(taken | candidate)
@@ -149,8 +177,8 @@ def _chosen(normal, right, candidates, price):
     return found
 
 
-def _absorbed(psf, field, orders, found):
-    """What the terms of second order make of the widths over the field becomes the axes', which hold any amount."""
+def _absorbed(psf: Psf, field: np.ndarray, orders: np.ndarray, found: np.ndarray) -> tuple[Psf, np.ndarray]:
+    """Psf and coefficients with the field's second-order terms moved into the widths, which hold any amount of them."""
     uu, uv, vv = (np.flatnonzero((orders == term).all(1))[0] for term in ((2, 0), (1, 1), (0, 2)))
     if not np.any(found[[uu, uv, vv], 1:]):
         return psf, found

@@ -1,35 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian-windowed moments: where a star is and how wide, for any symmetric image, without a model of it.
+"""Gaussian-windowed moments: place and width of a star with any symmetric image, without a model of it.
 
-The moments of a star seen through an elliptical Gaussian window of covariance W are those of a Gaussian of
-covariance V = (C^-1 + W^-1)^-1, if the star is one of covariance C (Bernstein & Jarvis 2002, AJ 123, 583).
+If a star is a Gaussian of covariance C, its moments through an elliptical Gaussian window of covariance W are those of
+a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 583).
 """
 
 import numpy as np
 
-NARROWEST = 0.2  # px2: a pixel alone has 1/12, and starlight never falls on one alone
-NARROWEST_WINDOW = 1.2  # px2: under narrower ones a sum over pixels is no integral
+from starpos.detection.stamps import Stamps
+
+# px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
+NARROWEST = 0.2
+# px2. Through a narrower window a sum over pixels is too far from the integral.
+NARROWEST_WINDOW = 1.2
 
 
-def at_least(shape, floor):
+def at_least(shape: np.ndarray, floor: float) -> np.ndarray:
     """The covariance shape (..., 2, 2) px2 with no principal axis below floor px2."""
     values, vectors = np.linalg.eigh(shape)
     return (vectors * np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
 
 
-def moments(stamps, x, y, window):
-    """One look through the window (2, 2) px2, or one each (N, 2, 2), at the points x, y (N,).
+def moments(
+    stamps: Stamps, x: np.ndarray, y: np.ndarray, window: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Moments of the stamps through a window (2, 2) px2, or one window each (N, 2, 2), centred on x, y (N,) px.
 
-    Returns mass (N,), the mean offset (N, 2) px from x, y and the covariance (N, 2, 2) px2 of the windowed image;
-    NaN where there is nothing. Pixels off the frame or saturated hold what they hold: without them the moments
-    would lean away from the edge.
+    Returns the sum (N,), the mean offset (N, 2) px from x, y and the covariance (N, 2, 2) px2 of the windowed image;
+    NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the centroid
+    would be biased away from the edge.
     """
     dx, dy = stamps.offsets(x, y)
     inverse = np.linalg.inv(window)[..., None, None].astype(np.float32)
     xx, xy, yy = (inverse[..., i, j, :, :] for i, j in ((0, 0), (0, 1), (1, 1)))
     exponent = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
     weighted = np.exp(-0.5 * exponent) * stamps.signal
-    rows, columns = weighted.sum(2), weighted.sum(1)  # the separable sums, over (N, S) from here on
+    # the sums separate: from here on over (N, S)
+    rows, columns = weighted.sum(2), weighted.sum(1)
     dx, dy = dx[:, 0, :], dy[:, :, 0]
     mass = columns.sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -40,15 +47,15 @@ def moments(stamps, x, y, window):
     return mass, np.stack([mx, my], 1), np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
 
 
-def window_for(shape):
-    """The window (..., 2, 2) px2 that suits stars of covariance shape: the same, unless too narrow for sums."""
+def window_for(shape: np.ndarray) -> np.ndarray:
+    """The window (..., 2, 2) px2 for stars of covariance shape: the same, unless too narrow for sums over pixels."""
     return at_least(shape, NARROWEST_WINDOW)
 
 
-def frame_shape(stamps, blur=0.0, rounds=12):
-    """The typical covariance C (2, 2) px2 of the stars in stamps, their own measurement through a matched window.
+def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarray | None:
+    """The typical covariance C (2, 2) px2 of the stars in stamps, measured through a window of the same shape.
 
-    blur px2: how much wider smoothing has made the stamps' images. Returns None if they agree on nothing.
+    blur, px2, is what smoothing added to their covariance. None if no star can be measured.
     """
     window = np.eye(2) * max(1.5, stamps.reach / 4) ** 2
     x, y = stamps.x.astype(float), stamps.y.astype(float)
@@ -58,11 +65,12 @@ def frame_shape(stamps, blur=0.0, rounds=12):
         with np.errstate(invalid="ignore"):
             usable = (np.abs(step).max(1) < 1.5) & (np.linalg.det(seen) > 0.01)
         if not usable.any():
-            return shape
+            break
         seen = np.median(seen[usable], axis=0)
         narrower = np.linalg.inv(seen) - np.linalg.inv(window)
         values, vectors = np.linalg.eigh(narrower)
-        limit = (stamps.reach / 2.0) ** 2  # wider than this the stamp does not hold the star
+        # a stamp does not hold a wider star
+        limit = (stamps.reach / 2.0) ** 2
         own = vectors @ np.diag(1 / np.clip(values, 1 / limit, 1 / NARROWEST)) @ vectors.T
         gain = np.eye(2) + own @ np.linalg.inv(window)
         step = np.where(usable[:, None], step @ gain.T, 0)
@@ -72,11 +80,11 @@ def frame_shape(stamps, blur=0.0, rounds=12):
         window = window_for(own)
         if change < 1e-3:
             break
-    return at_least(shape - blur * np.eye(2), NARROWEST)
+    return None if shape is None else at_least(shape - blur * np.eye(2), NARROWEST)
 
 
-def own_shape(seen, window):
-    """Covariances (N, 2, 2) px2 of stars from those of their windowed images (N, 2, 2); NaN where there are none."""
+def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Covariances (N, 2, 2) px2 of stars from those of their windowed images, seen (N, 2, 2); NaN where impossible."""
     sound = np.isfinite(seen).all((1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(seen))) > 1e-6)
     narrower = np.linalg.inv(np.where(sound[:, None, None], seen, np.eye(2))) - np.linalg.inv(window)
     sound &= np.abs(np.linalg.det(narrower)) > 1e-9
@@ -84,11 +92,11 @@ def own_shape(seen, window):
     return np.where(sound[:, None, None], own, np.nan)
 
 
-def relative_widths(seen, shape, window):
-    """(N, 2): the smaller and the larger squared width of windowed images over that of stars of `shape` (..., 2, 2).
+def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """The smaller and the larger squared width (N, 2) of windowed images, over those of stars of `shape` (..., 2, 2).
 
-    1 for a star like the frame's, towards 0 across a hot pixel; along a streak it reaches 2 if window = shape.
-    NaN counts as 0.
+    Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
+    the shape. NaN counts as 0.
     """
     expected = np.linalg.inv(np.linalg.inv(shape) + np.linalg.inv(window))
     root = np.linalg.inv(np.linalg.cholesky(expected))

@@ -5,14 +5,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.detection.background import phase_of
+from starpos.detection.background import Background, phase_of
 
-RAISED = 0.6  # of a pixel's noise, and
-UNEVEN = (
-    1.6  # times it: what about 50 pixels must show, four times the errors, to count for more than the mesh
-)
-
-# of a hot pixel's light, and of their noise: what the 24 pixels around it have less of, together
+# Around a star the sky counts as brighter or less even than the mesh says where about 50 pixels lie so far above it, or
+# scatter so much, in units of a pixel's noise: both are four times their errors.
+RAISED, UNEVEN = 0.6, 1.6
+# The 24 pixels around a hot pixel hold together less than this share of its light and than so many sigma of their noise.
 ALONE, NOTHING = 0.25, 3.0
 
 
@@ -22,10 +20,10 @@ class Stamps:
 
     x, y    (N,) int: the central pixel of each
     signal  (N, S, S) float32, DN above the background
-    noise   (N, S, S) float32, DN rms of the background, as large as sums over neighbouring pixels show it
+    noise   (N, S, S) float32, DN rms of the background, including the correlation of neighbouring pixels
     good    (N, S, S) bool: on the frame and not saturated
     full    (N, S, S) bool: saturated
-    phase   (N, S, S) int: which of the colour mosaic's 2 x 2 pixels, 0..3; 0 everywhere without a mosaic
+    phase   (N, S, S) int: number 0..3 in the colour mosaic's 2 x 2 pattern; 0 everywhere without a mosaic
     """
 
     x: np.ndarray
@@ -38,20 +36,24 @@ class Stamps:
 
     @property
     def reach(self) -> int:
+        """Pixels from the centre to the edge, (S - 1) / 2."""
         return self.signal.shape[1] // 2
 
-    def take(self, index) -> "Stamps":
+    def take(self, index: np.ndarray | slice) -> "Stamps":
+        """The stamps that index selects."""
         return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
-    def offsets(self, x, y):
-        """Column and row of every pixel relative to the points x, y (N,): two float32 (N, S, S) broadcastables."""
+    def offsets(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets of every pixel from the points x, y (N,) px: float32 (N, 1, S) and (N, S, 1)."""
         grid = np.arange(-self.reach, self.reach + 1)
         dx = (grid + (self.x - x)[:, None]).astype(np.float32)
         dy = (grid + (self.y - y)[:, None]).astype(np.float32)
         return dx[:, None, :], dy[:, :, None]
 
 
-def cut(plane, background, x, y, reach, saturation) -> Stamps:
+def cut(
+    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int, saturation: float
+) -> Stamps:
     """The Stamps of (2 reach + 1) px around the pixels x, y (N,) int of plane (h, w)."""
     height, width = plane.shape
     grid = np.arange(-reach, reach + 1)
@@ -65,23 +67,25 @@ def cut(plane, background, x, y, reach, saturation) -> Stamps:
     return Stamps(x=x, y=y, signal=pixels - level, noise=noise, good=on & ~full, full=full, phase=phase)
 
 
-def are_dots(plane, background, x, y):
-    """Whether the pixels x, y (N,) int are hot: less light in their neighbours together than in half of the brightest."""
+def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Whether the pixels x, y (N,) int are hot: their neighbours together have less than half the brightest's light."""
     core = cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9)
     peak = core.max(1)
     return core.sum(1) - peak < 0.5 * peak
 
 
-def are_alone(plane, background, x, y):
-    """Whether the pixels x, y (N,) int are hot beyond doubt: next to no light around them, no star beside them either."""
+def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Whether the pixels x, y (N,) int are certainly hot: almost no light in the 24 pixels around them."""
     around = cut(plane, background, x, y, 2, np.inf)
     peak = around.signal.max((1, 2))
     beside = around.signal.sum((1, 2)) - peak
     return beside < np.minimum(ALONE * peak, NOTHING * np.sqrt((around.noise**2).sum((1, 2))))
 
 
-def surroundings(plane, background, x, y, reach):
-    """What `uneven` says of the squares reach px around the pixels x, y (N,) int."""
+def surroundings(
+    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `uneven` returns for the pixels on the edge of a square, reach px from the pixels x, y (N,) int."""
     side, end = np.arange(-reach, reach), np.full(2 * reach, reach)
     columns = np.clip(x[:, None] + np.concatenate([side, end, -side, -end]), 0, plane.shape[1] - 1)
     rows = np.clip(y[:, None] + np.concatenate([-end, side, end, -side]), 0, plane.shape[0] - 1)
@@ -89,11 +93,11 @@ def surroundings(plane, background, x, y, reach):
     return uneven(plane[rows, columns] - level, noise)
 
 
-def uneven(signal, noise):
-    """How far (N,) the pixels (N, K) around stars lie above 0, and how much more they scatter than their noise.
+def uneven(signal: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far (N,) the pixels (N, K) around stars lie above 0, and their scatter (N,), both over the noise.
 
-    Both in units of the noise; 0 and 1 where it may be chance. Beside a roof, among twigs or under a cloud the sky is
-    brighter and less even than the mesh knows.
+    0 and 1 where a difference may be chance. Beside a roof, among twigs or under a cloud the sky is brighter and less
+    even than the background's mesh says.
     """
     score = signal / noise
     level = np.median(score, axis=1)

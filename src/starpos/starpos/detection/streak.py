@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Satellites' trails across a frame: a part of the sky with a level and a noise of its own, not a row of stars."""
+"""Satellite trails across a frame: treated as sky with its own level and noise, not as a row of stars."""
 
 from dataclasses import dataclass
 
@@ -7,21 +7,29 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-CELL = 8  # px: peaks along a trail are never further apart
-FEWEST = 12  # peaks that make a line
-SHORTEST = 100  # px
-HALF_WIDTH = 12  # px: a wider band is no trail
-BLOCK = 64  # px along a trail over which it is taken as even
-SIGNIFICANT = 5 * 1.25 / BLOCK**0.5  # of a pixel's sigma: five times the error of a block's median
+from starpos.detection.background import Background
+
+# px. Peaks along a trail are never farther apart.
+CELL = 8
+# A line needs so many peaks
+FEWEST = 12
+# and this length, px.
+SHORTEST = 100
+# px. A wider band is not a trail.
+HALF_WIDTH = 12
+# px along a trail over which its light is taken as constant.
+BLOCK = 64
+# Over a pixel's sigma: five times the error of a block's median.
+SIGNIFICANT = 5 * 1.25 / BLOCK**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Streak:
-    """A straight band through point (2,) px along the unit vector direction (2,), both (x, y).
+    """A straight band of light from point (2,) px along the unit vector direction (2,), both (x, y).
 
     length        px from the point to the streak's other end
-    level, noise  (blocks, 2 HALF_WIDTH + 1) DN above the sky and DN rms, at whole offsets across the band, in equal
-                  blocks along it; 0 where there is no light of it
+    level, noise  (blocks, 2 HALF_WIDTH + 1) DN above the sky and DN rms, in equal blocks along the band and at whole px
+                  across it; 0 where the streak has no light
     """
 
     point: np.ndarray
@@ -30,8 +38,8 @@ class Streak:
     level: np.ndarray
     noise: np.ndarray
 
-    def at(self, rows, columns):
-        """level and noise (DN) the streak has at pixels; 0 off it."""
+    def at(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Level and noise (DN) of the streak at pixels; 0 off it."""
         along, across = self._place(rows, columns)
         block = np.clip(along / self.length * len(self.level), 0, len(self.level) - 1).astype(int)
         offset = np.rint(across).astype(int) + HALF_WIDTH
@@ -40,18 +48,20 @@ class Streak:
         offset = np.where(on, offset, 0)
         return on * self.level[block, offset], on * self.noise[block, offset]
 
-    def _place(self, rows, columns):
+    def _place(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances of pixels along and across the streak, px."""
         dx, dy = columns - self.point[0], rows - self.point[1]
-        return dx * self.direction[0] + dy * self.direction[1], dy * self.direction[0] - dx * self.direction[
-            1
-        ]
+        along_x, along_y = self.direction
+        return dx * along_x + dy * along_y, dy * along_x - dx * along_y
 
 
-def find_streaks(plane, background, x, y):
-    """The Streaks (a tuple) on which peaks x, y (N,) int lie; what merely looks like a row of stars is none."""
+def find_streaks(
+    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray
+) -> tuple[Streak, ...]:
+    """The Streaks on which peaks x, y (N,) int px lie. A row of stars without light between them is not a streak."""
     if len(x) < FEWEST:
         return ()
-    found = []
+    found: list[Streak] = []
     grid = np.zeros((background.height // CELL + 1, background.width // CELL + 1), np.uint8)
     grid[y // CELL, x // CELL] = 255
     lines = cv2.HoughLinesP(grid, 1, np.pi / 360, FEWEST, minLineLength=SHORTEST / CELL, maxLineGap=2)
@@ -67,8 +77,11 @@ def find_streaks(plane, background, x, y):
     return tuple(found)
 
 
-def _through(points, ends):
-    """A point and a unit direction of the line through the points (N, 2) near the segment ends (2, 2)."""
+def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Point and unit direction of the line through those points (N, 2) that lie near the segment with these ends (2, 2).
+
+    None if too few points lie there.
+    """
     point, direction = ends[0], ends[1] - ends[0]
     length = np.hypot(*direction)
     direction = direction / length
@@ -86,8 +99,10 @@ def _through(points, ends):
     return point, direction
 
 
-def _measured(plane, background, point, direction):
-    """The Streak along a line from edge to edge of the frame, None where there is none."""
+def _measured(
+    plane: np.ndarray, background: Background, point: np.ndarray, direction: np.ndarray
+) -> Streak | None:
+    """The Streak along a line from edge to edge of the frame, or None if there is no light along it."""
     size = np.array([background.width, background.height])
     slope = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
     walls = np.stack([-point / slope, (size - 1 - point) / slope])
@@ -105,7 +120,7 @@ def _measured(plane, background, point, direction):
     level, noise = background.of_pixels(*centre, row, column)
     signal, sigma = plane[row, column] - level, np.median(noise, axis=-1)
     middle = np.median(signal, axis=-1)
-    # what is left of it is not independent from pixel to pixel along it: the noise of sums of three tells
+    # residuals of neighbouring pixels along the streak are correlated, so the noise is that of sums of three
     rest = signal - middle[..., None]
     rest = (rest[..., :-2] + rest[..., 1:-1] + rest[..., 2:]) / 3**0.5
     scatter, most = np.quantile(np.abs(rest), (0.9, 0.97), axis=-1)
@@ -113,7 +128,7 @@ def _measured(plane, background, point, direction):
     on = lit[:, HALF_WIDTH - 2 : HALF_WIDTH + 3].any(1) & ~lit[:, 0] & ~lit[:, -1]
     if on.sum() * BLOCK < SHORTEST:
         return None
-    # its edges lie between the offsets; at its ends it may fill a part of a block
+    # one more pixel on each side, because the edges lie between pixels; the end blocks may be filled only in part
     lit, whole = on[:, None] & lit, ndimage.binary_erosion(on)[:, None]
     level = middle * ndimage.binary_dilation(lit, np.ones((1, 3)))
     noise = np.where(whole, scatter / 1.645, most) * ndimage.binary_dilation(lit, np.ones((3, 3)))

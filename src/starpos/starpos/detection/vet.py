@@ -1,33 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Peaks to measured stars: fit each, leave out what is no star, flag what is not a good one."""
+"""From peaks to measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
 
 from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage, spatial
 
+from starpos.detection.background import Background
 from starpos.detection.blend import with_companions
-from starpos.detection.fit import OUTLIER, fit_stars
-from starpos.detection.learn import centroid, grey
+from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
+from starpos.detection.learn import Lesson, centroid, grey
+from starpos.detection.psf import Psf
 from starpos.detection.shape import moments, relative_widths, window_for
-from starpos.detection.stamps import cut, uneven
+from starpos.detection.stamps import Stamps, cut, uneven
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
-SPECK = 3  # pixels
-SPIKE = 3  # times sharper than a star
-RESOLVED = 3.0  # widths, 1.3 FWHM: nearer ones are measured, but each leans on the other
-STRANGE = 3.0  # chi-square of what no star alone makes: twigs, nebulae, stars under something
-WIDE = 1.7  # times the squared width of a star: no one star
-# times that, across; and SNR: such wide ones may be stars in a row, and stay, flagged
+# Outliers of up to so many pixels are a hot pixel or a cosmic ray on the star, not another source.
+SPECK = 3
+# A spike is so many times sharper than a star.
+SPIKE = 3
+# Widths of the PSF (3 are 1.3 FWHM): of closer pairs each star's position depends on the other's.
+RESOLVED = 3.0
+# A single star's chi-square stays below this; twigs, nebulae and covered stars exceed it.
+STRANGE = 3.0
+# An image with more than so many times a star's squared width is not a single star.
+WIDE = 1.7
+# If it is narrower than this across, and has this SNR, it may be several stars in a row: it is kept, with a flag.
 NARROW, CERTAIN = 1.2, 60
-LOUD = 3  # times the quietest pixel's noise
+# Pixels with so many times the noise of the quietest pixel of their stamp lie on a streak.
+LOUD = 3
 
 
-def measure(plane, background, x, y, lesson, saturation, min_snr):
-    """Columns x, y, flux, snr, covariance, flags, chi2, wide of the stars among the peaks x, y (N,) int, in no order."""
+def measure(
+    plane: np.ndarray,
+    background: Background,
+    x: np.ndarray,
+    y: np.ndarray,
+    lesson: Lesson,
+    saturation: float,
+    min_snr: float,
+) -> dict[str, np.ndarray]:
+    """Measure the stars among the peaks x, y (N,) int px: columns x, y, flux, snr, covariance, flags, chi2, wide.
+
+    The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have.
+    """
     psf = lesson.psf
 
-    def cut_at(x, y):
+    def cut_at(x: np.ndarray, y: np.ndarray) -> tuple[Stamps, np.ndarray]:
         stamps = _levelled(cut(plane, background, x, y, lesson.reach, saturation))
         spike, around = _spikes(stamps, lesson)
         signal = np.where(spike, around, stamps.signal)
@@ -46,7 +65,8 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
     with np.errstate(invalid="ignore", divide="ignore"):
         snr = fit.flux / fit.flux_sigma
         c = fit.covariance * _misfit(fit)[:, None, None]
-        matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))  # SNR in the sky's noise
+        # SNR in the sky's noise
+        matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))
         sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
         sound &= (fit.flux > 0) & (matched >= min_snr)
@@ -68,14 +88,14 @@ def measure(plane, background, x, y, lesson, saturation, min_snr):
     return {name: column[sound] for name, column in columns.items()}
 
 
-def _misfit(fit):
-    """(N,) factors on the covariance: chi2 where it is above what chance allows, else 1."""
+def _misfit(fit: Fit) -> np.ndarray:
+    """Factors (N,) on the covariance: chi2 where it is above what chance allows, else 1."""
     freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
     return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
 
 
-def _levelled(stamps):
-    """Stamps whose rims are not above 0, nor noisier than they say."""
+def _levelled(stamps: Stamps) -> Stamps:
+    """Stamps with level and noise of the sky corrected by what the pixels at their rims show."""
     rim = np.ones(stamps.signal.shape[1:], bool)
     rim[1:-1, 1:-1] = False
     level, noise = uneven(stamps.signal[:, rim], stamps.noise[:, rim])
@@ -86,13 +106,13 @@ def _levelled(stamps):
     return replace(stamps, signal=stamps.signal - level * stamps.noise, noise=stamps.noise * noise)
 
 
-def _spikes(stamps, lesson):
-    """Which pixels (N, S, S) tower over their neighbours as no star does, whatever they lie on, and those's mean."""
+def _spikes(stamps: Stamps, lesson: Lesson) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, S, S) bool much brighter than their neighbours, as in no star, and the mean of their neighbours."""
     grid = np.tile(np.arange(-1, 2, dtype=np.float32), (len(stamps.x), 1))
     star = lesson.psf.at(stamps.x, stamps.y).evaluate(grid[:, None, :], grid[:, :, None])[0]
     four = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
     top, beside = star[:, 1, 1], (star * four).sum((1, 2))
-    # 1 at least: a ring has a dark middle
+    # at least 1, because a ring has a dark middle
     sharpest = np.maximum(1.0, top / np.maximum(beside, 1e-3 * np.abs(top)))[:, None, None].astype(np.float32)
     grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
     around = ndimage.convolve(grey, four[None], mode="nearest")
@@ -100,25 +120,25 @@ def _spikes(stamps, lesson):
     return spike, around * lesson.response.gain.astype(np.float32)[stamps.phase]
 
 
-def _own_light(stamps, fit, spike):
-    """Stamps whose stars have lost a hot pixel or a cosmic ray on them; more than a speck stays, to be judged.
+def _own_light(stamps: Stamps, fit: Fit, spike: np.ndarray) -> Stamps:
+    """Stamps with the model in place of pixels that say nothing about the star's own shape.
 
-    Where the noise is a streak's the pixels tell nothing of a star's shape, and the model stands in for them.
+    These are hot pixels and cosmic rays, if there are not more than a few, and pixels on a streak, which are noisy.
     """
     speck = fit.outlier & (fit.outlier.sum((1, 2)) <= SPECK)[:, None, None]
     loud = stamps.noise > LOUD * stamps.noise.min((1, 2), keepdims=True)
     return replace(stamps, signal=np.where(speck | loud | spike, fit.model, stamps.signal))
 
 
-def _core(stamps, fit, psf, widths):
-    """(N, S, S) bool: the pixels within so many widths of the star's centre."""
+def _core(stamps: Stamps, fit: Fit, psf: Psf, widths: float) -> np.ndarray:
+    """Pixels (N, S, S) bool within so many widths of the star's centre."""
     return psf.at(fit.x, fit.y).within(*stamps.offsets(fit.x, fit.y), widths)
 
 
-def _is_dot(stamps, fit, response):
-    """Hot pixels and sharp cosmic rays: one pixel and the sky make these pixels likelier than the PSF does.
+def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
+    """Whether stars (N,) are hot pixels or sharp cosmic rays: one pixel on the sky describes them better than the PSF.
 
-    Where neither makes them likely, as on coarse pixels, the PSF must do so much worse.
+    Where one pixel does not describe them well either (a star on coarse pixels), the PSF must be twice as bad.
     """
     half = max(2, stamps.reach // 2 - 1)
     c = slice(stamps.reach - half, stamps.reach + half + 1)
@@ -135,10 +155,10 @@ def _is_dot(stamps, fit, response):
     return dot & (stamps.full[:, c, c].sum((1, 2)) < SPECK)
 
 
-def resolve(columns, psf):
-    """Sort by flux, keep one of each set of fits that ran into the same star, and flag neighbours as BLENDED.
+def resolve(columns: dict[str, np.ndarray], psf: Psf) -> dict[str, np.ndarray]:
+    """Sort the columns by flux, keep one of several fits of the same star, and flag close neighbours as BLENDED.
 
-    A wide image stays, flagged, where nothing better was measured.
+    A wide image is kept only if no better one was measured there.
     """
     order = np.argsort(-columns["flux"], kind="stable")
     columns = {name: column[order] for name, column in columns.items()}
@@ -146,9 +166,10 @@ def resolve(columns, psf):
     n = len(order)
     if n == 0:
         return columns
-    points = np.stack([columns["x"], columns["y"]], 1) @ psf.axes.T  # in widths of the PSF
-    pairs = spatial.cKDTree(points).query_pairs(6.0, output_type="ndarray")
-    pairs = np.sort(pairs, axis=1)  # the brighter first
+    # in widths of the PSF
+    points = np.stack([columns["x"], columns["y"]], 1) @ psf.axes.T
+    # the brighter star of each pair first
+    pairs = np.sort(spatial.cKDTree(points).query_pairs(6.0, output_type="ndarray"), axis=1)
     apart = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
     ratio = columns["flux"][pairs[:, 1]] / columns["flux"][pairs[:, 0]]
     keep = np.ones(n, bool)

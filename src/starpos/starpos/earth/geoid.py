@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -90,7 +91,9 @@ class Geoid:
         stride = int(np.clip(np.ceil(0.1 * north_m / column_m), 1, widest))
         return north_m, stride * column_m, stride
 
-    def _window(self, phi: float, lam: float, up: int, across: int, stride: int):
+    def _window(
+        self, phi: float, lam: float, up: int, across: int, stride: int
+    ) -> tuple[np.ndarray, float, float]:
         """Undulations (2 up, 2 across), NaN where there are none, and the place as row and column in it."""
         row, column = self.grid.locate(phi, lam)
         rows = np.arange(1 - up, 1 + up) + math.floor(row)
@@ -99,7 +102,7 @@ class Geoid:
         return nodes, row - rows[0], (column - columns[0]) / stride
 
 
-def read(path) -> Geoid:
+def read(path: Path | str) -> Geoid:
     """A Geoid from a GTX or GeoTIFF file; a bare name is also looked for where PROJ keeps its grids.
 
     Raises GeoidError with the reason where it is none.

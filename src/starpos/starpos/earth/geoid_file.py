@@ -34,7 +34,7 @@ class Grid:
     step_latitude: float
     step_longitude: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         rows, columns = self.values.shape
         steps = self.step_latitude, self.step_longitude
         if not np.isfinite([self.south, self.west, *steps]).all():
@@ -112,7 +112,7 @@ class Grid:
         return np.where(known, values, np.nan).astype(float)
 
 
-def read_grid(path) -> Grid:
+def read_grid(path: Path | str) -> Grid:
     """A Grid from a GTX or GeoTIFF file; GeoidError with the reason where it is none."""
     path = find(path)
     try:
@@ -132,7 +132,7 @@ def read_grid(path) -> Grid:
         raise GeoidError(f"{path}: no geoid grid that can be used: {e}") from None
 
 
-def find(path) -> Path:
+def find(path: Path | str) -> Path:
     """`path`, or, of a bare file name that is not here, where PROJ keeps its grids."""
     path = Path(path)
     if len(path.parts) != 1 or os.path.exists(path):  # Path.exists raises where a name is too long
@@ -144,7 +144,7 @@ def find(path) -> Path:
     return next((place for place in places if os.path.isfile(place)), path)
 
 
-def _read_gtx(path: Path, head: bytes, size: int):
+def _read_gtx(path: Path, head: bytes, size: int) -> tuple[np.ndarray, float, float, float, float]:
     """As NOAA's VDatum has it: big endian, rows from south to north.  The values stay in the file until they are used."""
     if len(head) < GTX_HEADER.size:
         raise GeoidError("it is shorter than a header")

@@ -23,7 +23,7 @@ MAX_BYTES = 1 << 30
 MAX_TAG_BYTES = 1 << 20
 
 
-def read_geotiff(path: Path, max_pixels: int):
+def read_geotiff(path: Path, max_pixels: int) -> tuple[np.ndarray, float, float, float, float]:
     """Values (rows, columns) float32; south and west of the first, steps in latitude and in longitude, deg.
 
     Rows from south to north, NaN where the file has no data.  Raises GeoidError with the reason.

@@ -27,7 +27,7 @@ class Atmosphere:
     pressure_stddev_pa: float = 200.0
     temperature_stddev_c: float = 2.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         checks = (
             ("pressure", self.pressure_pa, 0.0, 1.2e5, "Pa"),
             ("temperature", self.temperature_c, -100.0, 80.0, "deg C"),

@@ -34,7 +34,7 @@ class Deflection:
     eta_arcsec: float = 0.0
     stddev_arcsec: float = UNKNOWN_STDDEV_ARCSEC
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (
             not np.isfinite([self.xi_arcsec, self.eta_arcsec, self.stddev_arcsec]).all()
             or self.stddev_arcsec < 0

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame for people: scaled down and stretched, its stars circled, the identified ones named, a caption below."""
+"""A picture of a frame for people: scaled down and stretched, stars circled, identified ones named, with a caption."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -11,25 +12,34 @@ import numpy as np
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 
-SHOWN_PX = 1600  # of a frame's longer side, at most
-WHITE_PERCENTILE, WHITE_SIGMAS = 99.95, 30.0  # white is the higher of the two
-DOT_SIGMA_PX = 0.7  # of a star that the reduction has made smaller than a pixel
-COARSEST_SAMPLE = 1 << 18  # pixels that are enough to tell black and white
-NOISE_LAG = (
-    12  # between values whose difference is noise: further than a star is wide, nearer than the sky changes
-)
-RADII_PX = (3.0, 9.0)  # of a circle; smaller where there are many
-NAMED, NAME_PX2 = 40, 12000  # names at most, and the part of the picture that each may want
-CIRCLE, KEPT = 1, 2  # what may be written over if need be, and what never is
+Colour = tuple[int, int, int]  # BGR
+
+# Length of the picture's longer side, at most.
+SHOWN_PX = 1600
+# White is the higher of this percentile and so many sigma above the background.
+WHITE_PERCENTILE, WHITE_SIGMAS = 99.95, 30.0
+# A scaled-down picture is blurred by this, so that a star smaller than its pixels is still seen.
+DOT_SIGMA_PX = 0.7
+# So many pixels are enough to find black and white.
+COARSEST_SAMPLE = 1 << 18
+# Two values this far apart differ by noise only: the distance is larger than a star, and the sky changes more slowly.
+NOISE_LAG = 12
+# Smallest and largest radius of a circle; many stars get small ones.
+RADII_PX = (3.0, 9.0)
+# At most so many names, and not more than one for this part of the picture.
+NAMED, NAME_PX2 = 40, 12000
+# Marks of pixels that hold a circle, which a name may cover, and of those that no name may cover.
+CIRCLE, KEPT = 1, 2
 FONT, SCALE, LINE_PX, MARGIN_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.45, 18, 6
-SUBPIXEL = 4  # bits of OpenCV's fixed point
-DETECTED, IDENTIFIED, FLAGGED = (200, 160, 90), (110, 230, 110), (60, 150, 255)  # BGR
+# Bits of the fraction in OpenCV's fixed-point coordinates.
+SUBPIXEL = 4
+DETECTED, IDENTIFIED, FLAGGED = (200, 160, 90), (110, 230, 110), (60, 150, 255)
 TEXT, BAND, OUTLINE = (225, 225, 225), (32, 32, 32), (0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Which of a frame's stars are known, brightest first: rows of its Stars, names, V magnitudes (NaN: unknown)."""
+    """The identified stars of a frame, brightest first: rows of its Stars, names, V magnitudes (NaN: unknown)."""
 
     star: Sequence[int] = ()
     names: Sequence[str] = ()
@@ -39,10 +49,11 @@ class Identified:
 def annotate(
     frame: Frame, stars: Stars, identified: Identified = Identified(), remarks: Sequence[str] = ()
 ) -> np.ndarray:
-    """A picture of a frame, (h + caption, w, 3) uint8, BGR; the frame's (x, y) is at ((x, y) + 0.5) / n - 0.5 in it.
+    """Draw a frame: an array (h + caption, w, 3) uint8, BGR.
 
-    n is a whole number (`shrink`). Every star is circled, in the colour in which the caption counts its kind; the
-    brightest identified ones that have room are named. The caption: time, counts, remarks.
+    The frame's point (x, y) is at ((x, y) + 0.5) / n - 0.5 in it, with n from `shrink`. Every star is circled, in the
+    colour of its kind in the caption. The brightest identified stars are named where there is room. The caption holds
+    the time, the numbers of stars and the remarks.
     """
     n = shrink(frame)
     picture = _shown(frame.pixels, n)
@@ -76,42 +87,46 @@ def annotate(
 
 
 def shrink(frame: Frame) -> int:
-    """How many pixels of the frame, along x and along y, one of its picture holds.
+    """Pixels of the frame, along x and along y, in one pixel of its picture.
 
-    Even for a colour mosaic: each then holds as many of every colour, and no chequers are left.
+    The number is even for a colour mosaic: then each pixel of the picture holds every colour equally often.
     """
     n = -(-max(frame.width, frame.height) // SHOWN_PX)
     return n + n % 2 if frame.pattern else n
 
 
 def _shown(pixels: np.ndarray, n: int) -> np.ndarray:
-    """The mean of each n x n pixels (what is left over at right and below is cut), from background to white."""
+    """The means of n x n pixels, stretched from background to white; a rest at the right and below is cut off."""
     height, width = (max(1, side // n) for side in pixels.shape[:2])
     light = cv2.resize(pixels[: height * n, : width * n], (width, height), interpolation=cv2.INTER_AREA)
     if n > 1:
         light = cv2.GaussianBlur(light, (0, 0), DOT_SIGMA_PX)
     sample = light[:: -(-light.size // COARSEST_SAMPLE)].ravel().astype(int)
-    sigma = max(np.median(np.abs(sample - np.roll(sample, NOISE_LAG))) / 0.954, 0.5)
+    sigma = max(float(np.median(np.abs(sample - np.roll(sample, NOISE_LAG)))) / 0.954, 0.5)
     dark, bright, white = np.percentile(sample, (5, 95, WHITE_PERCENTILE))
-    black = dark + 1.64 * sigma  # the background where it is darkest: moonlight and dusk are to be seen
+    # the background where it is darkest, so that moonlight and dusk are seen
+    black = dark + 1.64 * sigma
     white = max(white, bright + WHITE_SIGMAS * sigma)
-    levels = np.arange(np.iinfo(light.dtype).max + 1)
-    grey = np.sqrt(np.clip((levels - black) / (white - black), 0, 1))  # lifts the faint ones
+    levels = np.arange(256 if light.dtype == np.uint8 else 65536)
+    # the root makes faint stars brighter
+    grey = np.sqrt(np.clip((levels - black) / (white - black), 0, 1))
     shown = (255 * grey).astype(np.uint8)[light]
     return shown if shown.ndim == 3 else cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR)
 
 
-def _circle(picture, centre, radius: float, colour) -> None:
+def _circle(picture: np.ndarray, centre: Sequence[float], radius: float, colour: Colour) -> None:
     x, y, r = (round(v * (1 << SUBPIXEL)) for v in (*centre, radius))
     cv2.circle(picture, (x, y), r, colour, 1, cv2.LINE_AA, SUBPIXEL)
 
 
-def _label(picture, taken: np.ndarray, centre, radius: float, text: str, colour) -> None:
-    """Write a text where it covers least, beside, above or below a star, and take its room; else not at all."""
+def _label(
+    picture: np.ndarray, taken: np.ndarray, centre: Sequence[float], radius: float, text: str, colour: Colour
+) -> None:
+    """Write a text beside, above or below a star, where it covers least, and mark its pixels; do nothing without room."""
     (width, ascent), descent = cv2.getTextSize(text, FONT, SCALE, 1)
     x, y = centre
     away = radius + 4
-    best, least = None, np.inf
+    best, least = None, math.inf
     for left, base in (
         (x + away, y + ascent / 2),
         (x - away - width, y + ascent / 2),
@@ -123,7 +138,7 @@ def _label(picture, taken: np.ndarray, centre, radius: float, text: str, colour)
         if left < 0 or top < 0 or right > taken.shape[1] or bottom > taken.shape[0]:
             continue
         room = taken[top:bottom, left:right]
-        covered = np.inf if (room == KEPT).any() else np.count_nonzero(room)
+        covered = math.inf if (room == KEPT).any() else float(np.count_nonzero(room))
         if covered < least:
             best, least = (room, (left, base)), covered
     if best is None:
@@ -134,8 +149,8 @@ def _label(picture, taken: np.ndarray, centre, radius: float, text: str, colour)
     cv2.putText(picture, text, origin, FONT, SCALE, colour, 1, cv2.LINE_AA)
 
 
-def _caption(width: int, parts) -> np.ndarray:
-    """The parts, each a text and its colour, on as many lines as they need."""
+def _caption(width: int, parts: Sequence[tuple[str, Colour]]) -> np.ndarray:
+    """A picture of the parts, each a text and its colour, on as many lines as they need."""
     space = _length("x x") - _length("xx")
     placed, x, line = [], MARGIN_PX, 0
     for text, colour in parts:
@@ -153,11 +168,12 @@ def _caption(width: int, parts) -> np.ndarray:
 
 
 def _length(text: str) -> int:
-    """px"""
+    """Length of a text in px."""
     return cv2.getTextSize(text, FONT, SCALE, 1)[0][0]
 
 
 def _time(unix_s: float | None) -> str:
+    """The caption's time."""
     if unix_s is None:
         return "no time"
     return datetime.fromtimestamp(unix_s, timezone.utc).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3] + " UTC"

@@ -1,37 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a camera writes into its own files of when it took them (EXIF 2.31), and how well that is known.
+"""The time and exposure that a camera writes into its own files (EXIF 2.31), and how well they are known.
 
-A camera's clock is set by hand to some zone's time, and counts whole seconds where it tells no fraction. So a time comes
-of it only where somebody vouches for the clock.
+A camera's clock is set by hand to the time of some zone, and often shows whole seconds only. So its time is used only if
+a person has said how good the clock is (CameraClock).
 """
 
 import io
 import logging
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from typing import Any
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.header import MAX_EXPOSURE_S
 
-UNTENDED_STDDEV_S = 60.0  # Canon and Nikon allow their clocks a minute a month
-ZONES_H = 14.0  # UTC-12 to UTC+14 are in use
-FIRST_YEAR = 1996  # of EXIF; a clock before it was never set
+# Canon and Nikon allow their clocks an error of a minute a month.
+UNTENDED_STDDEV_S = 60.0
+# UTC-12 to UTC+14 are in use.
+ZONES_H = 14.0
+# EXIF began then: a clock that shows an earlier year was never set.
+FIRST_YEAR = 1996
 
 
 @dataclass(frozen=True)
 class CameraClock:
-    """How far a camera's own clock is to be believed.
+    """A camera's own clock; TimeError if a value is out of its range.
 
-    utc_offset_h  what it shows less UTC, hours, east positive; None: as each file says (OffsetTimeOriginal)
-    stddev_s      of it against that, which all frames have in common
+    utc_offset_h  the time it shows minus UTC, hours, east positive; None: as each file says (OffsetTimeOriginal)
+    stddev_s      standard deviation of its error, which all frames share, s
     """
 
     utc_offset_h: float | None = None
     stddev_s: float = UNTENDED_STDDEV_S
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.utc_offset_h is not None and not abs(self.utc_offset_h) <= ZONES_H:
             raise TimeError(
                 f"a camera's clock {self.utc_offset_h:g} h from UTC is of no zone: give -{ZONES_H:g} to {ZONES_H:g} h"
@@ -40,11 +45,11 @@ class CameraClock:
             raise TimeError(f"a camera's clock is known to {self.stddev_s:g} s: give 0 to 86400 s")
 
 
-def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, float]:
-    """What the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) says of its Frame, by Frame's names.
+def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, Any]:
+    """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
 
-    exposure_s from ExposureTime. With a clock also mid_unix_s, stamp_stddev_s and clock_stddev_s: DateTimeOriginal and
-    SubSecTimeOriginal are the start of the exposure, rounded down. FrameError where these are there but say no time.
+    exposure_s comes from ExposureTime. With a clock also mid_unix_s, stamp_stddev_s and clock_stddev_s: DateTimeOriginal
+    and SubSecTimeOriginal are the start of the exposure, rounded down. FrameError if these exist but are not a time.
     """
     try:
         import exifread
@@ -52,13 +57,15 @@ def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, float]
         if clock is None:
             return {}
         raise FrameError(f"{place}: reading EXIF needs exifread; run `pip install exifread`.") from None
-    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it warns of every file without EXIF
+    # it warns about every file without EXIF
+    logging.getLogger("exifread").setLevel(logging.CRITICAL)
     try:
         tags = exifread.process_file(io.BytesIO(data), details=False)
-    except Exception:  # it raises whatever the bytes make it stumble over
+    # damaged bytes make it raise any kind of exception
+    except Exception:
         tags = {}
     exposure_s = _exposure_s(tags)
-    known = {} if exposure_s is None else {"exposure_s": exposure_s}
+    known: dict[str, Any] = {} if exposure_s is None else {"exposure_s": exposure_s}
     if clock is None or exposure_s is None or "EXIF DateTimeOriginal" not in tags:
         return known
     start_unix_s, step_s = _start(tags, place, clock)
@@ -69,8 +76,8 @@ def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, float]
     }
 
 
-def _exposure_s(tags):
-    """ExposureTime; None where there is none that could be."""
+def _exposure_s(tags: Mapping) -> float | None:
+    """ExposureTime in s; None if it is missing or impossible."""
     try:
         ratio = tags["EXIF ExposureTime"].values[0]
         seconds = ratio.num / ratio.den
@@ -79,8 +86,8 @@ def _exposure_s(tags):
     return seconds if 0 < seconds <= MAX_EXPOSURE_S else None
 
 
-def _start(tags, place, clock):
-    """Unix time of the middle of the clock's last step before the exposure, and that step (s)."""
+def _start(tags: Mapping, place: str, clock: CameraClock) -> tuple[float, float]:
+    """Unix time of the exposure's start (middle of the clock's last step before it), and the length of a step (s)."""
     text = _text(tags, "DateTimeOriginal")
     try:
         shown = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
@@ -101,14 +108,15 @@ def _start(tags, place, clock):
             )
         offset_h = float(parts[1] + "1") * (int(parts[2]) + int(parts[3]) / 60)
     digits = _text(tags, "SubSecTimeOriginal")
-    if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):  # many write zeros where they count none
+    # many cameras that count no fractions write zeros
+    if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):
         digits = ""
     step_s = 10.0 ** -len(digits)
     whole = shown.replace(tzinfo=timezone.utc).timestamp() - 3600 * offset_h
     return whole + (int(digits or 0) + 0.5) * step_s, step_s
 
 
-def _text(tags, name):
-    """The tag's text without padding; empty where there is none."""
+def _text(tags: Mapping, name: str) -> str:
+    """The text of a tag without padding; empty if the tag is missing."""
     value = getattr(tags.get(f"EXIF {name}"), "values", "")
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""

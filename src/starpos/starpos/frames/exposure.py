@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of an exposure beside what it shows: when it was, how long, how well that is known, and of what."""
+"""Facts of an exposure beside its pixels: when it was, how long, how well both are known, and where it came from."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -8,23 +8,25 @@ import numpy as np
 
 from starpos.errors import FrameError
 
-MOST_EXPOSURE_S = 3600.0  # tilts of more than one pose would be averaged
-MOST_STDDEV_S = 1e9  # of a time: more says nothing, and its square must not overflow
+# In a longer exposure the tilts of several poses would be averaged.
+MOST_EXPOSURE_S = 3600.0
+# A time known less well is unknown; and squares must not overflow.
+MOST_STDDEV_S = 1e9
 LARGEST_SIDE_PX = 1_000_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exposure:
-    """One exposure of a camera; a `Frame` adds its pixels, `Stars` what was found on it.
+    """One exposure of a camera; a `Frame` adds its pixels, `Stars` the stars found on it.
 
     mid_unix_s      middle of the exposure, UTC as a Unix time; None: unknown
     exposure_s      None: unknown
     source          where it came from, for messages: a path or a topic
-    focal_px        focal length that a file's header claims (FOCALLEN / XPIXSZ), px; a hint only; None: unknown
-    stamp_stddev_s  standard deviation of mid_unix_s against the clock that told it, common to all frames; 0: unknown
-    clock_stddev_s  standard deviation of that clock against UTC, which all frames have in common; 0: unknown
+    focal_px        focal length by the file's header (FOCALLEN / XPIXSZ), px; only a hint; None: unknown
+    stamp_stddev_s  standard deviation of mid_unix_s against the clock it was read from; 0: unknown
+    clock_stddev_s  standard deviation of that clock against UTC, an error that all frames share; 0: unknown
 
-    FrameError where a time, an error or the focal length is no number that it could be.
+    FrameError if a time, a standard deviation or the focal length is an impossible number.
     """
 
     mid_unix_s: float | None = None
@@ -58,12 +60,12 @@ class Exposure:
 
     @property
     def place(self) -> str:
-        """What a message calls it."""
+        """Name of the exposure in messages."""
         return self.source or "the frame"
 
     @property
     def about(self) -> dict[str, Any]:
-        """The fields above by name, for what is made of the same exposure."""
+        """The fields above by name, to make another object of the same exposure."""
         return {f.name: getattr(self, f.name) for f in fields(Exposure)}
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FITS to frames, from a file or from the bytes of one that a camera's driver has sent."""
+"""Read frames from FITS files, or from the bytes of one that a camera's driver has sent."""
 
 import io
 import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,20 +16,20 @@ from starpos.frames.header import KEYS, focal_px, times
 FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
 
-def read_fits(path) -> Frame:
-    """A frame from a FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it is none."""
+def read_fits(path: Path | str) -> Frame:
+    """Read a FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame."""
     return _read(path, str(path))[0]
 
 
-def decode_fits(data: bytes, source: str) -> tuple[Frame, dict]:
-    """The same from the bytes of a FITS file (also .fz), and what its header has of starpos.frames.header.KEYS.
+def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
+    """Read the bytes of a FITS file (also .fz): the Frame, and its header's keywords of starpos.frames.header.KEYS.
 
-    source says where the bytes came from. FrameError where they are no whole frame.
+    source says where the bytes came from. FrameError if they are not a whole frame.
     """
     return _read(io.BytesIO(data), source)
 
 
-def _read(file, place):
+def _read(file: Path | str | io.BytesIO, place: str) -> tuple[Frame, dict[str, Any]]:
     from astropy.io import fits
 
     try:
@@ -51,7 +54,7 @@ def _read(file, place):
     return frame, header
 
 
-def _first_image(hdus, place):
+def _first_image(hdus: Iterable, place: str) -> tuple[dict[str, Any], np.ndarray]:
     """Header (a dict of KEYS) and data (h, w) of the first HDU that holds an image."""
     for hdu in hdus:
         shape = [int(n) for n in hdu.shape] if hdu.is_image else []
@@ -71,8 +74,8 @@ def _first_image(hdus, place):
     raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
 
 
-def _pattern(header, place):
-    """The mosaic as it begins in the first pixel."""
+def _pattern(header: Mapping, place: str) -> str:
+    """The colour mosaic, in reading order from the first pixel."""
     pattern = str(header.get("BAYERPAT", "")).strip().lower()
     if pattern not in PATTERNS:
         raise FrameError(f"{place}: BAYERPAT is {pattern!r}; it must be RGGB, BGGR, GRBG or GBRG.")

@@ -8,8 +8,10 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.frames.exposure import Exposure, check_size
 
-MAX_PIXELS = 200_000_000  # a header may claim anything; this much fits a small robot's memory
-LOUDEST = 30_000  # times the noise above the sky or below it: further off is no light, as no sensor reaches that far
+# A header may claim any size; this many pixels fit into a small robot's memory.
+MAX_PIXELS = 200_000_000
+# A pixel more than so many times the noise above or below the sky is an error: no sensor has such a range.
+LOUDEST = 30_000
 PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 
 
@@ -20,7 +22,7 @@ class Frame(Exposure):
     pixels      (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
     pattern     the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
 
-    Raises FrameError on anything else.
+    FrameError for other types, shapes, sizes or patterns.
     """
 
     pixels: np.ndarray
@@ -54,7 +56,7 @@ class Frame(Exposure):
 
 
 def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
-    """uint8 or uint16 (h, w) of any real values by the rule of `reading.read_frame`; FrameError of others."""
+    """Convert real values (h, w) to uint8 or uint16 by the rule of `reading.read_frame`; FrameError for other values."""
     if values.dtype.kind not in "uif":
         raise FrameError(f"{place}: its pixels are {values.dtype}; give numbers.")
     if values.size == 0:
@@ -79,14 +81,18 @@ def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
     else:
         offset, scale = low, (65535 / span if narrow or span > 65535 else 1.0)
     out = np.empty(values.shape, np.uint16)
-    for row in range(0, len(values), 256):  # strips: a float64 copy of a whole frame is 170 MB
+    # in strips, because a float64 copy of a whole frame takes 170 MB
+    for row in range(0, len(values), 256):
         strip = np.clip(values[row : row + 256].astype(np.float64), low, high)
         out[row : row + 256] = np.rint((strip - offset) * scale)
     return out
 
 
-def _limits(values) -> tuple[float, float]:
-    """The least and the largest value, as far as LOUDEST allows: a pixel divided by a dead one would take all 16 bits."""
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    """The smallest and the largest value, limited by LOUDEST.
+
+    Without the limit a single pixel, divided by a dead pixel of the flat field, would take up all 16 bits.
+    """
     low, high = float(values.min()), float(values.max())
     some = np.atleast_2d(values)[:: max(1, len(values) // 256)].astype(np.float64)
     noise = np.median(np.abs(np.diff(some, axis=1))) if some.shape[1] > 1 else 0.0

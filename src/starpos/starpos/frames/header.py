@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame's header tells beside its pixels: when and how long it was exposed, and the focal length.
+"""Time, exposure and focal length from a frame's header.
 
-A header is a mapping of FITS keywords (those of KEYS) to values of any kind, of which nothing is believed unchecked.
+A header is a mapping of FITS keywords (those of KEYS) to values of any kind; every value is checked.
 """
 
 import math
 import re
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -26,13 +27,16 @@ KEYS = (
     "FOCALLEN",
     "XPIXSZ",
 )
-SCALES = ("utc", "tai", "tt", "tdb")  # of TIMESYS; UT1 would need tables
+# Time scales of TIMESYS that are read; UT1 would need tables.
+SCALES = ("utc", "tai", "tt", "tdb")
 MAX_EXPOSURE_S = 86400.0
 
 
 def times(header: Mapping, place: str) -> tuple[float | None, float | None, float]:
-    """Middle of the exposure (Unix, UTC) and its length in s, None where the header has none; and the middle's standard
-    deviation, which is that of its last digit, rounded or cut off.  FrameError of a bad one.
+    """Middle of the exposure (Unix time), its length (s), and the standard deviation (s) of the middle.
+
+    The first two are None if the header has none. The standard deviation comes from the last digit of the time, which may
+    be rounded or cut off. FrameError for a bad time or exposure; place names the frame in its message.
     """
     exposure = next((header[k] for k in ("EXPTIME", "EXPOSURE") if header.get(k) not in (None, "")), None)
     if exposure is not None:
@@ -50,29 +54,32 @@ def times(header: Mapping, place: str) -> tuple[float | None, float | None, floa
     start = header[key]
     if key == "DATE-OBS" and "T" not in str(start) and header.get("TIME-OBS"):
         start = f"{start}T{header['TIME-OBS']}"
+    # a day without an hour is not a time
     if isinstance(start, str) and re.fullmatch(r"\d{4}-\d\d-\d\d", start.strip()):
-        return None, exposure, 0.0  # a day without an hour is no time
+        return None, exposure, 0.0
     scale = str(header.get("TIMESYS", "UTC")).strip().lower()
     if scale not in SCALES:
         raise FrameError(f"{place}: its TIMESYS is {scale!r}; it must be one of {', '.join(SCALES)}.")
     return _middle(start, exposure, scale, f"{place}: its {key}"), exposure, _rounding(start)
 
 
-def _rounding(start) -> float:
-    """Standard deviation (s) of a text's last digit, as likely rounded as cut off; an MJD has more digits than matter."""
+def _rounding(start: object) -> float:
+    """Standard deviation (s) from a text's last digit, rounded or cut off; 0 for an MJD, which has digits enough."""
     if not isinstance(start, str):
         return 0.0
     decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
-    if decimals is None:  # without seconds
+    # a time without seconds
+    if decimals is None:
         return 60 / math.sqrt(3)
     return 10.0 ** -len(decimals[1] or "") / math.sqrt(3)
 
 
-def _middle(start, exposure_s, scale, what):
-    """Unix time of start (ISO 8601 text or an MJD) + exposure / 2, counted in TAI: safe at a leap second."""
+def _middle(start: Any, exposure_s: float, scale: str, what: str) -> float:
+    """Unix time of start (ISO 8601 text or an MJD) + exposure / 2, added in TAI: right across a leap second too."""
     from astropy.utils import iers
 
-    iers.conf.auto_download = False  # before astropy.time is imported, which looks for leap seconds
+    # before astropy.time is imported, which would download leap seconds
+    iers.conf.auto_download = False
     from astropy.time import Time, TimeDelta
 
     try:
@@ -91,7 +98,7 @@ def _middle(start, exposure_s, scale, what):
 
 
 def focal_px(header: Mapping) -> float | None:
-    """FOCALLEN (mm) / XPIXSZ (um) in px; None where one is missing or senseless: it is but a hint."""
+    """Focal length in px, FOCALLEN (mm) / XPIXSZ (um); None if one is missing or impossible. It is only a hint."""
     try:
         focal = float(header["FOCALLEN"]) * 1000.0 / float(header["XPIXSZ"])
     except (KeyError, TypeError, ValueError, ArithmeticError):

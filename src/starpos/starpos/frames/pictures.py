@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PNG, TIFF and JPEG to frames, from their bytes."""
+"""Read frames from the bytes of PNG, TIFF and JPEG files."""
 
 import struct
 import zlib
@@ -12,14 +12,15 @@ from starpos.frames.frame import MAX_PIXELS, Frame, to_unsigned
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8\xff"
-SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG: the segments that tell the size
+# Segments of a JPEG that hold its size, and the one where its image begins.
+SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 SCAN = 0xDA
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
-    """A frame from the bytes of a PNG, TIFF or JPEG by the rules of `reading.read_frame`; FrameError of anything else.
+    """Read the bytes of a PNG, TIFF or JPEG by the rules of `reading.read_frame`; FrameError for anything else.
 
-    place: where they came from.
+    place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
     """
     size = _size(data)
     if size is None:
@@ -32,7 +33,8 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
     if pixels is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; take or copy it again.")
     if pixels.ndim == 3:
-        pixels = pixels[:, :, :3]  # without the alpha channel
+        # without the alpha channel
+        pixels = pixels[:, :, :3]
         if pixels.shape[2] < 3:
             pixels = np.ascontiguousarray(pixels[:, :, 0])
         elif pixels.dtype == np.uint16:
@@ -44,10 +46,11 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
 
 
 def decode_picture(data: bytes) -> np.ndarray | None:
-    """A PNG's, TIFF's or JPEG's pixels as they are, None where they cannot be decoded; nothing is printed."""
+    """The pixels of a PNG, TIFF or JPEG as they are, None if they cannot be decoded; nothing is printed."""
     import cv2
 
-    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 4.6 has it at the top
+    # OpenCV 4.6 has setLogLevel at the top
+    log = getattr(cv2.utils, "logging", cv2)
     level = log.setLogLevel(0)
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -57,50 +60,56 @@ def decode_picture(data: bytes) -> np.ndarray | None:
         log.setLogLevel(level)
 
 
-def _size(data):
-    """(width, height) that its header claims, before a decoder makes room for it; None: no picture."""
+def _size(data: bytes) -> tuple[int, int] | None:
+    """Width and height by the header, known before a decoder reserves memory for them; None if this is not a picture."""
     try:
         if data.startswith(PNG_START):
-            return struct.unpack_from(">II", data, 16)
+            width, height = struct.unpack_from(">II", data, 16)
+            return width, height
         return _jpeg_size(data) if data.startswith(JPEG_START) else _tiff_size(data)
-    except struct.error:  # it ends before
+    # the data end too early
+    except struct.error:
         return None
 
 
-def _tiff_size(data):
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a TIFF by its header; None if this is not one."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         return None
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)
-    size = {}
+    size: dict[int, int] = {}
     for k in range(count):
         tag, kind, _ = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
-        if tag in (256, 257):  # ImageWidth, ImageLength: SHORT or LONG
+        # ImageWidth and ImageLength are SHORT or LONG
+        if tag in (256, 257):
             (size[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 10 + 12 * k)
     return (size[256], size[257]) if len(size) == 2 else None
 
 
-def _jpeg_size(data):
-    """The same of a JPEG, None also where it breaks off: a decoder would fill the rest with grey."""
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a JPEG by its header; None also if the end is missing, which a decoder would fill with grey."""
     at, size = 2, None
     while data[at : at + 1] == b"\xff":
         (kind,) = struct.unpack_from("B", data, at + 1)
-        if kind == 0xFF:  # padding
+        # padding
+        if kind == 0xFF:
             at += 1
             continue
         if kind == SCAN:
             return size if data.find(b"\xff\xd9", at) >= 0 else None
         if kind in SIZED:
-            size = struct.unpack_from(">HH", data, at + 5)[::-1]
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            size = width, height
         at += 2 + struct.unpack_from(">H", data, at + 2)[0]
     return None
 
 
-def _png_image(data):
-    """The chunks of a PNG that make its image, b"" where one is damaged or the last is missing.
+def _png_image(data: bytes) -> bytes:
+    """A PNG with only the chunks that its image needs; b"" if one is damaged or the last is missing.
 
-    libpng prints on standard error about damage, and about such things as colour profiles: it gets neither.
+    libpng would print messages about damage, and about other chunks, such as colour profiles, on standard error.
     """
     kept, at = [PNG_START], len(PNG_START)
     while at + 12 <= len(data):
@@ -109,7 +118,8 @@ def _png_image(data):
         at += 12 + length
         if at > len(data) or struct.pack(">I", zlib.crc32(chunk[4:-4])) != chunk[-4:]:
             return b""
-        if chunk[4:5].isupper():  # critical
+        # critical chunks begin with a capital letter
+        if chunk[4:5].isupper():
             kept.append(chunk)
         if chunk[4:8] == b"IEND":
             return b"".join(kept)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera's raw files to frames, from their bytes, through rawpy (LibRaw)."""
+"""Read frames from the bytes of cameras' raw files, through rawpy (LibRaw)."""
 
 import io
 import struct
@@ -10,15 +10,15 @@ from starpos.errors import FrameError, one_line
 from starpos.frames import exif
 from starpos.frames.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
 
-# TIFF 6.0: where the data of an image lie and how long they are, in strips or tiles; and the IFDs below one
+# Tags of TIFF 6.0: offsets and lengths of an image's strips, the same of its tiles, and the IFDs below this one.
 STRIPS, TILES, BELOW = (273, 279), (324, 325), 330
 MOST_IFDS, MOST_VALUES = 64, 1 << 20
 
 
 def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
-    """The mosaic as the sensor gave it, with its pattern, from the bytes of a raw file; FrameError of anything else.
+    """Read the mosaic as the sensor gave it, with its pattern, from the bytes of a raw file; FrameError if it is none.
 
-    place: where they came from.
+    place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
     """
     try:
         import rawpy
@@ -27,7 +27,8 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
             f"{place}: reading a camera's raw file needs rawpy; run `pip install rawpy`."
         ) from None
     try:
-        if _end(data) > len(data):  # LibRaw goes on with zeros in some formats
+        # LibRaw would fill the missing end of some formats with zeros
+        if _end(data) > len(data):
             raise ValueError("it breaks off")
         with rawpy.RawPy() as raw:
             raw.open_buffer(io.BytesIO(data))
@@ -35,12 +36,14 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
                 raise ValueError(f"it claims more than {MAX_PIXELS} pixels")
             raw.unpack()
             pixels = raw.raw_image_visible.copy()
-            if not pixels[-1].any():  # no sensor gives that
+            # no sensor gives a row of zeros
+            if not pixels[-1].any():
                 raise ValueError("its last row is empty")
             colours = raw.color_desc.decode("ascii", "replace")
             try:
                 pattern = "".join(colours[i] for i in np.ravel(raw.raw_pattern)).lower()
-            except NotImplementedError as e:  # a mosaic rawpy does not know, now and then a broken file
+            # a mosaic that rawpy does not know; sometimes a damaged file
+            except NotImplementedError as e:
                 pattern = str(e)
     except (rawpy.LibRawError, OSError, ValueError, TypeError, IndexError, AttributeError) as e:
         raise FrameError(f"{place}: this is not a whole raw file ({_words(e)}); copy it again.") from e
@@ -51,18 +54,19 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
     return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **exif.told(data, place, clock))
 
 
-def _words(error):
-    """An exception's, of which LibRaw's are bytes."""
+def _words(error: Exception) -> str:
+    """Message of an exception; LibRaw's messages are bytes."""
     told = error.args[0] if error.args else ""
     return one_line(told.decode("ascii", "replace") if isinstance(told, bytes) else error)
 
 
-def _end(data):
-    """Where the last strip or tile of a file built like TIFF (CR2, DNG, NEF ...) ends; 0 of others and of broken ones."""
+def _end(data: bytes) -> int:
+    """Offset of the end of the last strip or tile in a file built like TIFF (CR2, DNG, NEF ...); 0 for other files."""
     order = {b"II": "<", b"MM": ">"}.get(data[:2])
     if order is None or len(data) < 8:
         return 0
-    waiting, seen, end = [struct.unpack_from(order + "I", data, 4)[0]], set(), 0
+    seen: set[int] = set()
+    waiting, end = [struct.unpack_from(order + "I", data, 4)[0]], 0
     while waiting and len(seen) < MOST_IFDS:
         at = waiting.pop()
         if at in seen or not at:
@@ -79,8 +83,8 @@ def _end(data):
     return end
 
 
-def _ifd(data, at, order):
-    """The values of an IFD's tags named above, and where the next IFD is; struct.error where it is none."""
+def _ifd(data: bytes, at: int, order: str) -> tuple[dict[int, tuple[int, ...]], int]:
+    """Values of those tags of an IFD that are named above, and the offset of the next IFD; struct.error if it is none."""
     (count,) = struct.unpack_from(order + "H", data, at)
     tags = {}
     for k in range(count):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files to frames: FITS, TIFF, PNG, JPEG, camera raw; and a CSV of centroids to stars."""
+"""Read frames from files: FITS, TIFF, PNG, JPEG, camera raw; and stars from a CSV of centroids."""
 
 import csv
 import json
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,31 +20,31 @@ from starpos.frames.stars import Stars
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff")
-JPEG = (".jpg", ".jpeg")  # beside raw files it is but a copy of them
+JPEG = (".jpg", ".jpeg")  # beside raw files usually a copy of them
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 MAX_BYTES, MAX_CSV_BYTES = 2_000_000_000, 20_000_000
 DEFAULT_SIGMA_PX = 0.1  # of a centroid whose file has no sigma
 
 
-def read_frame(path, clock: CameraClock | None = None) -> Frame | Stars:
-    """Read one exposure, or the star list of one, by the file's suffix.
+def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | Stars:
+    """Read one exposure, or the star list of one; the file's suffix says which.
 
-    clock: of the camera that wrote the file, where somebody vouches for it.
+    clock is that of the camera which wrote the file, if it may be trusted.
 
-    FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or
-    in TIMESYS), EXPTIME or EXPOSURE its length in s; BAYERPAT (XBAYROFF, YBAYROFF) the mosaic; FOCALLEN
-    (mm) and XPIXSZ (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits stay,
-    rounded; others are shifted to begin at 0, and scaled to fill 16 bits where their range is wider than that
-    or, of floats, narrower than 4096. A few NaN or infinite pixels become the median, and what lies further from
-    it than any light (frame.LOUDEST) is clipped.
+    FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
+    TIMESYS), EXPTIME or EXPOSURE its length in s; BAYERPAT (XBAYROFF, YBAYROFF) is the mosaic; FOCALLEN (mm) and XPIXSZ
+    (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits are only rounded. Others are shifted
+    to begin at 0, and scaled to fill 16 bits if their range is wider than that or, for floats, narrower than 4096. A few
+    NaN or infinite pixels become the median. Values farther from it than any light (frame.LOUDEST) are clipped.
     TIFF, PNG, JPEG: 8 or 16 bits, grey or colour. 16-bit colour is scaled down to bgr8.
     Camera raw: the mosaic as the sensor gave it, through rawpy.
-    Of these the exposure is EXIF's, where exifread is installed; the time too, but only with a clock.
-    CSV: a first line `# {"NAXIS1": ..., "NAXIS2": ..., "DATE-OBS": ..., "EXPTIME": ...}` of which the NAXIS
-    pair is required, then columns x, y, flux and perhaps sigma (px); without it sigma is 0.1 px. The SNR is
-    1 px / sigma, that of a star image whose standard deviation is 1 px.
+    The exposure of pictures and raw files comes from EXIF if exifread is installed; their time too, but only with a
+    clock.
+    CSV: a first line `# {"NAXIS1": ..., "NAXIS2": ..., "DATE-OBS": ..., "EXPTIME": ...}`, in which the NAXIS pair is
+    required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, that
+    of a star image whose standard deviation is 1 px.
 
-    A missing time or exposure leaves mid_unix_s None. Raises FrameError for anything else not as above.
+    Without a time or an exposure mid_unix_s is None. FrameError for everything that is not as described here.
     """
     path = Path(path)
     try:
@@ -54,11 +55,12 @@ def read_frame(path, clock: CameraClock | None = None) -> Frame | Stars:
         raise FrameError(f"{path}: it cannot be read ({reason}); check its permissions and the disk.") from e
 
 
-def _check_file(path):
-    """FrameError or OSError unless this is a file with something in it that opens."""
+def _check_file(path: Path) -> None:
+    """Raise FrameError or OSError unless the path is a file that is not empty and can be opened."""
     try:
         status = path.stat()
-    except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a NUL in the name
+    # ValueError: the name contains a NUL
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         raise FrameError(f"{one_line(path)}: there is no such file; check the path.") from None
     if stat.S_ISDIR(status.st_mode):
         raise FrameError(f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}.")
@@ -66,11 +68,12 @@ def _check_file(path):
         raise FrameError(f"{path}: this is no regular file but a device or a pipe; give a frame's file.")
     if status.st_size == 0:
         raise FrameError(f"{path}: the file is empty; take the frame again.")
-    path.open("rb").close()  # a refusal here is told as what it is, not as a damaged image
+    # a file without permission to read would otherwise be reported as a damaged image
+    path.open("rb").close()
 
 
-def _reader_of(path):
-    """The function of (path, clock) that reads files of this suffix."""
+def _reader_of(path: Path) -> Callable[[Path, CameraClock | None], Frame | Stars]:
+    """The function of path and clock that reads files with this suffix."""
     suffix = path.suffix.lower()
     for suffixes, reader in (
         (FITS, lambda path, _: read_fits(path)),
@@ -84,20 +87,20 @@ def _reader_of(path):
     raise FrameError(f"{path}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
 
 
-def _bytes_of(path):
+def _bytes_of(path: Path) -> bytes:
     _check_size(path, MAX_BYTES)
     return path.read_bytes()
 
 
-def _check_size(path, most):
+def _check_size(path: Path, most: int) -> None:
     if path.stat().st_size > most:
         raise FrameError(f"{path}: it is larger than {most // 10**6} MB, too large for a frame.")
 
 
 def decode_frame(data: bytes, source: str) -> Frame:
-    """A frame from the bytes a camera sent: JPEG, PNG, TIFF, raw; FrameError where they are none. Its time stays unknown.
+    """Read the bytes a camera sent: JPEG, PNG, TIFF or raw; FrameError if they are not a frame. Its time stays unknown.
 
-    source: the camera's name for them, whose suffix tells a TIFF from a raw file.
+    source is the camera's name of the file; its suffix distinguishes a TIFF from a raw file.
     """
     if data.startswith((JPEG_START, PNG_START)) or Path(source).suffix.lower() in PICTURE:
         return picture_frame(data, source)
@@ -105,7 +108,7 @@ def decode_frame(data: bytes, source: str) -> Frame:
 
 
 def why_no_time(source: str) -> str:
-    """What a frame lacks whose mid_unix_s is None, and what to do: by the suffix of the file it came from."""
+    """Explain why a frame has no time (mid_unix_s is None) and what to do, by the suffix of its source."""
     suffix = Path(source).suffix.lower()
     if suffix in PICTURE + JPEG + RAW:
         vouch = "vouch for its camera's clock (--exif-utc-offset)"
@@ -115,7 +118,7 @@ def why_no_time(source: str) -> str:
     return "its header stamp is missing: set it to the middle of the exposure, UTC"
 
 
-def _read_csv(path):
+def _read_csv(path: Path) -> Stars:
     _check_size(path, MAX_CSV_BYTES)
     try:
         text = path.read_text(encoding="utf-8")
@@ -154,7 +157,7 @@ def _read_csv(path):
             f"{path}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
         )
     order = np.argsort(-column["flux"], kind="stable")
-    mid, exposure, rounding = times(header, path)
+    mid, exposure, rounding = times(header, str(path))
     return Stars(
         x=column["x"][order],
         y=column["y"][order],

@@ -2,6 +2,7 @@
 """The stars of one frame as a detector measured them."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +15,12 @@ ELONGATED = 4
 BLENDED = 8
 UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED
 COLUMNS = ("x", "y", "flux", "snr", "covariance", "flags")
-EDGE_PX = 2.0  # a star whose centroid is further outside its frame is none
-MOST_VARIANCE_PX2 = 1e12  # beyond any frame; squares of it must not overflow
-SYMMETRIC = 1e-6  # of the variances: by how much a covariance's two halves may differ
+# A centroid farther outside the frame than this is not a star's.
+EDGE_PX = 2.0
+# Larger than any frame; squares must not overflow.
+MOST_VARIANCE_PX2 = 1e12
+# The two halves of a covariance may differ by this share of the variances.
+SYMMETRIC = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -24,13 +28,13 @@ class Stars(Exposure):
     """N stars of a frame, brightest first; the centre of the top-left pixel is (0, 0).
 
     x, y            (N,) px: column and row
-    flux            (N,) DN above the background (any consistent unit: only its order and ratios count)
+    flux            (N,) DN above the background, or any other unit: only order and ratios are used
     snr             (N,) flux over its standard deviation
     covariance      (N, 2, 2) px2 of (x, y)
     flags           (N,) uint8, a sum of SATURATED, EDGE, ELONGATED, BLENDED
     width, height   px, of the frame
 
-    Sequences are converted; what does not fit together raises FrameError.
+    Sequences are converted to arrays. FrameError if the columns do not fit together or hold impossible values.
     """
 
     x: np.ndarray
@@ -68,9 +72,9 @@ class Stars(Exposure):
         if np.any(np.diff(self.flux) > 0):
             raise FrameError(f"{place}: the stars are not sorted; give them brightest first.")
 
-    def _set(self, name, dtype, shape, place):
+    def _set(self, name: str, dtype: type, shape: tuple[int, ...], place: str) -> None:
         try:
-            value = np.ascontiguousarray(getattr(self, name), dtype)
+            value: np.ndarray = np.ascontiguousarray(getattr(self, name), dtype)
         except (TypeError, ValueError, OverflowError):
             raise FrameError(f"{place}: the stars' {name} are not numbers; give an array of them.") from None
         if value.shape != shape:
@@ -79,32 +83,32 @@ class Stars(Exposure):
             raise FrameError(f"{place}: the stars' {name} holds NaN or infinity; leave such stars out.")
         object.__setattr__(self, name, value)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.x)
 
     @property
     def sigma(self) -> np.ndarray:
-        """(N,) px: one axis, whichever way it lies."""
+        """Standard deviation (N,) px of a position along one axis, averaged over directions."""
         return np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2)
 
     @property
     def on_frame(self) -> np.ndarray:
-        """(N,) whether the centroid lies on the frame, or within EDGE_PX of it."""
+        """Whether each centroid (N,) lies on the frame or within EDGE_PX of it."""
         on = (self.x > -EDGE_PX) & (self.x < self.width - 1 + EDGE_PX)
         return on & (self.y > -EDGE_PX) & (self.y < self.height - 1 + EDGE_PX)
 
     @property
     def sound(self) -> np.ndarray:
-        """(N,) whether no flag is set: a saturated, cut or blended image has its centroid elsewhere."""
+        """Whether each star (N,) has no flag; the centroid of a saturated, cut or blended image is biased."""
         return (self.flags & UNSOUND) == 0
 
-    def take(self, index) -> "Stars":
-        """The stars of an index array or a boolean mask of length N; an index must keep the order of flux."""
+    def take(self, index: np.ndarray | slice) -> "Stars":
+        """The stars that an index array, a slice or a boolean mask (N,) selects; their order of flux must stay."""
         return replace(self, **{name: getattr(self, name)[index] for name in COLUMNS})
 
 
-def no_stars(width: int, height: int, **about) -> Stars:
-    """The Stars of a frame on which there are none; about: what is known of the exposure."""
+def no_stars(width: int, height: int, **about: Any) -> Stars:
+    """The Stars of a frame without stars; `about` are fields of the Exposure."""
     none = np.zeros(0)
     return Stars(
         x=none,

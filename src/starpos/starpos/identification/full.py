@@ -110,7 +110,14 @@ def identified(
     )
 
 
-def _settled(field: FrameStars, xy, sigma, stars: OnFrame, pose: Pose, pair):
+def _settled(
+    field: FrameStars,
+    xy: np.ndarray,
+    sigma: np.ndarray,
+    stars: OnFrame,
+    pose: Pose,
+    pair: tuple[np.ndarray, np.ndarray],
+) -> tuple[Pose, tuple[np.ndarray, np.ndarray], np.ndarray] | None:
     """The pose fitted to its own pairs, these, their residuals (M, 2) px; None where they are fewer than FEWEST_STARS."""
     for _ in range(ROUNDS):
         star, near = pair
@@ -144,7 +151,9 @@ def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray, si
     return Pose(rotation.best_rotation(w, v), focal_px, mirrored).fitted(xy, w, sigma_px)
 
 
-def _resolved(catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float):
+def _resolved(
+    catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Which stars (brightest first) do not melt into a brighter one (N,), and how far these draw it (N,) px."""
     single, drawn = np.ones(len(index), bool), np.zeros(len(index))
     brighter, fainter = close_pairs(pixel, BLEND_PX)

@@ -28,14 +28,14 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.mirrored)
 
-    def __getitem__(self, k) -> "Candidates":
+    def __getitem__(self, k: slice) -> "Candidates":
         return Candidates(self.star[k], self.corner[k], self.mirrored[k])
 
 
 class Lookup:
     """One frame's triangles: which were looked up already, at which error."""
 
-    def __init__(self, field: FrameStars, table: TriangleCatalogue):
+    def __init__(self, field: FrameStars, table: TriangleCatalogue) -> None:
         self.field, self.table = field, table
         self.v = directions(field.xy[:1], np.array([field.focal_px]))[0]
         self._done: dict[float, int] = {}
@@ -70,7 +70,9 @@ def _triples(n: int) -> np.ndarray:
     return t[np.lexsort((t.sum(1), t.max(1)))]
 
 
-def _shapes(v: np.ndarray, triples: np.ndarray, error: np.ndarray):
+def _shapes(
+    v: np.ndarray, triples: np.ndarray, error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles as they are looked up: star (Q, 3), the corner of the largest angle first, of the smallest last; shape
     and tolerance (Q, 3) for `TriangleCatalogue.near`.
 

@@ -10,22 +10,24 @@ def close_pairs(xy: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray
     """Rows (M,), (M,) of the points xy (N, 2) that are closer than reach_px, the smaller row of each pair first."""
     order = np.argsort(xy[:, 0], kind="stable")
     x, y = xy[order].T
-    one, other = [], []
+    left, right = [], []
     # side by side in x, then every second one, ... : few of a frame's stars have a neighbour at all
     for k in range(1, len(x)):
         near = np.flatnonzero(x[k:] - x[:-k] < reach_px)
         if not len(near):
             break
         near = near[np.square(x[near + k] - x[near]) + np.square(y[near + k] - y[near]) < reach_px**2]
-        one.append(order[near])
-        other.append(order[near + k])
-    if not one:
+        left.append(order[near])
+        right.append(order[near + k])
+    if not left:
         return np.zeros(0, int), np.zeros(0, int)
-    one, other = np.concatenate(one), np.concatenate(other)
+    one, other = np.concatenate(left), np.concatenate(right)
     return np.minimum(one, other), np.maximum(one, other)
 
 
-def mutual_nearest(xy, predicted, radius) -> tuple[np.ndarray, np.ndarray]:
+def mutual_nearest(
+    xy: np.ndarray, predicted: np.ndarray, radius: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
     if not (len(xy) and len(predicted)):
         return np.zeros(0, int), np.zeros(0, int)

@@ -53,7 +53,7 @@ def stars(catalogue: Catalogue) -> np.ndarray:
     return np.concatenate([np.setdiff1d(plain_cut(catalogue), row), np.repeat(row, times)])
 
 
-def _number(tyc) -> np.ndarray:
+def _number(tyc: np.ndarray | list[np.ndarray]) -> np.ndarray:
     return (tyc[0] * 100_000 + tyc[1]) * 10 + tyc[2]
 
 
@@ -77,7 +77,7 @@ def angles_of_printed(catalogue: Catalogue) -> tuple[np.ndarray, np.ndarray]:
     years = EPOCH - _A_EPOCH
     ra, dec = ra + _A_PM_RA * MAS * years / np.cos(dec), dec + _A_PM_DEC * MAS * years
 
-    def at(ra, dec):
+    def at(ra: float, dec: float) -> np.ndarray:
         return angles(opposite_sides(np.stack([first, unit_vector(ra, dec), last])))
 
     here, step = at(ra, dec), _A_SIGMA_MAS * MAS

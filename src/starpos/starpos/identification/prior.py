@@ -37,7 +37,7 @@ class PointingPrior:
     attitude: np.ndarray
     focal_px: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         a = self.attitude
         if not (_unit(a) and np.abs(a @ a.T - np.eye(3)).max() < EXACT and np.linalg.det(a) > 0):
             raise ValueError("a Pointing's attitude must be a rotation (3, 3)")
@@ -83,7 +83,7 @@ class PlumbPrior:
     zenith_camera: np.ndarray
     tolerance_rad: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (_unit(self.zenith_sky) and _unit(self.zenith_camera)):
             raise ValueError("a Plumb's zeniths must be unit vectors (3,)")
         if not 0 <= self.tolerance_rad <= WIDEST_RAD:
@@ -145,7 +145,8 @@ def _frame_about(pole: np.ndarray) -> np.ndarray:
 
 def _most_voted(agree: np.ndarray) -> list[int]:
     """The rows of agree (P, P) with most votes, none of which votes for another."""
-    left, votes, pick = np.ones(len(agree), bool), agree.sum(1), []
+    pick: list[int] = []
+    left, votes = np.ones(len(agree), bool), agree.sum(1)
     while left.any() and len(pick) < MOST:
         k = int(np.argmax(np.where(left, votes, -1)))
         pick.append(k)

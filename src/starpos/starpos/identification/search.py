@@ -17,10 +17,12 @@ from starpos.instrument.camera import Camera
 
 # (brightest stars, their error in px); the last kinds are for lenses that distort
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
-LOG_HALF = np.log(0.5)
+LOG_HALF = math.log(0.5)
 MOST_LOOKED_AT = 25  # candidates a stage
 # how far stars may lie beyond the frame as it is, and (share of it) as it becomes
 EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
+
+Priors = Sequence[PointingPrior | PlumbPrior]
 
 
 def identify(
@@ -66,7 +68,7 @@ def identify_directions(
     return _identify(FrameStars.of(xy + margin, sigma_px, ideal, margin), sky, priors)
 
 
-def _identify(field: FrameStars, sky: Sky, priors) -> Identification | None:
+def _identify(field: FrameStars, sky: Sky, priors: Priors) -> Identification | None:
     if len(field) < FEWEST_STARS:
         return None
     for pose, radius_px, prior in _attempts(field, sky, priors):
@@ -75,7 +77,7 @@ def _identify(field: FrameStars, sky: Sky, priors) -> Identification | None:
     return None
 
 
-def _attempts(field: FrameStars, sky: Sky, priors) -> Iterator[Attempt]:
+def _attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[Attempt]:
     """What to try, in this order.  Half of the probability is the priors' where there are any."""
     for prior in priors:
         yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))

@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields
 from itertools import combinations
 from math import comb
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import CELLS, ZONES, cell_starts, ranges
 from starpos.units import DAY_S
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 PREFIX = "triangles-9-"  # of the folders in the cache; the number is the format's
 SCRATCH = "unfinished-"
@@ -196,7 +200,7 @@ def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
     return [(radius, spacing, n) for (radius, spacing, _), n in zip(CIRCLES, taken, strict=True)]
 
 
-def _triples_of_circles(tree, radius: float, spacing: float, most: int) -> np.ndarray:
+def _triples_of_circles(tree: "cKDTree", radius: float, spacing: float, most: int) -> np.ndarray:
     """Keys of all triples among the `most` first rows of the cKDTree in each circle: (a n + b) n + c, a < b < c."""
     centres = _spread(_circles(radius, spacing))
     n, chord = tree.n, 2 * np.sin(radius / 2)
@@ -227,7 +231,9 @@ def _spread(n: int) -> np.ndarray:
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], -1)
 
 
-def _in_bins(v: np.ndarray, rows: np.ndarray, triples: np.ndarray, longest_side: float):
+def _in_bins(
+    v: np.ndarray, rows: np.ndarray, triples: np.ndarray, longest_side: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Usable triangles in order of their bins: the columns of `TriangleCatalogue` from `corners` on."""
     n, parts = len(rows), []
     # a whole sky of triangles at once is 500 MB
@@ -241,7 +247,9 @@ def _in_bins(v: np.ndarray, rows: np.ndarray, triples: np.ndarray, longest_side:
     return corner[order], turn[order], code[order], np.array([longest_side]), starts.astype(np.int32)
 
 
-def _measured(v: np.ndarray, corner: np.ndarray, longest_side: float):
+def _measured(
+    v: np.ndarray, corner: np.ndarray, longest_side: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; their turn, shape and bin."""
     length = opposite_sides(v[corner])
     good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)

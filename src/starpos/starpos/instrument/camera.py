@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from starpos.errors import InstrumentError
 
@@ -24,9 +25,9 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if self.width < 1 or self.height < 1:
             raise InstrumentError(f"camera size {self.width} x {self.height} px: both must be at least 1")
@@ -65,7 +66,7 @@ class Camera:
         """The same camera with its focal lengths multiplied by `factor`."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
-    def directions(self, x, y) -> np.ndarray:
+    def directions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> np.ndarray:
         """Unit vectors (N, 3) in C of pixels x, y (N,): W = (X, Y, f) / norm, after undistortion.
 
         The paper prints another third component; docs/the_paper.md#star-vectors says why it is f.
@@ -79,7 +80,7 @@ class Camera:
             v[..., :2] = self._undistort(v[..., :2])
         return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
-    def project(self, v) -> np.ndarray:
+    def project(self, v: npt.ArrayLike) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind the camera."""
         v = np.asarray(v, float)
         z = np.where(v[..., 2] > 0, v[..., 2], np.nan)
@@ -109,7 +110,7 @@ class Camera:
         )
 
 
-def _distort(plane: np.ndarray, d) -> np.ndarray:
+def _distort(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
     """Brown-Conrady on tangent-plane coordinates (..., 2), OpenCV's `plumb_bob`."""
     k1, k2, p1, p2, k3 = d
     x, y = plane[..., 0], plane[..., 1]
@@ -124,7 +125,7 @@ def _distort(plane: np.ndarray, d) -> np.ndarray:
     )
 
 
-def _distortion_jacobian(plane: np.ndarray, d) -> np.ndarray:
+def _distortion_jacobian(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
     """d(distorted) / d(undistorted), (..., 2, 2)."""
     k1, k2, p1, p2, k3 = d
     x, y = plane[..., 0], plane[..., 1]

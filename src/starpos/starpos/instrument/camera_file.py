@@ -2,6 +2,7 @@
 """Camera calibration files: the YAML that camera_calibration, camera_info_manager and image_proc write and read."""
 
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from starpos.errors import InstrumentError
@@ -70,5 +71,5 @@ def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
     yaml_file.save(path, content, comment)
 
 
-def _matrix(rows: int, columns: int, values) -> dict:
+def _matrix(rows: int, columns: int, values: Sequence[float]) -> dict:
     return {"rows": rows, "cols": columns, "data": [float(value) for value in values]}

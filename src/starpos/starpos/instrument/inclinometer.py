@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
 from starpos.units import ARCSEC
@@ -41,7 +42,7 @@ class Tilt:
     temperature_c: float = float("nan")
     times: tuple[float, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", np.asarray(self.covariance, float))
         if not np.isfinite([self.theta_x, self.theta_y, self.utc_unix_s]).all():
             raise TiltError("a tilt reading is not a finite number: check the inclinometer")
@@ -68,7 +69,7 @@ class InclinometerErrors:
     temperature_rad_per_c: float = 3 * ARCSEC
     scale: float = 1e-4
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not 0 <= value <= 1:
                 raise InstrumentError(
@@ -111,13 +112,21 @@ def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
 
 
-def sca100t_angle(volts, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_SENSITIVITY_V_PER_G):
+def sca100t_angle(
+    volts: npt.ArrayLike,
+    offset_v: float = SCA100T_OFFSET_V,
+    sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
+) -> np.ndarray:
     """Angle in rad from the SCA100T's output: asin((V - offset) / sensitivity); NaN beyond +-1 g (paper, section 3.1)."""
     g = (np.asarray(volts, float) - offset_v) / sensitivity_v_per_g
     return np.arcsin(np.where(np.abs(g) <= 1, g, np.nan))
 
 
-def sca100t_volts(angle, offset_v=SCA100T_OFFSET_V, sensitivity_v_per_g=SCA100T_SENSITIVITY_V_PER_G):
+def sca100t_volts(
+    angle: npt.ArrayLike,
+    offset_v: float = SCA100T_OFFSET_V,
+    sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
+) -> np.ndarray:
     """The inverse of `sca100t_angle`: output voltage at an angle in rad."""
     return offset_v + sensitivity_v_per_g * np.sin(angle)
 
@@ -144,7 +153,12 @@ class TiltLog:
 
     @classmethod
     def of(
-        cls, utc_unix_s, theta_x, theta_y, temperature_c, noise_rad: float = SCA100T_NOISE_RAD
+        cls,
+        utc_unix_s: np.ndarray,
+        theta_x: np.ndarray,
+        theta_y: np.ndarray,
+        temperature_c: np.ndarray,
+        noise_rad: float = SCA100T_NOISE_RAD,
     ) -> "TiltLog":
         """Readings of one white noise, 1 sigma."""
         return cls(
@@ -237,7 +251,7 @@ class TiltLog:
         return index[np.unique(self.utc_unix_s[index], return_index=True)[1]]
 
 
-def read_tilt_csv(path, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
+def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
     """A TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if it is none."""
     path = Path(path)
     cure = "give a CSV with a line of names, utc_unix_s,theta_x_deg,theta_y_deg[,temperature_c], and readings"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the instrument is: optics, how its parts are fixed to each other, and how well that is known."""
 
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
@@ -33,15 +34,15 @@ class Calibration:
     `frames` frames; older than valid_days it is stale.
     """
 
-    misalignment_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     covariance_arcsec2: tuple = tuple(map(tuple, np.eye(3) * UNSTATED_CALIBRATION_ARCSEC**2))
     utc_unix_s: float = float("nan")
     temperature_c: float = float("nan")
-    tilt_deg: tuple[float, float] = (0.0, 0.0)
+    tilt_deg: tuple[float, ...] = (0.0, 0.0)
     frames: int = 0
     valid_days: float = float("inf")
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, numbers in (
             ("misalignment_deg", self.misalignment_deg),
             ("calibration's covariance", np.ravel(self.covariance_arcsec2)),
@@ -74,7 +75,11 @@ class Calibration:
             raise InstrumentError(f"valid_days is {self.valid_days}: must be positive")
 
     @classmethod
-    def of(cls, misalignment_deg, stddev_arcsec=(UNSTATED_CALIBRATION_ARCSEC,) * 3) -> "Calibration":
+    def of(
+        cls,
+        misalignment_deg: Sequence[float],
+        stddev_arcsec: Sequence[float] = (UNSTATED_CALIBRATION_ARCSEC,) * 3,
+    ) -> "Calibration":
         """From three angles and the errors (3,) about S's axes; InstrumentError where they are none."""
         if len(stddev_arcsec) != 3:
             raise InstrumentError("calibration_stddev_arcsec is three numbers")
@@ -140,7 +145,7 @@ class Instrument:
     inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
     clock_stddev_s: float = 0.01
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, numbers in (
             ("focal length", [self.focal_px]),
             ("link_to_camera", np.ravel(self.link_to_camera)),

@@ -5,6 +5,7 @@ import math
 import reprlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ KEYS = (
 )
 
 
-def read(path) -> Instrument:
+def read(path: Path | str) -> Instrument:
     """An Instrument from its YAML file (format below); InstrumentError with the reason where it is none.
 
     starpos_instrument: 1
@@ -68,10 +69,13 @@ def read(path) -> Instrument:
         raise InstrumentError(f"{path}: {e}") from None
 
 
-def write(path, instrument: Instrument, comment: str = "") -> None:
+def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
     """Write a file that `read` makes the same of; InstrumentError where it cannot be written.  comment: for people."""
     c, camera = instrument.calibration, instrument.camera
-    content = {"starpos_instrument": FORMAT, "camera": {"focal_px": float(instrument.focal_px)}}
+    content: dict[str, Any] = {
+        "starpos_instrument": FORMAT,
+        "camera": {"focal_px": float(instrument.focal_px)},
+    }
     if camera is not None:
         content["camera"] = {"width": camera.width, "height": camera.height}
         content["camera"] |= {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
@@ -108,7 +112,7 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
     return instrument
 
 
-def _camera(camera, folder: Path) -> tuple[Camera | None, float]:
+def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:
     """Intrinsics, None where only the focal length (px) is given."""
     if not isinstance(camera, dict):
         raise InstrumentError(
@@ -128,16 +132,21 @@ def _camera(camera, folder: Path) -> tuple[Camera | None, float]:
             )
         full = camera_file.read(folder / camera["calibration"])
         return full, full.fx
-    axes = ("fx", "fy", "cx", "cy")
-    _refuse_others(camera, ("width", "height", *axes, "distortion"))
+    _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion"))
     for side in ("width", "height"):
         if not isinstance(camera.get(side), int) or not 1 <= camera[side] <= LARGEST_SIDE:
             raise InstrumentError(
                 f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
             )
-    distortion = _row(camera.get("distortion", [0.0] * 5), "distortion")
-    sides = {side: camera[side] for side in ("width", "height")}
-    full = Camera(**sides, **{axis: _number(camera, axis) for axis in axes}, distortion=distortion)
+    full = Camera(
+        width=camera["width"],
+        height=camera["height"],
+        fx=_number(camera, "fx"),
+        fy=_number(camera, "fy"),
+        cx=_number(camera, "cx"),
+        cy=_number(camera, "cy"),
+        distortion=_row(camera.get("distortion", [0.0] * 5), "distortion"),
+    )
     return full, full.fx
 
 
@@ -165,7 +174,7 @@ def _calibration(content: dict) -> Calibration:
         utc = unix_of(str(about.get("utc")))
     except TimeError as e:
         raise InstrumentError(f"calibrated: {e}") from None
-    more = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
+    more: dict[str, Any] = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
     if "tilt_deg" in about:
         more["tilt_deg"] = _row(about["tilt_deg"], "tilt_deg")
     frames = about.get("frames", 0)
@@ -174,7 +183,7 @@ def _calibration(content: dict) -> Calibration:
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
 
 
-def _matrix(rows, key: str) -> tuple:
+def _matrix(rows: object, key: str) -> tuple:
     if not isinstance(rows, list) or len(rows) != 3:
         raise InstrumentError(f"{key} is {_short(rows)}: give three rows of three numbers")
     matrix = tuple(_row(row, key) for row in rows)
@@ -211,7 +220,7 @@ def _row(numbers: list, key: str) -> tuple[float, ...]:
     return tuple(_number({key: v}, key) for v in numbers)
 
 
-def _short(value) -> str:
+def _short(value: object) -> str:
     """What a file gives for a value, in a sentence; however deep it is."""
     if isinstance(value, int) and abs(value) > 1e18:
         return "a number beyond any sense"

@@ -4,13 +4,14 @@
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from starpos.errors import InstrumentError
 
 SIZE_LIMIT = 1 << 20
 
 
-def load(path: Path, what: str):
+def load(path: Path, what: str) -> Any:
     """The content of a file that should be `what` (for messages); InstrumentError where it cannot be read."""
     import yaml
 

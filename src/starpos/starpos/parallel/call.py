@@ -4,13 +4,13 @@
 import pickle
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 from starpos.errors import FrameError, StarposError, one_line
 
-Call = tuple[
-    Callable, object
-]  # the work, which can be pickled, and what it is of: a path, or a tuple of paths
+Files = str | tuple[str, ...]
+# The work, which can be pickled, and the file or files it is done on.
+Call = tuple[Callable[[Any], Any], Files]
 
 
 class Workers(Protocol):
@@ -23,7 +23,7 @@ class Workers(Protocol):
         """
 
 
-def worked(work: Callable, of) -> bytes:
+def worked(work: Callable, of: Files) -> bytes:
     """The answer, or the StarposError instead of one, pickled: an array that was a view of another may add up to another
     last digit than its copy, so what is done here goes through this too."""
     try:
@@ -39,7 +39,7 @@ def worked(work: Callable, of) -> bytes:
     return pickle.dumps(answer)
 
 
-def answer_of(outcome: bytes):
+def answer_of(outcome: bytes) -> Any:
     """What `worked` pickled; raises what is no frame's own failure."""
     answer = pickle.loads(
         outcome
@@ -49,7 +49,7 @@ def answer_of(outcome: bytes):
     return answer
 
 
-def given_up(of, why: str) -> FrameError:
+def given_up(of: Files, why: str) -> FrameError:
     """The answer for a frame that ends its workers."""
     return FrameError(f"{of}: given up: {why}")
 
@@ -60,7 +60,7 @@ class Here:
     def __enter__(self) -> "Here":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         pass
 
     def map(self, calls: Iterable[Call]) -> Iterator:

@@ -10,10 +10,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import urlsplit
 
 from starpos.errors import StarposError, one_line
-from starpos.parallel.call import Call, answer_of, given_up, worked
+from starpos.parallel.call import Call, Files, answer_of, given_up, worked
 from starpos.parallel.same import Same, differing, same_here
 
 PIP = "pip install distributed"
@@ -33,8 +34,9 @@ class ClusterError(StarposError):
 class Cluster:
     """An existing cluster by its scheduler's address; it keeps nothing of ours on leaving."""
 
-    def __init__(self, address: str):
-        self._address, self._client = address, None
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._client: Any = None
 
     def __enter__(self) -> "Cluster":
         try:
@@ -69,7 +71,7 @@ class Cluster:
             raise
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._client.close()
 
     def _check(self) -> None:
@@ -92,7 +94,8 @@ class Cluster:
         A call that the scheduler gives up, as its workers died, is worked again when no other of ours is: dask blames
         all that waited on such a worker.  One that ends its workers then too is given up.
         """
-        calls, here, under_way = iter(calls), same_here(), deque()
+        calls, here = iter(calls), same_here()
+        under_way: deque[tuple[Call, Any]] = deque()
         told = ahead = 0
         while True:
             if told % COUNT_EVERY == 0:
@@ -115,7 +118,7 @@ class Cluster:
                 ) from None
             yield answer_of(outcome)
 
-    def _outcome(self, call: Call, future, here: Same, others: list) -> bytes:
+    def _outcome(self, call: Call, future: Any, here: Same, others: list) -> bytes:
         from distributed import KilledWorker
 
         if isinstance(future, bytes):
@@ -133,7 +136,7 @@ class Cluster:
                 given_up(call[1], f"the workers that worked it died, at last alone ({one_line(error)})")
             )
 
-    def _begun(self, call: Call, here: Same):
+    def _begun(self, call: Call, here: Same) -> Any:
         """The call's future; its outcome, worked here, where its files are none that a worker could see."""
         work, of = call
         files = {}
@@ -159,7 +162,7 @@ class _Task:
     files: dict[str, int]  # size of each
     here: Same
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Callable[..., bytes], tuple]:
         return _on_worker, (self.work, self.of, self.files, self.here)
 
 
@@ -172,7 +175,7 @@ def _is_address(text: str) -> bool:
         return False
 
 
-def _on_worker(work: Callable, of, files: dict[str, int], here: Same) -> bytes:
+def _on_worker(work: Callable, of: Files, files: dict[str, int], here: Same) -> bytes:
     """`worked`, where this worker's starpos and files are those of the one who asks."""
     from distributed import get_worker
 

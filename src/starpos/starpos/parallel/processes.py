@@ -26,6 +26,9 @@ DYING_S = 1.0  # for a process that no longer answers to be gone
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 
+Task = tuple[int, Call]  # a call and its number
+
+
 class ProcessError(StarposError):
     """Processes do not start."""
 
@@ -42,15 +45,16 @@ class Processes:
     itself; a call that ends its process then too is given up.
     """
 
-    def __init__(self, number: int):
-        self._number, self._workers, self._stillborn = number, [], 0
+    def __init__(self, number: int) -> None:
+        self._number, self._stillborn = number, 0
+        self._workers: list[_Worker] = []
 
     def __enter__(self) -> "Processes":
         for _ in range(self._number):
             self._workers.append(_Worker())
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         for worker in self._workers:
             worker.end()
 
@@ -61,26 +65,28 @@ class Processes:
             yield from board.answers()
             for k, worker in enumerate(self._workers):
                 if worker.task is None and (task := board.take()) is not None and not worker.give(task):
-                    self._replace(k, board)
-            busy = {w.pipe: k for k, w in enumerate(self._workers) if w.task is not None}
+                    self._replace(k, board, task)
+            busy = [(k, w, w.task) for k, w in enumerate(self._workers) if w.task is not None]
             if not busy:
                 if board.finished:
                     return
                 continue
-            for pipe in wait(list(busy)):
-                k = busy[pipe]
+            ready = wait([worker.pipe for _, worker, _ in busy])
+            for k, worker, task in busy:
+                if worker.pipe not in ready:
+                    continue
                 try:
-                    outcome = self._workers[k].hear()
+                    outcome = worker.hear()
                 except (EOFError, OSError):
-                    self._replace(k, board)
+                    self._replace(k, board, task)
                     continue
                 self._stillborn = 0
                 if outcome is not None:
-                    board.came(self._workers[k].task, outcome)
-                    self._workers[k].task = None
+                    board.came(task, outcome)
+                    worker.task = None
 
-    def _replace(self, k: int, board: "_Board") -> None:
-        """A new process for one that has died, and its call back on the board."""
+    def _replace(self, k: int, board: "_Board", task: Task) -> None:
+        """Start a process in place of one that has died, and put its task back on the board."""
         dead = self._workers[k]
         why = dead.end(DYING_S)
         self._stillborn += not dead.ready
@@ -88,38 +94,38 @@ class Processes:
             del self._workers[k]
             raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
         self._workers[k] = _Worker()
-        board.died(dead.task, why)
+        board.died(task, why)
 
 
 class _Board:
     """Which call is next, and the answers in order."""
 
-    def __init__(self, calls: Iterable[Call], ahead: int):
+    def __init__(self, calls: Iterable[Call], ahead: int) -> None:
         self._coming, self._ahead = enumerate(calls), ahead
         self._under_way: set[int] = set()
-        self._again: deque[tuple[int, Call]] = deque()
+        self._again: deque[Task] = deque()
         self._tried: set[int] = set()  # that have ended a process
         self._done: dict[int, bytes] = {}
         self._given = self._told = 0
 
-    def take(self) -> tuple[int, Call] | None:
+    def take(self) -> Task | None:
         """A call to work, with its number; None where there is none, or none may be worked beside those under way."""
         if self._under_way & self._tried or (self._again and self._under_way):
             return None
+        task: Task | None = None
         if self._again:
             task = self._again.popleft()
-        elif self._given - self._told >= self._ahead or (task := next(self._coming, None)) is None:
-            return None
-        else:
+        elif self._given - self._told < self._ahead and (task := next(self._coming, None)) is not None:
             self._given += 1
-        self._under_way.add(task[0])
+        if task is not None:
+            self._under_way.add(task[0])
         return task
 
-    def came(self, task: tuple[int, Call], outcome: bytes) -> None:
+    def came(self, task: Task, outcome: bytes) -> None:
         self._under_way.discard(task[0])
         self._done[task[0]] = outcome
 
-    def died(self, task: tuple[int, Call], why: str) -> None:
+    def died(self, task: Task, why: str) -> None:
         number, (_, of) = task
         self._under_way.discard(number)
         if number not in self._tried:
@@ -144,14 +150,15 @@ class _Board:
 class _Worker:
     """A process; task: what it was given and has not answered; ready: whether it has said that it runs."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.pipe, theirs = get_context("spawn").Pipe()
-        self.task, self.ready = None, False
+        self.task: Task | None = None
+        self.ready = False
         self._process = get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
         with theirs, _for_one_that_starts():
             self._process.start()
 
-    def give(self, task: tuple[int, Call]) -> bool:
+    def give(self, task: Task) -> bool:
         """False where the process is no more."""
         self.task = task
         try:
@@ -178,7 +185,9 @@ class _Worker:
         self._process.close()
         if code == -signal.SIGKILL:
             return "killed, perhaps for want of memory: try fewer --jobs"
-        return f"exit status {code}" if code >= 0 else signal.strsignal(-code)
+        if code is not None and code < 0:
+            return signal.strsignal(-code) or f"signal {-code}"
+        return f"exit status {code}"
 
 
 @contextmanager

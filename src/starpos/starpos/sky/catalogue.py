@@ -12,6 +12,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from starpos.errors import CatalogueError
 from starpos.rotation import normalised
@@ -27,6 +28,8 @@ SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = (
     1.03,
 )  # an error is the smallest times CODE_STEP ** code
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
+
+Rows = np.ndarray | slice
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,7 +61,7 @@ class Catalogue:
         """Equal for equal stars: what a table made from this catalogue is known by."""
         digest = hashlib.sha256()
         for column in (self.ra_mas, self.dec_mas, self.vmag_centi):
-            digest.update(np.ascontiguousarray(column))
+            digest.update(np.ascontiguousarray(column).data)
         return digest.hexdigest()[:16]
 
     @cached_property
@@ -66,11 +69,11 @@ class Catalogue:
         """`zones.cell_starts` of the stars."""
         return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
 
-    def vmag(self, index=slice(None)) -> np.ndarray:
+    def vmag(self, index: Rows = slice(None)) -> np.ndarray:
         """Johnson V."""
         return self.vmag_centi[index] * 0.01
 
-    def directions(self, index, year: float = EPOCH) -> np.ndarray:
+    def directions(self, index: Rows, year: float = EPOCH) -> np.ndarray:
         """ICRS unit vectors (n, 3), barycentric, at a Julian year: linear motion; parallax is left out.
 
         It is 0.75 arcsec for the nearest star and below 0.03 for nearly all.
@@ -88,20 +91,20 @@ class Catalogue:
         v = v + east + north
         return normalised(v)
 
-    def sigma(self, index, year: float) -> np.ndarray:
+    def sigma(self, index: Rows, year: float) -> np.ndarray:
         """Error of a place at a Julian year, rad, one axis, 1 sigma (n,)."""
         years = year - (EPOCH_ZERO + self.epoch_code[index])
         motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
         return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
-    def names(self, index) -> list[str]:
+    def names(self, index: Rows) -> list[str]:
         """Designations: 'HIP 1234' where there is one, else 'TYC 1-2-3'."""
         return [
             f"HIP {h}" if h else "TYC {}-{}-{}".format(*t)
             for h, t in zip(self.hip[index].tolist(), self.tyc[index].tolist(), strict=True)
         ]
 
-    def cone(self, centre, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
+    def cone(self, centre: np.ndarray, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Indices of the stars within radius_rad of the unit vector `centre` at J2000, brightest first."""
         index = rows_near(self.cell_start, np.asarray(centre), radius_rad)
         if np.isfinite(limit_mag):
@@ -110,16 +113,27 @@ class Catalogue:
         return index[np.argsort(self.vmag_centi[index], kind="stable")]
 
 
-def pack(tyc, hip, vmag, ra_deg, dec_deg, pm_ra, pm_dec, sigma_mas, sigma_pm, epoch) -> Catalogue:
+def pack(
+    tyc: npt.ArrayLike,
+    hip: npt.ArrayLike,
+    vmag: npt.ArrayLike,
+    ra_deg: npt.ArrayLike,
+    dec_deg: npt.ArrayLike,
+    pm_ra: npt.ArrayLike,
+    pm_dec: npt.ArrayLike,
+    sigma_mas: npt.ArrayLike,
+    sigma_pm: npt.ArrayLike,
+    epoch: npt.ArrayLike,
+) -> Catalogue:
     """A Catalogue from plain columns: deg, mas/yr (pm_ra times cos dec), mas, Julian year; errors round up."""
     dec_mas = np.round(np.asarray(dec_deg) * 3.6e6).astype(np.int32)
     ra_mas = (np.round(np.asarray(ra_deg) * 3.6e6) % 1_296_000_000).astype(np.uint32)
     zone = np.clip(dec_mas // 3_600_000 + 90, 0, ZONES - 1)
     order = np.lexsort((ra_mas, zone))
 
-    def column(values, dtype):
+    def column(values: npt.ArrayLike, dtype: type[np.integer]) -> np.ndarray:
         limits = np.iinfo(dtype)
-        return np.clip(np.round(values), limits.min, limits.max).astype(dtype)[order]
+        return np.clip(np.round(np.asarray(values)), limits.min, limits.max).astype(dtype)[order]
 
     return Catalogue(
         ra_mas=ra_mas[order],
@@ -136,12 +150,12 @@ def pack(tyc, hip, vmag, ra_deg, dec_deg, pm_ra, pm_dec, sigma_mas, sigma_pm, ep
     )
 
 
-def _code(sigma, smallest: float) -> np.ndarray:
+def _code(sigma: npt.ArrayLike, smallest: float) -> np.ndarray:
     """The code of an error, rounded up."""
     return np.ceil(np.log(np.maximum(np.asarray(sigma, float), smallest) / smallest) / np.log(CODE_STEP))
 
 
-def save(catalogue: Catalogue, path) -> None:
+def save(catalogue: Catalogue, path: Path | str) -> None:
     """Write the compact file: differences along right ascension and split bytes, which deflate packs well."""
     c = catalogue
     step = np.diff(c.ra_mas.astype(np.int64), prepend=0).astype(np.uint32)
@@ -175,11 +189,11 @@ def _split(column: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1).T)
 
 
-def _join(planes: np.ndarray, dtype) -> np.ndarray:
+def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
     return np.ascontiguousarray(planes.T).view(dtype)[:, 0]
 
 
-def read(path) -> Catalogue:
+def read(path: Path | str) -> Catalogue:
     """The catalogue of one compact file; CatalogueError where it is missing, broken or of another format."""
     path = Path(path)
     try:

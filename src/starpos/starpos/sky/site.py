@@ -42,7 +42,7 @@ class Site:
 
     def overhead(
         self, catalogue: Catalogue, state: EarthState, toward: np.ndarray, radius: float, limit_mag: float
-    ):
+    ) -> np.ndarray:
         """Catalogue indices within `radius` rad of an observed ENU direction (3,), brightest first."""
         itrs = self.atmosphere.refraction().unbend(toward) @ self.enu
         # aberration and precession of the direction itself are far below the margin

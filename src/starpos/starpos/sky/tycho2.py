@@ -34,7 +34,7 @@ _SUPPLEMENT = {
 }  # fmt: skip
 
 
-def build(source, limit_mag: float, progress: Progress = quiet) -> Catalogue:
+def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> Catalogue:
     """The catalogue of all stars with V < limit_mag from a folder (or Debian's tycho2_*.orig.tar.xz) of the originals.
 
     Every star carries its own position error: mean position and motion where Tycho-2 has them, the observed place
@@ -66,8 +66,9 @@ def _originals(source: Path) -> Iterator[tuple[str, bytes]]:
             return
         with tarfile.open(source) as archive:
             for member in archive:
-                if Path(member.name).name in wanted and member.isfile():
-                    yield Path(member.name).name, archive.extractfile(member).read()
+                file = archive.extractfile(member) if member.isfile() else None
+                if file is not None and Path(member.name).name in wanted:
+                    yield Path(member.name).name, file.read()
     except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as e:
         reason = str(e).partition("\n")[0]
         raise CatalogueError(
