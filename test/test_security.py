@@ -53,7 +53,7 @@ READS_WHOLE = {
     "starpos/parallel/same.py": "our own source",
     "starpos/identification/paper.py": "of the package",
     "starpos/frames/reading.py": "MAX_BYTES, MAX_CSV_BYTES",
-    "starpos/report/bag.py": "installed messages",
+    "starpos/recording/bag.py": "installed messages",
     "starpos/report/folder.py": "TRUTH_LIMIT",
     "starpos/sky/tycho2.py": "the catalogue's own files, at `catalogue build`",
     "starpos_bringup/recording/bag.py": "installed messages",

@@ -37,6 +37,10 @@ class GeoidError(StarposError):
     """A grid of geoid undulations is missing or broken."""
 
 
+class BagError(StarposError):
+    """A recording (rosbag2) cannot be read, or unpacks to more than it may."""
+
+
 class CalibrationError(StarposError):
     """The stars do not support a calibration."""
 

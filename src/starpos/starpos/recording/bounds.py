@@ -1,29 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounds for rosbag2 files that `rosbags` reads: a small file must not unpack to more than there is memory or disk.
+"""Bounds for rosbag2 files that `rosbags` reads: a small file must not unpack to more than memory or disk can hold.
 
-rosbags (0.11) unpacks whatever a chunk, a message or a file holds, with no limit of its own, so its ways to do that are
-replaced by bounded ones.
+rosbags (0.11) unpacks whatever a chunk, a message or a file holds, without a limit.  This module replaces its functions
+that unpack by bounded ones.  The errors here do not name the bag: its reader does that (bag.py).
 """
 
 import shutil
 import tempfile
 from pathlib import Path
+from types import ModuleType
+from typing import IO, Any
 
-from starpos.errors import StarposError
+from starpos.errors import BagError
 
 MOST_METADATA = 1 << 24
-MOST_UNPACKED = 1 << 29  # of a chunk or a message; a frame of 21 megapixels is a twelfth of it
-MOST_AT_ONCE = 1 << 30  # of the chunks of a file that overlap in time: all are in memory then
-MCAP = b"\x89MCAP0\r\n"  # its first bytes, and its last
-LEFT_ON_DISK = 1 << 30  # by a bag that is packed as a file, and unpacked beside the others of /tmp
-
-
-class BagError(StarposError):
-    """What is read from a bag goes beyond a bound, or was never ended; what, not where."""
+# bytes of a chunk or a message; a frame of 21 megapixels has a twelfth of it
+MOST_UNPACKED = 1 << 29
+# bytes of the chunks of a file that overlap in time: rosbags has all of them in memory
+MOST_AT_ONCE = 1 << 30
+# the first and the last bytes of a file
+MCAP = b"\x89MCAP0\r\n"
+# bytes that stay free in the folder for temporary files, when a packed file is unpacked there
+LEFT_ON_DISK = 1 << 30
 
 
 def check_folder(path: Path) -> None:
-    """Before a bag is opened. BagError where its metadata.yaml is none, or an MCAP has a beginning and no end."""
+    """Check the files of a bag before it is opened.
+
+    Raises BagError if metadata.yaml is too large, or if an MCAP file begins as one and has no end.
+    """
     for file in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
         if file.suffix == ".mcap" and _is_cut_off(file):
             raise BagError(
@@ -44,9 +49,9 @@ def _is_cut_off(file: Path) -> bool:
 
 
 def bound_rosbags() -> None:
-    """Before a bag is opened; from then on rosbags raises BagError for what unpacks to too much, for all of the process.
+    """Make rosbags raise BagError for what unpacks to too much, in all of the process.  Call it before a bag is opened.
 
-    BagError where this version of rosbags unpacks in another way.
+    Raises BagError if this version of rosbags unpacks in another way.
     """
     from rosbags.rosbag2 import reader, storage_mcap
 
@@ -55,19 +60,20 @@ def bound_rosbags() -> None:
         if isinstance(zstd, _Zstd):
             return
         table["lz4"], table["zstd"] = _lz4, lambda data, size: _unpacked(zstd, data, size)
-        reader.zstd = _Zstd(zstd)
+        reader.zstd = _Zstd(zstd)  # type: ignore[assignment]  # takes the place of a module
     except AttributeError:
         raise BagError(
             "this version of rosbags unpacks as none we know, without bounds: pip install rosbags==0.11.9"
         ) from None
 
 
-def check_chunks(reader) -> None:
-    """Of an open rosbags.rosbag2.Reader. BagError where so many chunks overlap that they are too much together."""
+def check_chunks(reader: Any) -> None:
+    """Check the chunks of an open rosbags.rosbag2.Reader; raises BagError if too large ones overlap in time."""
     storages = getattr(reader.storage, "storages", [reader.storage])
     for storage in storages:
-        edges = []
-        for chunk in getattr(storage, "chunks", ()):  # of MCAP with an index; others are read one by one
+        edges: list[tuple[int, int, int]] = []
+        # only an MCAP with an index has a list of chunks; rosbags reads all others one by one
+        for chunk in getattr(storage, "chunks", ()):
             first, size = chunk.message_start_time, chunk.uncompressed_size
             edges += [(first, 0, size), (max(first, chunk.message_end_time), 1, -size)]
         at_once = 0
@@ -80,31 +86,31 @@ def check_chunks(reader) -> None:
 
 
 class _Zstd:
-    """What rosbags' reader calls of its zstd module, bounded."""
+    """The functions that rosbags' reader calls of its zstd module, bounded."""
 
-    def __init__(self, zstd):
+    def __init__(self, zstd: ModuleType):
         self._zstd = zstd
 
     def decompress(self, data: bytes) -> bytes:
-        """A message."""
+        """Unpack a message."""
         return _unpacked(self._zstd, data, MOST_UNPACKED)
 
-    def open(self, file, mode: str):
-        """A file of a bag, which rosbags unpacks into the folder for temporary files."""
+    def open(self, file: IO[bytes], mode: str) -> "_Bounded":
+        """Open a file of a bag, which rosbags unpacks into the folder for temporary files."""
         room = shutil.disk_usage(tempfile.gettempdir()).free - LEFT_ON_DISK
         return _Bounded(self._zstd.open(file, mode), room)
 
 
 class _Bounded:
-    """A file that is read, up to so many bytes."""
+    """A file that gives at most so many bytes."""
 
-    def __init__(self, file, most: int):
+    def __init__(self, file: Any, most: int):
         self._file, self._left, self._most = file, most, most
 
-    def __enter__(self):
+    def __enter__(self) -> "_Bounded":
         return self
 
-    def __exit__(self, *exception):
+    def __exit__(self, *exception: object) -> None:
         self._file.close()
 
     def read(self, size: int) -> bytes:
@@ -118,10 +124,11 @@ class _Bounded:
         return data
 
 
-def _unpacked(zstd, data: bytes, size: int) -> bytes:
-    """The frames of zstd in data, at most `size` bytes; BagError where there are more."""
+def _unpacked(zstd: ModuleType, data: bytes, size: int) -> bytes:
+    """Unpack the zstd frames in data, at most `size` bytes; raises BagError if there are more."""
     _check_size(size)
-    parts, left = [], size
+    parts: list[bytes] = []
+    left = size
     while data:
         frame = zstd.ZstdDecompressor()
         parts.append(frame.decompress(data, left + 1))
@@ -135,7 +142,7 @@ def _unpacked(zstd, data: bytes, size: int) -> bytes:
 
 
 def _lz4(data: bytes, size: int) -> bytes:
-    """As rosbags calls it, with the size that the chunk states."""
+    """Unpack an lz4 frame of the size that its chunk states; raises BagError if there is more."""
     from lz4.frame import LZ4FrameDecompressor
 
     _check_size(size)

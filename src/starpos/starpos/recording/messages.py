@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as this package's types: of rclpy in a node, of `rosbags` from a bag, which are alike.
+"""Converts messages into this package's types: those of rclpy in a node, and those of `rosbags` from a bag.
 
-What a message gets wrong raises the type's error, in one sentence.
+A message that cannot be right raises the error of its type, in one sentence.
 """
 
 import math
@@ -15,7 +15,7 @@ from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 
-# of Tilt.flags, as starpos_interfaces has them
+# bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED = 1, 2, 4
 UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED
 # encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
@@ -26,20 +26,23 @@ ENCODINGS = {
     **{f"bayer_{p}8": (np.uint8, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
     **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
 }
-MOST_TILT_VARIANCE = 1.0  # rad2: more says nothing, and must not overflow
-MOST_CELSIUS = 300.0  # of an inclinometer that still measures
-MAX_STARS = 100_000  # the most a detector publishes
+# rad2; a larger variance says nothing, and might overflow
+MOST_TILT_VARIANCE = 1.0
+# no inclinometer measures at a higher temperature
+MOST_CELSIUS = 300.0
+# a detector publishes no more
+MAX_STARS = 100_000
 
 
 def stamp_to_unix(stamp: Any) -> float | None:
-    """Unix seconds of a stamp, to the microsecond; None for 0, which means that no time is known."""
+    """Unix seconds of a stamp, to the microsecond; None for 0, which means that the time is unknown."""
     if stamp.sec == 0 and stamp.nanosec == 0:
         return None
     return stamp.sec + stamp.nanosec * 1e-9
 
 
 def message_to_stars(message: Any, source: str = "stars") -> Stars:
-    """Stars; FrameError where the message does not hold together (sizes, NaN, order, covariance)."""
+    """Stars from a StarArray; raises FrameError if sizes, values, order or covariances cannot be right."""
     rows = message.stars
     if len(rows) > MAX_STARS:
         raise FrameError(f"{source}: {len(rows)} stars are more than {MAX_STARS}: send the brightest.")
@@ -56,15 +59,16 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
         exposure_s=message.exposure or None,
         source=source,
         stamp_stddev_s=message.stamp_stddev,
-        clock_stddev_s=getattr(message, "clock_stddev", 0.0),  # bags from before it was told
+        # older bags do not have it
+        clock_stddev_s=getattr(message, "clock_stddev", 0.0),
     )
 
 
 def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
-    """A starpos Tilt; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
+    """Tilt from a message; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
-    The flags are the caller's to judge; a temperature that is none is unknown (NaN). TiltError for NaN, no stamp, over
-    30 deg, an impossible covariance.
+    An impossible temperature becomes NaN, unknown.  The flags are left to the caller.  Raises TiltError for NaN, no
+    stamp, an angle over 30 deg, or an impossible covariance.
     """
     covariance = np.array(message.covariance, float).reshape(2, 2)
     unix_s = stamp_to_unix(message.header.stamp)
@@ -85,7 +89,7 @@ def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD)
 
 
 def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
-    """A Camera; InstrumentError where the message is not a calibrated plumb_bob camera of the whole frame."""
+    """Camera from a CameraInfo; raises InstrumentError unless it is a calibrated plumb_bob camera of the whole frame."""
     k = np.array(message.k, float)
     d = np.array(message.d, float)
     if not np.isfinite(k).all() or not np.isfinite(d).all():
@@ -119,9 +123,9 @@ def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
 
 
 def message_to_frame(message: Any, source: str = "image_raw") -> Frame:
-    """A Frame on the message's own memory where byte order and alignment allow, else on a copy.
+    """Frame from an Image, on the message's own memory if byte order and alignment allow it, else on a copy.
 
-    FrameError where encoding, size, step and data do not fit together.
+    Raises FrameError if encoding, size, step and data do not fit together.
     """
     if message.encoding not in ENCODINGS:
         raise FrameError(
@@ -141,8 +145,7 @@ def message_to_frame(message: Any, source: str = "image_raw") -> Frame:
             f"{source}: {len(message.data)} bytes of pixels for {height} rows of {step} bytes; "
             "the frame is truncated or its sizes are wrong."
         )
-    order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(kind).newbyteorder(order)
+    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     shape = (height, width) if channels == 1 else (height, width, channels)
     strides = (step, dtype.itemsize) if channels == 1 else (step, channels, 1)
     pixels = np.ndarray(shape, dtype, message.data, strides=strides)

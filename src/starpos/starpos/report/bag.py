@@ -1,24 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rosbag2 holds of one instrument, read by `rosbags` without ROS."""
+"""Reads what a rosbag2 holds of one instrument."""
 
-import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, TiltLog
 from starpos.progress import Progress
-from starpos.recording import bounds
+from starpos.recording.bag import PACKAGE, BagReader
 from starpos.recording.messages import UNUSABLE, message_to_camera, message_to_tilt
 from starpos.report.folder import truth_in
 from starpos.report.night import Shot, Truth
 from starpos.report.solutions import deflection_of, shot_of
 
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
 SUFFIXES = (".mcap", ".db3")
-PACKAGE = "starpos_interfaces"
 STARS, TILT, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Tilt", "Solution"))
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TOPICS = {"stars": STARS, "tilt": TILT, "solver/solution": SOLUTION, "camera/camera_info": CAMERA_INFO}
@@ -26,7 +28,11 @@ TOPICS = {"stars": STARS, "tilt": TILT, "solver/solution": SOLUTION, "camera/cam
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recorded:
-    """One instrument's part of a bag; cameras by (width, height) of their frames; solutions: as the solver made them."""
+    """One instrument's part of a bag.
+
+    cameras: by (width, height) of their frames in px.  solutions: as the solver published them.
+    deflection: that the solver applied, None if no solution says so.
+    """
 
     path: Path
     namespace: str
@@ -34,31 +40,36 @@ class Recorded:
     tilts: TiltLog | None
     star_count: int
     solutions: tuple[Shot, ...]
-    deflection: Deflection | None  # that the solver applied
+    deflection: Deflection | None
     truth: Truth | None
     remarks: tuple[str, ...]
 
     @property
     def name(self) -> str:
+        """Name for headings: the bag's own, and the namespace if there is one."""
         return self.path.name + (f" {self.namespace}" if self.namespace != "/" else "")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it should be one: a folder with metadata.yaml or a bag's files, or a file of a bag's suffix."""
+    """Whether a path looks like a bag: a folder with metadata.yaml or a bag's files, or a file with a bag's suffix."""
     if path.is_file():
         return path.suffix.lower() in SUFFIXES
     return (path / "metadata.yaml").is_file() or any(next(path.glob(f"*{s}"), None) for s in SUFFIXES)
 
 
 def read(path: Path, namespace: str | None, tilt_noise_rad: float, progress: Progress) -> Recorded:
-    """All of one instrument but its stars; FrameError where it is no such bag."""
-    with _Bag(path) as bag:
+    """Read all of one instrument but its stars.
+
+    namespace: the instrument's; None where there is only one.  tilt_noise_rad: sigma of readings that state none.
+    Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
+    """
+    with BagReader(path, typed=True) as bag:
         chosen, connections = _instrument(bag, path, namespace)
         reading = _Reading(tilt_noise_rad)
         wanted = [c for c in connections if c.msgtype != STARS]
         total = sum(c.msgcount for c in wanted) or 1
-        for done, (kind, message) in enumerate(bag.messages(wanted), 1):
-            reading.take(kind, message)
+        for done, (connection, _, message) in enumerate(bag.decoded(wanted), 1):
+            reading.take(connection.msgtype, message)
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
         return Recorded(
@@ -74,85 +85,17 @@ def read(path: Path, namespace: str | None, tilt_noise_rad: float, progress: Pro
         )
 
 
-def star_lists(r: Recorded) -> Iterator:
-    """Its StarArray messages, one at a time."""
-    with _Bag(r.path) as bag:
+def star_lists(r: Recorded) -> Iterator[Any]:
+    """The StarArray messages of an instrument, one at a time."""
+    with BagReader(r.path, typed=True) as bag:
         _, connections = _instrument(bag, r.path, r.namespace)
-        for _, message in bag.messages([c for c in connections if c.msgtype == STARS]):
+        for _, _, message in bag.decoded([c for c in connections if c.msgtype == STARS]):
             yield message
 
 
-class _Bag:
-    """An open bag; what `rosbags` raises becomes FrameError."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __enter__(self):
-        from rosbags.highlevel import AnyReader
-
-        try:
-            bounds.check_folder(self.path)
-            bounds.bound_rosbags()
-            self._reader = AnyReader([self.path], default_typestore=_usual_types())
-            self._reader.open()
-            bounds.check_chunks(self._reader.readers[0])
-        except Exception as error:  # rosbags, its YAML, zstd and sqlite have their own for a broken file
-            raise self._broken(error) from None
-        return self
-
-    def __exit__(self, *exception):
-        self._reader.close()
-
-    @property
-    def connections(self) -> list:
-        return self._reader.connections
-
-    def messages(self, connections: list) -> Iterator[tuple[str, object]]:
-        """(type, message) in the bag's order."""
-        for c in connections:
-            if c.msgtype not in self._reader.typestore.fielddefs:
-                raise FrameError(
-                    f"{self.path}: it does not hold the definition of {c.msgtype}: enter the workspace that has "
-                    f"{PACKAGE}, or record as MCAP, which holds them"
-                )
-        if not connections:
-            return
-        messages = self._reader.messages(connections)
-        while True:
-            try:
-                connection, _, data = next(messages)
-                message = self._reader.deserialize(data, connection.msgtype)
-            except StopIteration:
-                return
-            except Exception as error:
-                raise self._broken(error) from None
-            yield connection.msgtype, message
-
-    def _broken(self, error: Exception) -> FrameError:
-        if isinstance(error, bounds.BagError):
-            return FrameError(f"{self.path}: {error}")
-        reason = " ".join(str(error).split())[:200]
-        return FrameError(f"{self.path}: not a readable bag ({type(error).__name__}: {reason})")
-
-
-def _usual_types():
-    """For a bag without definitions: ROS's own, and ours where a workspace is entered."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        texts = sorted((Path(prefix) / "share" / PACKAGE / "msg").glob("*.msg")) if prefix else []
-        if texts:
-            for text in texts:
-                store.register(get_types_from_msg(text.read_text(), f"{PACKAGE}/msg/{text.stem}"))
-            break
-    return store
-
-
-def _instrument(bag: _Bag, path: Path, namespace: str | None) -> tuple[str, list]:
-    """Namespace and connections of the instrument asked for; FrameError where it is not there, or one of several."""
-    found: dict[str, list] = {}
+def _instrument(bag: BagReader, path: Path, namespace: str | None) -> "tuple[str, Sequence[Connection]]":
+    """Namespace and connections of the instrument; raises FrameError if it is not there or one of several."""
+    found: dict[str, list[Connection]] = {}
     for c in bag.connections:
         for suffix, kind in TOPICS.items():
             if c.msgtype == kind and c.topic.endswith(f"/{suffix}"):
@@ -171,7 +114,7 @@ def _instrument(bag: _Bag, path: Path, namespace: str | None) -> tuple[str, list
 
 
 class _Reading:
-    """What has been read so far."""
+    """Collects the messages of one instrument."""
 
     def __init__(self, tilt_noise_rad: float):
         self.cameras: dict[tuple[int, int], Camera] = {}
@@ -182,8 +125,10 @@ class _Reading:
         self._unusable = 0
         self._why_no_camera = ""
 
-    def take(self, kind: str, message) -> None:
+    def take(self, kind: str, message: Any) -> None:
+        """Take in a message of a type; a tilt or a camera that cannot be is remarked only."""
         if kind == TILT:
+            tilt: Tilt | None
             try:
                 tilt = message_to_tilt(message, self._unknown_stddev_rad)
             except TiltError:
@@ -203,10 +148,12 @@ class _Reading:
                 self._why_no_camera = str(error)
 
     def tilt_log(self) -> TiltLog | None:
+        """The usable tilts; None if there are none."""
         in_time = sorted(self._tilts, key=lambda tilt: tilt.utc_unix_s)
         return TiltLog.of_readings(in_time) if in_time else None
 
     def remarks(self, path: Path) -> tuple[str, ...]:
+        """Sentences on what was left out."""
         said = []
         if self._unusable:
             said.append(f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken")

@@ -11,7 +11,8 @@ import sys
 import time
 from pathlib import Path
 
-from starpos_bringup.recording.bag import Bag, ReplayError, Topic
+from starpos.errors import BagError, StarposError
+from starpos_bringup.recording.bag import Bag, Topic
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PLAYED, CUT_SHORT, REFUSED = 0, 1, 2  # exit statuses
@@ -52,7 +53,7 @@ def main(arguments: list[str], stopped: list) -> int:
             wanted = bag.inputs(*INPUTS[options.inputs]) if options.inputs else options.topics
             topics = bag.topics(wanted, left_out=_say)
             return 0 if stopped else _play(bag, topics, options, ros, stopped)
-    except ReplayError as error:
+    except StarposError as error:
         _say(str(error))
         return REFUSED
 
@@ -118,7 +119,7 @@ def _play(bag: Bag, topics: dict[int, Topic], options, ros: list[str], stopped: 
         for context in contexts:
             rclpy.init(args=ros, context=context, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # a bad --ros-args; rcl has an error class for each
-        raise ReplayError(str(error)) from None
+        raise StarposError(str(error)) from None
     try:
         player = Player(topics.values(), options.rate, stopped, contexts)
         try:
@@ -142,7 +143,7 @@ def _rounds(player: "Player", bag: Bag, topics: dict[int, Topic], options, stopp
                 player.play(topic, log_ns, data)
                 if stopped:
                     break
-        except ReplayError as error:
+        except BagError as error:
             _say(str(error))
             status = CUT_SHORT
         if not options.loop or status or player.count == before:
