@@ -53,9 +53,7 @@ class Outcome:
     skipped: Counter = field(default_factory=Counter)
 
     def __add__(self, other: "Outcome") -> "Outcome":
-        return Outcome(
-            self.counts + other.counts, self.seconds + other.seconds, self.skipped + other.skipped
-        )
+        return Outcome(self.counts + other.counts, self.seconds + other.seconds, self.skipped + other.skipped)
 
 
 Tests = dict[str, Callable]  # by name: what runs them, given a file for their output; an Outcome
@@ -91,7 +89,9 @@ def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
     for suite in root.iter("testsuite"):
         failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
         skipped = int(suite.get("skipped", 0))
-        counts += Counter(passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped)
+        counts += Counter(
+            passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped
+        )
     counts += Counter(failed=int(status not in (0, NO_TESTS) and counts["failed"] == 0))
     seconds = [
         (float(case.get("time", 0)), f"{path.stem}: {case.get('classname')}::{case.get('name')}")
@@ -205,7 +205,9 @@ def main(args: list[str]) -> int:
         print(f"{count:4d} skipped: {reason}")
     for seconds, name in sorted(total.seconds, reverse=True)[:SHOWN]:
         print(f"{seconds:6.1f} s  {name}")
-    print(f"{total.counts['passed']} passed, {total.counts['failed']} failed, {total.counts['skipped']} skipped")
+    print(
+        f"{total.counts['passed']} passed, {total.counts['failed']} failed, {total.counts['skipped']} skipped"
+    )
     return int(total.counts["failed"] > 0)
 
 

@@ -4,7 +4,6 @@
 import re
 import threading
 import time
-from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,7 @@ from starpos_camera.sources.gphoto2_camera import nearest, seconds, sentence
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
 from starpos_testing.skies import raws
 
 TENTH = CaptureSettings(0.1, None, 5.0)
@@ -60,9 +59,7 @@ class Folder:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    for package in ("gphoto2", "exifread", "rawpy"):
-        if not find_spec(package):
-            lacks(package, "pip install")
+    require("gphoto2", "exifread", "rawpy")
     return Folder(tmp_path, monkeypatch)
 
 
@@ -258,6 +255,7 @@ def test_the_node_takes_frames_and_says_when_the_camera_is_gone(folder, start, l
 
 
 def test_what_is_refused_before_a_camera_is_looked_for():
+    require("gphoto2")
     assert "longer than `cadence`" in Gphoto2.refusal(values(), CaptureSettings(6.0, None, 5.0))
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dashboard's page in a browser, and the instrument that it shows: for the tests that look at it."""
 
-import dashboard as said
+import said
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, Imu, NavSatFix
 

@@ -5,9 +5,9 @@ import json
 import math
 
 import cv2
-import dashboard as said
 import numpy as np
 import pytest
+import said
 from sensor_msgs.msg import NavSatFix
 
 from starpos.errors import FrameError

@@ -3,8 +3,8 @@
 
 import math
 
-import dashboard as said
 import pytest
+import said
 from browser import ELLIPSES, metres_per_px
 
 

@@ -7,15 +7,14 @@ import socket
 import sys
 import urllib.request
 from contextlib import closing
-from importlib.util import find_spec
 
-import dashboard as said
 import pytest
+import said
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, NavSatFix
 
 from starpos.errors import StarposError
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
 from starpos_testing.nodes import Listener, Process, take_domain
 
 OK, WARN = 0, 1
@@ -31,8 +30,7 @@ def listener():
 
 @pytest.fixture
 def start():
-    if find_spec("tornado") is None:
-        lacks("tornado", "pip install")
+    require("tornado")
     processes = []
 
     def start(*parameters, executable="dashboard", module="starpos_dashboard.main", namespace="/"):

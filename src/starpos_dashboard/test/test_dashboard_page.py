@@ -3,8 +3,8 @@
 
 import math
 
-import dashboard as said
 import pytest
+import said
 from browser import HOSTILE, LAMPS
 
 from starpos_interfaces.msg import ErrorTerm, Solution, Tilt

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from starpos.cli import main
+from starpos_testing.lacking import require
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
 SIZE = ("--size", "1000", "700", *WIDE)
@@ -135,7 +136,7 @@ BAD_CALLS = {
 @pytest.mark.parametrize("command", ["solve", "identify", "detect"])
 def test_a_bad_call_is_exit_2_and_one_line(kind, command, archive, capfd):
     if kind == "an address that is none":
-        pytest.importorskip("distributed")
+        require("distributed")
     given = ["--tilt", str(archive / "turned" / "tilt.csv")] if command == "solve" else []
     status, out, err = run(capfd, [command, *frames(archive / "turned"), *given, *BAD_CALLS[kind]])
     assert (status, out, len(err.splitlines())) == (2, "", 1)
