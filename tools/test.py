@@ -165,6 +165,7 @@ def older(folder: str, report: str, pytest_args: list[str], out) -> Outcome:
         return Outcome(Counter(failed=1))
     python = ubuntu / "bin" / "python"
     with tempfile.TemporaryDirectory() as programs:
+        os.chmod(programs, 0o755)  # some tests become another user
         environment = bare_environment(python, Path(programs))
         chosen = [*NEWEST_ONLY, *pytest_args]
         return pytest(folder, report, chosen, out, python=str(python), environment=environment)
