@@ -21,9 +21,9 @@ CALLS = 8  # that a service keeps
 KILLER = """
 import os, random, signal, sys, time
 from pathlib import Path
-from starpos import camera_yaml, instrument_file
-from starpos.camera import Camera
-from starpos.instrument import Instrument
+from starpos.instrument import camera_file, instrument_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 
 folder, kills = Path(sys.argv[1]), int(sys.argv[2])
 cameras = [Camera.from_focal(100, 80, focal) for focal in (1000.0, 2000.0)]

@@ -23,9 +23,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-LINTERS = ["ruff check --output-format concise", "ruff format --check --output-format concise", "codespell"]
-if "[tool.mypy]" in (ROOT / "pyproject.toml").read_text():
-    LINTERS.append("mypy")
+LINTERS = [
+    *(f"ruff {check} --output-format concise" for check in ("check", "format --check")),
+    "codespell",
+    "mypy",
+]
 NO_TESTS = 5  # pytest's exit status where a -k left none
 SHOWN = 20  # of the slowest tests
 LANES = 3  # at once: some compute, others wait for nodes

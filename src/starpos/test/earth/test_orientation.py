@@ -292,7 +292,10 @@ def test_motion_needs_no_tables():
         epoch, velocity = earth_motion(unix_of(year, 7, 1))
         assert epoch == pytest.approx(year + 0.5, abs=0.01)
         assert np.linalg.norm(velocity) * erfa.CMPS == pytest.approx(29780, rel=0.02)
-    program = "import sys; from starpos.earth import earth_motion; earth_motion(0.0); print('astropy' in sys.modules)"
+    program = (
+        "import sys; from starpos.earth.orientation import earth_motion; "
+        "earth_motion(0.0); print('astropy' in sys.modules)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
     )

@@ -251,8 +251,9 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch, catalogue):
 
 def test_two_processes_at_once(own_cache):
     program = (
-        "import numpy as np; from starpos import catalogue, triangles\n"
-        f"t = triangles.cached(catalogue.load(), {WIDE}); print(len(t.corners), int(t.corners.sum()))"
+        "import numpy as np; from starpos.identification import triangles\n"
+        "from starpos.sky.catalogue import load_catalogue\n"
+        f"t = triangles.cached(load_catalogue(), {WIDE}); print(len(t.corners), int(t.corners.sum()))"
     )
     environment = os.environ | {"XDG_CACHE_HOME": str(own_cache.parent)}
     running = [
