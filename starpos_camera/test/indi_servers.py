@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from starpos_testing.lacking import lacks, require
-from starpos_testing.nodes import WAIT_S
+from starpos_testing.patience import WAIT_S
 
 SIMULATOR, DEVICE = "indi_simulator_ccd", "CCD Simulator"
 LIAR = Path(__file__).parent / "indi_liar.py"

@@ -12,8 +12,8 @@ import pytest
 
 from starpos_dashboard import access
 from starpos_testing.lacking import require
+from starpos_testing.patience import WAIT_S
 
-WAIT_S = 10.0
 SECRETS = ("/../setup.py", "/..%2fserver.py", "/vendor/../../server.py", "//etc/passwd", "/assets/index.html",
            "/vendor/d3-geo.LICENSE", "/%00", "/index.html/..", "/frame.jpg")  # fmt: skip
 

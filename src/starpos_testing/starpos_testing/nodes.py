@@ -18,8 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 
 from starpos_testing.domain import own_domain
-
-WAIT_S = 30.0  # for anything
+from starpos_testing.patience import WAIT_S
 
 
 @cache

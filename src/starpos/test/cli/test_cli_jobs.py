@@ -17,6 +17,7 @@ import pytest
 
 from starpos.cli import main
 from starpos_testing.lacking import require
+from starpos_testing.patience import WAIT_S
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
 SIZE = ("--size", "1000", "700", *WIDE)
@@ -214,7 +215,7 @@ def test_a_worker_killed_on_the_way_changes_no_answer(archive, capfd):
     with started(archive) as (process, first, workers, many):
         assert len(workers) == 2
         os.kill(workers[0], signal.SIGKILL)
-        rest, err = process.communicate(timeout=60)
+        rest, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err) == (0, "")
     *each, combined = (first + rest).splitlines()
     assert len(each) == len(many)
@@ -233,7 +234,7 @@ def test_workers_end_with_their_parent(ends, archive):
             os.killpg(process.pid, ends)  # as a terminal does
         else:
             process.kill()
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=WAIT_S)
         assert (process.returncode, err) == ((130, "") if ends == signal.SIGINT else (-ends, ""))
         assert len(fds) == 2
         assert all(gone(fd) for fd in fds)
@@ -245,7 +246,7 @@ def test_workers_end_where_nobody_reads_on(archive):
     with started(archive) as (process, _, workers, _):
         fds = [os.pidfd_open(w) for w in workers]
         process.stdout.close()
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=WAIT_S) == 0
         assert process.stderr.read() == ""
         assert all(gone(fd) for fd in fds)
         for fd in fds:

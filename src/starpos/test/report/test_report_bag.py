@@ -186,8 +186,14 @@ def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, ca
         for stars in lists:
             bag.stars(stars)
         bag.tilts(tilts)
-        wrong = [{"flags": 2}, {"x": float("nan")}, {"y": 1.0}, {"covariance": np.array([1.0, 0, 0, -1.0])},
-                 {"covariance": np.array([25.0, 0, 0, 25.0])}, {"covariance": np.array([1e-9, 1e-10, 0, 1e-9])}]  # fmt: skip
+        wrong = [
+            {"flags": 2},
+            {"x": float("nan")},
+            {"y": 1.0},
+            {"covariance": np.array([1.0, 0, 0, -1.0])},
+            {"covariance": np.array([25.0, 0, 0, 25.0])},
+            {"covariance": np.array([1e-9, 1e-10, 0, 1e-9])},
+        ]
         for stars in lists:
             for k, broken in enumerate(wrong):
                 at = stars.mid_unix_s + 0.01 * k
