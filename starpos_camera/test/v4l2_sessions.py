@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import v4l2
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_camera.sources.video import Video
 
@@ -60,12 +59,6 @@ def frames(source, settings=((None, None),)):
         out.append(told(source, CaptureSettings(exposure_s, gain, 5.0)))
         wait(0.2)
     return out
-
-
-def impatient(source):
-    """A frame, of a source that gives up after a second, not after ten."""
-    v4l2.MAX_WAIT_S = 1.0
-    return [told(source)]
 
 
 def unplugged(source):
