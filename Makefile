@@ -31,13 +31,14 @@ emulated: build
 	@. tools/env.sh && python tools/demo/emulated_instrument.py $(ARGS)
 
 test: build
+	@tools/setup/counterparts
 	@. tools/env.sh && python tools/test.py $(ARGS)
 
 lint: build
 	@. tools/env.sh && python tools/test.py --lint
 
 clean:
-	rm -rf build install log demo .pytest_cache .ruff_cache
+	rm -rf build install log demo .pytest_cache .ruff_cache .mypy_cache
 
 distclean: clean
 	rm -rf .underlay

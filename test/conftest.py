@@ -1,22 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ROS domain of this session's own, the graph's other end, and a solver that a file's tests share."""
 
-import os
-
 import pytest
-from domain_coordinator import domain_id
 
 from starpos_testing.graph.graph import Graph
 from starpos_testing.graph.shots import SOLVER
+from starpos_testing.nodes import take_domain
 
 
 @pytest.fixture(scope="session", autouse=True)
 def domain():
-    """A ROS_DOMAIN_ID from 1 to 100 that no other test session on this machine has."""
-    with domain_id() as number:
-        os.environ["ROS_DOMAIN_ID"] = str(number)
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        yield number
+    take_domain()
 
 
 @pytest.fixture(scope="module")

@@ -26,14 +26,15 @@ def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, sol
         )
     )
 
-    shown = {}
+    shown, looked_at = {}, set()
 
     def identified():
         """Pictures, stars and solutions of the frames that have all three, with circles of the solver's."""
         for image in images:
             stamp = (image.header.stamp.sec, image.header.stamp.nanosec)
             seen = [s for s in stars if s.header == image.header]
-            if stamp in graph.solutions and seen:
+            if stamp in graph.solutions and seen and stamp not in looked_at:
+                looked_at.add(stamp)
                 picture = message_to_frame(image).pixels
                 rows, columns = np.nonzero(np.abs(picture[: SMALL[1]].astype(int) - IDENTIFIED).max(2) < 40)
                 if len(rows):

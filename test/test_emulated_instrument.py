@@ -8,17 +8,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from starpos_testing.lacking import lacks
+from starpos_testing.patience import WAIT_S
 
 TOOL = Path(__file__).parent.parent / "tools" / "demo" / "emulated_instrument.py"
 FRAMES = 3
 
 
+@pytest.mark.timeout(5 * WAIT_S)
 def test_firmware_indi_camera_detector_and_solver_find_a_place_nobody_told_them(tmp_path):
     command = [sys.executable, str(TOOL), "--seed", "11", "--frames", str(FRAMES), "--out", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tool:
         try:
-            out, error = tool.communicate(timeout=80)
+            out, error = tool.communicate(timeout=4 * WAIT_S)
         except subprocess.TimeoutExpired:
             tool.send_signal(signal.SIGINT)  # it ends what it has started
             out, error = tool.communicate()

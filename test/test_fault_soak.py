@@ -6,15 +6,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from starpos_testing.patience import WAIT_S
+
 TOOL = Path(__file__).parent.parent / "tools" / "faults" / "fault_soak.py"
-FAULTS, SEED, PATIENCE_S = 200, 20778, 240
+FAULTS, SEED = 60, 20778
 
 
+@pytest.mark.timeout(5 * WAIT_S)
 def test_random_faults_make_no_wrong_fix_and_no_crash():
     command = [sys.executable, str(TOOL), "--faults", str(FAULTS), "--seed", str(SEED)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as tool:
         try:
-            out, _ = tool.communicate(timeout=PATIENCE_S)
+            out, _ = tool.communicate(timeout=4 * WAIT_S)
         except subprocess.TimeoutExpired:
             tool.send_signal(signal.SIGINT)  # it ends what it has started
             out, _ = tool.communicate()

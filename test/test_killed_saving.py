@@ -15,20 +15,20 @@ from starpos_common.messages import camera_to_message
 from starpos_interfaces.srv import SaveCalibration
 from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
-KILLS, KILLED_NODES = 100, 3
+KILLS, KILLED_NODES = 100, 2
 CALLS = 8  # that a service keeps
 # Forks a child that saves two contents in turn, kills it at a random moment, looks at the file; says how often which.
 KILLER = """
 import os, random, signal, sys, time
 from pathlib import Path
-from starpos import camera_yaml, instrument_file
-from starpos.camera import Camera
-from starpos.instrument import Instrument
+from starpos.instrument import camera_file, instrument_file
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 
 folder, kills = Path(sys.argv[1]), int(sys.argv[2])
 cameras = [Camera.from_focal(100, 80, focal) for focal in (1000.0, 2000.0)]
 files = {
-    "instrument.yaml": (lambda p, c: instrument_file.write(p, Instrument(c.fx, c)),
+    "instrument.yaml": (lambda p, c: instrument_file.write(p, Instrument(c.fx, camera=c)),
                         lambda p: instrument_file.read(p).focal_px),
     "camera.yaml": (lambda p, c: camera_file.write(p, c, "camera"), lambda p: camera_file.read(p).fx),
 }

@@ -11,7 +11,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
-from starpos_testing.graph.graph import WAIT_S
+from starpos_testing.patience import WAIT_S
 
 NIGHT = Path(__file__).parent / "data" / "night"
 POLICY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "sros2" / "policies.xml"

@@ -3,7 +3,8 @@
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
-the versions that Ubuntu 24.04 has (tools/setup/ubuntu-24.04.txt) in an environment of its own; `test.py --both` runs all.
+the versions that Ubuntu 24.04 has (tools/setup/ubuntu-24.04.txt), in an environment as bare as a newcomer's: without
+the counterparts that tools/setup/counterparts brings. `test.py --both` runs all.
 """
 
 import os
@@ -16,28 +17,48 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-LINTERS = [f"ruff {check} --output-format concise" for check in ("check", "format --check")]
-NO_TESTS = 5  # pytest's exit status where a -k left none
-COLCON = "--event-handlers console_direct+ console_stderr- status- summary- --packages-select"
-LANES = 3  # at once: some compute, others wait for nodes
-LONGEST_FIRST = (
-    "starpos", "graph", "starpos_camera", "starpos, Ubuntu's", "starpos_inclinometer", "starpos_camera, Ubuntu's",
-)  # fmt: skip
-VERSIONS = "tools/setup/ubuntu-24.04.txt"
-UBUNTU = ("src/starpos", "starpos_camera", "starpos_common", "starpos_inclinometer", "starpos_solver")
-# with the newest only, since they wait for nodes and for programs of others: CI is to end soon
-NEWEST_ONLY = [
-    f"starpos_camera/test/test_{name}.py"
-    for name in ("alpaca", "annotator", "camera", "clock", "detector", "gphoto2", "indi", "together", "v4l2")
+LINTERS = [
+    *(f"ruff {check} --output-format concise" for check in ("check", "format --check")),
+    "codespell",
+    "mypy",
 ]
+NO_TESTS = 5  # pytest's exit status where a -k left none
+SHOWN = 20  # of the slowest tests
+LANES = 3  # at once: some compute, others wait for nodes
+LONGEST_FIRST = ("graph", "starpos", "starpos_camera", "starpos, Ubuntu's", "starpos_inclinometer")
+VERSIONS = "tools/setup/ubuntu-24.04.txt"
+UNDERLAY = ROOT / ".underlay"
+# with the newest versions only: what waits for nodes, and what draws many nights, which versions do not change
+NEWEST_ONLY = [
+    "-m",
+    "not montecarlo",
+    *(f"--ignore=starpos_camera/test/test_{n}.py" for n in ("annotator", "camera", "clock", "detector")),
+    *(f"--ignore=starpos_camera/test/test_{n}.py" for n in ("together", "v4l2")),
+]
+# programs that a bare machine has not: those that tools/setup/missing looks for
+COUNTERPARTS = {"avr-gcc", "indiserver", "indi_simulator_ccd", "ip", "xmllint", "chromium", "chromedriver"}
 PRINTING, MAKING = threading.Lock(), threading.Lock()
 
-Tests = dict[str, Callable]  # of a name: what runs them, given a file for their output, and counts
+
+@dataclass
+class Outcome:
+    """What came of tests: how many passed, failed, were skipped; what each took; why which were skipped."""
+
+    counts: Counter = field(default_factory=Counter)
+    seconds: list[tuple[float, str]] = field(default_factory=list)
+    skipped: Counter = field(default_factory=Counter)
+
+    def __add__(self, other: "Outcome") -> "Outcome":
+        return Outcome(self.counts + other.counts, self.seconds + other.seconds, self.skipped + other.skipped)
+
+
+Tests = dict[str, Callable]  # by name: what runs them, given a file for their output; an Outcome
 
 
 def run(command: list[str], out=None, environment: dict[str, str] | None = None) -> int:
@@ -48,62 +69,61 @@ def run(command: list[str], out=None, environment: dict[str, str] | None = None)
     return result.returncode
 
 
-def lint() -> Counter:
+def lint() -> Outcome:
     """Run the linters."""
-    return Counter("failed" if run(shlex.split(linter)) else "passed" for linter in LINTERS)
+    return Outcome(Counter("failed" if run(shlex.split(linter)) else "passed" for linter in LINTERS))
 
 
-def junit_counts(path: Path, since: float, status: int, out) -> Counter:
-    """Counts of a JUnit file written after `since` (Unix s); a missing, stale or broken one is a failure.
+def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
+    """The outcome in a JUnit file written after `since` (Unix s); a missing, stale or broken one is a failure.
 
     So is an exit status that no failed test explains.
     """
     if not path.is_file() or path.stat().st_mtime < since:
         print(f"{path}: the tests ended without a result", file=out)
-        return Counter(failed=1)
+        return Outcome(Counter(failed=1))
     try:
-        suites = list(ElementTree.parse(path).getroot().iter("testsuite"))
+        root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         print(f"{path}: the tests ended with half a result ({error})", file=out)
-        return Counter(failed=1)
-    total = Counter()
-    for suite in suites:
+        return Outcome(Counter(failed=1))
+    counts = Counter()
+    for suite in root.iter("testsuite"):
         failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
         skipped = int(suite.get("skipped", 0))
-        total += Counter(passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped)
-    return total + Counter(failed=int(status not in (0, NO_TESTS) and total["failed"] == 0))
-
-
-def has_tests(folder: Path) -> bool:
-    return any(folder.glob("**/test_*.py"))
-
-
-def colcon(package: str, pytest_args: list[str], out) -> Counter:
-    """`colcon test`: the tests a package of ROS carries, in the environment it was built for."""
-    since = time.time()
-    command = [sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())"]
-    command += ["--log-level", "error", "--log-base", f"log/{package}", "test", *shlex.split(COLCON), package]
-    status = run(command + (["--pytest-args", *pytest_args] if pytest_args else []), out)
-    return junit_counts(ROOT / "build" / package / "pytest.xml", since, status, out)
+        counts += Counter(
+            passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped
+        )
+    counts += Counter(failed=int(status not in (0, NO_TESTS) and counts["failed"] == 0))
+    seconds = [
+        (float(case.get("time", 0)), f"{path.stem}: {case.get('classname')}::{case.get('name')}")
+        for case in root.iter("testcase")
+    ]
+    return Outcome(counts, seconds, Counter(skip.get("message") for skip in root.iter("skipped")))
 
 
 def pytest(
     folder: str, report: str, pytest_args: list[str], out, python=sys.executable, **options
-) -> Counter:
+) -> Outcome:
     """A folder's tests; options: those of `run`."""
     since, path = time.time(), ROOT / "log" / f"{report}.xml"
     status = run([python, "-m", "pytest", folder, f"--junit-xml={path}", *pytest_args], out, **options)
-    return junit_counts(path, since, status, out)
+    return outcome_of(path, since, status, out)
+
+
+def folders() -> dict[str, str]:
+    """The folders of packages' tests, by package."""
+    packages = [path.parent for pattern in ("*", "src/*") for path in ROOT.glob(f"{pattern}/package.xml")]
+    tests = [p / "test" for p in packages if any(p.glob("test/**/test_*.py"))]
+    return {folder.parent.name: str(folder.relative_to(ROOT)) for folder in tests}
 
 
 def newest(pytest_args: list[str]) -> Tests:
-    """Those of all packages and of the graph, in the workspace."""
-    packages = [p.parent.name for p in ROOT.glob("*/package.xml") if has_tests(p.parent / "test")]
-    tests = {name: partial(colcon, name, pytest_args) for name in packages}
-    tests["starpos"] = partial(pytest, "src/starpos/test", "starpos", pytest_args)
-    if has_tests(ROOT / "test"):
-        tests["graph"] = partial(pytest, "test", "graph", pytest_args)
-    return tests
+    """Tests of all packages and of the graph, in the workspace."""
+    return {
+        name: partial(pytest, folder, name, pytest_args)
+        for name, folder in (folders() | {"graph": "test"}).items()
+    }
 
 
 def made(folder: Path, out) -> bool:
@@ -115,61 +135,83 @@ def made(folder: Path, out) -> bool:
     with MAKING:
         if stamp.is_file() and stamp.read_text() == wanted:
             return True
-        base = (ROOT / ".underlay" / "python").read_text().strip()
+        base = (UNDERLAY / "python").read_text().strip()
         pip = [str(folder / "bin" / "python"), "-m", "pip", "--disable-pip-version-check", "install", "-q"]
         alone = os.environ | {"PYTHONPATH": ""}
         for command in ([base, "-m", "venv", "--clear", str(folder)], [*pip, "--no-input", "-r", VERSIONS]):
             if run(command, out, alone):
                 return False
         [packages] = folder.glob("lib/python*/site-packages")
-        behind = ROOT / ".underlay" / "venv" / packages.relative_to(folder)
+        behind = UNDERLAY / "venv" / packages.relative_to(folder)
+        # its packages, and not those its own .pth files name: the counterparts
         (packages / "workspace.pth").write_text(f"{behind}\n")
         stamp.write_text(wanted)
         return True
 
 
-def older(package: str, pytest_args: list[str], out) -> Counter:
-    """A package's tests with the versions that Ubuntu 24.04 has."""
-    folder = ROOT / ".underlay" / "ubuntu"
-    if not made(folder, out):
+def bare_environment(python: Path, programs: Path) -> dict[str, str]:
+    """Variables of a machine without counterparts: `programs` gets links to all others that are on the PATH."""
+    for folder in map(Path, os.environ["PATH"].split(os.pathsep)):
+        for program in folder.iterdir() if folder.is_dir() else ():
+            if program.name not in COUNTERPARTS and not (programs / program.name).is_symlink():
+                (programs / program.name).symlink_to(program)
+    rest = {name: value for name, value in os.environ.items() if name != "STARPOS_COMPLETE"}
+    return rest | {"PATH": f"{python.parent}{os.pathsep}{programs}"}
+
+
+def older(folder: str, report: str, pytest_args: list[str], out) -> Outcome:
+    """A folder's tests with the versions that Ubuntu 24.04 has, and nothing that a bare machine has not."""
+    ubuntu = UNDERLAY / "ubuntu"
+    if not made(ubuntu, out):
         print("Ubuntu 24.04's versions could not be installed", file=out)
-        return Counter(failed=1)
-    environment = os.environ | {"PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}"}
-    python, name = str(folder / "bin" / "python"), Path(package).name
-    chosen = [*(f"--ignore={path}" for path in NEWEST_ONLY), *pytest_args]
-    return pytest(f"{package}/test", f"{name}-ubuntu", chosen, out, python=python, environment=environment)
+        return Outcome(Counter(failed=1))
+    python = ubuntu / "bin" / "python"
+    with tempfile.TemporaryDirectory() as programs:
+        os.chmod(programs, 0o755)  # some tests become another user
+        environment = bare_environment(python, Path(programs))
+        chosen = [*NEWEST_ONLY, *pytest_args]
+        return pytest(folder, report, chosen, out, python=str(python), environment=environment)
 
 
-def shown(name: str, tests: Callable) -> Counter:
+def shown(name: str, tests: Callable) -> Outcome:
     """Run tests and show their output when it is whole."""
     begin = time.monotonic()
     with tempfile.TemporaryFile("w+") as out:
-        counts = tests(out)
+        outcome = tests(out)
         out.seek(0)
         with PRINTING:
             print(f"== {name}, {time.monotonic() - begin:.0f} s\n{out.read()}", flush=True)
-    return counts
+    return outcome
 
 
-def all_of(tests: Tests) -> Counter:
-    """The counts of all, some at once."""
+def all_of(tests: Tests) -> Outcome:
+    """The outcome of all, some at once."""
     names = sorted(
         tests, key=lambda n: (LONGEST_FIRST.index(n) if n in LONGEST_FIRST else len(LONGEST_FIRST), n)
     )
     with ThreadPoolExecutor(LANES) as lanes:
-        return sum(lanes.map(lambda name: shown(name, tests[name]), names), Counter())
+        return sum(lanes.map(lambda name: shown(name, tests[name]), names), Outcome())
 
 
 def main(args: list[str]) -> int:
     which = {"--lint", "--ubuntu", "--both"} & set(args)
     pytest_args = [a for a in args if a not in which]
-    total = Counter() if which == {"--ubuntu"} else lint()
+    total = Outcome() if which == {"--ubuntu"} else lint()
     tests = {} if which & {"--lint", "--ubuntu"} else newest(pytest_args)
     if which & {"--ubuntu", "--both"}:
-        tests |= {f"{Path(p).name}, Ubuntu's": partial(older, p, pytest_args) for p in UBUNTU}
+        tests |= {
+            f"{name}, Ubuntu's": partial(older, folder, f"{name}-ubuntu", pytest_args)
+            for name, folder in folders().items()
+        }
     total += all_of(tests)
-    print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
-    return int(total["failed"] > 0)
+    for reason, count in sorted(total.skipped.items()):
+        print(f"{count:4d} skipped: {reason}")
+    for seconds, name in sorted(total.seconds, reverse=True)[:SHOWN]:
+        print(f"{seconds:6.1f} s  {name}")
+    print(
+        f"{total.counts['passed']} passed, {total.counts['failed']} failed, {total.counts['skipped']} skipped"
+    )
+    return int(total.counts["failed"] > 0)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,13 @@ import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import yaml
 
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
 
 WIDTH, HEIGHT = 64, 48
 TOP_ROW, LEFT_COLUMN = 1.0, 0.25  # of the light of an asymmetric picture, black elsewhere
@@ -29,17 +28,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def needs(*modules: str):
-    for module in modules:
-        if not find_spec(module):
-            lacks("-r tools/setup/counterparts.txt", "pip install")
-
-
 class Simulator:
     """Cameras 0 (monochrome), 1 (Bayer, offset 1 in x) and 2 (colour), which look at a sky of their own: no network."""
 
     def __init__(self, folder: Path):
-        needs("alpaca", "alpaca_simulators")
+        require("alpaca", "alpaca_simulators")
         import alpaca_simulators
 
         template = Path(alpaca_simulators.__file__).parent / "config" / "template.yaml"

@@ -11,8 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from starpos_testing.lacking import lacks
-from starpos_testing.nodes import WAIT_S
+from starpos_testing.lacking import lacks, require
+from starpos_testing.patience import WAIT_S
 
 SIMULATOR, DEVICE = "indi_simulator_ccd", "CCD Simulator"
 LIAR = Path(__file__).parent / "indi_liar.py"
@@ -22,6 +22,7 @@ class IndiServer:
     """An indiserver of its own port, with its drivers; `start` again after `kill`."""
 
     def __init__(self, folder, *drivers):
+        require("indipyclient")
         for program in ("indiserver", SIMULATOR):
             if not shutil.which(program):
                 lacks("indi-bin")

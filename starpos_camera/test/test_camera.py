@@ -3,7 +3,6 @@
 
 import math
 import signal
-from importlib.util import find_spec
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from starpos.sky.catalogue import load_catalogue
 from starpos_common.messages import camera_to_message
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
 from starpos_testing.skies import raws
 
 SMALL = ("source:=simulated", "focal_mm:=50", "simulated.width:=640", "simulated.height:=480")
@@ -36,8 +35,7 @@ def hear_all(listener):
 
 
 def test_what_a_cameras_own_clock_is_off_goes_with_its_frames(start, listener, tmp_path):
-    if not find_spec("exifread"):
-        lacks("exifread", "pip install")
+    require("exifread")
     jpeg = cv2.imencode(".jpg", np.full((64, 96), 30, np.uint8))[1].tobytes()
     (tmp_path / "a.jpg").write_bytes(raws.with_exif(jpeg))
     _, _, captures = hear_all(listener)

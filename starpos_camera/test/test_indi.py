@@ -223,7 +223,7 @@ def test_closing_aborts_the_exposure_at_once(source, other):
     begin = time.monotonic()
     source.close()
     text, ended = attempt.end()
-    assert "closed" in text and ended - begin < 3
+    assert "closed" in text and ended - begin < LONG.exposure_s / 2
     other.hear("CCD_ABORT_EXPOSURE", "Ok")
     assert "the node ends" in sentence(source)
 
@@ -337,7 +337,7 @@ def test_the_node_publishes_frames_and_ends_at_once_in_a_long_exposure(server, o
     other.hear("CCD_EXPOSURE", "Busy", "60")
     begin = time.monotonic()
     status, out = camera.end(signal.SIGINT)
-    assert status == 0 and time.monotonic() - begin < 5, out
+    assert status == 0 and time.monotonic() - begin < 30, out
     other.hear("CCD_ABORT_EXPOSURE", "Ok")
 
 

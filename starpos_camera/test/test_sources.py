@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame sources by themselves."""
 
-from importlib.util import find_spec
-
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings, SourceEnded
 from starpos_interfaces.msg import Capture
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
 from starpos_testing.skies import raws
 
 NOW_S = 1793642400.0
@@ -152,9 +150,7 @@ def raw_files(folder, **exif):
 
 
 def test_a_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path):
-    for package in ("rawpy", "exifread"):
-        if not find_spec(package):
-            lacks(package, "pip install")
+    require("rawpy", "exifread")
     path = raw_files(tmp_path, subsec="25", offset="+01:00")  # of 18:00:00
     (refused,) = play(make(files__path=path), 1)
     assert "a.dng" in str(refused) and "files.exif" in str(refused)

@@ -18,6 +18,7 @@ from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.files import Files
 from starpos_camera.sources.source import CaptureError, CaptureSettings, NothingYet
 from starpos_camera.sources.watched_folder import IDLE_S, MOST_LOOKED_AT, PATIENCE, WatchedFolder
+from starpos_testing.patience import WAIT_S
 
 REST_S = 2.0
 SETTINGS = CaptureSettings(None, None, 5.0)
@@ -250,7 +251,7 @@ def make(path, **changes):
 
 def until_something(source):
     """The next exposure, or the error that is none of waiting."""
-    end = time.monotonic() + 20
+    end = time.monotonic() + WAIT_S
     while time.monotonic() < end:
         try:
             return source.capture(SETTINGS)

@@ -12,10 +12,10 @@ from pathlib import Path
 from starpos_inclinometer.sources.mcu_continuity import Continuity
 from starpos_inclinometer.sources.mcu_protocol import LineParser, Sample
 from starpos_testing.lacking import lacks
+from starpos_testing.patience import WAIT_S
 
 FIRMWARE = Path(__file__).parent.parent / "firmware"
 ELF, SIM = "inclinometer.elf", "inclinometer-sim"
-WAIT_S = 20.0
 NEEDED = {
     "gcc-avr": lambda: shutil.which("avr-gcc"),
     "avr-libc": lambda: preprocesses("avr-gcc", "-mmcu=atmega8", "avr/io.h"),

@@ -8,8 +8,7 @@ from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.sources.mcu import McuDecoder
 from starpos_inclinometer.sources.mcu_protocol import BAUD
 from starpos_inclinometer.sources.serial_link import LinkState, SerialLink
-
-WAIT_S = 20.0
+from starpos_testing.patience import WAIT_S
 
 
 class Reader:

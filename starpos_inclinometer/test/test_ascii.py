@@ -10,7 +10,6 @@ import tty
 
 import numpy as np
 import pytest
-from reader import WAIT_S
 
 from starpos_inclinometer.emulator import Pty
 from starpos_inclinometer.host_clock import HostClock, Moment
@@ -18,6 +17,7 @@ from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Phase
 from starpos_inclinometer.sources.source import Surroundings
+from starpos_testing.patience import WAIT_S
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 PLAIN = rf"(?P<x>{NUMBER}),(?P<y>{NUMBER})"

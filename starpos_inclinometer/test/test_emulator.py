@@ -14,6 +14,7 @@ from starpos_inclinometer.emulator import Mcu, Pty
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, SampleStatus
 from starpos_inclinometer.sources.sca100t import OUT_OF_RANGE, SATURATED, Sensor
+from starpos_testing.patience import WAIT_S
 
 COMMAND = [
     sys.executable,
@@ -89,7 +90,7 @@ def test_the_executable_ends_cleanly_and_removes_its_link(tmp_path, number):
     assert str(path).encode() in process.stdout.readline()
     assert path.is_symlink()
     process.send_signal(number)
-    _, err = process.communicate(timeout=10)
+    _, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err) == (0, b"")
     assert not path.is_symlink()
 
@@ -97,7 +98,7 @@ def test_the_executable_ends_cleanly_and_removes_its_link(tmp_path, number):
 def test_the_executable_refuses_with_one_line(tmp_path):
     path = tmp_path / "port"
     path.write_text("mine")
-    result = subprocess.run([*COMMAND, "--link", str(path)], capture_output=True, timeout=30, check=False)
+    result = subprocess.run([*COMMAND, "--link", str(path)], capture_output=True, timeout=WAIT_S, check=False)
     assert result.returncode == 1
     assert result.stderr.count(b"\n") == 1 and b"choose another --link" in result.stderr
     assert subprocess.run([*COMMAND, "--rate", "99"], capture_output=True, check=False).returncode == 2

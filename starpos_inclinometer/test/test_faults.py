@@ -14,7 +14,6 @@ import pytest
 from board import Board
 from corrupted import RATE_HZ, as_sent, decode, flipped, forged, lines
 from diagnostic_msgs.msg import DiagnosticArray
-from reader import WAIT_S
 from wire import Wire
 
 from starpos_inclinometer.emulator import Faults
@@ -27,6 +26,7 @@ from starpos_inclinometer.sources.reading import STUCK, Phase
 from starpos_inclinometer.sources.source import Surroundings
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
+from starpos_testing.patience import WAIT_S
 
 TILT_DEG = (3.0, -11.0)
 NEAR_DEG = 0.03  # eight times the noise

@@ -3,6 +3,7 @@
 
 import math
 import signal
+import statistics
 import time
 from pathlib import Path
 
@@ -78,7 +79,9 @@ def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listene
     stamps = [t.header.stamp.sec + t.header.stamp.nanosec * 1e-9 for t in listener.tilts]
     assert stamps == sorted(stamps)
     # The emulator asks for the tilt when the line is due: 24 ms of conversion and 11 ms of line later.
-    assert min(abs(stamps[20] - t + 0.035) for t in times) < 0.02
+    # On a busy machine one line or another is late.
+    late = [min((stamp - t + 0.035 for t in times), key=abs) for stamp in stamps[10:]]
+    assert abs(statistics.median(late)) < 0.02
     assert [b.sequence - a.sequence for a, b in zip(listener.tilts, listener.tilts[1:], strict=False)] == [
         1
     ] * (len(listener.tilts) - 1)

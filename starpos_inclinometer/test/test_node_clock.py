@@ -12,7 +12,8 @@ from rclpy.executors import SingleThreadedExecutor
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import InclinometerNode
 from starpos_interfaces.msg import Tilt
-from starpos_testing.nodes import WAIT_S, take_domain
+from starpos_testing.nodes import take_domain
+from starpos_testing.patience import WAIT_S
 
 
 @pytest.fixture

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from starpos_testing.domain import own_domain
+
 ROOT = Path(__file__).resolve().parents[2]
 
 QUICK_START = ROOT / "src" / "starpos_bringup" / "config" / "quick_start.xml"
@@ -248,13 +250,9 @@ def main() -> int:
     )
     options = parser.parse_args()
     only, rows = options.only.split(","), []
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     choose(options.profile)
-    from domain_coordinator import domain_id
-
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with domain_id() as number, tempfile.TemporaryDirectory() as scratch:
-        os.environ["ROS_DOMAIN_ID"] = str(number)
+    with own_domain(), tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         if "start" in only:
             from_start(folder, 1)  # the cache is warm from here

@@ -6,22 +6,20 @@
 Counts Ethernet's bytes, both ways, with all that DDS adds. Detection is on the mount, so that stars and tilts cross.
 """
 
-import os
 import sys
 import tempfile
 from pathlib import Path
+
+from starpos_testing.domain import own_domain
 
 CADENCE_S = 2.0
 
 
 def main() -> int:
-    from domain_coordinator import domain_id
-
     from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, traffic
 
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else 10
-    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
-        os.environ["ROS_DOMAIN_ID"] = str(number)
+    with own_domain(), tempfile.TemporaryDirectory() as folder:
         seen = traffic(Path(folder), frames, CADENCE_S)
     each, second = seen.bytes_per_frame, seen.bytes_per_second
     print(f"{seen.frames} frames, {seen.stars:.0f} stars each")

@@ -20,7 +20,9 @@ from pathlib import Path
 
 import demo
 import numpy as np
-from instrument_run import Place, Processes, own_domain
+from instrument_run import Place, Processes
+
+from starpos_testing.domain import own_domain
 
 PICTURE = Path(__file__).resolve().parents[2] / "src" / "starpos_dashboard" / "dashboard.png"
 PORT = Path("ttyUSB0")  # in the picture, where a robot's port has its name

@@ -23,7 +23,6 @@ from instrument_run import (
     executable,
     introduce,
     known_of,
-    own_domain,
     parse,
     parser_of,
     say_errors,
@@ -31,6 +30,8 @@ from instrument_run import (
     summarise,
     trouble_of,
 )
+
+from starpos_testing.domain import own_domain
 
 FRAMES, CADENCE_S, EXPOSURE_S = 10, 3.0, 0.5
 MEMORY_LIMIT_MB = 500  # of each node

@@ -28,13 +28,14 @@ from instrument_run import (
     Watcher,
     introduce,
     known_of,
-    own_domain,
     parse,
     parser_of,
     say_errors,
     summarise,
     trouble_of,
 )
+
+from starpos_testing.domain import own_domain
 
 FRAMES, CADENCE_S, EXPOSURE_S = 10, 3.0, 0.5
 START_S = 5.0

@@ -7,11 +7,9 @@ What tools/demo/demo.py and tools/demo/emulated_instrument.py have in common.
 import argparse
 import math
 import os
-import random
 import signal
 import subprocess
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,23 +57,6 @@ class Place:
             pointing_deg=pointing,
             misalignment_deg=self.misalignment,
         )
-
-
-@contextmanager
-def own_domain():
-    """A ROS_DOMAIN_ID that nobody has, least of all the graph of this shell, and only on this machine."""
-    others = [n for n in range(1, 100) if str(n) != os.environ.get("ROS_DOMAIN_ID")]
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ.pop("ROS_STATIC_PEERS", None)
-    try:
-        from domain_coordinator import domain_id
-    except ImportError:  # a robot without ros-jazzy-domain-coordinator
-        os.environ["ROS_DOMAIN_ID"] = str(random.choice(others))
-        yield
-        return
-    with domain_id(lambda: random.choice(others)) as number:
-        os.environ["ROS_DOMAIN_ID"] = str(number)
-        yield
 
 
 def executable(package: str, name: str) -> str:

@@ -11,7 +11,6 @@ defect in a log, recovery after every fault, and memory that stays.
 
 import argparse
 import math
-import os
 import signal
 import sys
 import tempfile
@@ -20,6 +19,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
+
+from starpos_testing.domain import own_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -231,12 +232,8 @@ def main(arguments=None) -> int:
     today = int(time.time() // 86400)
     parser.add_argument("--seed", type=int, default=today, help="default: of the day")
     options = parser.parse_args(arguments)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    from domain_coordinator import domain_id
-
     begin = time.monotonic()
-    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
-        os.environ["ROS_DOMAIN_ID"] = str(number)
+    with own_domain(), tempfile.TemporaryDirectory() as folder:
         restarts = max(4, options.faults // FAULTS_A_RESTART)
         soak, memory = run(options.faults, options.seed, Path(folder), restarts)
     return report(soak, memory, f"--faults {options.faults} --seed {options.seed}", time.monotonic() - begin)

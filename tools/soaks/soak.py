@@ -6,26 +6,22 @@
 Exit status 0; 1 where the memory of the last half has grown by more than 2 MB against the half before.
 """
 
-import os
 import sys
 import tempfile
 from pathlib import Path
 
+from starpos_testing.domain import own_domain
 from starpos_testing.processes import cpu_s, memory_mb
 
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 DAY, WARM, ALLOWED_MB = 17280, 500, 2.0
 
 
 def main() -> int:
-    from domain_coordinator import domain_id
-
     from starpos_testing.graph.graph import Graph
     from starpos_testing.graph.shots import SOLVER, shoot
 
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else DAY
-    with domain_id() as number, tempfile.TemporaryDirectory() as folder:
-        os.environ["ROS_DOMAIN_ID"] = str(number)
+    with own_domain(), tempfile.TemporaryDirectory() as folder:
         graph = Graph()
         try:
             solver = graph.start(Path(folder) / "log", "starpos_solver", "solver", *SOLVER)

@@ -16,7 +16,8 @@ import pytest
 import yaml
 from sensor_msgs.msg import NavSatFix
 
-from starpos_testing.nodes import WAIT_S, Listener, take_domain
+from starpos_testing.nodes import Listener, take_domain
+from starpos_testing.patience import WAIT_S
 
 pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
 
@@ -197,6 +198,6 @@ def test_a_process_that_is_killed_is_started_again_where_that_is_asked_for(run):
 
 @pytest.mark.skipif(not NIGHT.is_dir(), reason="no bag beside the package")
 def test_a_replay_ends_with_its_bag(run):
-    out, _ = run("replay", f"bag:={NIGHT}", "rate:=0").communicate(timeout=60)
+    out, _ = run("replay", f"bag:={NIGHT}", "rate:=0").communicate(timeout=WAIT_S)
     assert "fixes are coming" in out and "messages in" in out, out
     assert "Traceback" not in out and "has died" not in out

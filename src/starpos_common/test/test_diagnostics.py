@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_testing.nodes import take_domain
+from starpos_testing.patience import WAIT_S
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def test_every_task_is_published_each_second_even_in_paused_simulated_time(node)
     node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
     executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    end = time.monotonic() + 20
+    end = time.monotonic() + WAIT_S
     while len(received) < 2:
         assert time.monotonic() < end
         executor.spin_once(timeout_sec=0.5)
@@ -68,7 +69,7 @@ def test_the_same_node_of_two_instruments_has_two_names(node):
         Diagnostics(twin, {"Solution": lambda: Diagnosis(Level.OK, "")})
         executor.add_node(twin)
     wanted = {"/a/solver: Solution", "/b/c/solver: Solution", "solver: Solution"}
-    end = time.monotonic() + 20
+    end = time.monotonic() + WAIT_S
     while not wanted <= {message.status[0].name for message in received}:
         assert time.monotonic() < end, received
         executor.spin_once(timeout_sec=0.5)

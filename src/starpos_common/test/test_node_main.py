@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from starpos_testing.nodes import take_domain
+from starpos_testing.patience import WAIT_S
 
-WAIT_S = 20.0
 PROGRAM = """
 import sys
 from starpos_common.node_main import run
@@ -136,5 +136,5 @@ def test_a_thread_at_work_does_not_hold_up_the_end():
         "sys.exit(leave(3))\n"
     )
     command = [sys.executable, "-c", script]
-    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=30)
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=WAIT_S)
     assert (ended.returncode, ended.stdout) == (3, "said\n")

@@ -120,12 +120,12 @@ def test_a_mistyped_name_is_a_warning_with_the_nearest_one(make, tmp_path, capfd
     warn_of_unknown([node])
     assert capfd.readouterr().err == ""
     file = tmp_path / "mine.yaml"
-    file.write_text("/**/params:\n  ros__parameters:\n    refraction: {presure: 95000.0}\n    bogus: 3\n")
+    file.write_text("/**/params:\n  ros__parameters:\n    refraction: {pressures: 95000.0}\n    bogus: 3\n")
     node, values = make("nois:=2.0", file=file)
     warn_of_unknown([node])
     said = capfd.readouterr().err
     assert values["refraction.pressure"] == 1.0e5 and said.count("is ignored") == 3
-    assert "no parameter refraction.presure, it is ignored: did you mean refraction.pressure?" in said
+    assert "no parameter refraction.pressures, it is ignored: did you mean refraction.pressure?" in said
     assert "no parameter nois, it is ignored: did you mean noise?" in said
     assert "no parameter bogus, it is ignored: see `ros2 param list`" in said
 

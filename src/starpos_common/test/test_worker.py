@@ -4,8 +4,7 @@
 import threading
 
 from starpos_common.worker import Worker
-
-WAIT_S = 10.0
+from starpos_testing.patience import WAIT_S
 
 
 def test_newest_job_wins_and_results_come_in_order():

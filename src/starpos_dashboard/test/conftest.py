@@ -4,12 +4,11 @@
 import json
 import shutil
 import signal
-from importlib.util import find_spec
 
 import pytest
 from browser import CHROMIUM, OK, STALE_AFTER_S, Instrument, Page
 
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import lacks, require
 from starpos_testing.nodes import Listener, Process, take_domain
 
 
@@ -24,8 +23,7 @@ def listener():
 @pytest.fixture(scope="module")
 def node(listener):
     """The dashboard as a process; its address."""
-    if find_spec("tornado") is None:
-        lacks("tornado", "pip install")
+    require("tornado")
     parameters = (
         "port:=0",
         f"stale_after:={STALE_AFTER_S}",
@@ -42,8 +40,7 @@ def node(listener):
 
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory):
-    if find_spec("selenium") is None:
-        lacks("selenium", "pip install")
+    require("selenium")
     for program, package in (("chromium", "chromium"), ("chromedriver", "chromium-driver")):
         if not shutil.which(program):
             lacks(package)

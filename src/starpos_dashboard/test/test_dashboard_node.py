@@ -7,7 +7,6 @@ import socket
 import sys
 import urllib.request
 from contextlib import closing
-from importlib.util import find_spec
 
 import pytest
 import said
@@ -15,8 +14,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, NavSatFix
 
 from starpos.errors import StarposError
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
 from starpos_testing.nodes import Listener, Process, take_domain
+from starpos_testing.patience import WAIT_S
 
 OK, WARN = 0, 1
 
@@ -31,8 +31,7 @@ def listener():
 
 @pytest.fixture
 def start():
-    if find_spec("tornado") is None:
-        lacks("tornado", "pip install")
+    require("tornado")
     processes = []
 
     def start(*parameters, executable="dashboard", module="starpos_dashboard.main", namespace="/"):
@@ -116,7 +115,7 @@ def test_the_solver_of_another_instrument_on_the_graph_is_not_its_own(start, lis
     host, port = address_of(listener, "/a/dashboard: Page")
 
     def names_shown(url=f"http://{host}:{port}/events"):
-        with urllib.request.urlopen(url, timeout=10) as page:
+        with urllib.request.urlopen(url, timeout=WAIT_S) as page:
             state = next(line for line in page if b'"lights"' in line)
         return {light["name"] for light in json.loads(state.removeprefix(b"data: "))["lights"]}
 
@@ -141,7 +140,7 @@ def test_hostile_messages_are_taken_in_its_stride(start, listener):
     broken = said.image(64, 40)
     broken.width = 2**31
     flood = said.diagnostics(*((f"\x1b[2J\u202en{k}: T", 200, "<script>" * 500) for k in range(500)))
-    with urllib.request.urlopen(f"http://{host}:{port}/events?frame", timeout=10) as page:
+    with urllib.request.urlopen(f"http://{host}:{port}/events?frame", timeout=WAIT_S) as page:
         listener.wait(lambda: image.get_subscription_count() == 1)
         seen = []
 

@@ -7,22 +7,20 @@ import resource
 import socket
 import time
 from contextlib import ExitStack, closing
-from importlib.util import find_spec
 
 import pytest
 
 from starpos_dashboard import access
-from starpos_testing.lacking import lacks
+from starpos_testing.lacking import require
+from starpos_testing.patience import WAIT_S
 
-WAIT_S = 10.0
 SECRETS = ("/../setup.py", "/..%2fserver.py", "/vendor/../../server.py", "//etc/passwd", "/assets/index.html",
            "/vendor/d3-geo.LICENSE", "/%00", "/index.html/..", "/frame.jpg")  # fmt: skip
 
 
 @pytest.fixture
 def server():
-    if find_spec("tornado") is None:
-        lacks("tornado", "pip install")
+    require("tornado")
     from starpos_dashboard.server import DashboardServer, listen
 
     server = DashboardServer(listen("127.0.0.1", 0), access.own_names() | {"robot.example"}, clients=3)

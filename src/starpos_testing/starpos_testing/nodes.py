@@ -6,32 +6,31 @@ import os
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import cache
-from importlib.util import find_spec
+from pathlib import Path
 
 import rclpy
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 
-WAIT_S = 30.0  # for anything
+from starpos_testing.domain import own_domain
+from starpos_testing.patience import WAIT_S
 
 
 @cache
 def take_domain() -> None:
-    """A ROS domain of this process, on this machine only; no other test session has it where domain_coordinator is."""
-    if find_spec("domain_coordinator"):
-        from domain_coordinator import domain_id
-
-        held = ExitStack()
-        number = held.enter_context(domain_id())
-        atexit.register(held.close)
-    else:
-        number = 1 + os.getpid() % 99
-    os.environ["ROS_DOMAIN_ID"] = str(number)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    """A ROS domain of this process alone, until it ends; what starts in it is found at once."""
+    held = ExitStack()
+    held.enter_context(own_domain())
+    atexit.register(held.close)
+    # the profile of the launch files; where their package is not built, nodes find each other some seconds later
+    with suppress(PackageNotFoundError):
+        profile = Path(get_package_share_directory("starpos_bringup"), "config", "quick_start.xml")
+        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
 
 
 class Listener:

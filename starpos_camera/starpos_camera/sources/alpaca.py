@@ -93,7 +93,7 @@ class Alpaca:
 
         from starpos_camera.sources.alpaca_http import Session
 
-        camera = Camera(width=self._address, height=self._number)
+        camera = Camera(self._address, self._number)
         camera.rqs = Session()
         if not camera.Connected:
             camera.Connected = True

@@ -168,7 +168,7 @@ class Gphoto2Camera:
 
 
 def _found(model, port):
-    """Name and port of the one camera on the busses that fits."""
+    """Name and port of the one camera on the buses that fits."""
     import gphoto2
 
     found = gphoto2.Camera.autodetect()

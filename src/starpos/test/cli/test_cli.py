@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from starpos.cli import COMMANDS, main
+from starpos_testing.patience import WAIT_S
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
 PLACE = {"latitude": 47.3, "longitude": -122.8}
@@ -374,7 +375,7 @@ def test_help_imports_nothing_slow():
         "print([m for m in ('astropy', 'cv2', 'scipy', 'numpy', 'yaml') if m in sys.modules])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
     )
     assert done.stdout.splitlines()[-1] == "[]"
 
@@ -385,7 +386,7 @@ def test_solves_help_does_not_import_astropy():
         "print('astropy' in sys.modules)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
     )
     assert done.stdout.splitlines()[-1] == "False"
 
@@ -395,7 +396,7 @@ def test_python_m_starpos(tmp_path):
         [sys.executable, "-m", "starpos", "detect", str(tmp_path / "none.fits")],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=WAIT_S,
         check=False,
     )
     assert done.returncode == 2
@@ -456,5 +457,5 @@ def test_a_reader_that_goes_away_is_no_error(lists):
     command = [sys.executable, "-m", "starpos", "catalogue", "info"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=WAIT_S)
     assert errors == b""

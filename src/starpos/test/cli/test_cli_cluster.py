@@ -15,7 +15,7 @@ from starpos.errors import FrameError
 from starpos.parallel import cluster as cluster_module
 from starpos.parallel.cluster import Cluster, ClusterError
 from starpos.parallel.same import same_here
-from starpos_testing.skies.raws import needs
+from starpos_testing.lacking import needs
 
 pytestmark = needs("distributed")
 

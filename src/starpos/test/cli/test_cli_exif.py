@@ -9,6 +9,7 @@ import pytest
 
 from starpos.cli import main
 from starpos.frames.reading import read_frame
+from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
@@ -16,7 +17,7 @@ AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 LONGITUDE_DEG, OFFSET_H = -122.8, -8.0
 M_PER_S = 464.0 * np.cos(np.radians(47.3))
 
-pytestmark = [raws.needs("rawpy"), raws.needs("exifread")]
+pytestmark = [needs("rawpy"), needs("exifread")]
 
 
 @pytest.fixture(scope="module")

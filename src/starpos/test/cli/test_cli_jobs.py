@@ -16,6 +16,8 @@ from pathlib import Path
 import pytest
 
 from starpos.cli import main
+from starpos_testing.lacking import require
+from starpos_testing.patience import WAIT_S
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
 SIZE = ("--size", "1000", "700", *WIDE)
@@ -135,7 +137,7 @@ BAD_CALLS = {
 @pytest.mark.parametrize("command", ["solve", "identify", "detect"])
 def test_a_bad_call_is_exit_2_and_one_line(kind, command, archive, capfd):
     if kind == "an address that is none":
-        pytest.importorskip("distributed")
+        require("distributed")
     given = ["--tilt", str(archive / "turned" / "tilt.csv")] if command == "solve" else []
     status, out, err = run(capfd, [command, *frames(archive / "turned"), *given, *BAD_CALLS[kind]])
     assert (status, out, len(err.splitlines())) == (2, "", 1)
@@ -213,7 +215,7 @@ def test_a_worker_killed_on_the_way_changes_no_answer(archive, capfd):
     with started(archive) as (process, first, workers, many):
         assert len(workers) == 2
         os.kill(workers[0], signal.SIGKILL)
-        rest, err = process.communicate(timeout=60)
+        rest, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err) == (0, "")
     *each, combined = (first + rest).splitlines()
     assert len(each) == len(many)
@@ -232,7 +234,7 @@ def test_workers_end_with_their_parent(ends, archive):
             os.killpg(process.pid, ends)  # as a terminal does
         else:
             process.kill()
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=WAIT_S)
         assert (process.returncode, err) == ((130, "") if ends == signal.SIGINT else (-ends, ""))
         assert len(fds) == 2
         assert all(gone(fd) for fd in fds)
@@ -244,7 +246,7 @@ def test_workers_end_where_nobody_reads_on(archive):
     with started(archive) as (process, _, workers, _):
         fds = [os.pidfd_open(w) for w in workers]
         process.stdout.close()
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=WAIT_S) == 0
         assert process.stderr.read() == ""
         assert all(gone(fd) for fd in fds)
         for fd in fds:

@@ -26,6 +26,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import TimeError
 from starpos.sky.site import Site
 from starpos.units import ARCSEC, MAS
+from starpos_testing.patience import WAIT_S
 
 
 def unix_of(*utc):
@@ -297,7 +298,7 @@ def test_motion_needs_no_tables():
         "print('astropy' in sys.modules)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
     )
     assert done.stdout == "False\n"
 

@@ -14,13 +14,14 @@ from starpos.errors import FrameError, TimeError
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import decode_frame, read_frame
+from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
 MOSAIC = raws.mosaic()
 SHOWN_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()  # raws.START, were it UTC
 TEHRAN = CameraClock(3.5, 2.0)
 
-needs_rawpy, needs_exifread = raws.needs("rawpy"), raws.needs("exifread")
+needs_rawpy, needs_exifread = needs("rawpy"), needs("exifread")
 
 
 def jpeg(**exif):

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from starpos.identification import triangles
 from starpos.instrument.camera import Camera
+from starpos_testing.patience import WAIT_S
 
 WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
 
@@ -259,7 +260,7 @@ def test_two_processes_at_once(own_cache):
         subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True)
         for _ in range(2)
     ]
-    said = [p.communicate(timeout=120)[0] for p in running]
+    said = [p.communicate(timeout=WAIT_S)[0] for p in running]
     assert [p.returncode for p in running] == [0, 0]
     assert said[0] == said[1] != ""
     assert len(list(own_cache.iterdir())) == 1  # nothing half made is left

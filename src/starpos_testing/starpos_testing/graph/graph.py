@@ -16,9 +16,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix
 
 from starpos_interfaces.msg import Capture, Solution, StarArray, Tilt
-
-WAIT_S = 40.0  # for anything; a fresh machine builds its star triangles meanwhile
-END_S = 10.0
+from starpos_testing.patience import WAIT_S
 
 
 def executable(package: str, name: str) -> str:
@@ -51,7 +49,7 @@ class Executable:
         if self.process.poll() is None:
             self.signal(signal.SIGINT)
         try:
-            self.process.wait(END_S)
+            self.process.wait(WAIT_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()

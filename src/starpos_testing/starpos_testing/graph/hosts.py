@@ -28,8 +28,9 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import NavSatFix
 
 from starpos_interfaces.msg import Solution
-from starpos_testing.graph.graph import END_S, WAIT_S, Executable, executable
+from starpos_testing.graph.graph import Executable, executable
 from starpos_testing.lacking import lacks
+from starpos_testing.patience import WAIT_S
 
 DEVICE = "link0"
 KINDS = {"solver/solution": Solution, "fix": NavSatFix}
@@ -202,7 +203,7 @@ class Ear:
     def __exit__(self, *error) -> None:
         self._process.stdin.close()  # which is what it ends at
         try:
-            self._process.wait(END_S)
+            self._process.wait(WAIT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
         self._thread.join()

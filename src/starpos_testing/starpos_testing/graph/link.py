@@ -10,11 +10,11 @@ import numpy as np
 from starpos.simulation.scene import scene_of
 from starpos_testing.graph.hosts import Cable, Ear, Host
 from starpos_testing.graph.shots import FULL, focal_of
+from starpos_testing.patience import WAIT_S
 
 FULL_FRAME_BYTES = FULL[0] * FULL[1] * 2
 PIXEL_UM = 6.4
 TILT_RATE_HZ = 10  # of the inclinometer as it comes
-QUIET_S = 10.0  # without a camera, to see what the tilts take
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,17 @@ class Traffic:
     bytes_per_second: float  # of that: the tilts
 
 
-def traffic(folder: Path, frames: int, cadence_s: float) -> Traffic:
-    """Of so many frames of the whole camera; the first ones, while nodes and middleware find each other, do not count."""
+def traffic(folder: Path, frames: int, cadence_s: float, quiet_s: float = 10.0) -> Traffic:
+    """Of so many frames of the whole camera; the first ones, while nodes and middleware find each other, do not count.
+
+    quiet_s: how long without a camera, to see what the tilts take.
+    """
     with two_hosts() as instrument:
         camera = start(instrument, folder, FULL, cadence_s)
         ear, cable = instrument.ear, instrument.cable
 
         def after(count: int) -> tuple[int, float]:
-            instrument.wait(lambda: len(ear.fixed) >= count, seconds=60.0 + count * cadence_s)
+            instrument.wait(lambda: len(ear.fixed) >= count, seconds=WAIT_S + count * cadence_s)
             return cable.bytes, max(ear.at_s.values())
 
         (begin, begin_s), first = after(2), len(ear.solutions)
@@ -102,8 +105,8 @@ def traffic(folder: Path, frames: int, cadence_s: float) -> Traffic:
         counted = len(ear.solutions) - first
         camera.end()
         quiet = cable.bytes
-        ear.comes(lambda: False, QUIET_S)
-        each_second = (cable.bytes - quiet) / QUIET_S
+        ear.comes(lambda: False, quiet_s)
+        each_second = (cable.bytes - quiet) / quiet_s
         each_frame = (end - begin - each_second * (end_s - begin_s)) / counted
         stars = np.mean([s.stars_detected for s in ear.solutions.values()])
     return Traffic(counted, float(stars), each_frame, each_second)

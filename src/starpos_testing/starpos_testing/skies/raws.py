@@ -4,23 +4,14 @@
 rawpy reads such files and writes none, so this writes the least of one that LibRaw takes for a camera's.
 """
 
-import os
 import struct
-from importlib.util import find_spec
 
 import numpy as np
-import pytest
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 SIZES = {BYTE: 1, ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, SRATIONAL: 8}
 COLOURS = {"r": 0, "g": 1, "b": 2}
 START = "2026:11:02 18:00:00"
-
-
-def needs(module):
-    """A mark of tests that skip without an optional library; where STARPOS_COMPLETE is set, as in CI, they fail."""
-    absent = not find_spec(module) and not os.environ.get("STARPOS_COMPLETE")
-    return pytest.mark.skipif(absent, reason=f"not on this machine: pip install {module}")
 
 
 def exif_tags(start=START, subsec=None, offset=None, exposure=(1, 2)):
