@@ -14,8 +14,6 @@
 // What self-calibration takes away: share of the gain, and volts at the input, of each channel.
 static const double GAIN_ERROR[2] = {0.02, -0.015}, OFFSET_V[2] = {40e-6, -25e-6};
 
-double gaussian(void);
-
 enum { COMMUNICATIONS, DATA, MODE, FILTER, DAC, OFFSET, GAIN, TEST };
 static const uint8_t BYTES[] = {1, 3, 2, 3, 1, 3, 3, 3};
 enum { IDLE, CONTINUOUS, SINGLE, STANDBY, ZERO_SCALE, FULL_SCALE };

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the firmware does to the parts that their data sheets forbid.
+// Records what the firmware does to the parts against their data sheets.
 #pragma once
 
-void complain(const char *what); // a string that stays; said once each
-const char *complaints(void);    // of all so far, separated by "; "
+void complain(const char *what); // records a sentence, each only once
+const char *complaints(void);    // all sentences so far, separated by "; "

@@ -30,22 +30,6 @@ static char input[4096];
 static size_t input_length;
 static bool input_running;
 
-static char said[1024];
-
-void complain(const char *what)
-{
-    if (strstr(said, what) || strlen(said) + strlen(what) + 3 > sizeof said)
-        return;
-    if (*said)
-        strcat(said, "; ");
-    strcat(said, what);
-}
-
-const char *complaints(void)
-{
-    return said;
-}
-
 double mcu_now(void)
 {
     return (double)avr->cycle / MCU_HZ;

@@ -18,6 +18,7 @@ struct sensor {
     double deselected_at;
 };
 
+double gaussian(void); // standard normal noise, for the converter too
 void sensor_init(struct sensor *s);
 void sensor_tilt(struct sensor *s, double now, double x, double y, double rate_x, double rate_y); // rad, rad/s
 double sensor_volts(struct sensor *s, int axis, double now); // `now` must not go back
