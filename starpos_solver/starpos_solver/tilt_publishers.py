@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the tilts come from one inclinometer alone.
 
-ROS lets anybody publish on `tilt`, and the readings of two inclinometers, mixed, make confident wrong fixes: while two are
-heard, neither is believed. A publisher that was killed stays in the graph for a while, so what counts is who is heard. One
-publisher is told from another by the frame of its messages and by the numbers that DDS gives them, which grow from message
-to message of one publisher.
+ROS lets anybody publish on `tilt`, and the readings of two inclinometers, mixed, make confident wrong fixes: while two
+are heard, neither is believed. A publisher that was killed stays in the graph for a while, so what counts is who is
+heard. One publisher is told from another by the frame of its messages and by the numbers that DDS gives them, which grow
+from message to message of one publisher.
 """
 
 from dataclasses import dataclass

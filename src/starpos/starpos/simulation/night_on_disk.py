@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.frames.star_list import write_star_list
 from starpos.progress import Progress, quiet
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, render
 from starpos.sky.catalogue import Catalogue
@@ -43,7 +43,7 @@ def write_night(
             stars = expose(now, catalogue, start, exposure_s, rng)
             if stars_only:
                 listed = detected(now, stars, start + exposure_s / 2, exposure_s, rng)
-                write_stars(folder / f"stars_{k:04d}.csv", listed, _text(start))
+                write_star_list(folder / f"stars_{k:04d}.csv", listed, _text(start))
             else:
                 write_fits(
                     folder / f"frame_{k:04d}.fits", render(now, stars, start, exposure_s, rng), _text(start)
@@ -80,19 +80,3 @@ def write_fits(path, frame: Frame, start_utc: str) -> None:
     header["FOCALLEN"] = (frame.focal_px / 1000, "mm, at 1 um pixels")
     header["XPIXSZ"] = (1.0, "um")
     fits.PrimaryHDU(frame.pixels, header).writeto(path, overwrite=True)
-
-
-def write_stars(path, stars: Stars, start_utc: str) -> None:
-    """A list of stars as CSV, in the form `read_frame` reads."""
-    about = {
-        "DATE-OBS": start_utc,
-        "EXPTIME": stars.exposure_s,
-        "NAXIS1": stars.width,
-        "NAXIS2": stars.height,
-    }
-    sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
-    rows = "".join(
-        f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n"
-        for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True)
-    )
-    Path(path).write_text(f"# {json.dumps(about)}\nx,y,flux,sigma\n{rows}")

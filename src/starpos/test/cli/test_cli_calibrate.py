@@ -10,9 +10,9 @@ import pytest
 
 from starpos.calibration.intrinsics import PARAMETERS
 from starpos.cli import main
+from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file
 from starpos.instrument.instrument import Calibration
-from starpos.simulation.night_on_disk import write_stars
 from starpos.utc import utc_text
 from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
@@ -34,7 +34,9 @@ def skies(tmp_path_factory, catalogue):
     folder = tmp_path_factory.mktemp("skies")
     tilts = ["utc_unix_s,theta_x_deg,theta_y_deg"]
     for k, (stars, level) in enumerate(zip(lists, levels, strict=True)):
-        write_stars(folder / f"{k}.csv", stars, utc_text(stars.mid_unix_s - stars.exposure_s / 2).rstrip("Z"))
+        write_star_list(
+            folder / f"{k}.csv", stars, utc_text(stars.mid_unix_s - stars.exposure_s / 2).rstrip("Z")
+        )
         x, y = np.degrees(np.arcsin((a3 @ level[2])[:2]))
         tilts.append(f"{stars.mid_unix_s},{x:.7f},{y:.7f}")
     (folder / "tilt.csv").write_text("\n".join(tilts) + "\n")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from starpos.cli import main
+from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file, instrument_file
-from starpos.simulation.night_on_disk import write_stars
 from starpos.utc import utc_text
 from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
@@ -38,7 +38,9 @@ class Night:
 def written(shot, folder) -> Night:
     rows = ["utc_unix_s,theta_x_deg,theta_y_deg,temperature_c"]
     for k, stars in enumerate(shot.frames):
-        write_stars(folder / f"{k}.csv", stars, utc_text(stars.mid_unix_s - stars.exposure_s / 2).rstrip("Z"))
+        write_star_list(
+            folder / f"{k}.csv", stars, utc_text(stars.mid_unix_s - stars.exposure_s / 2).rstrip("Z")
+        )
         t = shot.tilts[stars.mid_unix_s]
         rows.append(f"{stars.mid_unix_s},{np.degrees(t.theta_x):.8f},{np.degrees(t.theta_y):.8f},15.0")
     (folder / "tilt.csv").write_text("\n".join(rows) + "\n")

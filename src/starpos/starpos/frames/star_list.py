@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Star lists on disk: a CSV of centroids, read and written."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from starpos.errors import FrameError, one_line
+from starpos.frames.files import check_size
+from starpos.frames.header import focal_px, times
+from starpos.frames.stars import Stars
+
+MAX_CSV_BYTES = 20_000_000
+DEFAULT_SIGMA_PX = 0.1  # of a centroid whose file has no sigma
+
+
+def read_star_list(path: Path) -> Stars:
+    check_size(path, MAX_CSV_BYTES)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise FrameError(f"{path}: this is not a text file; give a CSV of centroids.") from None
+    first, _, rest = text.partition("\n")
+    try:
+        header = json.loads(first.removeprefix("#"))
+        width, height = header["NAXIS1"], header["NAXIS2"]
+        if not first.startswith("#") or not isinstance(width, int) or not isinstance(height, int):
+            raise ValueError
+    except (ValueError, KeyError, TypeError, RecursionError):
+        line = '# {"NAXIS1": 5616, "NAXIS2": 3744, "DATE-OBS": "...", "EXPTIME": 0.5}'
+        raise FrameError(
+            f"{path}: its first line does not give the frame's size; write it like {line}."
+        ) from None
+    try:
+        rows = [row for row in csv.reader(rest.splitlines()) if row]
+    except csv.Error as e:
+        raise FrameError(f"{path}: this is not a CSV ({one_line(e)}); write one star a line.") from None
+    names = [name.strip().lower() for name in rows[0]] if rows else []
+    if not {"x", "y", "flux"} <= set(names):
+        raise FrameError(
+            f"{path}: its second line names the columns {names}; it must name x, y, flux and may sigma."
+        )
+    try:
+        table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(names))
+        if len(table) != len(rows) - 1:
+            raise ValueError
+    except ValueError:
+        raise FrameError(f"{path}: a row is not {len(names)} numbers; write one star a line.") from None
+    column = dict(zip(names, table.T, strict=True))
+    sigma = column.get("sigma", np.full(len(table), DEFAULT_SIGMA_PX))
+    if not np.all((sigma > 0) & (sigma < 1e3)):
+        raise FrameError(
+            f"{path}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
+        )
+    order = np.argsort(-column["flux"], kind="stable")
+    mid, exposure, rounding = times(header, str(path))
+    return Stars(
+        x=column["x"][order],
+        y=column["y"][order],
+        flux=column["flux"][order],
+        snr=1.0 / sigma[order],
+        covariance=(sigma[order] ** 2)[:, None, None] * np.eye(2),
+        flags=np.zeros(len(table)),
+        width=width,
+        height=height,
+        mid_unix_s=mid,
+        exposure_s=exposure,
+        source=str(path),
+        focal_px=focal_px(header),
+        stamp_stddev_s=rounding,
+    )
+
+
+def write_star_list(path, stars: Stars, start_utc: str) -> None:
+    """A list of stars as CSV, in the form `read_frame` reads."""
+    about = {
+        "DATE-OBS": start_utc,
+        "EXPTIME": stars.exposure_s,
+        "NAXIS1": stars.width,
+        "NAXIS2": stars.height,
+    }
+    sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
+    rows = "".join(
+        f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n"
+        for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True)
+    )
+    Path(path).write_text(f"# {json.dumps(about)}\nx,y,flux,sigma\n{rows}")
