@@ -197,7 +197,8 @@ def read(path: Path | str) -> Catalogue:
     """The catalogue of one compact file; CatalogueError where it is missing, broken or of another format."""
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as f:
+        # numpy leaves a file open that turns out to be none of its own
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as f:
             if int(f["format"]) != FORMAT:
                 raise CatalogueError(
                     f"{path}: format {int(f['format'])}, this program reads {FORMAT}: build it again"
