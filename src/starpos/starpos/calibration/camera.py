@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera from the sky: frames are identified with the camera as it is given, the camera is fitted to their stars, and
-the better camera finds more of them, to the faint and the corners."""
+"""Calibrates a camera with the sky.
+
+Frames are identified with the given camera, the camera is fitted to their stars, and the better camera finds more stars:
+fainter ones, and those in the corners.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,17 +30,19 @@ from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 
-# what the coarse matches of the first rounds may tell: a term too many, and the corners' wrong matches make it come true
+# the first rounds have coarse matches and fit few terms: with more, wrong matches in the corners would confirm themselves
 FREE = (("fx", "fy", "k1"), ("fx", "fy", "cx", "cy", "k1"), ("fx", "fy", "cx", "cy", "k1", "k2"))
-# Of few stars nearly all must fit: a wrong lens leaves some over, which of many do not matter
+# of fewer stars than this nearly all must fit, because a wrong lens leaves some over
 FEW, NEARLY_ALL = 2 * fewest_stars(), 0.9
-ROUNDS = 5  # the most, of those in which all may
-SETTLED_SHARE = 0.002  # of the stars: so few more are no reason for another round
+# most rounds in which all terms are fitted
+ROUNDS = 5
+# a round that finds no more than this share of new stars is the last
+SETTLED_SHARE = 0.002
 
 
 @dataclass(frozen=True)
 class FromSky:
-    """The camera that frames told, and which of them (indices) were identified: the fit's, in order."""
+    """A camera from frames; used: indices of the frames that were identified, in the order of the fit."""
 
     fit: Intrinsics
     used: tuple[int, ...]
@@ -53,9 +58,10 @@ def calibrate_camera(
 ) -> FromSky:
     """One camera from frames of any attitudes.
 
-    levels: of each frame, C into the local level L (3, 3), None where it is unknown; given: right to 3 % of the focal
-    length and a few px of distortion.  Frames that are not identified are left out.  Raises CalibrationError where no
-    camera comes of it, InstrumentError for a mirrored frame, TimeError for an impossible time.
+    levels: for each frame the rotation (3, 3) of C into the local level L, None if unknown.
+    given: a camera that is right to 3 % of the focal length and a few px of distortion.
+    Frames that are not identified are left out.  Raises CalibrationError if no camera can be found, InstrumentError for
+    a mirrored frame, TimeError for an impossible time.
     """
     for stars in frames:
         if (stars.width, stars.height) != (given.width, given.height):
@@ -65,11 +71,12 @@ def calibrate_camera(
             )
     table = triangles.cached(catalogue, given.half_diagonal_rad, progress)
     skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
-    camera, known, before = given, {}, 0
+    camera, before = given, 0
+    attitudes: dict[int, np.ndarray] = {}
     for k, free in enumerate((*FREE, *[PARAMETERS] * ROUNDS)):
         sightings = {}
         for n, frame in enumerate(skies):
-            if sighting := frame.sighting(camera, atmosphere, known.get(n)):
+            if sighting := frame.sighting(camera, atmosphere, attitudes.get(n)):
                 sightings[n] = sighting
             progress("camera", (k + (n + 1) / len(skies)) / (len(FREE) + ROUNDS))
         if not sightings:
@@ -79,7 +86,7 @@ def calibrate_camera(
             )
         fit = fit_camera(list(sightings.values()), given, atmosphere, free)
         check_invertible(fit.camera)
-        camera, known = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
+        camera, attitudes = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
         count = sum(len(s.xy) for s in sightings.values())
         if k >= len(FREE) and abs(count - before) <= SETTLED_SHARE * count:
             break
@@ -96,20 +103,29 @@ def calibrate_camera(
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame's stars and the sky of its date."""
+    """The stars of a frame, and the sky of its date."""
 
     stars: Stars
     level: np.ndarray | None
     sky: Sky
 
     @classmethod
-    def of(cls, stars: Stars, level, catalogue: Catalogue, table: triangles.TriangleCatalogue) -> "_Frame":
+    def of(
+        cls,
+        stars: Stars,
+        level: np.ndarray | None,
+        catalogue: Catalogue,
+        table: triangles.TriangleCatalogue,
+    ) -> "_Frame":
         return cls(stars.take(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s))
 
     def sighting(
         self, camera: Camera, atmosphere: Atmosphere, attitude: np.ndarray | None
     ) -> Sighting | None:
-        """Its stars as this camera identifies them, first near the attitude where one is known; None: it does not."""
+        """The stars that are identified with this camera, first near a known attitude (3, 3); None if none are.
+
+        Raises InstrumentError for a mirrored frame.
+        """
         seen = unbent(camera.directions(self.stars.x, self.stars.y), self.level, atmosphere)
         priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
         found = identify_directions(seen, self.stars.sigma, camera, self.sky, priors)
@@ -119,9 +135,9 @@ class _Frame:
             raise InstrumentError(
                 f"{self.stars.source}: the frame is mirrored (its rows run bottom-up): flip it"
             )
-        return self._of(found, camera)
+        return self._sighting(found, camera)
 
-    def _of(self, found: Identification, camera: Camera) -> Sighting:
+    def _sighting(self, found: Identification, camera: Camera) -> Sighting:
         use = sound_matches(self.stars, found, ENOUGH_SOUND)
         star, index = found.star[use], found.catalogue[use]
         return Sighting(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera and one attitude a frame from identified stars: robust weighted least squares with weak priors.
+"""Fits one camera, and one attitude per frame, to identified stars: robust weighted least squares with weak priors.
 
-A narrow field cannot tell everything: a shift of the principal point is nearly a turn of the camera, k2 and k3 are nearly
-k1.  The priors say how far a camera may be from the one it was given as; the covariance holds what the sky told and what
-the priors did.  Attitudes are eliminated frame by frame (Schur complement), so that their number costs little.
+A narrow field cannot tell everything: a shift of the principal point looks nearly like a turn of the camera, and k2 and
+k3 look nearly like k1.  The priors say how far the camera may be from the given one; the covariance is that of sky and
+priors together.  Attitudes are eliminated frame by frame (Schur complement), so that many frames cost little.
 """
 
 from collections.abc import Sequence
@@ -19,29 +19,38 @@ from starpos.fix.outliers import distance2, judged
 from starpos.instrument.camera import Camera
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-# 1 sigma of the priors about the given camera: mean focal length, fx over fy, principal point (of the longer side), and
-# what k1, k2, p1, p2, k3 shift the corner by (of half the diagonal)
+# 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
+# side), and the shift of a corner by k1, k2, p1, p2, k3 (share of half the diagonal)
 FOCAL, SQUARE, PRINCIPAL = 0.03, 0.005, 0.03
 CORNER = (0.02, 0.01, 0.003, 0.003, 0.005)
-# Without tilts: refraction shrinks the field as at the zenith across the vertical, twice that along it at 45 deg
-UNLEVELLED = 1.25, 0.3  # of the shrinking at the zenith: taken, and 1 sigma an axis
-UNTIMED = 1e-4  # that and less is the scale changed by aberration, which needs a time
-TOLD = 0.5  # of the prior's sigma: below it the sky has told a parameter
-BEYOND_PRIOR = 5.0  # sigma: no camera as it was given
-STARS_EACH = 3  # for each free parameter; with fewer one wrong match in a corner can pass for a lens
+# Refraction shrinks the field: across the vertical as at the zenith, along it twice as much at 45 deg.  For a frame of
+# unknown level: the shrinking that is assumed, and its sigma per axis, in units of that at the zenith
+UNLEVELLED = 1.25, 0.3
+# aberration, which needs a time, changes the scale by this at most
+UNTIMED = 1e-4
+# the sky has told a parameter if its sigma is below this share of the prior's
+TOLD = 0.5
+# sigma; a parameter further off than this is not of the given camera
+BEYOND_PRIOR = 5.0
+# stars for each free parameter; with fewer, one wrong match in a corner can look like a lens
+STARS_EACH = 3
 MAX_SCATTER_PX = 1.5
-MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6  # the last in sigma of the priors
+# the last in sigma of the priors
+MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6
 STEP_RAD = 1e-6  # of the numerical derivatives for the attitudes
-BORDER = 25  # points a side at which a camera is checked and its error told
+# a camera is checked, and its error computed, at so many points per side of the frame
+BORDER = 25
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sighting:
-    """One frame's identified stars.
+    """The identified stars of one frame.
 
-    xy (N, 2) px and covariance_px2 (N, 2, 2) as measured; directions (N, 3): where they are, aberration in them;
-    direction_sigma (N,) rad, one axis; attitude (3, 3): `directions` into C, about right; level (3, 3): C into the local
-    level L, None where it is unknown; timed: whether the aberration is of the frame's date.
+    xy (N, 2) in px and covariance_px2 (N, 2, 2): as measured.
+    directions (N, 3): apparent directions, aberration included; direction_sigma (N,): sigma per axis in rad.
+    attitude (3, 3): takes `directions` into C, approximately.
+    level (3, 3): takes C into the local level L; None if unknown.
+    timed: whether the aberration is that of the frame's date.
     """
 
     xy: np.ndarray
@@ -55,12 +64,14 @@ class Sighting:
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """A camera that the sky told.
+    """A camera that was fitted to stars.
 
-    covariance (9, 9): of PARAMETERS, scatter beyond the stars' own errors included; prior_sigma (9,): what was known
-    before; attitudes (F, 3, 3): of the frames; xy (N, 2) px: the stars that were kept, frame by frame; frame (N,): where
-    each is; residual (N, 2) px: measured less predicted; before (N, 2): the same with the given camera, its focal length
-    and the attitudes fitted; scatter_px: 1 sigma an axis beyond the stars' own errors; rejected: stars left out.
+    covariance (9, 9): of PARAMETERS, with the scatter beyond the stars' own errors; prior_sigma (9,): of the priors.
+    attitudes (F, 3, 3): of the frames.
+    xy (N, 2) in px: the stars that were kept, frame by frame; frame (N,): the frame of each.
+    residual (N, 2) in px: measured minus predicted; before (N, 2): with the given camera, of which only the focal length
+    and the attitudes were fitted.
+    scatter_px: sigma per axis beyond the stars' own errors.  rejected: number of stars left out.
     """
 
     camera: Camera
@@ -76,26 +87,29 @@ class Intrinsics:
 
     @property
     def values(self) -> np.ndarray:
-        """(9,) of PARAMETERS."""
+        """Values (9,) of PARAMETERS."""
         return _values(self.camera)
 
     @property
     def sigma(self) -> np.ndarray:
+        """Standard deviations (9,) of PARAMETERS."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def told(self) -> np.ndarray:
-        """Which of PARAMETERS the sky told (9,); the others are held by their priors."""
+        """Mask (9,) of those PARAMETERS that the sky determines; the others are held by their priors."""
         return self.sigma < TOLD * self.prior_sigma
 
     @property
     def rms_px(self) -> float:
-        """Of the residuals, one axis."""
+        """Root mean square of the residuals per axis."""
         return rms(self.residual)
 
     def sigma_px(self, xy: np.ndarray) -> np.ndarray:
-        """How far off (N,) px, 1 sigma an axis, the camera's predictions at pixels xy (N, 2) are once a frame's attitude
-        and the scale are fitted: what is left of the covariance for those who use the camera."""
+        """Sigma per axis (N,) in px of the camera's predictions at pixels xy (N, 2), after a fit of attitude and scale.
+
+        Every use of the camera fits these two, so their part of the covariance does not matter.
+        """
         grid = _grid(self.camera, BORDER)
         j, free = (_derivatives(self.camera, np.concatenate([grid, xy]), k) for k in (PARAMETERS, ()))
         n = 2 * len(grid)
@@ -110,17 +124,16 @@ class Intrinsics:
 
 
 def rms(residual: np.ndarray) -> float:
-    """Root mean square of residuals (N, 2), one axis."""
+    """Root mean square per axis of residuals (N, 2)."""
     return float(np.sqrt(np.mean(residual * residual)))
 
 
 def fit_camera(
     sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str] = PARAMETERS
 ) -> Intrinsics:
-    """The camera of all sightings, near the `given` one; of its parameters those not in `free` stay as they are.
+    """Fit a camera near the `given` one to all sightings; parameters that are not in `free` keep their values.
 
-    Raises CalibrationError where the stars are too few or do not agree; whether they agree well enough and on a camera
-    that can be is for `check_sound` to say.
+    Raises CalibrationError if the stars are too few or do not agree.  `check_sound` tells whether the fit is good.
     """
     count, fewest = sum(len(s.xy) for s in sightings), fewest_stars(free)
     if count < fewest:
@@ -151,12 +164,12 @@ def fit_camera(
 
 
 def fewest_stars(free: Sequence[str] = PARAMETERS) -> int:
-    """How many a camera needs of which these are free; an attitude counts for one."""
+    """Number of stars that a camera with these free parameters needs; an attitude counts as one parameter."""
     return STARS_EACH * (len(free) + 1)
 
 
 def check_sound(fitted: Intrinsics, given: Camera) -> None:
-    """CalibrationError where the fit is none to work with."""
+    """Raise CalibrationError if the fit is not good enough to work with."""
     if (np.abs(fitted.values - _values(given)) > BEYOND_PRIOR * fitted.prior_sigma).any():
         raise CalibrationError(
             "the stars want a camera too unlike the given one: check focal length and pixel size, and that the frames "
@@ -171,7 +184,7 @@ def check_sound(fitted: Intrinsics, given: Camera) -> None:
 
 
 def check_invertible(camera: Camera) -> None:
-    """CalibrationError where the distortion folds inside the frame."""
+    """Raise CalibrationError if the distortion folds inside the frame."""
     try:
         camera.directions(*_grid(camera, BORDER).T)
     except InstrumentError:
@@ -181,19 +194,19 @@ def check_invertible(camera: Camera) -> None:
 
 
 def unbent(seen: np.ndarray, level: np.ndarray | None, atmosphere: Atmosphere) -> np.ndarray:
-    """Directions (N, 3) in C without refraction; without a level, with a middling one undone."""
+    """Directions (N, 3) in C with the refraction removed; without a level, an average one."""
     if level is not None:
         return atmosphere.refraction().unbend(seen @ level.T) @ level
     return rotation.normalised(seen / np.append([_shrinking(atmosphere)] * 2, 1.0))
 
 
 def _shrinking(atmosphere: Atmosphere) -> float:
-    """Of a field whose level is unknown: the factor by which refraction makes it smaller."""
+    """Factor by which refraction makes a field of unknown level smaller."""
     return 1 - UNLEVELLED[0] * atmosphere.refraction().a
 
 
 def _grid(camera: Camera, side: int) -> np.ndarray:
-    """Pixels (side^2, 2) evenly over the frame, its corners included."""
+    """Pixels (side^2, 2) on a regular grid over the frame, its corners included."""
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, side), np.linspace(0, camera.height - 1, side))
     return np.stack([x.ravel(), y.ravel()], -1)
 
@@ -202,15 +215,13 @@ def _values(camera: Camera) -> np.ndarray:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
-def _with_values(camera: Camera, values) -> Camera:
-    fx, fy, cx, cy, *distortion = (float(v) for v in values)
-    return Camera(
-        width=camera.width, height=camera.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion)
-    )
+def _with_values(camera: Camera, values: np.ndarray) -> Camera:
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = values.tolist()
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2, k3))
 
 
-# The unknowns q, in sigma of their priors: scale, squareness, seven of the camera, then what the air may do beyond what
-# is assumed of it: strength of the refraction, and what shrinks the field along x and y where the level is not known.
+# The unknowns q, in sigma of their priors: scale, squareness, seven parameters of the camera, the strength of the
+# refraction relative to the model, and the shrinking of the field along x and y where the level is not known
 UNKNOWNS = ("scale", "square", *PARAMETERS[2:], "refraction", "shrink_x", "shrink_y")
 CAMERA_UNKNOWNS = 9
 
@@ -221,36 +232,46 @@ def _only(name: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _CameraEstimate:
+    """The unknowns q (U,) and the attitudes (F, 3, 3) of the frames."""
+
     q: np.ndarray
     attitudes: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Settled:
+    """A finished fit: covariance (U, U) of q, mask `keep` (N,) of the stars, variance beyond their errors in px2."""
+
     state: _CameraEstimate
-    covariance: np.ndarray  # of q
+    covariance: np.ndarray
     keep: np.ndarray
     jitter2: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class _CameraAdjustment:
-    """All stars of all frames, frame by frame: first (F,) is the row where each begins."""
+    """The least-squares problem: all N stars of all F frames, frame by frame.
+
+    sigma (U,): of the priors of UNKNOWNS, 0 for one that is held.
+    xy (N, 2) px, stated (N, 2, 2) px2, places (N, 3): seen place, its covariance and direction of each star.
+    frame (N,): the frame of each star; first (F,): the row where each frame begins.
+    start (F, 3, 3): approximate attitudes.  level (F, 3, 3): C into L, 0 if unknown.
+    """
 
     given: Camera
-    sigma: np.ndarray  # of UNKNOWNS' priors; 0 for what is held
+    sigma: np.ndarray
     xy: np.ndarray
-    stated: np.ndarray  # (N, 2, 2) px2
+    stated: np.ndarray
     places: np.ndarray
     frame: np.ndarray
     first: np.ndarray
     start: np.ndarray
-    level: np.ndarray  # (F, 3, 3); 0 where it is unknown
+    level: np.ndarray
     atmosphere: Atmosphere
 
     @classmethod
     def of(
-        cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free
+        cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
     ) -> "_CameraAdjustment":
         sightings = [s for s in sightings if len(s.xy)]
         counts = [len(s.xy) for s in sightings]
@@ -279,11 +300,11 @@ class _CameraAdjustment:
 
     @cached_property
     def levelled(self) -> np.ndarray:
-        """Whether each star's frame has a level (N,)."""
-        return self.level.any((1, 2))[self.frame]
+        """Mask (N,) of the stars whose frame has a known level."""
+        return np.any(self.level != 0, axis=(1, 2))[self.frame]
 
     def named_per_unit(self) -> np.ndarray:
-        """(9, U): how PARAMETERS change with the unknowns."""
+        """Derivatives (9, U) of PARAMETERS with respect to the unknowns."""
         m = np.zeros((len(PARAMETERS), len(UNKNOWNS)))
         m[0, :2], m[1, :2] = np.array([1, 0.5]) * self.given.fx, np.array([1, -0.5]) * self.given.fy
         m[range(2, 9), range(2, 9)] = 1.0
@@ -293,7 +314,7 @@ class _CameraAdjustment:
         return _with_values(self.given, _values(self.given) + self.named_per_unit() @ q)
 
     def seen(self, state: _CameraEstimate) -> np.ndarray:
-        """Directions (N, 3) in C from which the light comes."""
+        """Directions (N, 3) in C from which the light of the stars comes."""
         u = np.einsum("nij,nj->ni", state.attitudes[self.frame], self.places)
         strength, *shrink = (state.q * self.sigma)[CAMERA_UNKNOWNS:]
         model = self.atmosphere.refraction(1 + strength)
@@ -315,38 +336,40 @@ class _CameraAdjustment:
         return _CameraEstimate(state.q, new)
 
     def derivatives(self, state: _CameraEstimate) -> tuple[np.ndarray, np.ndarray]:
-        """d predicted / d q (N, 2, U), and for the turns of its own frame (N, 2, 3)."""
+        """Derivatives of the predicted pixels with respect to q (N, 2, U) and to a turn of their own frame (N, 2, 3)."""
         seen, camera = self.seen(state), self.camera(state.q)
         here = camera.project(seen)
         of_q = np.zeros((len(here), 2, len(UNKNOWNS)))
         for k in np.flatnonzero(self.sigma):
             q = state.q.copy()
             q[k] += 1.0 if k < CAMERA_UNKNOWNS else 1e-3
-            # the projection is linear in each parameter of the camera: a difference is the derivative
+            # the projection is linear in each parameter of the camera, so a difference is the derivative
             if k < CAMERA_UNKNOWNS:
                 of_q[..., k] = self.camera(q).project(seen) - here
             else:
                 of_q[..., k] = (camera.project(self.seen(replace(state, q=q))) - here) * 1e3
         of_turn = []
+        # the light turns with the sky; the change of the refraction over a step is negligible
         for turn in np.eye(3) * STEP_RAD:
-            ahead, behind = (
-                camera.project(seen + sign * np.cross(turn, seen)) for sign in (1, -1)
-            )  # the light turns with the sky but for what refraction changes over the step
+            ahead, behind = (camera.project(seen + sign * np.cross(turn, seen)) for sign in (1, -1))
             of_turn.append((ahead - behind) / (2 * STEP_RAD))
         return of_q, np.stack(of_turn, -1)
 
-    def step(self, state: _CameraEstimate, covariance: np.ndarray, keep: np.ndarray):
-        """One of Gauss and Newton: dq (U,), turns (F, 3), and the covariance of q (U, U)."""
+    def step(
+        self, state: _CameraEstimate, covariance: np.ndarray, keep: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A Gauss-Newton step: change of q (U,), turns of the frames (F, 3), and the covariance (U, U) of q."""
         weight = np.linalg.cholesky(_inverse(covariance)) * keep[:, None, None]
         of_q, of_turn = self.derivatives(state)
         jq, jt = (np.einsum("nki,nkj->nij", weight, j) for j in (of_q, of_turn))
         r = np.einsum("nki,nk->ni", weight, self.residual(state))
 
-        def each_frame(a, b):
+        def sum_per_frame(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             return np.add.reduceat(np.einsum("nki,nkj->nij", a, b), self.first)
 
-        turns = each_frame(jt, jt) + np.eye(3)  # which a frame without stars needs, and no other feels
-        mixed, pull = each_frame(jt, jq), each_frame(jt, r[..., None])[..., 0]
+        # the unit matrix serves a frame without stars; it is negligible for all others
+        turns = sum_per_frame(jt, jt) + np.eye(3)
+        mixed, pull = sum_per_frame(jt, jq), sum_per_frame(jt, r[..., None])[..., 0]
         solved, pulled = np.linalg.solve(turns, mixed), np.linalg.solve(turns, pull[..., None])[..., 0]
         flat = jq.reshape(-1, len(UNKNOWNS))
         normal = np.eye(len(UNKNOWNS)) + flat.T @ flat - np.einsum("fki,fkj->ij", mixed, solved)
@@ -363,7 +386,10 @@ class _CameraAdjustment:
     def refined(
         self, state: _CameraEstimate, covariance: np.ndarray, keep: np.ndarray
     ) -> tuple[_CameraEstimate, np.ndarray]:
-        """The minimum from `state`, and the covariance of q there."""
+        """The minimum that is reached from `state`, and the covariance (U, U) of q there.
+
+        Raises CalibrationError if the stars do not project into the frame.
+        """
         cost = self.cost(state, covariance, keep)
         if cost == np.inf:
             raise CalibrationError(
@@ -377,14 +403,15 @@ class _CameraAdjustment:
                     state, cost = new, lower
                     break
             else:
-                break  # as low as rounding lets it be
+                # rounding lets the cost become no lower
+                break
             if np.abs(dq).max() < SETTLED:
                 break
         return state, inverse
 
 
 def _settled(problem: _CameraAdjustment) -> _Settled:
-    """The fit with outliers left out and the stars' errors widened to their scatter."""
+    """The fit without outliers, with the stars' errors widened to their scatter; raises CalibrationError."""
     state = _CameraEstimate(np.zeros(len(UNKNOWNS)), problem.start)
     keep, jitter2, settled = np.ones(len(problem.xy), bool), 0.0, False
     unknowns = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
@@ -405,13 +432,13 @@ def _settled(problem: _CameraAdjustment) -> _Settled:
 
 
 def _inverse(covariance: np.ndarray) -> np.ndarray:
-    """Of symmetric matrices (N, 2, 2): written out, ten times as quick as LAPACK's."""
+    """Inverses of symmetric matrices (N, 2, 2); written out, because LAPACK takes ten times as long."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return np.stack([c, -b, -b, a], -1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
 
 
 def _derivatives(camera: Camera, xy: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """d pixel / d parameter (2 N, 9); without names, / d attitude and scale, which every frame fits (2 N, 4)."""
+    """Derivatives (2 N, 9) of pixels by the parameters; without names, by attitude and scale (2 N, 4)."""
     v = camera.directions(*xy.T)
     here = camera.project(v)
     if not names:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A3 from frames: at a known place, or (see turning.py) at several headings of an unknown one."""
+"""A3 from frames: at a known place, or at several headings of an unknown place (turning.py)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, PlumbLine, Readings, hang
+from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, FixedFrame, PlumbLine, Readings, hang
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver
 from starpos.frames.stars import Stars
+from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import MOST_C, Calibration, Instrument
 from starpos.progress import Progress, quiet
@@ -22,27 +23,28 @@ from starpos.units import ARCSEC
 
 ROUNDS = 4
 SETTLED_RAD = 0.02 * ARCSEC
-OF_PLACE = (
-    "refraction",
-    "clock",
-    "time stamp",
-    "ut1",
-    "pole",
-)  # terms that move the zenith, mostly of all frames alike
+# terms that move the zenith, of all frames about alike
+OF_PLACE = ("refraction", "clock", "time stamp", "ut1", "pole")
 VALID_DAYS = 365.0
-MOST_SCATTER = 4.0  # chi-square a degree of freedom of frames that have one zenith
-TURN_SIGMA = 3.0  # by which the fixes hold what the leans told of A3's turn: they are of the same tilts
-OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25  # frames further off are left out, up to this share of all
+# chi-square per degree of freedom that frames of one zenith may have
+MOST_SCATTER = 4.0
+# the fixes use so many times the sigma of A3's turn that the leans gave, because both come from the same tilts
+TURN_SIGMA = 3.0
+# frames further off are left out, up to this share of all
+OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25
 
+# the tilt at (mid_unix_s, exposure_s)
 Tilts = Callable[[float, float], Tilt]
+# A3 and the zenith from readings, A3 as it is, and the fixes
+FindPlumbLine = Callable[[Readings, np.ndarray, list[Fix]], PlumbLine]
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The instrument with its A3, and each frame solved with it.
+    """An instrument with its new A3, and each frame solved with it.
 
-    plumb_stddev_arcsec: of the plumb line in the camera, the worse of two axes.  The fixes hold A3 for unknown: what they
-    say of the place they say without the calibration that was made of them.
+    plumb_stddev_arcsec: sigma of the plumb line in the camera, on the worse of two axes.
+    The budgets of the fixes take A3 as unknown, because the calibration was made from the same frames.
     """
 
     instrument: Instrument
@@ -51,6 +53,7 @@ class Calibrated:
 
     @property
     def fixes(self) -> list[Fix]:
+        """The fixes of the frames that have one."""
         return [s.fix for s in self.solutions if s.fix]
 
 
@@ -65,9 +68,11 @@ def calibrate_at(
 ) -> Calibrated:
     """A3 from one or more frames at a known astronomic place; the solver's A3 need not be near.
 
-    tilt: of (mid_unix_s, exposure_s).  One lean of the instrument tells A3 but for its turn about the plumb line, which
-    only a fix at another lean needs; the covariance says so.  turn_stddev_deg: how well the solver's A3 has it.  FixError
-    without a fix, or where the frames do not agree.
+    tilt: a function of (mid_unix_s, exposure_s).
+    site_stddev_arcsec: sigma of the place.
+    turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not tell
+    that turn, and only a fix at another lean needs it; the covariance shows it.
+    Raises FixError if there is no fix or the frames do not agree.
     """
 
     def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
@@ -92,34 +97,39 @@ def calibrate(
     solver: Solver,
     frames: Sequence[Stars],
     tilt: Tilts,
-    find: Callable[[Readings, np.ndarray, list[Fix]], PlumbLine],
+    find: FindPlumbLine,
     fewest: int,
     progress: Progress = quiet,
 ) -> Calibrated:
-    """Solve the frames and `find` A3 from what they say, until it stands still; from fewer fixes it stays what it was."""
+    """Solve the frames and `find` A3 from their fixes, again until it settles; with fewer fixes A3 stays as it was.
+
+    Raises FixError if the frames do not agree.
+    """
     unknown = Calibration.of(solver.instrument.calibration.misalignment_deg, UNKNOWN_ARCSEC)
     solver = _with(solver, unknown)
-    solutions: list[Solution | None] = [None] * len(frames)
-    plumb, sound = None, []
+    solutions: list[Solution] = []
+    hints: list[Hint | None] = [None] * len(frames)
+    plumb: PlumbLine | None = None
+    sound: list[FixedFrame] = []
     for k in range(ROUNDS):
-        for n, stars in enumerate(frames):
-            known = solutions[n].hint if solutions[n] else None
-            solutions[n] = solver.solve(stars, tilt, known)
+        solutions = []
+        for n, (stars, hint) in enumerate(zip(frames, hints, strict=True)):
+            solutions.append(solver.solve(stars, tilt, hint))
             progress("calibrating", (k + (n + 1) / len(frames)) / ROUNDS)
-        solved = [s for s in solutions if s.fix]
+        hints = [s.hint for s in solutions]
+        solved = [FixedFrame(s.fix, s.tilt) for s in solutions if s.fix and s.tilt]
         if len(solved) < fewest:
             break
         a3 = solver.instrument.mounting.a3
         plumb, sound = _found(find, solved, solver.instrument)
         solver = _with(solver, _unknown(plumb, sound))
-        if (
-            k and np.linalg.norm(plumb.a3[2] - a3[2]) < SETTLED_RAD
-        ):  # a turn about the plumb line changes no fix
+        # a turn about the plumb line changes no fix
+        if k and np.linalg.norm(plumb.a3[2] - a3[2]) < SETTLED_RAD:
             break
     progress("calibrating", 1.0)
     if plumb is None:
         return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
-    # not before: with a wrong A3 the errors are not known either
+    # the check waits for the end, because with a wrong A3 the errors are not known either
     if plumb.scatter > _most_scatter(len(sound)):
         raise FixError(
             f"{len(sound)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
@@ -129,7 +139,9 @@ def calibrate(
         plumb = replace(plumb, covariance=plumb.covariance * plumb.scatter)
         solutions = [_scattered(s, plumb.scatter) for s in solutions]
     if plumb.astray:
-        solutions = [replace(s, fix=_strayed(s.fix, plumb.astray)) if s.fix else s for s in solutions]
+        solutions = [
+            replace(s, fix=_with_zenith_error(s.fix, plumb.astray)) if s.fix else s for s in solutions
+        ]
     mean_plumb = Readings.of(sound, solver.instrument.inclinometer).mean_plumb
     error = float(plumb.stddev_across(mean_plumb) / ARCSEC)
     instrument = replace(solver.instrument, calibration=_dated(plumb, sound))
@@ -137,9 +149,9 @@ def calibrate(
 
 
 def _found(
-    find: Callable, solved: list[Solution], instrument: Instrument
-) -> tuple[PlumbLine, list[Solution]]:
-    """What `find` makes of the frames that agree with each other, and these."""
+    find: FindPlumbLine, solved: list[FixedFrame], instrument: Instrument
+) -> tuple[PlumbLine, list[FixedFrame]]:
+    """The plumb line that `find` gives for the frames that agree with each other, and these frames."""
     a3, errors = instrument.mounting.a3, instrument.inclinometer
     plumb = find(Readings.of(solved, errors), a3, [s.fix for s in solved])
     sound = [s for s, off in zip(solved, plumb.off, strict=True) if off < OUTLIER_SIGMA]
@@ -148,14 +160,17 @@ def _found(
     return find(Readings.of(sound, errors), a3, [s.fix for s in sound]), sound
 
 
-def _unknown(plumb: PlumbLine, sound: list[Solution]) -> Calibration:
-    """A3 as the fixes hold it: unknown, but for its turn about the plumb line where the leans told it; an unknown one
-    makes an error of every lean."""
+def _unknown(plumb: PlumbLine, sound: list[FixedFrame]) -> Calibration:
+    """A3 as the budgets of the fixes take it: unknown, except for its turn about the plumb line if the leans told that.
+
+    With an unknown turn every lean would become an error.
+    """
     tilt_deg = _mean_tilt_deg(sound)
     up = a2_matrix(*np.radians(tilt_deg))[2]
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
-    if plumb.astray:  # then `_strayed` has it: the noise of single tilts would seem to tell it here
+    # `_with_zenith_error` accounts for the turn then; here the noise of single tilts would seem to tell it
+    if plumb.astray:
         about = 0.0
     covariance = np.eye(3) * across**2 + np.outer(up, up) * (about**2 - across**2)
     held = Calibration(
@@ -167,15 +182,16 @@ def _unknown(plumb: PlumbLine, sound: list[Solution]) -> Calibration:
 
 
 def _most_scatter(frames: int) -> float:
-    """Chi-square a degree of freedom that sound frames may have; few may have more."""
-    from scipy.special import gammainccinv  # slow to import
+    """Chi-square per degree of freedom that sound frames may have; few frames may have more."""
+    # slow to import
+    from scipy.special import gammainccinv
 
     freedom = max(2 * frames - 5, 1)
     return max(MOST_SCATTER, 2 * float(gammainccinv(freedom / 2, 1e-9)) / freedom)
 
 
 def _scattered(solution: Solution, scatter: float) -> Solution:
-    """With the error of the tilt that the frames' scatter shows."""
+    """The solution with the tilt's error enlarged to the scatter of the frames."""
     if solution.fix is None:
         return solution
     terms = tuple(
@@ -184,16 +200,14 @@ def _scattered(solution: Solution, scatter: float) -> Solution:
     return replace(solution, fix=replace(solution.fix, terms=terms))
 
 
-def _strayed(fix: Fix, astray: float) -> Fix:
-    """With an error of the zenith (rad) that is the same for all frames, whichever way they look."""
+def _with_zenith_error(fix: Fix, astray: float) -> Fix:
+    """The fix with an error of the zenith (rad) that is the same for all frames, at any heading."""
     here, step = np.array([fix.latitude, fix.longitude]), 1e-6
     link = Site(*np.degrees(here)).enu.T @ fix.link_to_enu
     prime, meridian = curvature_radii_m(fix.latitude)
-    moves = (
-        (0.0, 1 / (prime * max(np.cos(fix.latitude), 1e-9))),
-        (1 / meridian, 0.0),
-    )  # rad for a metre east, north
-    columns = []
+    # latitude, longitude in rad for a metre east, north
+    moves = ((0.0, 1 / (prime * max(np.cos(fix.latitude), 1e-9))), (1 / meridian, 0.0))
+    columns: list[list[float]] = []
     for metre, attitude in zip(
         moves, ((0, 1 / prime, np.tan(fix.latitude) / prime), (-1 / meridian, 0, 0)), strict=True
     ):
@@ -205,7 +219,7 @@ def _strayed(fix: Fix, astray: float) -> Fix:
 
 
 def _usual_scatter(frames: int) -> float:
-    """What is not clearly more than frames say of themselves."""
+    """Chi-square per degree of freedom that frames with rightly stated errors usually stay below."""
     return 1 + 2 * np.sqrt(2 / max(2 * frames - 5, 1))
 
 
@@ -213,8 +227,8 @@ def _with(solver: Solver, calibration: Calibration) -> Solver:
     return replace(solver, instrument=replace(solver.instrument, calibration=calibration))
 
 
-def _dated(plumb: PlumbLine, solved: list[Solution]) -> Calibration:
-    """As of the middle of the frames."""
+def _dated(plumb: PlumbLine, solved: list[FixedFrame]) -> Calibration:
+    """The calibration at the mean time, temperature and tilt of the frames."""
     found = Calibration(
         covariance_arcsec2=tuple(map(tuple, (plumb.covariance / ARCSEC**2).tolist())),
         utc_unix_s=float(np.mean([s.fix.utc_unix_s for s in solved])),
@@ -226,11 +240,12 @@ def _dated(plumb: PlumbLine, solved: list[Solution]) -> Calibration:
     return found.turned_to(plumb.a3)
 
 
-def _mean_temperature_c(solved: list[Solution]) -> float:
-    known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MOST_C]  # NaN is not
+def _mean_temperature_c(solved: list[FixedFrame]) -> float:
+    # an unknown temperature is NaN, which is not below MOST_C
+    known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MOST_C]
     return float(np.mean(known)) if known else float("nan")
 
 
-def _mean_tilt_deg(solved: list[Solution]) -> tuple[float, float]:
+def _mean_tilt_deg(solved: list[FixedFrame]) -> tuple[float, float]:
     x, y = np.degrees(np.mean([[s.tilt.theta_x, s.tilt.theta_y] for s in solved], axis=0))
     return float(x), float(y)

@@ -1,18 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where on the frame stars lie off their predicted places, and by how much: pictures, with matplotlib."""
+"""Pictures of the residuals of stars over the frame, with matplotlib."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos.calibration.intrinsics import Intrinsics, rms
 
-MOST_ARROWS = 400  # more stars than this are drawn as the means of cells
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+
+# more stars than this are drawn as the means of cells
+MOST_ARROWS = 400
 ARROW_CELLS, COLOUR_CELLS = 22, 12  # along the longer side
-USUAL_ARROW = 0.8  # of a cell of ARROW_CELLS: how long the key's arrow is
+# length of the key's arrow, in cells of ARROW_CELLS
+USUAL_ARROW = 0.8
 FEWEST_IN_CELL = 3
 
 
-def draw(path, fit: Intrinsics, title: str) -> None:
-    """Write a picture of residual vectors before and after the fit, and of what is left, binned over the frame."""
+def draw(path: Path | str, fit: Intrinsics, title: str) -> None:
+    """Write a picture of the residuals before and after the fit, and of their rms over the frame."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -33,10 +42,10 @@ def draw(path, fit: Intrinsics, title: str) -> None:
     figure.savefig(path, dpi=90)
 
 
-def draw_residuals(axes, xy: np.ndarray, residual: np.ndarray, width: int, height: int) -> None:
-    """Residuals (N, 2) px of stars at xy (N, 2) px as arrows over a frame, with an arrow that says their scale.
+def draw_residuals(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: int, height: int) -> None:
+    """Draw residuals (N, 2) px of stars at xy (N, 2) px as arrows over a frame, with a key for their length.
 
-    Of more than MOST_ARROWS stars the means of cells with FEWEST_IN_CELL or more.
+    More than MOST_ARROWS stars are drawn as the means of cells with FEWEST_IN_CELL or more.
     """
     if len(xy) > MOST_ARROWS:
         xy, residual = _Cells(xy, ARROW_CELLS, width, height).means(xy, residual)
@@ -50,8 +59,8 @@ def draw_residuals(axes, xy: np.ndarray, residual: np.ndarray, width: int, heigh
     _frame(axes, width, height)
 
 
-def draw_rms(axes, xy: np.ndarray, residual: np.ndarray, width: int, height: int):
-    """The frame in square cells coloured by the rms of the residuals in them; returns the image, for a colour bar."""
+def draw_rms(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: int, height: int) -> "QuadMesh":
+    """Colour square cells of a frame by the rms of their residuals (N, 2) px; returns the image for a colour bar."""
     cells = _Cells(xy, COLOUR_CELLS, width, height)
     (square,) = cells.means(np.square(residual).mean(1))
     colour = np.full(len(cells.count), np.nan)
@@ -63,34 +72,37 @@ def draw_rms(axes, xy: np.ndarray, residual: np.ndarray, width: int, height: int
 
 
 class _Cells:
-    """Square cells over a frame, so many along its longer side, and which of them each star is in."""
+    """Square cells over a frame, `along` of them on its longer side.
+
+    cell (N,): the cell of each star; count, filled: number of stars per cell, and whether they are enough.
+    """
 
     def __init__(self, xy: np.ndarray, along: int, width: int, height: int):
         self.size = max(width, height) / along
         self.shape = int(np.ceil(height / self.size)), int(np.ceil(width / self.size))
         last = [self.shape[1] - 1, self.shape[0] - 1]
         column, row = np.clip(np.floor((xy + 0.5) / self.size).astype(int), 0, last).T
-        self.of = row * self.shape[1] + column
-        self.count = np.bincount(self.of, minlength=self.shape[0] * self.shape[1])
+        self.cell = row * self.shape[1] + column
+        self.count = np.bincount(self.cell, minlength=self.shape[0] * self.shape[1])
         self.filled = self.count >= FEWEST_IN_CELL
 
     def means(self, *values: np.ndarray) -> list[np.ndarray]:
-        """Of each array (N, ...) the means in the filled cells (M, ...)."""
+        """Means (M, ...) over the filled cells of each array (N, ...)."""
         return [self._mean(v) for v in values]
 
     def _mean(self, v: np.ndarray) -> np.ndarray:
         total = np.zeros((len(self.count), *v.shape[1:]))
-        np.add.at(total, self.of, v)
+        np.add.at(total, self.cell, v)
         return total[self.filled] / self.count[self.filled].reshape(-1, *[1] * (v.ndim - 1))
 
 
 def _round_number(value: float) -> float:
-    """1, 2 or 5 times a power of ten, at or just below `value`."""
+    """The largest 1, 2 or 5 times a power of ten that is not above `value`."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)
 
 
-def _frame(axes, width: int, height: int) -> None:
+def _frame(axes: "Axes", width: int, height: int) -> None:
     axes.set(
         xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x, px", ylabel="y, px", aspect="equal"
     )

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos`: the instrument without ROS, so that a night can be worked off a disk.  One file a command."""
+"""The command `starpos`: the instrument without ROS, for a night that is on disk.  Each command has a file."""
 
 import argparse
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from importlib import import_module
+from typing import NoReturn
 
 from starpos import __version__
 from starpos.errors import StarposError
@@ -25,17 +27,18 @@ BAD_CALL = 2
 
 
 class CommandParser(argparse.ArgumentParser):
-    """One line for a bad call, as for any other error."""
+    """A parser that prints one line for a bad call, as for any other error."""
 
-    def error(self, message: str):
+    def error(self, message: str) -> NoReturn:
+        """Print the message and exit."""
         self.exit(BAD_CALL, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-def _one_line_each(command: str):
-    """A warnings.showwarning that prints as any error is printed, and each sentence once."""
-    shown = set()
+def _one_line_each(command: str) -> Callable[..., None]:
+    """A warnings.showwarning that prints warnings like errors, each sentence once."""
+    shown: set[str] = set()
 
-    def show(message, *_about, **_more):
+    def show(message: Warning | str, *_about: object, **_more: object) -> None:
         text = " ".join(str(message).split())
         if text not in shown:
             shown.add(text)
@@ -50,23 +53,27 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     given = sys.argv[1:] if argv is None else argv
-    for name in BLAS_THREADS:  # a command is what loads numpy
+    # numpy, which reads these, is loaded with the command
+    for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        if given and given[0] == name:  # only the command in use is imported: --help stays quick
+        # only the command in use is imported, so that --help is quick
+        if given and given[0] == name:
             import_module(f"starpos.cli.{name}").define(sub)
     args = parser.parse_args(given)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _one_line_each(args.command)
-            status = args.run(args)
-        sys.stdout.flush()  # here, where a reader that has gone is expected, and not while the interpreter ends
+            status: int = args.run(args)
+        # a reader that has gone must be noticed here, and not while the interpreter ends
+        sys.stdout.flush()
         return status
     except StarposError as e:
         print(f"starpos {args.command}: {e}", file=sys.stderr)
         return BAD_CALL
-    except BrokenPipeError:  # the reader of our output has gone, as in `starpos ... | head`
+    # the reader of our output has gone, as in `starpos ... | head`
+    except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:

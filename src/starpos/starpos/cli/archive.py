@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `solve` is given: the frames of one night with their table of tilts, or an archive, a folder a night."""
+"""The input of `solve`: the frames of one night with their table of tilts, or an archive with a folder per night."""
 
 import os
 from dataclasses import dataclass
@@ -10,18 +10,21 @@ from starpos.errors import FrameError, TiltError
 
 @dataclass(frozen=True)
 class NightFolder:
-    """Frames that share one table of tilts, and make one fix together; folder: None where they were named one by one."""
+    """Frames with one table of tilts that make one fix together.
+
+    tilt: absolute path.  folder: None if the frames were named one by one.
+    """
 
     frames: tuple[str, ...]
-    tilt: str  # absolute
+    tilt: str
     folder: str | None = None
 
 
 def nights_of(given: list[str], tilt: str | None) -> list[NightFolder | FrameError]:
-    """One night of frames and a table; without a table, a night of each folder, or why it is none.
+    """One night from frames and a table; without a table a night for each folder, or the error why it is none.
 
-    FITS where there are any, else CSV, by name: as `report` takes a folder.  FrameError for what is not there,
-    TiltError for frames without a table.
+    A folder's frames are its FITS files, or if there are none its CSV files, in the order of their names.
+    Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:
         return [NightFolder(tuple(given), os.path.abspath(tilt))]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos calibrate`: what the stars tell of the instrument, written where the other commands read it."""
+"""`starpos calibrate`: the camera and A3 from stars, written to files that the other commands read."""
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
@@ -22,10 +23,11 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
 NOTHING = 1  # exit status
-CAMERA_NAME = "camera"  # the node's
+# the name that the camera node uses
+CAMERA_NAME = "camera"
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser, "one JSON object for --camera and one for --site instead of text")
     parser.add_argument(
         "--camera",
@@ -47,7 +49,7 @@ def define(parser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     if args.camera is None and args.site is None:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
     if args.map is not None and args.camera is None:
@@ -69,6 +71,8 @@ def run(args) -> int:
                 )
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.site is not None:
+            if tilts is None:
+                raise InstrumentError("--site needs the tilts: give --tilt CSV")
             calibrate_site.run(args, frames, instrument, tilts)
     except (CalibrationError, FixError) as e:
         common.complain("calibrate", e)
@@ -76,9 +80,10 @@ def run(args) -> int:
     return common.UNREADABLE if unreadable else 0
 
 
-def _stars_of_all(args) -> tuple[list[Stars], bool]:
+def _stars_of_all(args: argparse.Namespace) -> tuple[list[Stars], bool]:
     """The stars of the frames that can be read, and whether some cannot."""
-    progress, frames, unreadable = common.ProgressBar(), [], False
+    progress, unreadable = common.ProgressBar(), False
+    frames: list[Stars] = []
     for k, (_, item) in enumerate(common.frames_of(args.frames, common.clock_of(args))):
         if isinstance(item, FrameError):
             common.complain("calibrate", item)
@@ -89,13 +94,14 @@ def _stars_of_all(args) -> tuple[list[Stars], bool]:
     return frames, unreadable
 
 
-def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None) -> Camera:
-    """--camera: fit, write, draw and print it."""
+def _camera(
+    args: argparse.Namespace, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None
+) -> Camera:
+    """Fit the camera of --camera, write, draw and print it."""
     air = common.atmosphere_of(args)
     given = instrument.camera_for(frames[0].width, frames[0].height)
-    if tilts is None:
-        levels = [None] * len(frames)
-    else:
+    levels: Sequence[np.ndarray | None] = [None] * len(frames)
+    if tilts is not None:
         frames, levels = _levelled(frames, instrument, tilts)
     found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, common.ProgressBar())
     for k in sorted(set(range(len(frames))) - set(found.used)):
@@ -113,9 +119,12 @@ def _camera(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog | 
     return found.fit.camera
 
 
-def _levelled(frames: Sequence[Stars], instrument: Instrument, tilts: TiltLog):
-    """The frames that have a tilt, and C into L for each; a sentence about the others."""
-    kept, levels = [], []
+def _levelled(
+    frames: Sequence[Stars], instrument: Instrument, tilts: TiltLog
+) -> tuple[list[Stars], list[np.ndarray]]:
+    """The frames that have a tilt, with the rotation (3, 3) of C into L for each; complains about the others."""
+    kept: list[Stars] = []
+    levels: list[np.ndarray] = []
     for stars in frames:
         try:
             if stars.mid_unix_s is None:
@@ -147,7 +156,7 @@ def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[St
 
 
 def _about(found: FromSky) -> str:
-    """The camera as a table."""
+    """A table of the camera's parameters."""
     fit = found.fit
     lines = [
         f"{len(found.used)} frames, {len(fit.xy)} stars ({fit.rejected} left out): {fit.rms_px:.3f} px rms an axis, "
@@ -179,7 +188,8 @@ def _draw(path: str, found: FromSky) -> None:
     )
     try:
         residual_map.draw(path, fit, title)
-    except (OSError, ValueError) as e:  # ValueError: a suffix matplotlib cannot write
+    # ValueError comes from a suffix that matplotlib cannot write
+    except (OSError, ValueError) as e:
         raise InstrumentError(f"{path}: the map cannot be written there ({e})") from None
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos calibrate --site`: A3 at a known place, written into an instrument file."""
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +19,11 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 from starpos.sky.site import Site
 
-UNKNOWN_DEG = 60.0  # an angle with such an error is any
+# an angle with a larger sigma counts as unknown
+UNKNOWN_DEG = 60.0
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--site",
         type=float,
@@ -45,8 +47,8 @@ def define(parser) -> None:
     )
 
 
-def check(args) -> None:
-    """InstrumentError for a call that does not hold together."""
+def check(args: argparse.Namespace) -> None:
+    """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid) != (None,) * 4
     if args.site is None:
         if deflection or args.geodetic or (args.output, args.valid_days, args.turn_stddev) != (None,) * 3:
@@ -68,8 +70,8 @@ def check(args) -> None:
         raise InstrumentError(f"--site {latitude:g} {longitude:g}: give latitude and longitude in deg")
 
 
-def run(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> None:
-    """Find, write and print it; FixError where the frames do not tell."""
+def run(args: argparse.Namespace, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> None:
+    """Find A3, write and print it; raises FixError if the frames do not tell it."""
     solver = Solver(instrument, catalogue.load_catalogue(), common.atmosphere_of(args))
     site, stddev_arcsec = _site(args)
     found = calibrate_at(
@@ -90,12 +92,13 @@ def run(args, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> No
         print(about, end="")
 
 
-def _site(args) -> tuple[Site, float]:
-    """Astronomic place, and how well that is known, arcsec."""
+def _site(args: argparse.Namespace) -> tuple[Site, float]:
+    """The astronomic place, and its sigma in arcsec."""
     if not args.geodetic:
         return Site(*args.site), 0.0
-    d = common.vertical_of(args).at(*np.radians(args.site))
-    return Site(*np.degrees(astronomic(*np.radians(args.site), d))), d.stddev_arcsec
+    latitude, longitude = np.radians(args.site).tolist()
+    d = common.vertical_of(args).at(latitude, longitude)
+    return Site(*np.degrees(astronomic(latitude, longitude, d)).tolist()), d.stddev_arcsec
 
 
 def _about(found: Calibrated, site: Site) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos catalogue`: what the catalogues of stars and triangles hold, and building them."""
+"""`starpos catalogue`: shows and builds the catalogues of stars and triangles."""
 
 import argparse
 import sys
@@ -9,6 +9,7 @@ import numpy as np
 
 from starpos.cli import common
 from starpos.errors import CatalogueError
+from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
 
 ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source package tycho2:
@@ -16,7 +17,7 @@ ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source pa
 which brings tycho2_2.orig.tar.xz; give that archive, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat."""
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     info = kinds.add_parser("info", help="stars, magnitudes and errors of the catalogue in use")
     info.add_argument("path", nargs="?", metavar="FILE", help="another file than the one in use")
@@ -43,7 +44,8 @@ def define(parser) -> None:
     triangle.set_defaults(run=show_triangles)
 
 
-def show(args) -> int:
+def show(args: argparse.Namespace) -> int:
+    """Print the stars, magnitudes and errors of a catalogue."""
     c = catalogue.load_catalogue(args.path)
     v = c.vmag()
     sigma_mas = c.sigma(slice(None), args.year) / catalogue.MAS
@@ -60,7 +62,8 @@ def show(args) -> int:
     return 0
 
 
-def build_file(args) -> int:
+def build_file(args: argparse.Namespace) -> int:
+    """Build a catalogue from the original files; raises CatalogueError."""
     from starpos.sky import tycho2
 
     made = tycho2.build(args.originals, args.limit_mag, common.ProgressBar())
@@ -73,11 +76,13 @@ def build_file(args) -> int:
     return 0
 
 
-def show_triangles(args) -> int:
+def show_triangles(args: argparse.Namespace) -> int:
+    """Print the catalogue of triangles of a field, or the paper's."""
     return show_paper() if args.paper else show_field(common.camera_of(args))
 
 
 def show_paper() -> int:
+    """Count the paper's triangles again and print them beside its own numbers."""
     from starpos.identification import paper
 
     c = catalogue.load_catalogue()
@@ -101,7 +106,8 @@ def show_paper() -> int:
     return 0
 
 
-def show_field(camera) -> int:
+def show_field(camera: Camera) -> int:
+    """Print the catalogue of triangles for a camera."""
     from starpos.fix.solver import Solver
     from starpos.identification import triangles
     from starpos.instrument.instrument import Instrument
@@ -124,8 +130,8 @@ def show_field(camera) -> int:
     return 0
 
 
-def _stars_on_frames(camera, v: np.ndarray, frames: int = 2000) -> np.ndarray:
-    """How many of the directions v (N, 3) lie on each of some frames all over the sky."""
+def _stars_on_frames(camera: Camera, v: np.ndarray, frames: int = 2000) -> np.ndarray:
+    """Numbers (frames,) of the directions v (N, 3) that lie on each of random frames."""
     from scipy.spatial import cKDTree
     from scipy.spatial.transform import Rotation
 

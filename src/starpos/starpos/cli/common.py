@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands share: the instrument's and the air's options, reading frames, JSON without NaN, progress."""
+"""Shared by the commands: options of the instrument and the air, reading of frames, JSON without NaN, progress."""
 
 import argparse
 import json
 import math
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from starpos.earth import geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.fix.fix import Fix
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
@@ -20,12 +23,14 @@ from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file
 from starpos.instrument.camera import Camera
 
-GIVEN_STDDEV_ARCSEC = 1.0  # of a deflection given by hand without its error
+# sigma of a deflection that is given by hand without one
+GIVEN_STDDEV_ARCSEC = 1.0
 
 
 def add_frames(
     parser: argparse.ArgumentParser, json_help: str = "one JSON object a frame instead of a table"
 ) -> None:
+    """Add the frames and --json."""
     parser.add_argument(
         "frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids"
     )
@@ -33,7 +38,7 @@ def add_frames(
 
 
 def add_exif(parser: argparse.ArgumentParser) -> None:
-    """What `clock_of` reads."""
+    """Add the options that `clock_of` reads."""
     parser.add_argument(
         "--exif-utc-offset",
         type=_utc_offset,
@@ -56,11 +61,12 @@ def _utc_offset(text: str) -> float | str:
     return FILES_OWN if text == FILES_OWN else number(-ZONES_H, ZONES_H)(text)
 
 
-_utc_offset.__name__ = "float"  # what argparse calls it
+# the name that argparse prints
+_utc_offset.__name__ = "float"
 
 
 def clock_of(args: argparse.Namespace) -> CameraClock | None:
-    """The clock that wrote the files' EXIF; None where nobody vouches for it."""
+    """The clock that wrote the times in EXIF; None if the options do not give it.  Raises InstrumentError."""
     offset_h, stddev_s = args.exif_utc_offset, args.exif_clock_stddev
     if offset_h is None:
         if stddev_s is not None:
@@ -72,12 +78,13 @@ def clock_of(args: argparse.Namespace) -> CameraClock | None:
 
 
 def add_optics(parser: argparse.ArgumentParser) -> None:
+    """Add --focal-mm and --pixel-um."""
     parser.add_argument("--focal-mm", type=float, metavar="MM", help="focal length; within 3 %%")
     parser.add_argument("--pixel-um", type=float, metavar="UM", help="pixel size")
 
 
 def add_instrument(parser: argparse.ArgumentParser) -> None:
-    """What `instrument_of` reads."""
+    """Add the options that `instrument_of` reads."""
     parser.add_argument(
         "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
     )
@@ -92,6 +99,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
 
 
 def add_turn(parser: argparse.ArgumentParser) -> None:
+    """Add the option that `turn_of` reads."""
     parser.add_argument(
         "--turn-stddev",
         type=number(1e-6, 180),
@@ -101,11 +109,12 @@ def add_turn(parser: argparse.ArgumentParser) -> None:
 
 
 def turn_of(args: argparse.Namespace) -> float:
-    """deg; what --turn-stddev says."""
+    """Sigma in deg of A3's turn about the plumb line, from --turn-stddev."""
     return 180.0 if args.turn_stddev is None else args.turn_stddev
 
 
 def add_self_calibration(parser: argparse.ArgumentParser) -> None:
+    """Add --self-calibrate and --turn-stddev."""
     parser.add_argument(
         "--self-calibrate",
         action="store_true",
@@ -115,24 +124,32 @@ def add_self_calibration(parser: argparse.ArgumentParser) -> None:
 
 
 def check_self_calibration(args: argparse.Namespace) -> None:
-    """InstrumentError for a turn's error that nothing would take note of."""
+    """Raise InstrumentError for a --turn-stddev that would be ignored."""
     if args.turn_stddev is not None and not args.self_calibrate:
         raise InstrumentError("--turn-stddev is for --self-calibrate: give both")
 
 
 def add_size(parser: argparse.ArgumentParser) -> None:
-    """Frame size; with it the optics are the paper's where they are not given."""
-    size = {"type": number(16, 100_000, int), "metavar": ("W", "H"), "nargs": 2, "default": (5616, 3744)}
-    parser.add_argument("--size", **size, help="frame size in px (5616 3744)")
+    """Add the frame size, and make the paper's optics the default."""
+    parser.add_argument(
+        "--size",
+        type=number(16, 100_000, int),
+        nargs=2,
+        default=(5616, 3744),
+        metavar=("W", "H"),
+        help="frame size in px (5616 3744)",
+    )
     parser.set_defaults(focal_mm=600.0, pixel_um=6.4)
 
 
 def camera_of(args: argparse.Namespace) -> Camera:
     """An ideal camera from --focal-mm, --pixel-um and --size."""
-    return Camera.from_focal(*args.size, instrument.focal_px_of(args.focal_mm, args.pixel_um))
+    width, height = args.size
+    return Camera.from_focal(width, height, instrument.focal_px_of(args.focal_mm, args.pixel_um))
 
 
 def add_air(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `atmosphere_of` reads."""
     parser.add_argument(
         "--pressure-hpa", type=float, metavar="HPA", help="air pressure at the instrument, not reduced"
     )
@@ -141,6 +158,7 @@ def add_air(parser: argparse.ArgumentParser) -> None:
 
 
 def add_vertical(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `vertical_of` reads."""
     parser.add_argument("--xi", type=float, metavar="ARCSEC", help="deflection of the vertical, north (0)")
     parser.add_argument("--eta", type=float, metavar="ARCSEC", help="deflection of the vertical, east (0)")
     parser.add_argument(
@@ -154,7 +172,7 @@ def add_vertical(parser: argparse.ArgumentParser) -> None:
 
 
 def vertical_of(args: argparse.Namespace) -> Vertical:
-    """The deflection given by hand, or a geoid's; that of knowing nothing without either."""
+    """The deflection that is given by hand or by a geoid; without either an unknown one.  Raises StarposError."""
     by_hand = args.xi, args.eta, args.deflection_stddev
     if args.geoid is not None:
         if by_hand != (None, None, None):
@@ -168,27 +186,31 @@ def vertical_of(args: argparse.Namespace) -> Vertical:
     return Deflection(args.xi or 0.0, args.eta or 0.0, stddev)
 
 
-def number(low: float, high: float, kind: type = float):
-    """An argparse type: a number from low to high."""
+def number(low: float, high: float, kind: type[int] | type[float] = float) -> Callable[[str], Any]:
+    """An argparse type: a number of a kind, from low to high."""
 
-    def parse(text: str):
+    def parse(text: str) -> float:
         value = kind(text)
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(f"{text} must lie between {low:g} and {high:g}")
         return value
 
-    parse.__name__ = kind.__name__  # what argparse calls it
+    # the name that argparse prints
+    parse.__name__ = kind.__name__
     return parse
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
-    """The air as far as it was given."""
+    """The air from the options, as far as they give it."""
     pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100
     return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity)
 
 
-def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> instrument.Instrument:
-    """From --instrument, or --focal-mm and --pixel-um, or what the first frame's header says."""
+def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> instrument.Instrument:
+    """The instrument from --instrument, or from --focal-mm and --pixel-um, or from the first frame's header.
+
+    Raises InstrumentError if the options do not fit together or there is no focal length.
+    """
     path = getattr(args, "instrument", None)
     misalignment = getattr(args, "misalignment", None)
     flat = args.focal_mm is not None or args.pixel_um is not None or misalignment is not None
@@ -208,13 +230,22 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
         raise InstrumentError(
             "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
         )
-    return instrument.Instrument(
-        focal_px, calibration=instrument.Calibration(misalignment_deg=tuple(misalignment or (0.0, 0.0, 0.0)))
-    )
+    rx, ry, rz = misalignment or (0.0, 0.0, 0.0)
+    return instrument.Instrument(focal_px, calibration=instrument.Calibration(misalignment_deg=(rx, ry, rz)))
 
 
-def frames_of(paths: list[str], clock: CameraClock | None = None):
-    """(path, Frame or Stars or FrameError) of each, read one at a time."""
+class HasFocalLength(Protocol):
+    """A frame, or what is known of it."""
+
+    @property
+    def focal_px(self) -> float | None:
+        """Focal length in px that the frame's header states; None if it states none."""
+
+
+def frames_of(
+    paths: list[str], clock: CameraClock | None = None
+) -> Iterator[tuple[str, Frame | Stars | FrameError]]:
+    """(path, Frame or Stars or FrameError) of each path, read one at a time."""
     for path in paths:
         try:
             yield path, read_frame(path, clock)
@@ -223,7 +254,7 @@ def frames_of(paths: list[str], clock: CameraClock | None = None):
 
 
 def stars_of(item: Frame | Stars) -> Stars:
-    """Detected stars, or the given ones."""
+    """The stars of a list, or those detected on a frame."""
     if isinstance(item, Stars):
         return item
     from starpos.detection import detect
@@ -232,11 +263,12 @@ def stars_of(item: Frame | Stars) -> Stars:
 
 
 def print_json(value: dict) -> None:
-    """One line; numbers that are none become null."""
+    """Print an object on one line; NaN and infinity become null."""
     print(json.dumps(_plain(value)), flush=True)
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
+    """A value of types that json knows, without NaN and infinity."""
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
@@ -249,7 +281,7 @@ def _plain(value):
 
 
 def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection) -> None:
-    """One line where a geoid was given and has nothing to say about the place."""
+    """Complain if the geoid that was given has no data at the place."""
     if args.geoid is not None and deflection == Deflection():
         stddev = deflection.stddev_arcsec
         complain(
@@ -258,19 +290,21 @@ def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection)
 
 
 def complain(command: str, error: StarposError | str) -> None:
+    """Print a line on standard error, as the command's."""
+    # clears a progress bar
     if sys.stderr.isatty():
-        print("\r\x1b[K", end="", file=sys.stderr)  # a progress bar may stand there
+        print("\r\x1b[K", end="", file=sys.stderr)
     print(f"starpos {command}: {error}", file=sys.stderr)
 
 
-def tell_extrapolation(command: str, solved: list) -> None:
-    """One line for all Solutions whose Earth rotation is beyond the table: the days and the error of the worst."""
-    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
-    if worst is not None and worst.extrapolated_days > 0:
-        (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
+def tell_extrapolation(command: str, fixes: Sequence[tuple[Fix, float]]) -> None:
+    """Complain about the fix of the most days beyond the IERS table, if there is one.  fixes: with their days."""
+    fix, days = max(fixes, key=lambda f: f[1], default=(None, 0.0))
+    if fix is not None and days > 0:
+        (ut1,) = (t for t in fix.terms if t.name == "ut1")
         complain(
             command,
-            f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
+            f"the Earth's rotation is extrapolated {days:.0f} days beyond the IERS table, "
             f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data",
         )
 
@@ -279,9 +313,9 @@ UNREADABLE = 2  # exit status
 
 
 class ProgressBar:
-    """A bar on standard error for work of more than half a second; silent where that is no terminal."""
+    """A bar on standard error for work of more than half a second; silent if that is no terminal."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.begin = time.monotonic()
         self.shown = False
 

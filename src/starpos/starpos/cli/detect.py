@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos detect`: the stars of frames."""
 
+import argparse
+from typing import TYPE_CHECKING
+
 from starpos.cli import common, jobs
 from starpos.cli.frame_work import Detecting, Reader
 from starpos.errors import FrameError
 from starpos.frames.stars import Stars
 
+if TYPE_CHECKING:
+    from starpos.detection import Detection
 
-def define(parser) -> None:
+
+def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     status, work, number = 0, Detecting(Reader()), len(args.frames)
     with jobs.workers_of(args, number) as workers:
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
@@ -24,7 +30,7 @@ def run(args) -> int:
     return status
 
 
-def _tell(path: str, answer, as_json: bool) -> None:
+def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", as_json: bool) -> None:
     if isinstance(answer, FrameError):
         common.complain("detect", answer)
         if as_json:
@@ -34,7 +40,7 @@ def _tell(path: str, answer, as_json: bool) -> None:
     stars = found if isinstance(found, Stars) else found.stars
     if as_json:
         common.print_json({"file": path, "stars": _rows(stars), "cpu_ms": cpu_ms})
-    elif found is stars:
+    elif isinstance(found, Stars):
         print(f"{path}: a list of {len(stars)} stars", flush=True)
     else:
         print(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `detect`, `identify` and `solve` do with one frame: work that goes to any process or machine, for it is small.
+"""The work of `detect`, `identify` and `solve` on one frame, as small objects that can go to any process or machine.
 
-Each takes a frame's path and gives its answer, or the FrameError that is the frame's own.
+Each is called with the path of a frame and returns its answer; it raises FrameError if the frame is at fault.
 """
 
 import os
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Reader:
-    """`read_frame`, which keeps one frame that is going to be asked for again: in its own process only."""
+    """Reads frames, and keeps one that will be asked for again, in its own process only."""
 
     clock: CameraClock | None = None
     _kept: dict = field(default_factory=dict, compare=False)
@@ -39,16 +39,17 @@ class Reader:
         return self._kept.pop(path) if path in self._kept else read_frame(path, self.clock)
 
     def keep(self, path: str, item: Frame | Stars) -> None:
+        """Keep a frame for the next call with its path."""
         self._kept.clear()
         self._kept[path] = item
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[type["Reader"], tuple[CameraClock | None]]:
         return Reader, (self.clock,)
 
 
 @dataclass(frozen=True)
 class About:
-    """What a night's first frame says of the instrument."""
+    """Frame size and focal length in px, as the first frame of a night states them."""
 
     width: int
     height: int
@@ -57,7 +58,7 @@ class About:
 
 @dataclass(frozen=True)
 class Look:
-    """About the first of several frames that can be read; None where none can."""
+    """Finds the About of the first of several frames that can be read; None if none can."""
 
     read: Reader
 
@@ -72,7 +73,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Listing:
-    """The stars of a frame."""
+    """Gives the stars of a frame."""
 
     read: Reader
 
@@ -82,7 +83,7 @@ class Listing:
 
 @dataclass(frozen=True)
 class Detecting:
-    """(Detection, or the Stars of a list, cpu_ms) of `detect`."""
+    """Work of `detect`: the Detection of a frame, or the Stars of a list, and the CPU time in ms."""
 
     read: Reader
 
@@ -97,7 +98,7 @@ class Detecting:
 
 @dataclass(frozen=True)
 class Identifying:
-    """(Solution, cpu_ms) of `identify`."""
+    """Work of `identify`: the Solution of a frame, and the CPU time in ms."""
 
     read: Reader
     instrument: Instrument
@@ -105,7 +106,8 @@ class Identifying:
     def __call__(self, path: str) -> tuple[Solution, float]:
         item = self.read(path)
         solver = Solver(self.instrument, catalogue.load_catalogue())
-        with suppress(StarposError):  # identify says it
+        # `identify` reports the error
+        with suppress(StarposError):
             solver.prepare(item.width, item.height)
         begin = time.process_time()
         answer = solver.identify(stars_of(item))
@@ -114,16 +116,16 @@ class Identifying:
 
 @dataclass(frozen=True)
 class Solving:
-    """The Solution of a frame with a table of tilts."""
+    """Work of `solve`: the Solution of a frame; tilt: absolute path of the table."""
 
     read: Reader
     instrument: Instrument
     atmosphere: Atmosphere
-    tilt: str  # absolute
+    tilt: str
 
     @property
     def files(self) -> tuple[str, ...]:
-        """What it reads besides the frame."""
+        """Files that it reads besides the frame."""
         return (self.tilt,)
 
     def __call__(self, path: str) -> Solution:
@@ -133,7 +135,7 @@ class Solving:
 
 
 def tilts(path: str, noise_rad: float) -> TiltLog:
-    """The table as it is now, read once; TiltError as `read_tilt_csv` has it."""
+    """The table of tilts, read again only if the file has changed; raises TiltError as `read_tilt_csv` does."""
     try:
         status = os.stat(path)
     except (OSError, ValueError):
@@ -142,5 +144,5 @@ def tilts(path: str, noise_rad: float) -> TiltLog:
 
 
 @lru_cache(maxsize=4)
-def _tilts(path: Path, noise_rad: float, _of: tuple[int, int]) -> TiltLog:
+def _tilts(path: Path, noise_rad: float, _time_and_size: tuple[int, int]) -> TiltLog:
     return read_tilt_csv(path, noise_rad)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos identify`: where frames look, from their stars alone."""
 
+import argparse
+
 import numpy as np
 
 from starpos.cli import common, jobs
@@ -9,7 +11,7 @@ from starpos.errors import FrameError
 from starpos.fix.solver import Solution, Status
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
     common.add_exif(parser)
     common.add_optics(parser)
@@ -17,15 +19,17 @@ def define(parser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     any_found, unreadable, number = False, False, len(args.frames)
     read = Reader(common.clock_of(args))
     with jobs.workers_of(args, number) as workers:
         (about,) = workers.map([(Look(read), tuple(args.frames))])
-        work = Listing(read)  # each frame says why it cannot be read
+        # without a frame that can be read, each one reports why it cannot
+        work: Listing | Identifying = Listing(read)
         if about is not None:
-            work = Identifying(read, common.instrument_of(args, about))
-            jobs.prepare(work.instrument, about)
+            instrument = common.instrument_of(args, about)
+            work = Identifying(read, instrument)
+            jobs.prepare(instrument, about)
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
@@ -46,6 +50,7 @@ def run(args) -> int:
 
 
 def as_json(path: str, s: Solution) -> dict:
+    """The solution of a frame as JSON has it; angles in deg, None for what was not found."""
     a = s.attitude
     return {
         "file": path,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the frames of a call are worked: --jobs and --scheduler."""
+"""Options for the processes or machines that work on the frames: --jobs and --scheduler."""
 
 import argparse
 import sys
@@ -21,7 +21,7 @@ AUTO = "auto"
 
 
 def add_jobs(parser: argparse.ArgumentParser) -> None:
-    """What `workers_of` reads."""
+    """Add the options that `workers_of` reads."""
     parser.add_argument(
         "--jobs",
         type=_jobs,
@@ -43,7 +43,7 @@ def _jobs(text: str) -> int:
 
 
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:
-    """No more processes than frames."""
+    """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
     if args.scheduler is not None:
         if args.jobs is not None:
             raise InstrumentError("--scheduler names machines, --jobs processes of this one: give either")
@@ -53,7 +53,7 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
 
 
 def watched(answers: Iterable, number: int) -> Iterator:
-    """The same, with a bar where the answers themselves do not show how far it is."""
+    """The answers as they are, with a progress bar unless standard output shows them on the same terminal."""
     bar = common.ProgressBar()
     for k, answer in enumerate(answers, 1):
         if not sys.stdout.isatty():
@@ -62,7 +62,8 @@ def watched(answers: Iterable, number: int) -> Iterator:
 
 
 def prepare(instrument: Instrument, about: About) -> None:
-    """Have the triangles in the cache, where all processes of a machine find them."""
+    """Put the triangles into the cache, where all processes of a machine find them."""
     solver = Solver(instrument, catalogue.load_catalogue(), progress=common.ProgressBar())
-    with suppress(StarposError):  # which the frames will say
+    # the frames report the error
+    with suppress(StarposError):
         solver.prepare(about.width, about.height)

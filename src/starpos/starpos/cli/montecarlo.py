@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos montecarlo`: the paper's table of identified random fields, on this program; whole nights as well."""
+"""`starpos montecarlo`: the paper's table of identified random fields, made by this program; whole nights as well."""
 
 import argparse
 import json
 import sys
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -12,15 +13,19 @@ import numpy as np
 from starpos.cli import common, montecarlo_nights
 from starpos.errors import FrameError
 from starpos.fix.solver import Solver
+from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue
+from starpos.sky.catalogue import Catalogue
 
-PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}  # % of 1000 fields with so many false stars
-PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}  # % of fields of so many stars
+# % identified of 1000 fields with so many false stars, and of fields of so many stars
+PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}
+PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}
 PAPER_CAMERA = Camera.from_focal(5616, 3744, 93750.0)
-PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9  # the stars a field of the paper holds on average
+# a field of the paper holds so many stars on average
+PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
 
 EPILOG = """Realistic fields: brightness off by 0.3 mag, 5 % of the stars not detected, stars closer than 4 px one.
 --ideal leaves all three out, as the paper does.  False stars are brighter than all others.  Fields of 5, 6, 7 stars are
@@ -28,7 +33,7 @@ the brightest ones of random fields.  A right answer has the frame's centre with
 Exit status: 0; 1 where an answer was wrong or invented."""
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     whole = common.number(0, 10_000_000, int)
     parser.add_argument("--fields", type=whole, default=1000, metavar="N", help="of each kind (1000)")
@@ -78,7 +83,7 @@ def define(parser) -> None:
     montecarlo_nights.define(parser.add_subparsers(dest="experiment", metavar="[nights|honesty]"))
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     stars, camera = catalogue.load_catalogue(), common.camera_of(args)
     conditions = _conditions(args, stars, camera)
     solver = Solver(Instrument(camera.fx), stars, progress=common.ProgressBar())
@@ -99,9 +104,9 @@ def run(args) -> int:
 
 
 def looking(solver: Solver) -> montecarlo_fields.Answer:
-    """Where `solver` says that a frame's centre looks."""
+    """A function that asks `solver` for the direction (3,) in ICRS of a frame's centre."""
 
-    def answer(stars):
+    def answer(stars: Stars) -> np.ndarray | None:
         a = solver.identify(stars).attitude
         if a is None:
             return None
@@ -110,7 +115,7 @@ def looking(solver: Solver) -> montecarlo_fields.Answer:
     return answer
 
 
-def _conditions(args, stars, camera) -> montecarlo_fields.Conditions:
+def _conditions(args: argparse.Namespace, stars: Catalogue, camera: Camera) -> montecarlo_fields.Conditions:
     limit = args.limit_mag
     if limit is None:
         limit = (
@@ -119,11 +124,13 @@ def _conditions(args, stars, camera) -> montecarlo_fields.Conditions:
             else montecarlo_fields.limit_for(camera, stars, PAPER_STARS)
         )
     make = montecarlo_fields.ideal if args.ideal else montecarlo_fields.Conditions
-    return make(camera, limit, sigma_px=args.noise_px, focal_error=args.focal_error / 100)
+    return make(camera=camera, limit_mag=limit, sigma_px=args.noise_px, focal_error=args.focal_error / 100)
 
 
-def _rows(args, stars, conditions):
-    """Label, the paper's figure in %, number of fields and fields of each row of the table."""
+def _rows(
+    args: argparse.Namespace, stars: Catalogue, conditions: montecarlo_fields.Conditions
+) -> Iterator[tuple[str, str, int, Iterator[montecarlo_fields.Field]]]:
+    """Label, the paper's figure in %, number of fields, and fields for each row of the table."""
     papers = conditions.camera == PAPER_CAMERA and conditions.limit_mag == PAPER_LIMIT_MAG
     for k in args.false:
         fields = montecarlo_fields.false_stars(stars, conditions, args.seed, k)
@@ -136,7 +143,7 @@ def _rows(args, stars, conditions):
         yield "random points", "", number, montecarlo_fields.points(conditions, args.seed)
 
 
-def _print_head(conditions, stars) -> None:
+def _print_head(conditions: montecarlo_fields.Conditions, stars: Catalogue) -> None:
     c, camera = conditions, conditions.camera
     width, height = np.degrees(2 * np.arctan([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy]))
     print(
@@ -169,8 +176,8 @@ def _print_row(label: str, paper: str, t: montecarlo_fields.Tally, as_json: bool
     )
 
 
-def _keep(tally: montecarlo_fields.Tally, conditions, folder: Path) -> None:
-    """Fields that failed, as CSV with their truth in the first line."""
+def _keep(tally: montecarlo_fields.Tally, conditions: montecarlo_fields.Conditions, folder: Path) -> None:
+    """Write the fields that failed as CSV, with their truth in the first line; raises FrameError."""
     head = {"NAXIS1": conditions.camera.width, "NAXIS2": conditions.camera.height}
     try:
         folder.mkdir(parents=True, exist_ok=True)

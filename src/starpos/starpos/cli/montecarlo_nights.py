@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos montecarlo nights` and `honesty`: whole nights at random, their errors and whether the claims hold."""
+"""`starpos montecarlo nights` and `honesty`: random nights, their errors, and whether the stated errors are right."""
 
 import argparse
 import os
@@ -13,13 +13,20 @@ from starpos.cli import common
 from starpos.simulation import montecarlo_nights
 from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos.sky import catalogue
+from starpos.sky.catalogue import Catalogue
 
-PAPER_ARCSEC = (30.2, 49.0)  # mean absolute errors of latitude and longitude over its 50 nights
+RandomNight = Callable[[np.random.Generator, Catalogue], NightOutcome]
+
+# the paper's mean absolute errors of latitude and longitude over its 50 nights
+PAPER_ARCSEC = (30.2, 49.0)
 PAPER_CLOCK_S = 0.001
 ARCSEC_M = 30.87
-SOLVED = 0.95  # share of the nights that must have an answer
-TARGETS_ARCSEC = (1.0, 0.15)  # of the SCA100T and of a tiltmeter of 0.1 arcsec
-ALLOWED = 0.10  # of the normalised error squared off what it should be
+# share of the nights that must have an answer
+SOLVED = 0.95
+# for the SCA100T, and for a tiltmeter of 0.1 arcsec
+TARGETS_ARCSEC = (1.0, 0.15)
+# relative deviation of the normalised error squared from its expectation
+ALLOWED = 0.10
 
 NIGHTS = """The paper's fifty nights: a new place, date, pointing, A3 and zero each night, 25 frames at each of four
 headings, A3 told to nobody, clock to 1 ms; mean absolute errors on the ground (longitude times the cosine of latitude)
@@ -30,7 +37,7 @@ error drawn at random: the errors squared over their claimed covariance should a
 Exit status: 0; 1 where they are off by more than 10 %, or one night in twenty has no answer."""
 
 
-def define(experiments) -> None:
+def define(experiments: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add both to a parser's subparsers."""
     for name, number, text, work in (
         ("nights", 50, NIGHTS, run_nights),
@@ -54,7 +61,7 @@ def define(experiments) -> None:
         parser.set_defaults(run=work)
 
 
-def run_nights(args) -> int:
+def run_nights(args: argparse.Namespace) -> int:
     night = partial(montecarlo_nights.turned_night, errors=_errors(args), clock_stddev_s=PAPER_CLOCK_S)
     solved = [o for o in _all(args, night) if not o.trouble]
     off = np.array([o.off for o in solved]).reshape(-1, 3)
@@ -80,7 +87,7 @@ def run_nights(args) -> int:
     return int(not (len(solved) >= SOLVED * args.nights and np.all(error <= _target_m(args))))
 
 
-def run_honesty(args) -> int:
+def run_honesty(args: argparse.Namespace) -> int:
     outcomes = _all(args, partial(_either, errors=_errors(args)))
     rows = [("all", outcomes)] + [(k, [o for o in outcomes if o.kind == k]) for k in ("turned", "calibrated")]
     for label, some in rows:
@@ -102,35 +109,37 @@ def run_honesty(args) -> int:
     return int(not (enough and np.all(np.abs(ratios / [2.0, 2.0, 1.0] - 1) < ALLOWED)))
 
 
-def _target_m(args) -> float:
-    """For the mean absolute errors."""
+def _target_m(args: argparse.Namespace) -> float:
+    """Target in m for the mean absolute errors."""
     sca100t, quiet = TARGETS_ARCSEC
     return ARCSEC_M * (sca100t if args.tiltmeter is None else min(sca100t, quiet * args.tiltmeter / 0.1))
 
 
 def _nees(solved: list[NightOutcome]) -> np.ndarray:
-    """Mean normalised errors squared of position by gravity, on the ground, and heading."""
+    """Mean normalised errors squared (3,): of the astronomic place, the geodetic place, and the heading."""
     if not solved:
         return np.full(3, np.nan)
-    # of the rare night whose last pose nobody believed there is no heading
+    # a rare night has no heading, because no fix of its last pose was accepted
     return np.nanmean([(o.position_nees, o.ground_nees, o.heading_nees) for o in solved], axis=0)
 
 
-def _errors(args) -> montecarlo_nights.InclinometerErrors:
+def _errors(args: argparse.Namespace) -> montecarlo_nights.InclinometerErrors:
     return (
         montecarlo_nights.SCA100T if args.tiltmeter is None else montecarlo_nights.tiltmeter(args.tiltmeter)
     )
 
 
-def _either(rng: np.random.Generator, stars, errors) -> NightOutcome:
-    """A night of either kind; fewer frames than the paper's make more nights."""
+def _either(
+    rng: np.random.Generator, stars: Catalogue, errors: montecarlo_nights.InclinometerErrors
+) -> NightOutcome:
+    """A night of either kind, with fewer frames than the paper's so that more nights can be worked."""
     if rng.random() < 0.5:
         headings = int(rng.integers(3, 9))
         return montecarlo_nights.turned_night(rng, stars, errors, headings, int(rng.integers(1, 7)))
     return montecarlo_nights.calibrated_night(rng, stars, errors, int(rng.integers(1, 9)))
 
 
-def _all(args, night: Callable) -> list[NightOutcome]:
+def _all(args: argparse.Namespace, night: Callable) -> list[NightOutcome]:
     """Every night's outcome, the same ones however many processes there are."""
     seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, common.ProgressBar()
     for k, outcome in _each(night, seeds, min(args.jobs, args.nights)):
@@ -151,12 +160,16 @@ def _all(args, night: Callable) -> list[NightOutcome]:
     return ordered
 
 
-def _each(night: Callable, seeds: list, jobs: int) -> Iterator[tuple[int, NightOutcome]]:
+def _each(
+    night: RandomNight, seeds: list[np.random.SeedSequence], jobs: int
+) -> Iterator[tuple[int, NightOutcome]]:
+    """(number, outcome) of the night of each seed, in any order."""
     if jobs == 1:
         for k, seed in enumerate(seeds):
             yield k, _one(night, seed)
         return
-    _stars()  # before the processes part: they share it, and the triangles are built once
+    # loaded before the processes start, so that they share it and build the triangles once
+    _stars()
     with ProcessPoolExecutor(jobs) as pool:
         yield 0, pool.submit(_one, night, seeds[0]).result()
         waiting = {pool.submit(_one, night, seed): k for k, seed in enumerate(seeds[1:], 1)}
@@ -164,10 +177,10 @@ def _each(night: Callable, seeds: list, jobs: int) -> Iterator[tuple[int, NightO
             yield waiting[done], done.result()
 
 
-def _one(night: Callable, seed) -> NightOutcome:
+def _one(night: RandomNight, seed: np.random.SeedSequence) -> NightOutcome:
     return night(np.random.default_rng(seed), _stars())
 
 
 @lru_cache(maxsize=1)
-def _stars():
+def _stars() -> Catalogue:
     return catalogue.load_catalogue()

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos report`: what nights gave, as pictures and one page that opens anywhere."""
+"""`starpos report`: the results of nights as pictures, and as one page that any browser opens."""
 
+import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starpos.cli import common
 from starpos.errors import FrameError, InstrumentError
@@ -14,12 +17,16 @@ from starpos.report.night import Night
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
+if TYPE_CHECKING:
+    from starpos.report.bag import Recorded
+
 NO_FIX = 1
-ALL_FIGURES = 6  # nights that have all their figures; of more there are the table and the errors
+# so many nights get all their figures; more get the table and the errors only
+ALL_FIGURES = 6
 PIP = "pip install matplotlib rosbags"
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "nights",
         nargs="+",
@@ -37,7 +44,7 @@ def define(parser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     common.check_self_calibration(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
@@ -67,8 +74,8 @@ def run(args) -> int:
     return 0 if any(n.combined for n in nights) else NO_FIX
 
 
-def _night(path: Path, args) -> Night:
-    """One night worked through; StarposError where there is nothing to work on."""
+def _night(path: Path, args: argparse.Namespace) -> Night:
+    """The Night of a folder or a bag; raises StarposError if there is nothing to work on."""
     from starpos.report import bag, folder, recorded
     from starpos.report.working import Workshop, worked
 
@@ -94,19 +101,19 @@ def _night(path: Path, args) -> Night:
     return recorded.night(found, replace(shop, instrument_for=_once_a_size(_with_camera(args, found))))
 
 
-def _tilt_noise(args) -> float:
-    """rad, of a reading that does not tell its own; the focal length has no say in it."""
+def _tilt_noise(args: argparse.Namespace) -> float:
+    """Noise in rad of a tilt that does not state its own."""
     return _instrument(args).inclinometer.noise_rad
 
 
-def _instrument(args) -> Instrument:
-    """What the options say besides the camera."""
+def _instrument(args: argparse.Namespace) -> Instrument:
+    """The instrument of the options, with any camera."""
     return common.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
 
 
-def _once_a_size(instrument_for):
-    """The same, asked for the first frame of each size only."""
-    known = {}
+def _once_a_size(instrument_for: Callable[[Stars], Instrument]) -> Callable[[Stars], Instrument]:
+    """A function like `instrument_for` that asks it only for the first frame of each size."""
+    known: dict[tuple[int, int], Instrument] = {}
 
     def remembered(stars: Stars) -> Instrument:
         size = stars.width, stars.height
@@ -117,8 +124,8 @@ def _once_a_size(instrument_for):
     return remembered
 
 
-def _with_camera(args, found):
-    """Instruments whose camera is the bag's own for that size of frame, unless the options give a focal length."""
+def _with_camera(args: argparse.Namespace, found: "Recorded") -> Callable[[Stars], Instrument]:
+    """A function that gives the instrument for a frame, with the bag's camera unless the options have a focal length."""
 
     def instrument_for(stars: Stars) -> Instrument:
         camera = found.cameras.get((stars.width, stars.height))

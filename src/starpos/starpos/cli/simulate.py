@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos simulate`: a night on disk, frames, tilts and the truth, from a place you choose."""
+"""`starpos simulate`: writes a night of frames, tilts and their truth, from a place you choose."""
+
+import argparse
 
 import numpy as np
 
@@ -10,7 +12,7 @@ from starpos.simulation.scene import scene_of
 from starpos.sky import catalogue
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", metavar="FOLDER", help="where frame_0000.fits ..., tilt.csv and truth.json go")
     parser.add_argument("-n", "--frames", type=common.number(1, 1e6, int), default=5, help="how many (5)")
     parser.add_argument("--latitude", type=common.number(-90, 90), default=35.7046, help="deg, astronomic")
@@ -69,7 +71,7 @@ def define(parser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     scene = scene_of(
         size=tuple(args.size),
         focal_px=focal_px_of(args.focal_mm, args.pixel_um),

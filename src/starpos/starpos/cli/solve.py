@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos solve`: position and heading of frames with their tilts, each and all together."""
+"""`starpos solve`: position and heading from frames with their tilts, for each frame and for all together."""
 
+import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,10 +25,11 @@ from starpos.utc import utc_text
 
 NO_FIX = 1
 WORTH_SAVING_ARCSEC = 600.0
-COUNTS = ("frames", "poses", "left_out", "moved")  # of an average
+# numbers of an average that are printed
+COUNTS = ("frames", "poses", "left_out", "moved")
 
 
-def define(parser) -> None:
+def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
     parser.add_argument(
         "--tilt",
@@ -48,17 +50,17 @@ def define(parser) -> None:
 
 @dataclass(frozen=True)
 class Plan:
-    """How a night is worked: what is done with each frame, and what is known for all."""
+    """How to work on a night: the work on each frame, and solver and tilts, None if no frame can be read."""
 
     night: NightFolder
     work: Solving | Listing
-    solver: Solver | None = None  # None where no frame can be read
+    solver: Solver | None = None
     tilts: TiltLog | None = None
 
 
 @dataclass(frozen=True)
 class Solved:
-    """As much of a Solution as is needed to the end of a night."""
+    """The part of a Solution that is needed until the end of a night."""
 
     fix: Fix
     extrapolated_days: float
@@ -67,12 +69,14 @@ class Solved:
     log_odds: float
 
     @classmethod
-    def of(cls, s: Solution) -> "Solved":
-        light = replace(s.fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        return cls(light, s.extrapolated_days, s.stars_detected, len(s.names), s.attitude.log_odds)
+    def of(cls, s: Solution, fix: Fix) -> "Solved":
+        """The part of a solution with a fix."""
+        light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
+        log_odds = s.attitude.log_odds if s.attitude else float("nan")
+        return cls(light, s.extrapolated_days, s.stars_detected, len(s.names), log_odds)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     common.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
@@ -94,7 +98,8 @@ def run(args) -> int:
         calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
         answers = jobs.watched(workers.map(calls), sum(len(plan.night.frames) for plan in plans))
         for plan in plans:
-            rows = zip(plan.night.frames, answers, strict=False)  # as many of the answers as are this night's
+            # takes the answers of this night, and leaves the others
+            rows: Iterable = zip(plan.night.frames, answers, strict=False)
             if args.self_calibrate:
                 rows = _turned(args, plan, list(rows))
             statuses.append(_tell(args, plan.night, rows, vertical))
@@ -102,16 +107,17 @@ def run(args) -> int:
 
 
 def _refused(why: StarposError, given: list) -> int:
-    """A night that cannot be worked is the call's failure where it is all there is; else its own."""
+    """Complain about a night that cannot be worked on; raises the error if it is the only night."""
     if len(given) == 1:
         raise why
     common.complain("solve", why)
     return common.UNREADABLE
 
 
-def _plan(args, night: NightFolder, about: About | None, read: Reader) -> Plan:
+def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, read: Reader) -> Plan:
+    # without a frame that can be read, each one reports why it cannot
     if about is None:
-        return Plan(night, Listing(read))  # each frame says why it cannot be read
+        return Plan(night, Listing(read))
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
     table = tilts(night.tilt, instrument.inclinometer.noise_rad)
     jobs.prepare(instrument, about)
@@ -124,22 +130,23 @@ def _plan(args, night: NightFolder, about: About | None, read: Reader) -> Plan:
     )
 
 
-def _tell(args, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
-    """Print (path, Solution or FrameError) of each frame and what they make together; the exit status."""
-    solved, unreadable = [], False
+def _tell(args: argparse.Namespace, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
+    """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status."""
+    solved: list[Solved] = []
+    unreadable = False
     for path, answer in rows:
         if isinstance(answer, FrameError):
             unreadable = True
             answer = Solution(Status.BAD_INPUT, str(answer), source=path, utc_unix_s=None, stars_detected=0)
         if answer.fix:
-            solved.append(Solved.of(answer))
+            solved.append(Solved.of(answer, answer.fix))
         else:
             common.complain("solve", answer.message)
         if args.json:
             common.print_json({"file": path} | _json_of(answer.fix, vertical) | _json_about(answer))
         else:
             print(_line(path, answer), flush=True)
-    common.tell_extrapolation("solve", solved)
+    common.tell_extrapolation("solve", [(s.fix, s.extrapolated_days) for s in solved])
     together = _combine(night, solved)
     if solved:
         last = solved[-1].fix
@@ -148,39 +155,43 @@ def _tell(args, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
 
-def _turned(args, plan: Plan, rows: list) -> Iterator:
+def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> Iterator:
     """(path, Solution or FrameError) of frames (path, Stars or FrameError), solved with the A3 that all of them tell."""
     frames = [stars for _, stars in rows if isinstance(stars, Stars)]
-    answers = iter(_of_turn(args, plan, frames) if frames else ())
+    answers: Iterator[Solution] = iter(())
+    if frames and plan.solver is not None and plan.tilts is not None:
+        answers = iter(_solved_by_turning(args, plan.night, plan.solver, plan.tilts, frames))
     for path, item in rows:
         yield path, next(answers) if isinstance(item, Stars) else item
 
 
-def _of_turn(args, plan: Plan, frames: list[Stars]) -> Sequence[Solution]:
-    solver = plan.solver
+def _solved_by_turning(
+    args: argparse.Namespace, night: NightFolder, solver: Solver, tilts: TiltLog, frames: list[Stars]
+) -> Sequence[Solution]:
+    """Find A3 and the solutions of a night's frames, and write A3 as --save asks."""
     try:
-        turned = turn(solver, frames, plan.tilts.average, common.turn_of(args), solver.progress)
+        turned = turn(solver, frames, tilts.average, common.turn_of(args), solver.progress)
     except FixError as e:
         return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames]
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
         kept = "" if args.save is None else f" {args.save} is not written:"
-        _say(plan.night, f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further")
+        _say(night, f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further")
         return turned.solutions
     angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
-    _say(plan.night, f"calibrated: --misalignment {angles}; {error}")
+    _say(night, f"calibrated: --misalignment {angles}; {error}")
     if args.save is not None:
         instrument_file.write(Path(args.save), turned.instrument, f"A3 by turning on the spot: {error}")
     return turned.solutions
 
 
 def _say(night: NightFolder, text: StarposError | str) -> None:
-    """A line on standard error about a whole night."""
+    """Print a line about a whole night on standard error."""
     common.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
 
 
 def _combine(night: NightFolder, solved: list[Solved]) -> Average | None:
-    """All fixes as one; None, with a sentence, where they do not belong together."""
+    """The average of all fixes; None, with a line on standard error, if they do not belong together."""
     if not solved:
         return None
     try:
@@ -197,7 +208,7 @@ def _combine(night: NightFolder, solved: list[Solved]) -> Average | None:
 
 
 def _json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
-    """The keys of the contract that a fix fills; without one they are null."""
+    """The keys of --json that come from a fix; None for each if there is none."""
     keys = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
             "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
             "deflection_stddev_arcsec", "budget")  # fmt: skip
@@ -225,13 +236,13 @@ def _json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
 
 
 def _in_degrees(covariance: np.ndarray) -> np.ndarray:
-    """(east m, north m, heading deg) from (east m, north m, heading rad)."""
+    """A covariance (3, 3) of east m, north m, heading rad with the heading in deg instead."""
     unit = np.array([1.0, 1.0, np.degrees(1.0)])
     return covariance * np.outer(unit, unit)
 
 
 def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
-    """1 sigma of each source: east m, north m, heading deg; the deflection only concerns the geodetic position."""
+    """1 sigma (3,) of each source: east m, north m, heading deg; the deflection acts on the geodetic place only."""
     terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
     extra = geodetic(fix.latitude, fix.longitude, 0.0, np.zeros((3, 3)), vertical).covariance
     terms["deflection (geodetic only)"] = np.sqrt(np.diag(extra)) * [1, 1, np.degrees(1)]
@@ -264,7 +275,11 @@ def _where(fix: Fix | Average) -> str:
 
 
 def _print_combined(
-    night: NightFolder, all_together: Average | None, solved: list[Solved], args, vertical: Vertical
+    night: NightFolder,
+    all_together: Average | None,
+    solved: list[Solved],
+    args: argparse.Namespace,
+    vertical: Vertical,
 ) -> None:
     name = {} if night.folder is None else {"night": night.folder}
     if args.json:
@@ -291,8 +306,8 @@ def _print_combined(
         return
     ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, vertical)
     turned = f" (the last of {all_together.poses} poses)" if all_together.poses > 1 else ""
-    of = "" if night.folder is None else f"{night.folder}: "
-    print(f"{of}{all_together.frames} frames together: {_where(all_together)}{turned} (astronomic)")
+    folder = "" if night.folder is None else f"{night.folder}: "
+    print(f"{folder}{all_together.frames} frames together: {_where(all_together)}{turned} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "

@@ -73,8 +73,8 @@ def read_star_list(path: Path) -> Stars:
     )
 
 
-def write_star_list(path, stars: Stars, start_utc: str) -> None:
-    """A list of stars as CSV, in the form `read_frame` reads."""
+def write_star_list(path: Path | str, stars: Stars, start_utc: str) -> None:
+    """Write a list of stars as CSV, in the form that `read_frame` reads."""
     about = {
         "DATE-OBS": start_utc,
         "EXPTIME": stars.exposure_s,

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night on a page: what its frames gave, how steady that is, and what limits it.
+"""A report on a night: what its frames gave, how steady that is, and what limits it.
 
-`folder` and `bag` say what there is to solve, `working` makes a Night of it, `measures` takes its numbers, the
-`*_figures` draw them, `page` makes one HTML page of all, and `writing` puts it on disk.
+`folder` and `bag` read what there is to solve, `working` makes a Night of it, `measures` computes numbers, the
+`*_figures` draw them, `page` makes one HTML page, and `writing` puts it on disk.
 """

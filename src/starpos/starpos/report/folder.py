@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night in a folder, as `starpos simulate` writes it: frames or lists of stars, tilt.csv, perhaps truth.json."""
+"""Reads a night from a folder as `starpos simulate` writes it: frames or lists of stars, tilt.csv, maybe truth.json."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ TRUTH_LIMIT = 1 << 26
 
 @dataclass(frozen=True)
 class StarList:
-    """A frame's stars, or why there are none."""
+    """The stars of a frame, or the error for which there are none."""
 
     name: str
     stars: Stars | FrameError
@@ -29,9 +29,9 @@ class StarList:
 
 @dataclass(frozen=True, kw_only=True)
 class StarLists:
-    """What is to be solved: `read` goes through the `count` exposures one at a time, as often as it is called.
+    """Exposures to solve: each call of `read` goes through all `count` of them, one at a time.
 
-    tilt: of (mid_unix_s, exposure_s), raises TiltError.
+    tilt: a function of (mid_unix_s, exposure_s) that may raise TiltError.
     """
 
     name: str
@@ -43,12 +43,13 @@ class StarLists:
 
 
 def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
-    """The frames of a folder by name; FrameError where there are none, or truth.json is no truth.
+    """The frames of a folder in the order of their names: its FITS files, or if there are none its CSV files.
 
-    FITS where there are any, else CSV: a picture without a time gives no place.  Where tilt.csv is missing each frame
-    says so.
+    Pictures are left out, because without a time they give no place.  If tilt.csv is missing, each frame says so.
+    Raises FrameError if there are no frames, or truth.json cannot be used.
     """
     frames = frames_in(folder)
+    tilt: Callable[[float, float], Tilt]
     try:
         tilt = read_tilt_csv(folder / TILTS, tilt_noise_rad).average
     except TiltError as error:
@@ -74,7 +75,7 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
 
 
 def frames_in(folder: Path) -> list[Path]:
-    """Paths by name, at least one; FrameError where there is none."""
+    """Paths of the frames in a folder by name, at least one; raises FrameError if there is none."""
     try:
         files = sorted(p for p in folder.iterdir() if p.is_file())
     except OSError as e:
@@ -89,7 +90,10 @@ def frames_in(folder: Path) -> list[Path]:
 
 
 def truth_in(folder: Path) -> Truth | None:
-    """Of truth.json: latitude_deg, longitude_deg, and of its frames mid_unix_s and heading_deg; None without the file."""
+    """The truth from truth.json (latitude_deg, longitude_deg, mid_unix_s and heading_deg of frames); None without it.
+
+    Raises FrameError if the file cannot be read or holds something else.
+    """
     path = folder / TRUTH
     if not path.is_file():
         return None
@@ -108,7 +112,8 @@ def truth_in(folder: Path) -> Truth | None:
         raise FrameError(
             f"{path}: not what is true of a night: give latitude_deg and longitude_deg, or take the file away"
         ) from None
-    return Truth(*np.radians(place).tolist(), headings)
+    latitude, longitude = np.radians(place).tolist()
+    return Truth(latitude, longitude, headings)
 
 
 def _no_tilt(reason: str) -> Callable[[float, float], Tilt]:

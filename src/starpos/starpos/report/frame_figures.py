@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the frames: residuals over the frame, where on the sky they looked, and their health in time."""
+"""Figures of the frames: their health in time, and the residuals of all over one frame."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -7,27 +10,31 @@ from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREEN, ORANGE, PURPLE, RED, plain
 from starpos.utc import utc_text
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-def draw_health(figure, night: Night) -> None:
-    """Stars, residual, tilt and working time of every frame against time."""
+
+def draw_health(figure: "Figure", night: Night) -> None:
+    """Draw stars, residual, tilt and working time of every frame against time."""
     shots = night.shots
     at, label = _times(shots)
     panels = figure.subplots(4, 1, sharex=True)
-    mark = "o" if len(shots) <= 150 else "."
-    many = {"ms": 3.5 if mark == "o" else 2.5, "ls": "none", "marker": mark}
+    mark, size = ("o", 3.5) if len(shots) <= 150 else (".", 2.5)
+    points: dict[str, Any] = {"ms": size, "ls": "none", "marker": mark}
     panels[0].plot(
         at,
         [s.stars_detected for s in shots],
         color=ORANGE,
         label="detected",
-        **many | {"ms": 1.8 * many["ms"], "mfc": "none"},
+        **points | {"ms": 1.8 * size, "mfc": "none"},
     )
-    panels[0].plot(at, [s.stars_matched for s in shots], color=BLUE, label="in the fix", **many)
+    panels[0].plot(at, [s.stars_matched for s in shots], color=BLUE, label="in the fix", **points)
     panels[0].set_ylabel("stars")
     panels[0].set_ylim(0, 1.15 * max(1, *(s.stars_detected for s in shots)))
     _legend(panels[0])
     residual = np.array([s.residual_arcsec for s in shots])
-    panels[1].plot(at, residual, color=BLUE, **many)
+    panels[1].plot(at, residual, color=BLUE, **points)
     panels[1].set_ylabel("residual,\narcsec")
     panels[1].set_ylim(0, 1.2 * np.nanmax(np.append(residual, 1e-3)))
     tilt = np.degrees([s.tilt for s in shots]) * 3600
@@ -35,13 +42,13 @@ def draw_health(figure, night: Night) -> None:
     mean = tilt[known].mean(0) if known.any() else np.zeros(2)
     for k, (axis, colour) in enumerate((("x", GREEN), ("y", PURPLE))):
         panels[2].plot(
-            at, tilt[:, k] - mean[k], color=colour, label=f"{axis} about {mean[k] / 3600:+.4f}°", **many
+            at, tilt[:, k] - mean[k], color=colour, label=f"{axis} about {mean[k] / 3600:+.4f}°", **points
         )
     panels[2].set_ylabel("tilt,\narcsec")
     _legend(panels[2])
     seconds = np.array([[s.identify_s, s.fix_s] for s in shots]) * 1e3
-    panels[3].plot(at, seconds[:, 0], color=ORANGE, label="identification", **many)
-    panels[3].plot(at, seconds[:, 1], color=BLUE, label="fix", **many)
+    panels[3].plot(at, seconds[:, 0], color=ORANGE, label="identification", **points)
+    panels[3].plot(at, seconds[:, 1], color=BLUE, label="fix", **points)
     panels[3].set_ylabel("time, ms")
     panels[3].set_ylim(0, 1.2 * np.nanmax(np.append(seconds, 1.0)))
     _legend(panels[3])
@@ -57,12 +64,12 @@ def draw_health(figure, night: Night) -> None:
     figure.align_ylabels(panels)
 
 
-def _legend(axes) -> None:
+def _legend(axes: "Axes") -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
-def _times(shots) -> tuple[list[float], str]:
-    """Where the frames lie on the axis, and what it is: minutes, or numbers where a time is unknown."""
+def _times(shots: Sequence[Shot]) -> tuple[list[float], str]:
+    """Position of each frame on the time axis, and the axis' label: minutes, or numbers if a time is unknown."""
     times = np.array([s.utc_unix_s for s in shots])
     if not np.isfinite(times).all():
         return list(range(1, len(shots) + 1)), "frame number"
@@ -72,17 +79,13 @@ def _times(shots) -> tuple[list[float], str]:
 
 
 def overlaid(night: Night) -> tuple[np.ndarray, np.ndarray, tuple[int, int]] | None:
-    """xy, residual_px (N, 2) of all frames of the night's first size that tell them, and that size."""
+    """Places xy and residual_px (N, 2) of the stars of all fixes with the first fix's frame size, and that size.
+
+    None if no fix has residuals.
+    """
     shots = [s for _, s in night.fixed if s.size and len(s.residual_px)]
-    if not shots:
+    if not shots or shots[0].size is None:
         return None
-    shots = [s for s in shots if s.size == shots[0].size]
-    return (
-        np.concatenate([s.xy for s in shots]),
-        np.concatenate([s.residual_px for s in shots]),
-        shots[0].size,
-    )
-
-
-def pointed(shot: Shot) -> bool:
-    return shot.pointing is not None and shot.size is not None and np.isfinite(shot.utc_unix_s)
+    size = shots[0].size
+    alike = [s for s in shots if s.size == size]
+    return np.concatenate([s.xy for s in alike]), np.concatenate([s.residual_px for s in alike]), size

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers that the figures show: deviations of the frames from each other and from the truth."""
+"""Numbers for the figures: deviations of the frames from each other and from the truth."""
 
 from dataclasses import dataclass
 
@@ -7,31 +7,32 @@ import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.report.night import Night, ReportedPlace, Truth
+from starpos.rotation import half_turn
 from starpos.units import ARCSEC
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
 FEWEST_FOR_OUTLIERS = 5
 SIGMA_PER_MAD = 1.4826
 SAME_TIME_S = 0.01
-TURNED_RAD, TURNED_SIGMA = (
-    np.radians(0.1),
-    10.0,
-)  # headings further from their mean are of an instrument that turned
-INSIDE_1_SIGMA = -2 * np.log(1 - 0.3935)  # squared distance of the ellipses in two dimensions
+# if headings are further from their mean, the instrument was turned
+TURNED_RAD, TURNED_SIGMA = np.radians(0.1), 10.0
+# squared distances, in sigma, of the ellipses that hold 39 % and 95 % in two dimensions
+INSIDE_1_SIGMA = -2 * np.log(1 - 0.3935)
 INSIDE_95 = -2 * np.log(1 - 0.95)
-PAPER_STABILITY = (0.5256, 1.70, 6.336)  # arcsec, mean absolute deviations of latitude, longitude, north
-PAPER_NIGHTS = (
-    0.5028 * 60,
-    0.816 * 60,
-)  # arcsec, mean absolute errors of latitude and longitude in 50 nights
+# the paper's mean absolute deviations of latitude, longitude, north in arcsec
+PAPER_STABILITY = (0.5256, 1.70, 6.336)
+# the paper's mean absolute errors of latitude and longitude in 50 nights, in arcsec
+PAPER_NIGHTS = (0.5028 * 60, 0.816 * 60)
 
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Frames against their mean: number (N,) from 1, arcsec (N, 3) of latitude, longitude, heading, their sigma (N, 3).
+    """Deviations of frames from their mean.
 
-    outlier (N,): far from the others in latitude or longitude.  heading_from: 'mean', 'truth', or '' where the instrument
-    turned and nobody knows how; its column is NaN then.
+    number (N,): of each frame, from 1.  arcsec, sigma (N, 3): deviation of latitude, longitude, heading, and its sigma.
+    outlier (N,): mask of frames far from the others in latitude or longitude.
+    heading_from: what headings are compared with, 'mean' or 'truth'; '' if the instrument turned and the truth is
+    unknown, their column is NaN then.
     """
 
     number: np.ndarray
@@ -42,12 +43,13 @@ class Stability:
 
     @property
     def mean_absolute(self) -> np.ndarray:
+        """Mean absolute deviation (3,) of latitude, longitude, heading in arcsec."""
         return np.abs(self.arcsec).mean(0)
 
 
 def stability(night: Night) -> Stability:
-    """Of each frame's own fix; at least one."""
-    places = [s.place for _, s in night.fixed]
+    """Stability of the fixes of a night, each with its own tilt; at least one fix is needed."""
+    places = night.places
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
     away, heading_from = _from_mean(seen), "mean"
     if np.abs(away[:, 2]).max() > max(
@@ -66,10 +68,10 @@ def stability(night: Night) -> Stability:
     )
 
 
-def steadiness(night: Night) -> Stability:
-    """The same with one tilt for all frames: what stars and air do alone."""
-    away = _from_mean(night.steady)
-    without_tilt = np.array([_own_sigma(s.place, without="tilt") for _, s in night.fixed])
+def steadiness(night: Night, steady: np.ndarray) -> Stability:
+    """Stability of the fixes with one tilt for all, `steady` (N, 3) of the night: the part of stars and air alone."""
+    away = _from_mean(steady)
+    without_tilt = np.array([_own_sigma(p, without="tilt") for p in night.places])
     return Stability(
         np.array([k for k, _ in night.fixed]),
         away / ARCSEC,
@@ -80,37 +82,36 @@ def steadiness(night: Night) -> Stability:
 
 
 def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
-    """East, north in m of the frames with a fix from a place (rad), (N, 2)."""
-    return np.array([offset_m(s.place, latitude, longitude) for _, s in night.fixed])
+    """East, north (N, 2) in m of the fixes from a place (rad)."""
+    return np.array([offset_m(p, latitude, longitude) for p in night.places])
 
 
 def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
     """East, north in m of a place from another (rad)."""
     prime, meridian = curvature_radii_m(latitude)
-    east = wrapped(place.longitude - longitude) * prime * np.cos(latitude)
+    east = half_turn(place.longitude - longitude) * prime * np.cos(latitude)
     return float(east), float((place.latitude - latitude) * meridian)
 
 
 def middle(night: Night) -> tuple[float, float]:
-    """Latitude, longitude (rad) that the scatter is drawn about: the combined place, else the frames' mean."""
+    """Latitude, longitude (rad) of the centre of the scatter: the average, or if there is none the mean of the fixes."""
     if night.combined:
         return night.combined.latitude, night.combined.longitude
-    seen = np.array([[s.place.latitude, s.place.longitude] for _, s in night.fixed])
+    seen = np.array([[p.latitude, p.longitude] for p in night.places])
     latitude, longitude = seen[0] + wrapped(seen - seen[0]).mean(0)
     return float(latitude), float(longitude)
 
 
 def share_inside(night: Night, squared_distance: float) -> int:
-    """How many frames lie within an ellipse of their own errors about the middle."""
+    """Number of frames within an ellipse of their own errors about the middle."""
     apart = around(night, *middle(night))
-    own = np.array([s.place.own[:2, :2] for _, s in night.fixed]) + np.eye(2) * 1e-12
+    own = np.array([p.own[:2, :2] for p in night.places]) + np.eye(2) * 1e-12
     return int(np.sum(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(own), apart) <= squared_distance))
 
 
-def error_arcsec(night: Night) -> np.ndarray:
-    """Latitude, longitude (2,) of the night less the truth, in arcsec."""
-    c, t = night.combined, night.truth
-    return wrapped(np.array([c.latitude - t.latitude, c.longitude - t.longitude])) / ARCSEC
+def error_arcsec(place: ReportedPlace, truth: Truth) -> np.ndarray:
+    """Latitude, longitude (2,) of a place minus the truth, in arcsec."""
+    return wrapped(np.array([place.latitude - truth.latitude, place.longitude - truth.longitude])) / ARCSEC
 
 
 def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
@@ -118,7 +119,7 @@ def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
     return _angles(place.covariance, place.latitude)[:2] / ARCSEC
 
 
-def wrapped(angle):
+def wrapped(angle: np.ndarray) -> np.ndarray:
     """Angles in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
@@ -129,7 +130,7 @@ def _from_mean(seen: np.ndarray) -> np.ndarray:
 
 
 def _own_sigma(place: ReportedPlace, without: str = "none") -> np.ndarray:
-    """Latitude, longitude, heading in rad, of what is new in each frame."""
+    """Sigma (3,) of latitude, longitude, heading in rad by the errors that are new in each frame."""
     own = [t.covariance[:3, :3] for t in place.terms if not t.common and not t.name.startswith(without)]
     return _angles(sum(own, np.zeros((3, 3))), place.latitude)
 
@@ -141,7 +142,7 @@ def _angles(covariance: np.ndarray, latitude: float) -> np.ndarray:
 
 
 def _outliers(away: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Far off the scatter of all, and further than their own claims (N, 2) allow."""
+    """Mask (N,) of frames far outside the scatter of all, and further off than their own sigma (N, 2) allows."""
     if len(away) < FEWEST_FOR_OUTLIERS:
         return np.zeros(len(away), bool)
     far = np.abs(away - np.median(away, axis=0))
@@ -150,7 +151,7 @@ def _outliers(away: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _true_headings(night: Night) -> np.ndarray | None:
-    """(N,) rad, one a fix; None where some are unknown."""
+    """True headings (N,) in rad of the fixes; None if some are unknown."""
     if night.truth is None or not night.truth.headings:
         return None
     moments, headings = np.array(night.truth.headings).T

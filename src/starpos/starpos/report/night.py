@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report is made of: the frames of a night, what each gave, and what they give together."""
+"""The content of a report: the frames of a night, the answer of each, and their average."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,10 +19,10 @@ NO_STARS = np.zeros((0, 2))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReportedPlace:
-    """Astronomic latitude, longitude and heading (rad; NaN: no one heading), and what is wrong with them.
+    """Astronomic latitude, longitude and heading (rad), with their errors.
 
-    covariance (3, 3) of east m, north m, heading rad; terms: what it is the sum of.  poses: how often the instrument was
-    set up for it; the heading is that of the last.
+    heading: that of the last pose; NaN if there is no one heading.  poses: number of poses that the place comes from.
+    covariance (3, 3): of east m, north m, heading rad, the sum of the `terms`.
     """
 
     utc_unix_s: float
@@ -35,6 +35,7 @@ class ReportedPlace:
 
     @classmethod
     def of(cls, fix: Fix | Average) -> "ReportedPlace":
+        """The place of a fix or an average."""
         poses = fix.poses if isinstance(fix, Average) else 1
         return cls(
             utc_unix_s=fix.utc_unix_s,
@@ -48,25 +49,26 @@ class ReportedPlace:
 
     @property
     def own(self) -> np.ndarray:
-        """(3, 3) of the errors that are new in every frame: what makes the frames differ from each other."""
+        """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
         return sum((t.covariance[:3, :3] for t in self.terms if not t.common), np.zeros((3, 3)))
 
     @property
     def sigma(self) -> np.ndarray:
-        """(3,): east m, north m, heading rad."""
+        """Standard deviations (3,) of east m, north m, heading rad."""
         return np.sqrt(np.diag(self.covariance))
 
     def on_ground(self, vertical: Vertical) -> Geodetic:
+        """The geodetic place, with the deflection of the vertical removed."""
         return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shot:
-    """One frame: how it ended, and as much of its answer as there is.
+    """One frame: its status, and as much of its answer as there is.
 
-    utc_unix_s: NaN where unknown.  xy, residual_px (M, 2): the stars of its fix where they were seen, and that less where
-    the fit has them.  size: of the frame, px.  tilt: rad.  camera_to_itrs (3, 3): attitude on the Earth,
-    of the stars alone.
+    utc_unix_s: NaN if unknown.  size: of the frame in px.  tilt: in rad.
+    xy, residual_px (M, 2): seen places of the stars of its fix, and these minus the fitted ones.
+    camera_to_itrs (3, 3): attitude against the Earth by the stars alone.
     """
 
     name: str
@@ -90,7 +92,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where the instrument really stood (astronomic, rad); headings: (mid_unix_s, rad) of frames."""
+    """The true place of the instrument (astronomic, rad); headings: (mid_unix_s, rad) of frames."""
 
     latitude: float
     longitude: float
@@ -101,8 +103,9 @@ class Truth:
 class Night:
     """All frames of one place.
 
-    origin: a sentence, whence the fixes are.  combined: None where there is none, why_not then says why.  steady (N, 3):
-    the latitude, longitude, heading (rad) that the fixes have with one tilt for all, where the camera stood still.
+    origin: a sentence that says where the fixes come from.
+    combined: the average; None if there is none, and why_not says why.
+    steady (N, 3): latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved.
     """
 
     name: str
@@ -118,5 +121,10 @@ class Night:
 
     @property
     def fixed(self) -> list[tuple[int, Shot]]:
-        """(number from 1, frame) of the frames with a fix."""
+        """The frames with a fix, each with its number from 1."""
         return [(k, s) for k, s in enumerate(self.shots, 1) if s.place]
+
+    @property
+    def places(self) -> list[ReportedPlace]:
+        """The places of the frames with a fix."""
+        return [s.place for s in self.shots if s.place]

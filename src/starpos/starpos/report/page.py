@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One HTML page that needs nothing else: its pictures are in it, it loads nothing, and text from files is only text."""
+"""Writes a night as one HTML page.
+
+The page holds its pictures and loads nothing, and all text that comes from files is escaped.
+"""
 
 import base64
 from collections import Counter
@@ -10,12 +13,13 @@ import numpy as np
 
 from starpos import __version__
 from starpos.report import measures
-from starpos.report.night import Night
+from starpos.report.night import Night, ReportedPlace, Truth
 from starpos.report.pictures import Picture
 from starpos.report.style import figures_of
 from starpos.utc import utc_text
 
-LISTED = 200  # names of frames
+# so many names of frames are listed
+LISTED = 200
 STYLE = """
 :root { color-scheme: light dark; --ink: #1d2329; --soft: #5a646e; --paper: #fbfbf9; --card: #ffffff; --line: #dcdfe2;
   --bad: #b3401f; }
@@ -45,7 +49,10 @@ figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { 
 def page(
     nights: Sequence[Night], each: Sequence[Sequence[Picture]], overall: Sequence[Picture], made_utc: str
 ) -> str:
-    """The page; each: the pictures of every night, empty ones where there were too many; overall: of all nights."""
+    """The HTML of nights.
+
+    each: pictures of each night, all empty if the nights are too many; overall: pictures of all nights together.
+    """
     title = (
         f"starpos report: {nights[0].name}" if len(nights) == 1 else f"starpos report: {len(nights)} nights"
     )
@@ -77,7 +84,7 @@ def page(
 
 
 def _place(night: Night) -> str:
-    """The answer, or why there is none."""
+    """The answer of a night, or the reason why there is none."""
     if night.combined is None:
         return f'<p class="place bad">No position: {escape(night.why_not)}</p>'
     c = night.combined
@@ -93,7 +100,7 @@ def _place(night: Night) -> str:
 
 
 def _degrees(angle: float) -> str:
-    """As `starpos solve` prints it."""
+    """An angle in rad as degrees, in the form that `starpos solve` prints."""
     return f"{np.degrees(angle):+.6f}&deg;"
 
 
@@ -121,7 +128,7 @@ def _summary(night: Night) -> str:
         else:
             rows.append(("Heading", "none in common: the instrument turned between the frames"))
     if night.truth and night.combined:
-        rows.append(("Error against the truth", _error(night)))
+        rows.append(("Error against the truth", _error(night.combined, night.truth)))
     used = len(night.fixed)
     failed = Counter(s.status.value for s in night.shots if s.place is None)
     counts = f"{used} with a fix" + "".join(f", {n} {escape(why)}" for why, n in failed.most_common())
@@ -133,17 +140,17 @@ def _summary(night: Night) -> str:
     if times:
         rows.append(("From, to", f"{escape(utc_text(min(times)))}, {escape(utc_text(max(times)))}"))
     if used:
-        rows += _of_fixes(night)
+        rows += _rows_on_fixes(night)
     rows.append(("Source", escape(night.origin)))
     rows += [("Note", escape(remark)) for remark in night.remarks]
     cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>\n" for name, text in rows)
     return f"<table>\n{cells}</table>\n{_names(night)}"
 
 
-def _of_fixes(night: Night) -> list[tuple[str, str]]:
+def _rows_on_fixes(night: Night) -> list[tuple[str, str]]:
     shots = [s for _, s in night.fixed]
 
-    def median(values):
+    def median(values: Sequence[float]) -> float:
         return float(np.median(values))
 
     detected, matched = (median([getattr(s, k) for s in shots]) for k in ("stars_detected", "stars_matched"))
@@ -163,7 +170,7 @@ def _of_fixes(night: Night) -> list[tuple[str, str]]:
             )
         )
     if night.steady is not None:
-        lat, lon, north = (figures_of(v) for v in measures.steadiness(night).mean_absolute)
+        lat, lon, north = (figures_of(v) for v in measures.steadiness(night, night.steady).mean_absolute)
         rows.append((
             "Stability",
             f"latitude {lat}&Prime;, longitude {lon}&Prime;, north {north}&Prime; with one tilt for all (the paper's "
@@ -172,9 +179,9 @@ def _of_fixes(night: Night) -> list[tuple[str, str]]:
     return rows
 
 
-def _error(night: Night) -> str:
-    east, north = measures.offset_m(night.combined, night.truth.latitude, night.truth.longitude)
-    latitude, longitude = measures.error_arcsec(night)
+def _error(place: ReportedPlace, truth: Truth) -> str:
+    east, north = measures.offset_m(place, truth.latitude, truth.longitude)
+    latitude, longitude = measures.error_arcsec(place, truth)
     return (
         f"{figures_of(np.hypot(east, north))} m: {east:+.0f} m E {north:+.0f} m N, latitude {latitude:+.2f}&Prime;, "
         f"longitude {longitude:+.2f}&Prime;"
@@ -209,7 +216,7 @@ def _table_of_nights(nights: Sequence[Night]) -> str:
         if n.combined and n.truth:
             east, north = measures.offset_m(n.combined, n.truth.latitude, n.truth.longitude)
             cells[2] = f"{north:+.0f} m, {east:+.0f} m"
-            cells[3] = ", ".join(f"{v:+.2f}&Prime;" for v in measures.error_arcsec(n))
+            cells[3] = ", ".join(f"{v:+.2f}&Prime;" for v in measures.error_arcsec(n.combined, n.truth))
         name = f'<a href="#night{number}">{escape(n.name)}</a>'
         row = [str(number), name, *cells, f"{len(n.fixed)} of {len(n.shots)}"]
         rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>")

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which figures a night has, each with what one sees in it and what would be suspicious."""
+"""The figures of a night, each with a caption: what it shows, and what would be suspicious."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +15,13 @@ from starpos.report.night import Night
 from starpos.report.style import figures_of, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """name: of its file, without suffix.  caption: plain text."""
+    """A figure as PNG; name: of its file, without suffix; title, caption: plain text."""
 
     name: str
     title: str
@@ -26,13 +30,14 @@ class Picture:
 
 
 def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
-    """All that this night has the data for; without a fix only the health of its frames."""
+    """All figures that a night has data for; without a fix only the health of its frames."""
     if night.fixed:
-        yield from _of_place(night)
+        yield from _place_pictures(night)
         if (over := frame_figures.overlaid(night)) is not None:
             yield _residuals(*over)
-        with suppress(TimeError):  # of a recorded solution that no table of the Earth's rotation knows
-            if any(frame_figures.pointed(s) for s in night.shots):
+        # the time of a recorded solution may lie outside the tables of the Earth's rotation
+        with suppress(TimeError):
+            if sky_figure.views(night):
                 yield _drawn("sky", "Where the camera looked", _sky_caption(), 6.4,
                          lambda f: sky_figure.draw_sky(f, night, catalogue))  # fmt: skip
     if night.shots:
@@ -40,15 +45,15 @@ def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
 
 
 def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
-    """Error night by night, of at least one numbered night whose truth is known."""
+    """The errors of numbered nights whose truth is known, at least one."""
     return _drawn(
         "nights", "Error of the nights", NIGHTS, 5.0, lambda f: place_figures.draw_nights(f, nights)
     )
 
 
-def _of_place(night: Night) -> Iterator[Picture]:
+def _place_pictures(night: Night) -> Iterator[Picture]:
     if night.steady is not None:
-        s = measures.steadiness(night)
+        s = measures.steadiness(night, night.steady)
         yield _drawn("stability", "Stability: one tilt for all frames", _stability_caption(s, STEADY), 6.8,
                      lambda f: place_figures.draw_stability(f, s))  # fmt: skip
     if len(night.fixed) > 1:
@@ -57,11 +62,13 @@ def _of_place(night: Night) -> Iterator[Picture]:
                      lambda f: place_figures.draw_stability(f, each))  # fmt: skip
     yield _drawn("scatter", "Scatter of the fixes", _scatter_caption(night), 6.4,
                  lambda f: place_figures.draw_scatter(f, night))  # fmt: skip
-    if night.fixed[0][1].place.terms:
+    if night.places[0].terms:
         yield _drawn("budget", "Error budget", BUDGET, 5.6, lambda f: place_figures.draw_budget(f, night))
 
 
-def _drawn(name: str, title: str, caption: str, height_in: float, draw: Callable) -> Picture:
+def _drawn(
+    name: str, title: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
+) -> Picture:
     figure = new_figure(height_in)
     draw(figure)
     return Picture(name, title, caption, png_of(figure))
@@ -128,15 +135,14 @@ def _scatter_caption(night: Night) -> str:
     )
 
 
-def _residuals(xy, residual_px, size) -> Picture:
+def _residuals(xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -> Picture:
     rms = figures_of(np.sqrt(np.mean(residual_px**2)))
     text = f"{len(xy)} stars, root mean square {rms} px an axis. {RESIDUALS}"
     height = 0.9 + 6.4 * min(size[1] / size[0], 1.6)
 
-    def draw(figure) -> None:
-        figure.get_layout_engine().set(
-            rect=(0, 0.06, 1, 0.94)
-        )  # the arrow that tells the scale is outside its axes
+    def draw(figure: "Figure") -> None:
+        # the key of the arrows lies outside the axes
+        figure.set_layout_engine("constrained", rect=(0, 0.06, 1, 0.94))
         residual_map.draw_residuals(figure.subplots(), xy, residual_px, *size)
 
     return _drawn("residuals", "Residuals over the frame", text, height, draw)

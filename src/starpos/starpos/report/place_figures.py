@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the place: how steady the frames are, how they scatter, what the errors are made of, night by night."""
+"""Figures of the place: stability of the frames, their scatter, the error budget, and the errors of several nights."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,13 +11,18 @@ from starpos.report.measures import Stability
 from starpos.report.night import Night, ReportedPlace
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, RED, SKY, figures_of, number_axis, plain
 
-MANY = 150  # points beyond which they are small and their bars a band
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# more points than this are drawn small, with a band instead of bars
+MANY = 150
 SMALLEST_SHOWN = 1e-3  # m or arcsec
 DEFLECTION = "deflection (geodetic only)"
 
 
-def draw_stability(figure, s: Stability) -> None:
-    """Three panels, of latitude, longitude and heading in arcsec against the frame's number."""
+def draw_stability(figure: "Figure", s: Stability) -> None:
+    """Draw three panels: latitude, longitude and heading in arcsec against the frame's number."""
     panels = figure.subplots(3, 1, sharex=True)
     names = ("latitude", "longitude", "north")
     for k, (axes, name, paper) in enumerate(zip(panels, names, measures.PAPER_STABILITY, strict=True)):
@@ -46,8 +52,8 @@ def draw_stability(figure, s: Stability) -> None:
     panels[-1].set_xlabel("frame number")
 
 
-def _with_errors(axes, x, value, sigma) -> None:
-    """Points with bars of 1 sigma, or a band where there are many."""
+def _with_errors(axes: "Axes", x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> None:
+    """Draw points with bars of 1 sigma, or with a band if there are many."""
     many = len(x) > MANY
     if many:
         axes.fill_between(x, -sigma, sigma, color=SKY, alpha=0.3, lw=0, label="1 sigma")
@@ -58,12 +64,12 @@ def _with_errors(axes, x, value, sigma) -> None:
     axes.set_ylim(-reach, reach)
 
 
-def draw_scatter(figure, night: Night) -> None:
-    """The fixes in m about the combined place, the ellipses of one frame's own errors and of the combined place."""
+def draw_scatter(figure: "Figure", night: Night) -> None:
+    """Draw the fixes in m about the average, the ellipses of one frame's own errors and those of the average."""
     axes = figure.subplots()
     latitude, longitude = measures.middle(night)
     points = measures.around(night, latitude, longitude)
-    own = np.mean([s.place.own[:2, :2] for _, s in night.fixed], axis=0)
+    own = np.mean([p.own[:2, :2] for p in night.places], axis=0)
     plain(axes)
     reach = [np.abs(points).max(), 2.45 * np.sqrt(np.linalg.eigvalsh(own)[-1])]
     _ellipses(axes, own, SKY, "one frame, its own errors", fill=True)
@@ -84,8 +90,8 @@ def draw_scatter(figure, night: Night) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=9, frameon=False)
 
 
-def _ellipses(axes, covariance: np.ndarray, colour: str, label: str, fill: bool) -> None:
-    """Of 39 % (1 sigma) and of 95 %."""
+def _ellipses(axes: "Axes", covariance: np.ndarray, colour: str, label: str, fill: bool) -> None:
+    """Draw the ellipses of a covariance (2, 2) that hold 39 % (1 sigma) and 95 %."""
     from matplotlib.patches import Ellipse
 
     values, vectors = np.linalg.eigh(covariance)
@@ -95,15 +101,17 @@ def _ellipses(axes, covariance: np.ndarray, colour: str, label: str, fill: bool)
         (measures.INSIDE_1_SIGMA, "-", 0.3, "39 %"),
     ):
         height, width = 2 * np.sqrt(squared * np.maximum(values, 0))
-        how = {"fc": colour, "ec": "none", "alpha": alpha} if fill else {"fc": "none", "ec": colour}
+        how: dict[str, Any] = (
+            {"fc": colour, "ec": "none", "alpha": alpha} if fill else {"fc": "none", "ec": colour}
+        )
         axes.add_patch(
             Ellipse((0, 0), width, height, angle=angle, ls=style, lw=1.6, label=f"{label}, {share}", **how)
         )
 
 
-def draw_budget(figure, night: Night) -> None:
-    """Bars of 1 sigma, east and north in m and heading in arcsec, of one frame and of the average, largest on top."""
-    one = _shares(night.fixed[0][1].place, night)
+def draw_budget(figure: "Figure", night: Night) -> None:
+    """Draw bars of 1 sigma of each source, for one frame and for the average, with the largest on top."""
+    one = _shares(night.places[0], night)
     places = [("one frame", one, SKY)]
     if night.combined and len(night.fixed) > 1:
         places.append((f"average of {len(night.fixed)}", _shares(night.combined, night), BLUE))
@@ -115,7 +123,7 @@ def draw_budget(figure, night: Night) -> None:
         axes.grid(axis="y", visible=False)
         values = [[shares.get(n, np.zeros(3))[k] for n in names] for _, shares, _ in places]
         top = np.nanmax(values, initial=1e-9)
-        # three decades below whichever is smaller, a frame or the average: an A3 that nobody knew would hide the rest
+        # the axis begins three decades below the smaller of frame and average: an unknown A3 would hide all other bars
         highest = [np.nanmax(row, initial=1e-9) for row in values]
         low = max(min(highest) * 1e-3, min((v for row in values for v in row if v > 0), default=top) / 2)
         for j, ((label, _, colour), row) in enumerate(zip(places, values, strict=True)):
@@ -144,7 +152,7 @@ def _short(value: float) -> str:
 
 
 def _shares(place: ReportedPlace, night: Night) -> dict[str, np.ndarray]:
-    """1 sigma (3,) of each source: east m, north m, heading arcsec; NaN where there is no heading."""
+    """1 sigma (3,) of each source: east m, north m, heading arcsec; the latter is NaN if there is no heading."""
     unit = np.array([1, 1, 1 / measures.ARCSEC])
     shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}
     deflection = place.on_ground(night.vertical).covariance - place.covariance
@@ -155,11 +163,12 @@ def _shares(place: ReportedPlace, night: Night) -> dict[str, np.ndarray]:
     return shares
 
 
-def draw_nights(figure, nights: Sequence[tuple[int, Night]]) -> None:
-    """Error of latitude and longitude in arcsec of the numbered nights whose truth is known, at least one."""
-    number = [k for k, _ in nights]
-    error = np.array([measures.error_arcsec(n) for _, n in nights])
-    sigma = np.array([measures.sigma_arcsec(n.combined) for _, n in nights])
+def draw_nights(figure: "Figure", nights: Sequence[tuple[int, Night]]) -> None:
+    """Draw the errors of latitude and longitude in arcsec of numbered nights; at least one with a place and a truth."""
+    known = [(k, n.combined, n.truth) for k, n in nights if n.combined and n.truth]
+    number = [k for k, _, _ in known]
+    error = np.array([measures.error_arcsec(place, truth) for _, place, truth in known])
+    sigma = np.array([measures.sigma_arcsec(place) for _, place, _ in known])
     panels = figure.subplots(2, 1, sharex=True)
     for k, (axes, name, paper) in enumerate(
         zip(panels, ("latitude", "longitude"), measures.PAPER_NIGHTS, strict=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag's part to a Night: solved anew where stars and tilts are both there, else what the solver said is shown."""
+"""Makes a Night of a bag: solved again if the bag has stars and tilts, else with the recorded solutions."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from starpos.rotation import full_turn
 
 
 def night(recorded: Recorded, shop: Workshop) -> Night:
-    """The night of a bag; StarposError where nothing in it can be worked on."""
+    """The night of a bag; raises StarposError if nothing in it can be used."""
     r = recorded
     if r.star_count and (r.tilts or not r.solutions):
         try:
@@ -38,7 +38,7 @@ def _exposures(r: Recorded) -> StarLists:
     def no_tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
         raise TiltError(f"{r.path}: no usable tilt in it: record the topic tilt too")
 
-    tilt = r.tilts.average if r.tilts else no_tilt
+    tilt: Callable[[float, float], Tilt] = r.tilts.average if r.tilts else no_tilt
     origin = f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}"
     return StarLists(
         name=r.name, origin=origin, count=r.star_count, read=read_stars, tilt=tilt, truth=r.truth
@@ -46,7 +46,7 @@ def _exposures(r: Recorded) -> StarLists:
 
 
 def _against_recorded(solved: Night, r: Recorded) -> tuple[str, ...]:
-    """A remark where the solver said something else at the time."""
+    """A remark if the recorded solutions differ from the new ones."""
     if solved.combined is None or not any(s.place for s in r.solutions):
         return ()
     said = _bound([s.place for s in r.solutions if s.place])
@@ -79,7 +79,7 @@ def _as_recorded(r: Recorded, shop: Workshop) -> Night:
 
 
 def _bound(places: list[ReportedPlace]) -> ReportedPlace:
-    """The plain mean; its covariance is never more than the mean of theirs, however they go together."""
+    """The plain mean of places, with the mean of their covariances: an upper bound, whatever their correlation is."""
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
     away = wrapped(seen - seen[0])
     mean = seen[0] + away.mean(0)

@@ -1,45 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where on the sky the frames looked: azimuth and zenith distance of outlines, their stars and the brightest ones."""
+"""Map of the sky with the frames of a night: their outlines and stars, and the brightest stars around."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.fix.solver import Attitude
-from starpos.report.frame_figures import pointed
 from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE
 from starpos.rotation import normalised
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site
 
-OUTLINES = 12  # frames whose stars are shown
-BRIGHT = 60  # stars shown that no frame need have seen
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# so many frames are shown with outline and stars
+OUTLINES = 12
+# so many of the brightest stars are shown, whether a frame saw them or not
+BRIGHT = 60
 REACHES_DEG = (5, 10, 15, 20, 30, 45, 60, 90)
 FAINTEST_DOT = 11.0
 
 
-def draw_sky(figure, night: Night, catalogue: Catalogue) -> None:
-    """North on top, east to the right, the zenith in the middle; needs a place and a frame that points."""
-    axes = figure.subplots(subplot_kw={"projection": "polar"})
-    place = night.combined or night.fixed[0][1].place
+@dataclass(frozen=True)
+class View:
+    """A frame whose pointing is known, with its size in px."""
+
+    shot: Shot
+    pointing: Attitude
+    size: tuple[int, int]
+
+    def directions(self, xy: np.ndarray) -> np.ndarray:
+        """ICRS directions (N, 3) of pixels xy (N, 2), without distortion."""
+        plane = (xy - (np.array(self.size) - 1) / 2) / self.pointing.focal_px
+        return normalised(np.column_stack([plane, np.ones(len(plane))]) @ _axes(self.pointing))
+
+
+def views(night: Night) -> list[View]:
+    """The frames of a night of which it is known where they looked."""
+    return [
+        View(s, s.pointing, s.size)
+        for s in night.shots
+        if s.pointing is not None and s.size is not None and np.isfinite(s.utc_unix_s)
+    ]
+
+
+def draw_sky(figure: "Figure", night: Night, catalogue: Catalogue) -> None:
+    """Draw north on top, east to the right, the zenith in the middle; needs a fix and one of the `views`."""
+    axes: Any = figure.subplots(subplot_kw={"projection": "polar"})
+    place = night.combined or night.places[0]
     site = Site(np.degrees(place.latitude), np.degrees(place.longitude), night.atmosphere)
-    shots = [s for s in night.shots if pointed(s)]
+    seen = views(night)
     centres = np.concatenate(
-        [site.refracted(_axes(s.pointing)[2:], earth_state(s.utc_unix_s)) for s in shots]
+        [site.refracted(_axes(v.pointing)[2:], earth_state(v.shot.utc_unix_s)) for v in seen]
     )
-    shown = _different(shots, centres)
-    outlines = [site.refracted(_outline(s), earth_state(s.utc_unix_s)) for s in shown]
+    shown = _different(seen, centres)
+    outlines = [site.refracted(_outline(v), earth_state(v.shot.utc_unix_s)) for v in shown]
     reach = _reach(np.concatenate(outlines))
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
-    _bright(axes, site, earth_state(np.median([s.utc_unix_s for s in shots])), catalogue, reach)
-    for shot, outline in zip(shown, outlines, strict=True):
+    middle_unix_s = float(np.median([v.shot.utc_unix_s for v in seen]))
+    _bright(axes, site, earth_state(middle_unix_s), catalogue, reach)
+    for view, outline in zip(shown, outlines, strict=True):
+        shot = view.shot
         axes.plot(*polar(outline), color=ORANGE, lw=1.3)
         if len(shot.xy):
-            stars = site.refracted(looking(shot, shot.xy), earth_state(shot.utc_unix_s))
+            stars = site.refracted(view.directions(shot.xy), earth_state(shot.utc_unix_s))
             axes.scatter(*polar(stars), s=_dot(shot.magnitudes), color=BLUE, lw=0, zorder=3)
     axes.plot(*polar(centres), "+", color=ORANGE, ms=7, mew=1.4, zorder=4)
     axes.set_rlim(0, reach)
@@ -50,10 +82,10 @@ def draw_sky(figure, night: Night, catalogue: Catalogue) -> None:
     _legend(axes)
 
 
-def _legend(axes) -> None:
+def _legend(axes: "Axes") -> None:
     from matplotlib.lines import Line2D
 
-    def dot(colour, magnitude, text, **more):
+    def dot(colour: str, magnitude: float, text: str, **more: Any) -> Line2D:
         size = np.sqrt(_dot(np.array([magnitude]))[0])
         return Line2D([], [], ls="none", marker="o", color=colour, ms=size, mew=0, label=text, **more)
 
@@ -68,12 +100,12 @@ def _legend(axes) -> None:
 
 
 def _dot(magnitude: np.ndarray) -> np.ndarray:
-    """Area in points squared."""
+    """Area of a star's dot in points squared."""
     return 1.2 + 1.1 * np.clip(FAINTEST_DOT - np.nan_to_num(magnitude, nan=9.0), 0, None) ** 1.7
 
 
-def _bright(axes, site: Site, state: EarthState, catalogue: Catalogue, reach: float) -> None:
-    """The brightest stars of the part of the sky that is shown."""
+def _bright(axes: "Axes", site: Site, state: EarthState, catalogue: Catalogue, reach: float) -> None:
+    """Draw the brightest stars up to a zenith distance `reach` in deg."""
     index = site.overhead(catalogue, state, np.array([0.0, 0.0, 1.0]), np.radians(reach), 6.5)[:BRIGHT]
     v = site.observed(catalogue, index, state)
     theta, r = polar(v)
@@ -83,12 +115,12 @@ def _bright(axes, site: Site, state: EarthState, catalogue: Catalogue, reach: fl
 
 
 def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth in rad and zenith distance in deg."""
+    """Azimuth (N,) in rad and zenith distance (N,) in deg of directions (N, 3) in ENU."""
     return np.arctan2(enu[:, 0], enu[:, 1]), np.degrees(np.arctan2(np.hypot(enu[:, 0], enu[:, 1]), enu[:, 2]))
 
 
 def _axes(a: Attitude) -> np.ndarray:
-    """Rows x (columns), y (rows) and z of the camera in ICRS (3, 3)."""
+    """Camera axes (3, 3) in ICRS: its rows are x (along columns), y (along rows) and z."""
     ca, sa, cd, sd = np.cos(a.ra), np.sin(a.ra), np.cos(a.dec), np.sin(a.dec)
     east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])
     cr, sr = np.cos(a.roll), np.sin(a.roll)
@@ -96,34 +128,28 @@ def _axes(a: Attitude) -> np.ndarray:
     return np.stack([-x if a.mirrored else x, -(cr * north + sr * east), [cd * ca, cd * sa, sd]])
 
 
-def looking(shot: Shot, xy: np.ndarray) -> np.ndarray:
-    """ICRS directions (N, 3) of pixels, without distortion."""
-    centre = (np.array(shot.size) - 1) / 2
-    plane = (xy - centre) / shot.pointing.focal_px
-    v = np.column_stack([plane, np.ones(len(plane))]) @ _axes(shot.pointing)
-    return normalised(v)
-
-
-def _outline(shot: Shot) -> np.ndarray:
-    width, height = shot.size
+def _outline(view: View) -> np.ndarray:
+    """ICRS directions (N, 3) along the edge of a frame."""
+    width, height = view.size
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]], float) - 0.5
     steps = np.linspace(0, 1, 9)[:-1, None]
     sides = [a + (b - a) * steps for a, b in pairwise(corners)]
-    return looking(shot, np.concatenate([*sides, corners[:1]]))
+    return view.directions(np.concatenate([*sides, corners[:1]]))
 
 
-def _different(shots: Sequence[Shot], centres: np.ndarray) -> list[Shot]:
-    """Frames that look elsewhere than those before, a dozen at most."""
+def _different(seen: Sequence[View], centres: np.ndarray) -> list[View]:
+    """Frames that look elsewhere than all before them, OUTLINES at most."""
     kept: list[int] = []
-    for k, shot in enumerate(shots):
-        field = 0.5 * shot.size[1] / shot.pointing.focal_px
+    for k, view in enumerate(seen):
+        field = 0.5 * view.size[1] / view.pointing.focal_px
         if all(np.linalg.norm(centres[k] - centres[j]) > field for j in kept):
             kept.append(k)
         if len(kept) == OUTLINES:
             break
-    return [shots[k] for k in kept]
+    return [seen[k] for k in kept]
 
 
 def _reach(enu: np.ndarray) -> float:
+    """Zenith distance in deg at the edge of the map, so that all directions (N, 3) are on it."""
     furthest = 1.08 * polar(enu)[1].max()
     return next((r for r in REACHES_DEG if r >= furthest), 90)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's messages as the report's types: what was recorded of stars and solutions."""
+"""Converts recorded stars and solutions (messages) into the report's types."""
+
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +18,13 @@ from starpos.rotation import full_turn
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
 
+# by the number in Solution.status
 STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT, Status.TILT_OUT_OF_RANGE,
-          Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip  # by Solution.status
+          Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip
 
 
-def star_list_of(m) -> StarList:
-    """The stars of a StarArray, or what is wrong with it."""
+def star_list_of(m: Any) -> StarList:
+    """The stars of a StarArray, or the error for which they cannot be used."""
     name = _name("stars", stamp_to_unix(m.header.stamp))
     try:
         return StarList(name, message_to_stars(m, name))
@@ -33,8 +36,8 @@ def _name(what: str, utc_unix_s: float | None) -> str:
     return f"{what} " + ("of unknown time" if utc_unix_s is None else utc_text(utc_unix_s))
 
 
-def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
-    """Of a Solution; its heading is geodetic, ours astronomic."""
+def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
+    """The frame of a Solution message, whose geodetic heading becomes astronomic.  cameras: by size of frame."""
     status = STATUS[m.status] if m.status < len(STATUS) else Status.BAD_INPUT
     at = stamp_to_unix(m.header.stamp)
     utc = float("nan") if at is None else at
@@ -95,12 +98,12 @@ def shot_of(m, cameras: dict[tuple[int, int], Camera]) -> Shot:
 
 
 def _finite(value: float) -> float:
-    """NaN for what no instrument says."""
+    """The value, or NaN for one that no instrument can give."""
     return float(value) if abs(value) < 1e9 else float("nan")
 
 
-def deflection_of(m) -> Deflection | None:
-    """That the solver applied; its error from what it widened the position by."""
+def deflection_of(m: Any) -> Deflection | None:
+    """The deflection that the solver applied; its sigma follows from how much wider the geodetic covariance is."""
     _, meridian = curvature_radii_m(np.radians(m.latitude))
     wider = max(m.covariance_geodetic[4] - m.covariance[4], 0.0)
     try:

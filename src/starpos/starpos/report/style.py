@@ -1,28 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the figures look: one size, one palette, and a Figure to a PNG without any global state of matplotlib."""
+"""Look of the figures: their size and colours, and PNG files without any global state of matplotlib."""
 
 import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos import __version__
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 WIDTH_IN, DPI = 7.2, 130
-# Okabe and Ito's, told apart by all eyes
+# of Okabe and Ito, whom colour-blind readers can follow too
 BLUE, ORANGE, GREEN, RED, SKY, PURPLE, GREY = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#6e6e6e"
 )  # fmt: skip
 MADE_BY = f"starpos {__version__} report"
 
 
-def new_figure(height_in: float):
+def new_figure(height_in: float) -> "Figure":
+    """An empty figure of the common width."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
 
 
-def png_of(figure) -> bytes:
-    """The Figure as PNG, which says who made it."""
+def png_of(figure: "Figure") -> bytes:
+    """The figure as PNG, with starpos named as the software that made it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
@@ -31,15 +38,15 @@ def png_of(figure) -> bytes:
     return out.getvalue()
 
 
-def plain(axes) -> None:
-    """A quiet frame and grid."""
+def plain(axes: "Axes") -> None:
+    """Give axes a light grid and only the left and bottom lines of the frame."""
     axes.grid(alpha=0.25, lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9)
 
 
-def number_axis(axes, numbers) -> None:
-    """Whole numbers along x, with room at both ends."""
+def number_axis(axes: "Axes", numbers: Sequence[int] | np.ndarray) -> None:
+    """Put whole numbers along x, with room at both ends."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = min(numbers), max(numbers)
@@ -49,7 +56,7 @@ def number_axis(axes, numbers) -> None:
 
 
 def figures_of(value: float, digits: int = 3) -> str:
-    """A number to so many significant digits, without an exponent where it can be read without."""
+    """A number with so many significant digits, and with an exponent only if it is very large or small."""
     if not np.isfinite(value):
         return "unknown"
     if value == 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposures to a Night: every frame solved, all of them averaged."""
+"""Makes a Night of exposures: solves each frame and averages the fixes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -9,6 +9,7 @@ import numpy as np
 
 from starpos.averaging.average import average
 from starpos.calibration.turning import turn
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
@@ -16,6 +17,7 @@ from starpos.fix.budget import heading_of, place_of
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
+from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import a2_matrix
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
@@ -25,12 +27,17 @@ from starpos.report.night import NO_TILT, Night, ReportedPlace, Shot
 from starpos.sky.catalogue import Catalogue
 from starpos.utc import utc_text
 
-STILL_SIGMA = 8.0  # readings further than this from their mean say that the camera was moved
+# if readings are further from their median than this, the camera was moved
+STILL_SIGMA = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Workshop:
-    """What solving needs besides the exposures; instrument_for: of a frame's stars, raises InstrumentError."""
+    """All that solving needs besides the exposures.
+
+    instrument_for: gives the instrument for the stars of a frame, may raise InstrumentError.
+    turn_stddev_deg: to calibrate by turning, the sigma of A3's turn; None to use A3 as given.
+    """
 
     instrument_for: Callable[[Stars], Instrument]
     catalogue: Catalogue
@@ -40,20 +47,28 @@ class Workshop:
     progress: Progress = quiet
 
     def solver(self, stars: Stars) -> Solver:
+        """The solver for frames like this one."""
         return Solver(self.instrument_for(stars), self.catalogue, self.atmosphere, progress=self.progress)
 
 
 def worked(exposures: StarLists, shop: Workshop) -> Night:
-    """The night of these exposures; InstrumentError where no frame can have one."""
-    solve = _one_by_one if shop.turn_stddev_deg is None else _turned
-    shots, fixes, instrument, remarks, extrapolated_days = [], [], None, [], 0.0
-    for done, (exposure, solution, used, said) in enumerate(solve(exposures, shop), 1):
-        shots.append(_shot(exposure, solution))
-        if solution.fix:
-            fixes.append(solution.fix)
-            instrument = used
-            extrapolated_days = max(extrapolated_days, solution.extrapolated_days)
-        remarks += said
+    """The night of these exposures; raises InstrumentError if there is no instrument for a frame."""
+    if shop.turn_stddev_deg is None:
+        solved = _one_by_one(exposures, shop)
+    else:
+        solved = _turned(exposures, shop, shop.turn_stddev_deg)
+    shots: list[Shot] = []
+    fixes: list[Fix] = []
+    remarks: list[str] = []
+    instrument: Instrument | None = None
+    extrapolated_days = 0.0
+    for done, item in enumerate(solved, 1):
+        shots.append(_shot(item.exposure, item.solution))
+        if item.solution.fix:
+            fixes.append(item.solution.fix)
+            instrument = item.instrument
+            extrapolated_days = max(extrapolated_days, item.solution.extrapolated_days)
+        remarks += item.remarks
         shop.progress(exposures.name[:20], done / exposures.count)
     combined, why_not, said = _combined(fixes, shots)
     remarks += said
@@ -73,50 +88,65 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
         truth=exposures.truth,
         remarks=tuple(remarks),
     )
-    return replace(night, steady=_steady(night, instrument)) if combined else night
+    steady = _steady(night, instrument) if combined and instrument else None
+    return replace(night, steady=steady)
 
 
-def _one_by_one(exposures: StarLists, shop: Workshop) -> Iterator:
-    """(Exposure, Solution, Instrument, remarks) of each frame."""
-    hint, prepared = None, set()
+@dataclass(frozen=True)
+class _Solved:
+    """A frame, its solution, the instrument it was solved with (None if it has no stars), and what there is to say."""
+
+    exposure: StarList
+    solution: Solution
+    instrument: Instrument | None
+    remarks: tuple[str, ...] = ()
+
+
+def _one_by_one(exposures: StarLists, shop: Workshop) -> Iterator[_Solved]:
+    """Solve each frame by itself."""
+    hint: Hint | None = None
+    prepared: set[tuple[int, int]] = set()
     for exposure in exposures.read():
         if not isinstance(exposure.stars, Stars):
-            yield exposure, _unreadable(exposure), None, ()
+            yield _Solved(exposure, _unreadable(exposure), None)
             continue
         solver = shop.solver(exposure.stars)
         size = exposure.stars.width, exposure.stars.height
-        if size not in prepared:  # else the time of the first frame would hold the building of the triangles
+        # otherwise the time of the first frame would include the building of the triangles
+        if size not in prepared:
             prepared.add(size)
-            with suppress(StarposError):  # which the frame itself will say
+            # the frame itself reports an error
+            with suppress(StarposError):
                 solver.prepare(*size)
         solution = solver.solve(exposure.stars, exposures.tilt, hint)
         hint = solution.hint or hint
-        yield exposure, solution, solver.instrument, ()
+        yield _Solved(exposure, solution, solver.instrument)
 
 
-def _turned(exposures: StarLists, shop: Workshop) -> Iterator:
-    """The same of all frames together, with the A3 that they tell."""
+def _turned(exposures: StarLists, shop: Workshop, turn_stddev_deg: float) -> Iterator[_Solved]:
+    """Solve all frames together, with the A3 that they tell."""
     rows = list(exposures.read())
-    good = [e for e in rows if isinstance(e.stars, Stars)]
-    answers, instrument, said = iter(()), None, ()
+    good = [e.stars for e in rows if isinstance(e.stars, Stars)]
+    solutions: list[Solution] = []
+    instrument: Instrument | None = None
+    remarks: tuple[str, ...] = ()
     if good:
-        solver = shop.solver(good[0].stars)
+        solver = shop.solver(good[0])
         instrument = solver.instrument
         try:
-            turned = turn(
-                solver, [e.stars for e in good], exposures.tilt, shop.turn_stddev_deg, shop.progress
-            )
-            answers, instrument = iter(turned.solutions), turned.instrument
+            turned = turn(solver, good, exposures.tilt, turn_stddev_deg, shop.progress)
+            solutions, instrument = list(turned.solutions), turned.instrument
             angles = " ".join(f"{a:.5f}" for a in instrument.calibration.misalignment_deg)
-            said = (
+            remarks = (
                 f"A3 was found from the headings: --misalignment {angles}, the plumb line in the camera to "
                 f"{turned.plumb_stddev_arcsec:.2f} arcsec",
             )
         except FixError as error:
-            answers = (Solution.failed(e.stars, Status.POOR_FIT, str(error)) for e in good)
+            solutions = [Solution.failed(stars, Status.POOR_FIT, str(error)) for stars in good]
+    answers = iter(solutions)
     for k, exposure in enumerate(rows):
         solution = next(answers) if isinstance(exposure.stars, Stars) else _unreadable(exposure)
-        yield exposure, solution, instrument, said if k == 0 else ()
+        yield _Solved(exposure, solution, instrument, remarks if k == 0 else ())
 
 
 def _unreadable(exposure: StarList) -> Solution:
@@ -126,22 +156,9 @@ def _unreadable(exposure: StarList) -> Solution:
 
 
 def _shot(exposure: StarList, s: Solution) -> Shot:
-    """What the report keeps of a solution."""
-    stars, fix = exposure.stars, s.fix
-    seen = {}
-    if s.star is not None:
-        seen["xy"] = np.stack([stars.x, stars.y], -1)[s.star]
-        seen["magnitudes"] = s.magnitudes
-    if fix:
-        seen |= {
-            "place": ReportedPlace.of(fix),
-            "residual_px": -fix.residual_px,
-            "residual_arcsec": fix.residual_arcsec,
-            "camera_to_itrs": fix.camera_to_itrs,
-        }
-    elif s.attitude:
-        seen["residual_arcsec"] = s.attitude.residual_arcsec
-    return Shot(
+    """The part of a solution that the report shows."""
+    stars = exposure.stars
+    shot = Shot(
         name=exposure.name,
         status=s.status,
         message=s.message,
@@ -153,12 +170,23 @@ def _shot(exposure: StarList, s: Solution) -> Shot:
         tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
         identify_s=s.identify_s,
         fix_s=s.fix_s,
-        **seen,
+        residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+    )
+    if isinstance(stars, Stars) and s.star is not None and s.magnitudes is not None:
+        shot = replace(shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes)
+    if s.fix is None:
+        return shot
+    return replace(
+        shot,
+        place=ReportedPlace.of(s.fix),
+        residual_px=-s.fix.residual_px,
+        residual_arcsec=s.fix.residual_arcsec,
+        camera_to_itrs=s.fix.camera_to_itrs,
     )
 
 
 def _combined(fixes: Sequence[Fix], shots: Sequence[Shot]) -> tuple[ReportedPlace | None, str, list[str]]:
-    """The average; else a sentence why not; and what there is to say of it."""
+    """The average or None, a sentence why there is none, and remarks on it."""
     if not fixes:
         return None, why_none(shots), []
     try:
@@ -179,26 +207,27 @@ def _combined(fixes: Sequence[Fix], shots: Sequence[Shot]) -> tuple[ReportedPlac
 
 
 def why_none(shots: Sequence[Shot]) -> str:
-    """A sentence for a night without a fix."""
+    """A sentence that says why a night has no fix."""
     if not shots:
         return "there is no frame in it"
     return f"none of its {len(shots)} frames gave a fix; the first: {shots[0].message}"
 
 
 def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
-    """Night.steady: the fixes with the mean tilt of the night for each; None where the camera did not stand still."""
+    """Places (N, 3) for Night.steady, each with the mean tilt of the night; None if the camera was moved."""
     tilts = np.array([s.tilt for _, s in night.fixed])
-    headings = np.array([s.place.heading for _, s in night.fixed])
-    own = np.array([s.place.own for _, s in night.fixed])
-    moved = np.abs(tilts - np.median(tilts, axis=0)).max() * 6.371e6
+    headings = np.array([p.heading for p in night.places])
+    own = np.array([p.own for p in night.places])
+    attitudes = [s.camera_to_itrs for _, s in night.fixed if s.camera_to_itrs is not None]
+    moved = np.abs(tilts - np.median(tilts, axis=0)).max() * EARTH_RADIUS_M
     noise = np.sqrt(np.median(np.trace(own[:, :2, :2], axis1=1, axis2=2) / 2))
     turned = np.abs(wrapped(headings - headings[0])).max()
     if len(tilts) < 3 or moved > STILL_SIGMA * noise + 1.0 or turned > np.radians(1.0):
         return None
     g = a2_matrix(*tilts.mean(0)) @ instrument.mounting.a3
     steady = []
-    for _, shot in night.fixed:
-        place = place_of(g @ shot.camera_to_itrs.T)
+    for camera_to_itrs in attitudes:
+        place = place_of(g @ camera_to_itrs.T)
         link_to_enu = place.local_to_enu @ g @ instrument.mounting.link_to_camera
         steady.append((place.latitude, place.longitude, heading_of(link_to_enu)))
     return np.array(steady)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a report on disk: each whole or not at all, and nothing overwritten that is not a report's."""
+"""Writes the files of a report: each whole or not at all, and never over a file that is no report's."""
 
 import os
 import tempfile
@@ -8,7 +8,8 @@ from pathlib import Path
 
 from starpos.errors import StarposError
 
-MARK = b"starpos"  # in the head of every file that a report writes
+# every file of a report has this mark in its first HEAD bytes
+MARK = b"starpos"
 HEAD = 400
 
 
@@ -17,14 +18,15 @@ class WriteError(StarposError):
 
 
 def write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """The files of these names; WriteError where one cannot be written, or one of that name is somebody else's."""
+    """Write files by name; raises WriteError if one cannot be written, or would replace a file that is no report's."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in files:
             _check_ours(folder / name)
         for name, content in files.items():
             _write_whole(folder / name, content)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+    # ValueError comes from a NUL in the name
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise WriteError(
             f"{folder}: the report cannot be written there ({reason}): give another --out"
@@ -46,7 +48,8 @@ def _write_whole(path: Path, content: bytes) -> None:
     try:
         with open(descriptor, "wb") as file:
             file.write(content)
-        os.chmod(temporary, 0o644)  # mkstemp's is for its owner alone
+        # mkstemp makes files that only their owner can read
+        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated frames, nights and Monte-Carlo runs, with their truth."""
+"""Simulated frames and nights, and Monte-Carlo runs, with their truth."""

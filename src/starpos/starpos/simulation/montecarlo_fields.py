@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random star fields whose pointing is known, and what identification makes of them: the paper's table again.
+"""Random star fields of known pointing, and a tally of the answers that identification gives for them.
 
-Catalogue places at J2000 without aberration.  A field is known by its seed and number: the same stars whatever is
-done to them afterwards.
+The fields repeat the paper's table.  Their places are those of the catalogue at J2000, without aberration.  Seed and
+number determine the stars of a field, whatever is done to them afterwards.
 """
 
 import time
@@ -18,19 +18,23 @@ from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
 
-TOLERANCE_ARCSEC = 20.0  # of the frame's centre, or a pixel where that is more
-FALSE_STEP_MAG = 0.1  # a false star outshines the next one by this
-POINTS = (5, 60)  # fewest and most of a field of random points
+# of the frame's centre; a pixel if that is more
+TOLERANCE_ARCSEC = 20.0
+# each false star is brighter than the next by this
+FALSE_STEP_MAG = 0.1
+# fewest and most of a field of random points
+POINTS = (5, 60)
 
-Answer = Callable[[Stars], np.ndarray | None]  # where the frame's centre looks, ICRS (3,)
+# direction (3,) in ICRS of the frame's centre, None if not identified
+Answer = Callable[[Stars], np.ndarray | None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """What a camera sees of the stars brighter than limit_mag.
+    """How a camera sees the stars brighter than limit_mag.
 
-    sigma_px: error of a centroid, one axis; scatter_mag: of a brightness; missing: share of the stars not detected;
-    blend_px: closer stars are one; focal_error: largest relative error of the focal length that is assumed.
+    sigma_px: error of a centroid per axis.  scatter_mag: error of a brightness.  missing: share of stars not detected.
+    blend_px: stars closer than this become one.  focal_error: largest relative error of the assumed focal length.
     """
 
     camera: Camera
@@ -43,25 +47,28 @@ class Conditions:
 
     @property
     def tolerance_rad(self) -> float:
-        """How far off the frame's centre may be in a right answer."""
+        """Largest error (rad) of the frame's centre in a right answer."""
         return max(TOLERANCE_ARCSEC * ARCSEC, 1 / self.camera.fx)
 
 
-def ideal(camera: Camera, limit_mag: float = 9.0, **more) -> Conditions:
-    """The paper's: every star is seen with its catalogue brightness, however close to the next."""
+def ideal(camera: Camera, limit_mag: float = 9.0, **more: float) -> Conditions:
+    """The paper's conditions: each star is seen with its catalogue brightness, however close to the next it is."""
     return Conditions(camera=camera, limit_mag=limit_mag, scatter_mag=0.0, missing=0.0, blend_px=0.0, **more)
 
 
 def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:
-    """The magnitude at which a frame of this camera holds so many stars on average."""
-    sky = 4 * np.pi * camera.fx * camera.fy / (camera.width * camera.height)  # frames that make up a sphere
-    rank = min(int(stars * sky), len(catalogue) - 1)
+    """Limiting magnitude at which a frame of this camera holds so many stars on average."""
+    frames_in_sky = 4 * np.pi * camera.fx * camera.fy / (camera.width * camera.height)
+    rank = min(int(stars * frames_in_sky), len(catalogue) - 1)
     return round(float(np.partition(catalogue.vmag_centi, rank)[rank]) / 100, 2)
 
 
 @dataclass(frozen=True)
 class Field:
-    """Stars of a frame at xy (N, 2) px, brightest first; centre (3,): where it looks, None: nowhere."""
+    """Stars of a frame at xy (N, 2) px, brightest first.
+
+    centre (3,): ICRS direction of the frame's centre; None if the field is no part of the sky.
+    """
 
     xy: np.ndarray
     mag: np.ndarray
@@ -72,11 +79,14 @@ class Field:
         return len(self.xy)
 
     def brightest(self, n: int) -> "Field":
-        """The field as it is when no more than n stars are detected."""
+        """The field with its n brightest stars only."""
         return Field(self.xy[:n], self.mag[:n], self.centre, f"{self.name} {n} stars")
 
     def with_false(self, n: int, camera: Camera) -> "Field":
-        """The field with n random points brighter than all its stars; of n + 1 points the last n are the same."""
+        """The field with n random points brighter than all its stars.
+
+        The points of n are the last n of those of n + 1.
+        """
         rng = np.random.default_rng(list(self.name.encode()))
         points = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))[::-1]
         top = self.mag[0] if len(self.mag) else 9.0
@@ -89,7 +99,7 @@ class Field:
         )
 
     def stars(self, conditions: Conditions) -> Stars:
-        """What a detector would have made of it."""
+        """The list that a detector would give for this field."""
         n, camera = len(self), conditions.camera
         covariance = np.broadcast_to(np.eye(2) * conditions.sigma_px**2, (n, 2, 2))
         flux = 10 ** (-0.4 * (self.mag - 15))
@@ -108,7 +118,7 @@ class Field:
 
 
 def draw(catalogue: Catalogue, conditions: Conditions, seed: int, number: int) -> Field:
-    """One field of a random part of the sky at a random angle."""
+    """Draw a field of a random part of the sky at a random angle."""
     c, rng = conditions, np.random.default_rng([seed, number])
     attitude, r = np.linalg.qr(rng.normal(size=(3, 3)))
     attitude = attitude * np.sign(np.diag(r))
@@ -126,7 +136,7 @@ def draw(catalogue: Catalogue, conditions: Conditions, seed: int, number: int) -
 
 
 def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
-    """Random points: no part of the sky."""
+    """Draw a field of random points, which is no part of the sky."""
     rng, camera = np.random.default_rng([seed, number, 1]), conditions.camera
     n = int(rng.integers(*POINTS))
     xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
@@ -134,7 +144,7 @@ def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
 
 
 def _blended(xy: np.ndarray, mag: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Stars closer than reach_px to a brighter one, joined to it; again brightest first."""
+    """Places and magnitudes after stars closer than reach_px were joined to the brighter one; brightest first."""
     xy, light, single = xy.copy(), 10 ** (-0.4 * mag), np.ones(len(mag), bool)
     apart = np.linalg.norm(xy[:, None] - xy, axis=2)
     for a, b in zip(*np.nonzero(np.triu(apart < reach_px, 1)), strict=True):
@@ -147,13 +157,13 @@ def _blended(xy: np.ndarray, mag: np.ndarray, reach_px: float) -> tuple[np.ndarr
 
 
 def false_stars(catalogue: Catalogue, conditions: Conditions, seed: int, n: int) -> Iterator[Field]:
-    """Fields with n false stars, without end."""
+    """Fields with n false stars; endless."""
     for number in count():
         yield draw(catalogue, conditions, seed, number).with_false(n, conditions.camera)
 
 
 def few_stars(catalogue: Catalogue, conditions: Conditions, seed: int, n: int) -> Iterator[Field]:
-    """The n brightest stars of the fields that hold as many, without end; CatalogueError where hardly any does."""
+    """The n brightest stars of each field that has as many; endless.  Raises CatalogueError if hardly any has."""
     found = 0
     for number in count():
         drawn = draw(catalogue, conditions, seed, number)
@@ -167,14 +177,17 @@ def few_stars(catalogue: Catalogue, conditions: Conditions, seed: int, n: int) -
 
 
 def points(conditions: Conditions, seed: int) -> Iterator[Field]:
-    """Fields of random points, without end."""
+    """Fields of random points; endless."""
     for number in count():
         yield draw_points(conditions, seed, number)
 
 
 @dataclass
 class Tally:
-    """Answers to fields: how many were right, wrong (or invented) and none; cpu_ms of each; fields not answered right."""
+    """Counts of right, wrong (or invented) and missing answers to fields.
+
+    cpu_ms: CPU time of each answer.  failed: fields without a right answer, with 'wrong' or 'none'.
+    """
 
     correct: int = 0
     wrong: int = 0
@@ -184,10 +197,11 @@ class Tally:
 
     @property
     def fields(self) -> int:
+        """Number of fields."""
         return self.correct + self.wrong + self.none
 
     def ask(self, given: Field, stars: Stars, answer: Answer, tolerance_rad: float) -> None:
-        """Have one more field answered."""
+        """Count the answer to one more field, given as stars."""
         begin = time.process_time()
         found = answer(stars)
         self.cpu_ms.append(1000 * (time.process_time() - begin))
@@ -203,7 +217,7 @@ class Tally:
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:
-    """The 95 % confidence interval of a share of which n trials found so many successes (Wilson 1927)."""
+    """95 % confidence interval of a probability, after so many successes in n trials (Wilson 1927)."""
     if n == 0:
         return 0.0, 1.0
     z2, p = 1.96**2, successes / n

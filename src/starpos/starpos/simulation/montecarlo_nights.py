@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole nights at random, worked as a user would, against their truth: the paper's fifty, and whether claims are true.
+"""Random nights, worked as a user would and compared with their truth: they test whether stated errors are right.
 
-Nothing that is drawn is told to the instrument but its size: where it stands, how camera and inclinometer are fixed to
-each other, the inclinometer's zero, wandering, scale and temperature, the air, the clock, the Earth's rotation, the
-errors of the catalogue.
+The paper has fifty such nights.  Drawn at random are the place, how camera and inclinometer are fixed to each other, the
+inclinometer's zero, drift, scale and temperature, the air, the clock, the Earth's rotation and the errors of the
+catalogue.  The instrument is told only how large these are.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -31,39 +31,46 @@ from starpos.sky.catalogue import EPOCH, Catalogue
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC, DAY_S, MAS
 
-CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
+# the paper's camera
+CAMERA = Camera.from_focal(5616, 3744, 93750.0)
 EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
 FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0  # 2016 to 2026
-LEAN_DEG = 0.05  # how far off the plumb line a turn by hand is, 1 sigma
+# 1 sigma of the lean that a turn by hand causes
+LEAN_DEG = 0.05
 SCA100T = InclinometerErrors()
 
 
 def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
-    """One that is as steady as it is quiet."""
+    """Errors of a tiltmeter whose drift is as small as its noise."""
     noise = noise_arcsec * ARCSEC
     return InclinometerErrors(noise, noise / 8, noise, noise, SCA100T.scale)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NightWorld:
-    """What is so, and what the instrument is told of it.
+    """The truth of a night, and what the instrument is told of it.
 
-    scene: the instrument at its place, by the catalogue `sky`, its errors included; site: where it stands by gravity;
-    clock_s: its stamps less UTC; warmth_c: temperature less the one at which its zero is what it is.
+    scene: the instrument with its errors at its place, under the stars of `sky`.  site: its place by gravity.
+    clock_s: its time stamps minus UTC.  per_c (2,): change of the inclinometer's zero in rad per deg C.
+    told, air: instrument and air as the user knows them.
     """
 
     scene: Scene
     site: Site
     sky: Catalogue
     clock_s: float
-    per_c: np.ndarray  # (2,) rad
+    per_c: np.ndarray
     told: Instrument
     air: Atmosphere
 
 
 @dataclass(frozen=True, kw_only=True)
 class NightOutcome:
-    """One night: east, north (m) and heading (rad) off, by gravity and on the ground, with what was claimed of them."""
+    """Errors of one night and the covariances stated for them.
+
+    off (3,): east m, north m, heading rad, against the astronomic truth; off_ground: against the geodetic truth.
+    trouble: why there is no answer; then all numbers are NaN.
+    """
 
     kind: str
     off: np.ndarray
@@ -74,24 +81,24 @@ class NightOutcome:
 
     @property
     def position_nees(self) -> float:
-        """2 on average, of true claims."""
+        """Squared error of the astronomic place in units of its covariance; 2 on average if that is right."""
         return float(self.off[:2] @ np.linalg.solve(self.covariance[:2, :2], self.off[:2]))
 
     @property
     def ground_nees(self) -> float:
-        """The same of the geodetic position."""
+        """Squared error of the geodetic place in units of its covariance; 2 on average if that is right."""
         m = self.off_ground[:2]
         return float(m @ np.linalg.solve(self.covariance_ground[:2, :2], m))
 
     @property
     def heading_nees(self) -> float:
-        """1 on average."""
+        """Squared error of the heading in units of its variance; 1 on average if that is right."""
         return float(self.off[2] ** 2 / self.covariance[2, 2])
 
 
 @dataclass
 class Zero:
-    """An inclinometer's zero as it wanders."""
+    """The zero of an inclinometer as it wanders with time."""
 
     errors: InclinometerErrors
     rng: np.random.Generator
@@ -99,7 +106,7 @@ class Zero:
     rad: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
     def at(self, unix_s: float) -> np.ndarray:
-        """(2,) rad; times must not go back."""
+        """The zero (2,) in rad at a time, not before the last one."""
         hours = max(unix_s - self.now_s, 0.0) / 3600
         self.rad = self.rad + self.rng.normal(0, 1, 2) * self.errors.drift_rad_per_sqrt_hour * np.sqrt(hours)
         self.now_s = max(self.now_s, unix_s)
@@ -113,16 +120,15 @@ def draw(
     clock_stddev_s: float,
     camera: Camera,
 ) -> tuple[NightWorld, float]:
-    """A World at a random time and place, and that time."""
+    """Draw a world at a random time and place; returns it with the time (Unix s)."""
     begin = rng.uniform(FIRST_UNIX_S, LAST_UNIX_S)
     year = EPOCH + (begin - 946728000.0) / (365.25 * DAY_S)
     altitude, roll = rng.uniform(70, 86), rng.uniform(0, 360)
     azimuth = rng.uniform(0, 360)
     truth = Calibration().turned_to(_mounted(rng, camera_to_enu(azimuth, altitude, roll)[2]))
     told = Instrument(camera.fx, inclinometer=errors, clock_stddev_s=clock_stddev_s)
-    air = rng.choice(
-        [Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3), Atmosphere.measured(None, None)]
-    )
+    airs = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3), Atmosphere.measured(None, None)
+    air = airs[rng.choice(len(airs))]
     scene = Scene(
         camera=camera,
         instrument=replace(told, calibration=truth),
@@ -150,7 +156,7 @@ def draw(
 
 
 def at_place(world: NightWorld, rng: np.random.Generator, unix_s: float) -> NightWorld:
-    """The same instrument at another place, in other air, the Earth turned by what the tables err."""
+    """The instrument at another random place, in other air, with other errors of the Earth's rotation."""
     latitude = np.degrees(np.arcsin(rng.uniform(np.sin(np.radians(-66)), np.sin(np.radians(66)))))
     longitude = rng.uniform(-180, 180)
     air = world.air
@@ -169,14 +175,14 @@ def at_place(world: NightWorld, rng: np.random.Generator, unix_s: float) -> Nigh
 
 
 def _mounted(rng: np.random.Generator, up: np.ndarray) -> np.ndarray:
-    """A3 (3, 3) of an inclinometer that stands upright to 2 deg, and faces anywhere, while the camera has `up` (3,)."""
+    """A3 (3, 3) of an inclinometer that is upright to about 1 deg and faces anywhere; `up` (3,): the zenith in C."""
     x, y = np.sin(np.radians(rng.normal(0, 1, 2)))
     plumb = np.array([x, y, np.sqrt(1 - x * x - y * y)])
     return rotation.from_vector(plumb * rng.uniform(0, 2 * np.pi)) @ rotation.shortest_turn(up, plumb)
 
 
 def _with_errors(catalogue: Catalogue, year: float, rng: np.random.Generator) -> Catalogue:
-    """The sky as it is: every star off its catalogue place by an error of the size stated for the year."""
+    """The true sky: each star is off its catalogue place by an error of the size stated for the year."""
     n = len(catalogue)
     sigma = catalogue.sigma(np.arange(n), year) / MAS
     east, north = rng.normal(0, 1, (2, n)) * sigma
@@ -195,9 +201,12 @@ def photograph(
     frames: int,
     rng: np.random.Generator,
 ) -> tuple[list[Stars], TiltLog, float]:
-    """Frames at each heading, turned by hand in between; the inclinometer's readings; the last heading (rad)."""
-    stars, rows, now = [], [], begin
-    warmth, trend = rng.normal(0, 2.0), rng.normal(0, 1.0)  # deg C, and an hour
+    """Frames at several headings, with a turn by hand in between; returns stars, tilts and the last heading (rad)."""
+    stars: list[Stars] = []
+    rows: list[tuple[float, ...]] = []
+    now = begin
+    # deg C, and deg C per hour
+    warmth, trend = rng.normal(0, 2.0), rng.normal(0, 1.0)
     for turned in turns_deg:
         lean = rng.normal(0, LEAN_DEG, 2)
         scene = world.scene
@@ -218,7 +227,9 @@ def photograph(
                 rows.append((moment, *read_tilt(shaky, 0.0, rng), 15.0 + warm))
             now += CADENCE_S
         now += TURN_S
-    return stars, TiltLog.of(*np.array(rows).T, world.told.inclinometer.noise_rad), scene.heading
+    unix_s, theta_x, theta_y, temperature_c = np.array(rows).T
+    log = TiltLog.of(unix_s, theta_x, theta_y, temperature_c, world.told.inclinometer.noise_rad)
+    return stars, log, scene.heading
 
 
 def turned_night(
@@ -230,13 +241,13 @@ def turned_night(
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,
 ) -> NightOutcome:
-    """Re-mounted somewhere and turned on the spot, A3 unknown."""
+    """A night of an instrument with unknown A3 that is turned on the spot."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
-    turns = np.arange(headings) * 360 / headings
+    turns = [k * 360 / headings for k in range(headings)]
     stars, tilts, heading = photograph(world, Zero(errors, rng, begin), begin, turns, frames, rng)
     solver = Solver(world.told, catalogue, world.air)
 
-    def answer():
+    def answer() -> Average:
         return average(turn(solver, stars, tilts.average).fixes)
 
     return _outcome("turned", answer, world.site, heading, rng)
@@ -250,7 +261,7 @@ def calibrated_night(
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,
 ) -> NightOutcome:
-    """Calibrated at a known place at two leans, then days later at another, in other air, leaning otherwise."""
+    """A night after a calibration: that one at a known place with two leans, this one days later at another place."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     zero = Zero(errors, rng, begin)
     stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)
@@ -268,7 +279,7 @@ def calibrated_night(
 
     shots, levels, heading = photograph(there, zero, later, [0.0], frames, rng)
 
-    def answer():
+    def answer() -> Average:
         found = calibrate_at(solver, stars + more, tilts.average, world.site)
         ready = replace(solver, instrument=found.instrument)
         solutions = [ready.solve(s, levels.average) for s in shots]
@@ -277,18 +288,20 @@ def calibrated_night(
     return _outcome("calibrated", answer, there.site, heading, rng)
 
 
-def _outcome(kind: str, answer, site: Site, heading: float, rng: np.random.Generator) -> NightOutcome:
-    """What came of it, against the truth."""
+def _outcome(
+    kind: str, answer: Callable[[], Average], site: Site, heading: float, rng: np.random.Generator
+) -> NightOutcome:
+    """Compare an answer with the truth: the astronomic site and the heading (rad)."""
     try:
-        a: Average = answer()
+        a = answer()
     except StarposError as e:
-        nothing, unknown = np.full(3, np.nan), np.full((3, 3), np.nan)
+        nothing, no_covariance = np.full(3, np.nan), np.full((3, 3), np.nan)
         return NightOutcome(
             kind=kind,
             off=nothing,
-            covariance=unknown,
+            covariance=no_covariance,
             off_ground=nothing,
-            covariance_ground=unknown,
+            covariance_ground=no_covariance,
             trouble=str(e),
         )
     unknown = Deflection()
@@ -308,5 +321,6 @@ def _outcome(kind: str, answer, site: Site, heading: float, rng: np.random.Gener
 
 
 def _apart(latitude: float, longitude: float, heading: float, phi: float) -> np.ndarray:
+    """East m, north m, heading rad (3,) of differences in rad at the latitude phi."""
     prime, meridian = curvature_radii_m(phi)
     return np.array([half_turn(longitude) * prime * np.cos(phi), latitude * meridian, half_turn(heading)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated night on disk: frames (FITS) or star lists (CSV), tilt.csv, and truth.json to hold a solution against."""
+"""Writes a simulated night: frames (FITS) or star lists (CSV), tilt.csv, and truth.json to compare a solution with."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ TILT_RATE_HZ = 10.0
 
 
 def write_night(
-    folder,
+    folder: Path | str,
     scene: Scene,
     catalogue: Catalogue,
     start_utc: str,
@@ -31,7 +31,10 @@ def write_night(
     rng: np.random.Generator,
     progress: Progress = quiet,
 ) -> None:
-    """Write `frames` exposures of a scene that turns by turn_deg of azimuth from one to the next."""
+    """Write `frames` exposures of a scene that turns by turn_deg of azimuth from one to the next.
+
+    Raises FrameError if the folder cannot be written.
+    """
     begin = unix_of(start_utc)
     folder = Path(folder)
     try:
@@ -64,19 +67,21 @@ def write_night(
 
 
 def _text(unix_s: float) -> str:
+    """UTC in the form of FITS' DATE-OBS, to the microsecond."""
     import datetime
 
     moment = datetime.datetime.fromtimestamp(round(unix_s, 6), datetime.timezone.utc)
     return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")
 
 
-def write_fits(path, frame: Frame, start_utc: str) -> None:
-    """A frame as FITS with DATE-OBS (start of exposure, UTC) and EXPTIME."""
+def write_fits(path: Path | str, frame: Frame, start_utc: str) -> None:
+    """Write a frame as FITS with DATE-OBS (start of exposure, UTC), EXPTIME and, if known, the focal length."""
     from astropy.io import fits
 
     header = fits.Header()
     header["DATE-OBS"] = (start_utc, "start of exposure, UTC")
     header["EXPTIME"] = (frame.exposure_s, "s")
-    header["FOCALLEN"] = (frame.focal_px / 1000, "mm, at 1 um pixels")
-    header["XPIXSZ"] = (1.0, "um")
+    if frame.focal_px is not None:
+        header["FOCALLEN"] = (frame.focal_px / 1000, "mm, at 1 um pixels")
+        header["XPIXSZ"] = (1.0, "um")
     fits.PrimaryHDU(frame.pixels, header).writeto(path, overwrite=True)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated instrument under a simulated sky: frames and tilts with their errors, from a known place.
+"""A simulated instrument under a simulated sky: frames and tilts, with errors, from a known place.
 
-It uses this package's own apparent places, so it tests everything after them; the places themselves are held against
-ERFA's and astropy's numbers in the tests.
+It uses this package's own apparent places, so it tests everything after them; the tests compare the places themselves
+with numbers of ERFA and astropy.
 """
 
 from dataclasses import dataclass, field
@@ -27,24 +27,27 @@ CENTROID_FLOOR_PX, DETECTED_SNR = 0.02, 6.0
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """What reaches the pixels: the paper's telescope and camera by default."""
+    """Telescope, detector and air; by default the paper's.
+
+    zero_point_e_s: electrons per second of a star of V = 0.  seeing_arcsec: each star's own motion, 1 sigma.
+    """
 
     fwhm_px: float = 2.4
-    zero_point_e_s: float = 3.0e7  # electrons per second of a star of V = 0
+    zero_point_e_s: float = 3.0e7
     sky_mag_arcsec2: float = 18.0
     read_noise_e: float = 6.0
     gain_e_dn: float = 1.0
     bias_dn: float = 512.0
     full_well_dn: float = 16383.0
-    seeing_arcsec: float = 0.2  # each star's own motion, 1 sigma
+    seeing_arcsec: float = 0.2
     limit_mag: float = 11.0
 
 
 @dataclass(frozen=True)
 class TiltErrors:
-    """Errors of one inclinometer reading: white noise, zero of the two axes, drift of the zero per hour, step; rad.
+    """Errors of an inclinometer reading in rad: white noise, zero per axis, its drift per hour, and the step `quantum`.
 
-    scale: of the angle itself, by axis.
+    scale: relative error of the angle itself, by axis.
     """
 
     noise: float = np.radians(0.0035)
@@ -56,7 +59,7 @@ class TiltErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """An instrument standing at a site and looking somewhere."""
+    """An instrument at a site, and its pointing."""
 
     camera: Camera
     instrument: Instrument
@@ -69,7 +72,7 @@ class Scene:
 
     @property
     def attitude(self) -> np.ndarray:
-        """C into ENU (3, 3)."""
+        """Rotation (3, 3) of C into ENU."""
         return camera_to_enu(self.azimuth_deg, self.altitude_deg, self.roll_deg)
 
     @property
@@ -80,7 +83,7 @@ class Scene:
 
     @property
     def tilt(self) -> tuple[float, float]:
-        """theta_x, theta_y in rad without errors."""
+        """True theta_x, theta_y in rad."""
         up = self.instrument.mounting.a3 @ self.attitude[2]
         return float(np.arcsin(up[0])), float(np.arcsin(up[1]))
 
@@ -96,28 +99,36 @@ class Exposed:
     catalogue: np.ndarray
 
 
-def expose(scene: Scene, catalogue: Catalogue, start_unix_s: float, exposure_s: float, rng) -> Exposed:
-    """Where each star's light falls while the sky turns over the standing camera."""
+def expose(
+    scene: Scene, catalogue: Catalogue, start_unix_s: float, exposure_s: float, rng: np.random.Generator
+) -> Exposed:
+    """Pixels where the light of each star falls, while the sky turns over the camera at rest."""
     camera, optics = scene.camera, scene.optics
     reach = camera.half_diagonal_rad * 1.02
     middle_state = earth_state(start_unix_s + exposure_s / 2)
     index = scene.site.overhead(catalogue, middle_state, scene.attitude[:, 2], reach, optics.limit_mag)
-    px = []
+    moments = []
     for t in (start_unix_s, start_unix_s + exposure_s / 2, start_unix_s + exposure_s):
         state = middle_state if t == middle_state.utc_unix_s else earth_state(t)
-        px.append(camera.project(scene.site.observed(catalogue, index, state) @ scene.attitude))
-    px = np.stack(px) + rng.normal(0, optics.seeing_arcsec / camera.scale_arcsec, (len(index), 2))
+        moments.append(camera.project(scene.site.observed(catalogue, index, state) @ scene.attitude))
+    px = np.stack(moments) + rng.normal(0, optics.seeing_arcsec / camera.scale_arcsec, (len(index), 2))
     on = (
         np.isfinite(px).all((0, 2))
         & (px[1] > -6).all(1)
         & (px[1] < [camera.width + 5, camera.height + 5]).all(1)
     )
     electrons = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * catalogue.vmag(index))
-    return Exposed(*(p[on] for p in px), electrons[on], index[on])
+    start, middle, end = px[:, on]
+    return Exposed(start, middle, end, electrons[on], index[on])
 
 
 def render(
-    scene: Scene, stars: Exposed, start_unix_s: float, exposure_s: float, rng, source: str = "simulated"
+    scene: Scene,
+    stars: Exposed,
+    start_unix_s: float,
+    exposure_s: float,
+    rng: np.random.Generator,
+    source: str = "simulated",
 ) -> Frame:
     """A 16-bit frame: trailed Gaussian images integrated over pixels, sky, photon and read noise, clipping."""
     camera, optics = scene.camera, scene.optics
@@ -126,7 +137,8 @@ def render(
     place, amount = _star_light(camera, optics, stars)
     np.add.at(light, place, amount)
     pixels = np.empty(len(light), np.uint16)
-    for begin in range(0, len(light), STRIP_PX):  # the noise of a whole frame at once is 250 MB
+    # in strips, because the noise of a whole frame takes 250 MB
+    for begin in range(0, len(light), STRIP_PX):
         part = light[begin : begin + STRIP_PX]
         part += rng.standard_normal(len(part), dtype=np.float32) * np.sqrt(
             part + np.float32(optics.read_noise_e**2)
@@ -135,9 +147,8 @@ def render(
         part += np.float32(optics.bias_dn + 0.5)
         np.clip(part, 0, optics.full_well_dn, out=part)
         pixels[begin : begin + STRIP_PX] = part
-    pixels = pixels.reshape(camera.height, camera.width)
     return Frame(
-        pixels,
+        pixels.reshape(camera.height, camera.width),
         pattern="",
         mid_unix_s=start_unix_s + exposure_s / 2,
         exposure_s=exposure_s,
@@ -168,8 +179,8 @@ def _star_light(camera: Camera, optics: Optics, stars: Exposed) -> tuple[np.ndar
     return (y * camera.width + x)[on], image[on].astype(np.float32)
 
 
-def read_tilt(scene: Scene, hours: float, rng) -> tuple[float, float]:
-    """One inclinometer reading (rad), `hours` after its zero was true."""
+def read_tilt(scene: Scene, hours: float, rng: np.random.Generator) -> tuple[float, float]:
+    """One inclinometer reading theta_x, theta_y (rad), `hours` after the drift of its zero began."""
     e = scene.tilt_errors
     theta = np.array(scene.tilt) * (1 + np.asarray(e.scale)) + e.zero + hours * np.asarray(e.drift_hour)
     theta += rng.normal(0, 1, 2) * e.noise
@@ -189,10 +200,10 @@ def scene_of(
     tilt_noise_deg: float = 0.0035,
     tilt_zero_deg: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
-    """The paper's instrument at a place, with what is usually varied as plain numbers."""
+    """The paper's instrument at a place; plain numbers for what is usually varied."""
     azimuth_deg, altitude_deg, roll_deg = pointing_deg
     return Scene(
-        camera=Camera.from_focal(*size, focal_px),
+        camera=Camera.from_focal(size[0], size[1], focal_px),
         instrument=Instrument(focal_px, calibration=Calibration(misalignment_deg=misalignment_deg)),
         site=Site(latitude_deg, longitude_deg, atmosphere),
         azimuth_deg=azimuth_deg,
@@ -207,9 +218,14 @@ def scene_of(
 
 
 def detected(
-    scene: Scene, stars: Exposed, mid_unix_s: float, exposure_s: float, rng, source: str = "simulated"
+    scene: Scene,
+    stars: Exposed,
+    mid_unix_s: float,
+    exposure_s: float,
+    rng: np.random.Generator,
+    source: str = "simulated",
 ) -> Stars:
-    """The stars as a good detector would list them: errors by photon noise, with a floor of 0.02 px; SNR above 6."""
+    """The list of a good detector: errors by photon noise with a floor of 0.02 px, stars of SNR above 6 only."""
     optics, camera = scene.optics, scene.camera
     sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2
     area = np.pi * optics.fwhm_px**2

@@ -100,7 +100,7 @@ def test_pictures_are_drawn_and_lie_beside_the_page(drawn):
 def test_one_tilt_for_all_takes_the_inclinometers_noise_away(still, catalogue):
     night = worked(folder.exposures(still, SCA100T_NOISE_RAD), shop(catalogue))
     tilts = np.array([s.tilt for _, s in night.fixed])
-    own, steady = measures.stability(night).arcsec, measures.steadiness(night).arcsec
+    own, steady = measures.stability(night).arcsec, measures.steadiness(night, night.steady).arcsec
     # what the tilts did to latitude and longitude is what was taken away, and it is all there is between the two
     design = np.column_stack([tilts - tilts.mean(0), np.ones(len(tilts))])
     for axis in range(2):

@@ -129,7 +129,7 @@ def test_the_share_inside_is_of_the_frames_own_errors(rng):
 
 def test_the_error_is_the_night_less_the_truth():
     n = night([0.7] * 2, [0.5] * 2, [1.0] * 2, Truth(0.7 - 3 * ARCSEC, 0.5 + 4 * ARCSEC))
-    np.testing.assert_allclose(measures.error_arcsec(n), [3, -4], atol=1e-9)
+    np.testing.assert_allclose(measures.error_arcsec(n.combined, n.truth), [3, -4], atol=1e-9)
 
 
 def test_a_residual_points_to_where_the_star_was_seen(lists, catalogue):
@@ -154,7 +154,7 @@ def test_stars_are_drawn_where_they_stand_on_the_sky(lists, catalogue):
     n = work(lists, catalogue)
     site = Site(np.degrees(n.combined.latitude), np.degrees(n.combined.longitude), AIR)
     for shot in n.shots:
-        icrs = sky_figure.looking(shot, shot.xy)
+        icrs = sky_figure.View(shot, shot.pointing, shot.size).directions(shot.xy)
         azimuth, zenith_deg = sky_figure.polar(site.refracted(icrs, earth_state(shot.utc_unix_s)))
         camera = Camera.from_focal(*shot.size, FOCAL_PX)
         true = camera.directions(*shot.xy.T) @ camera_to_enu(40.0, 78.0, 15.0).T  # as `simulate` points
