@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From astronomic to geodetic: the deflection of the vertical.
+"""The deflection of the vertical, which takes astronomic places and headings into geodetic ones.
 
 Signs and symbols: docs/frames_and_symbols.md#the-vertical.
 """

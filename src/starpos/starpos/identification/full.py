@@ -177,7 +177,7 @@ def _fitted_alone(
 def _resolved(
     catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether stars (N,), brightest first, are not blended with a brighter one, and how far fainter ones move them, px."""
+    """Which stars (N,), brightest first, are not blended with a brighter one; how far fainter ones move them (px)."""
     single, drawn = np.ones(len(index), bool), np.zeros(len(index))
     brighter, fainter = close_pairs(pixel, BLEND_PX)
     if len(fainter):
