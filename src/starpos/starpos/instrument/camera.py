@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from starpos.errors import InstrumentError
 
@@ -72,7 +72,7 @@ class Camera:
         """The camera with its focal lengths multiplied by `factor`."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
-    def directions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> np.ndarray:
+    def directions(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Unit vectors (N, 3) in C of pixels x, y (N,): W = (X, Y, f) / norm, after undistortion.
 
         The paper prints another third component; docs/the_paper.md#star-vectors says why it is f.
@@ -86,7 +86,7 @@ class Camera:
             v[..., :2] = self._undistort(v[..., :2])
         return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
-    def project(self, v: npt.ArrayLike) -> np.ndarray:
+    def project(self, v: ArrayLike) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind the camera."""
         v = np.asarray(v, float)
         z = np.where(v[..., 2] > 0, v[..., 2], np.nan)

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
 from starpos.units import ARCSEC
@@ -129,7 +129,7 @@ def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
 
 
 def sca100t_angle(
-    volts: npt.ArrayLike,
+    volts: ArrayLike,
     offset_v: float = SCA100T_OFFSET_V,
     sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
 ) -> np.ndarray:
@@ -139,7 +139,7 @@ def sca100t_angle(
 
 
 def sca100t_volts(
-    angle: npt.ArrayLike,
+    angle: ArrayLike,
     offset_v: float = SCA100T_OFFSET_V,
     sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
 ) -> np.ndarray:

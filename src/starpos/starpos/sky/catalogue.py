@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from starpos.errors import CatalogueError
 from starpos.rotation import normalised
@@ -117,16 +117,16 @@ class Catalogue:
 
 
 def pack(
-    tyc: npt.ArrayLike,
-    hip: npt.ArrayLike,
-    vmag: npt.ArrayLike,
-    ra_deg: npt.ArrayLike,
-    dec_deg: npt.ArrayLike,
-    pm_ra: npt.ArrayLike,
-    pm_dec: npt.ArrayLike,
-    sigma_mas: npt.ArrayLike,
-    sigma_pm: npt.ArrayLike,
-    epoch: npt.ArrayLike,
+    tyc: ArrayLike,
+    hip: ArrayLike,
+    vmag: ArrayLike,
+    ra_deg: ArrayLike,
+    dec_deg: ArrayLike,
+    pm_ra: ArrayLike,
+    pm_dec: ArrayLike,
+    sigma_mas: ArrayLike,
+    sigma_pm: ArrayLike,
+    epoch: ArrayLike,
 ) -> Catalogue:
     """Make a Catalogue from columns (N,), tyc (N, 3), in deg, mas/yr (pm_ra times cos dec), mas and Julian years.
 
@@ -137,7 +137,7 @@ def pack(
     zone = np.clip(dec_mas // 3_600_000 + 90, 0, ZONES - 1)
     order = np.lexsort((ra_mas, zone))
 
-    def column(values: npt.ArrayLike, dtype: type[np.integer]) -> np.ndarray:
+    def column(values: ArrayLike, dtype: type[np.integer]) -> np.ndarray:
         limits = np.iinfo(dtype)
         return np.clip(np.round(np.asarray(values)), limits.min, limits.max).astype(dtype)[order]
 
@@ -156,7 +156,7 @@ def pack(
     )
 
 
-def _code(sigma: npt.ArrayLike, smallest: float) -> np.ndarray:
+def _code(sigma: ArrayLike, smallest: float) -> np.ndarray:
     """Codes of errors, rounded up."""
     return np.ceil(np.log(np.maximum(np.asarray(sigma, float), smallest) / smallest) / np.log(CODE_STEP))
 
