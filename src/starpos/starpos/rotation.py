@@ -4,7 +4,7 @@
 import math
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 
 def full_turn(angle: float) -> float:
@@ -19,7 +19,7 @@ def half_turn(angle: float) -> float:
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
-def unit_vector(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> np.ndarray:
+def unit_vector(longitude: ArrayLike, latitude: ArrayLike) -> np.ndarray:
     """Unit vectors (..., 3) of longitude and latitude, or of right ascension and declination, in rad."""
     across = np.cos(latitude)
     return np.stack([across * np.cos(longitude), across * np.sin(longitude), np.sin(latitude)], -1)
@@ -40,7 +40,7 @@ def about_axis(axis: int, angle: float) -> np.ndarray:
     return r
 
 
-def from_vector(v: npt.ArrayLike) -> np.ndarray:
+def from_vector(v: ArrayLike) -> np.ndarray:
     """Rotation by |v| rad about v (3,) (Rodrigues)."""
     x, y, z = np.asarray(v, float).tolist()
     angle2 = x * x + y * y + z * z
@@ -70,7 +70,7 @@ def to_small_vector(r: np.ndarray) -> np.ndarray:
     return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
 
 
-def cross_matrix(v: npt.ArrayLike) -> np.ndarray:
+def cross_matrix(v: ArrayLike) -> np.ndarray:
     """The matrix (3, 3) [v]x, so that cross_matrix(v) @ w = v x w."""
     x, y, z = np.asarray(v, float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

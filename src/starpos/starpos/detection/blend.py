@@ -112,7 +112,7 @@ def with_companions(
 
 
 def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
-    """Which stars (N,) bool leave more light unexplained than a single star does."""
+    """Whether stars (N,) leave more light unexplained than a single star does."""
     freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
     with np.errstate(invalid="ignore"):
         odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (fit.outlier.sum((1, 2)) > 2)

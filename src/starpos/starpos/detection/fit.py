@@ -15,7 +15,7 @@ FIT_WIDTHS = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """How light becomes DN, and how noise grows with it: s DN add the variance dn_per_photon s + (misfit s)^2 DN2.
+    """The sensor's response to light: s DN add the variance dn_per_photon s + (misfit s)^2 DN2.
 
     gain           (P,) relative sensitivity of each phase of the colour mosaic, mean 1; (1,) without a mosaic
     colour_spread  relative scatter (1 sigma) of one star's gains about these, because stars have colours
@@ -30,7 +30,7 @@ class Response:
 
     @property
     def own_gains(self) -> int:
-        """How many gains are fitted for each star: P, or none without a mosaic."""
+        """Number of gains that are fitted for each star: P, or 0 without a mosaic."""
         return len(self.gain) if len(self.gain) > 1 else 0
 
     def columns(

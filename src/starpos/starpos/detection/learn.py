@@ -142,7 +142,7 @@ def _teachers(
 
 
 def _most_alike(stamps: Stamps) -> np.ndarray:
-    """Which stamps (N,) bool have similar shapes, as stars have and twigs have not.
+    """Select the stamps, (N,) bool, with similar shapes, as stars have and twigs have not.
 
     All of them if most lie near the median shape, else those near the shape at which they are densest.
     """
@@ -196,7 +196,7 @@ def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.nda
 
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Which of the peaks `index` have no neighbour within 12 px that is higher than a fiftieth of them."""
+    """Whether the peaks `index` have no neighbour within 12 px that is higher than a fiftieth of their height."""
     points = np.stack([x, y], 1)
     pairs = spatial.cKDTree(points).query_pairs(12, output_type="ndarray")
     crowded = np.zeros(len(x), bool)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame to its stars: background, peaks, PSF and noise learnt from bright stars, a fit of each, a selection."""
+"""Detect a frame's stars: background, peaks, PSF and noise learnt from bright stars, a fit of each, a selection."""
 
 from dataclasses import dataclass, replace
 from typing import Any

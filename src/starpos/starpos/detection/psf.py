@@ -10,7 +10,7 @@ units of the star's widths. The series has no term of first order, so its centre
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
@@ -128,7 +128,7 @@ class Psf:
         return replace(self, axes=root @ self.axes, widths=root @ widths @ root)
 
 
-def gaussian(shape: np.ndarray, x: npt.ArrayLike = (0.0,), y: npt.ArrayLike = (0.0,)) -> Psf:
+def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) -> Psf:
     """The Psf of an elliptical Gaussian of covariance shape (2, 2) px2; its box holds the points x, y (N,) px.
 
     The first axis is the long one.

@@ -85,7 +85,7 @@ def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.nd
 def surroundings(
     plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `uneven` returns for the pixels on the edge of a square, reach px from the pixels x, y (N,) int."""
+    """The sky's level and scatter (`uneven`) on the edges of squares, reach px from the pixels x, y (N,) int."""
     side, end = np.arange(-reach, reach), np.full(2 * reach, reach)
     columns = np.clip(x[:, None] + np.concatenate([side, end, -side, -end]), 0, plane.shape[1] - 1)
     rows = np.clip(y[:, None] + np.concatenate([-end, side, end, -side]), 0, plane.shape[0] - 1)
@@ -94,7 +94,7 @@ def surroundings(
 
 
 def uneven(signal: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far (N,) the pixels (N, K) around stars lie above 0, and their scatter (N,), both over the noise.
+    """Level (N,) and scatter (N,) of the pixels (N, K) around stars, both over the noise.
 
     0 and 1 where a difference may be chance. Beside a roof, among twigs or under a cloud the sky is brighter and less
     even than the background's mesh says.

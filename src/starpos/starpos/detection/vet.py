@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From peaks to measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
+"""Turn peaks into measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The deflection of the vertical from the slopes of a geoid grid, with what the grid cannot resolve as its error."""
+"""The deflection of the vertical from the slopes of a geoid grid, with an error for what the grid cannot resolve."""
 
 import math
 from dataclasses import dataclass
@@ -12,19 +12,23 @@ from starpos.earth.geoid_file import Grid, read_grid
 from starpos.earth.vertical import Deflection
 from starpos.units import ARCSEC
 
-# Nodes each way under the spline: at 8 its ends no longer tell (0.27^8), at 2 it is one cubic.
+# Nodes under the spline in each direction: with 8 its ends have no effect (0.27^8), with 2 it is a single cubic.
 REACHES = (8, 4, 2)
-# The neighbourhood whose roughness, the change of slope from node to node, tells what the grid leaves out, each way; and
-# how many times that is said to be missing: with it EGM96 misses the slopes of the national geoids of Australia, Austria,
-# Iceland, the Netherlands, Poland, South Africa, Spain, Switzerland and the USA by 0.3 (its islands) to 1.2 (Iceland)
-# sigma, root mean square (tools/data/geoid_sigma.py).
+# The error comes from the grid's roughness, the change of slope from node to node, within this distance and number of
+# nodes in each direction,
 ROUGH_DEG, ROUGH_NODES = 0.5, (8, 60)
+# times this factor. With it the slopes of EGM96 differ from those of the national geoids of Australia, Austria, Iceland,
+# the Netherlands, Poland, South Africa, Spain, Switzerland and the USA by 0.3 (islands of the USA) to 1.2 (Iceland)
+# sigma, root mean square (tools/data/geoid_sigma.py).
 UNRESOLVED = 1.5
 FLOOR_ARCSEC = 0.5
-ROUGH_NORTH_DEG = 87.0  # nearer to a pole the columns bend of themselves
-NEAREST_POLE_DEG = 1e-3  # 111 m: where east and west end
+# Closer to a pole than this, meridians converge so fast that the roughness is not that of the geoid.
+ROUGH_NORTH_DEG = 87.0
+# 111 m from a pole; closer, east and west have no meaning.
+NEAREST_POLE_DEG = 1e-3
 WIDEST_STRIDE_DEG = 10.0
-LARGEST_ARCSEC = 120.0  # more is a cliff between data and none; the Earth's own stay below 100
+# Larger values come from an edge of the data; the Earth's own deflections stay below 100.
+LARGEST_ARCSEC = 120.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +38,13 @@ class Geoid:
     grid: Grid
 
     def at(self, latitude: float, longitude: float) -> Deflection:
-        """The Deflection at a place in rad; that of knowing nothing where the grid has no data around it.
+        """The Deflection at a place in rad; the default Deflection, of unknown value, if the grid has no data there.
 
         xi = -dN / (M dphi), eta = -dN / (N' cos(phi) dlambda): Heiskanen & Moritz, Physical Geodesy (1967), section 2-22,
-        with WGS 84's radii M, N' and a cubic spline through the nodes.  They are deflections at the geoid.  At the ground
-        the curvature of the plumb line adds 0.17 arcsec sin(2 phi) a km of height, and in mountains arcseconds more,
-        which no grid of the geoid tells and for which the stated error leaves room.  An astronomic place will do for a
-        geodetic one: 10 arcsec, 300 m, do not tell.
+        with the radii M, N' of WGS 84 and a cubic spline through the nodes. They are deflections at the geoid. At the
+        ground the curvature of the plumb line adds 0.17 arcsec sin(2 phi) for each km of height, and in mountains some
+        arcseconds more. No geoid grid shows these; the stated error includes them. An astronomic place may be given for a
+        geodetic one: 10 arcsec (300 m) make no difference.
         """
         phi = np.clip(np.degrees(latitude), NEAREST_POLE_DEG - 90, 90 - NEAREST_POLE_DEG)
         lam = np.degrees(longitude)
@@ -48,13 +52,15 @@ class Geoid:
             return Deflection()
         xi, eta = self._slopes(phi, lam)
         stddev = math.hypot(FLOOR_ARCSEC, UNRESOLVED * self._roughness(phi, lam))
-        if not all(abs(v) < LARGEST_ARCSEC for v in (xi, eta, stddev)):  # NaN neither
+        # false for NaN too
+        if not all(abs(v) < LARGEST_ARCSEC for v in (xi, eta, stddev)):
             return Deflection()
         return Deflection(xi, eta, stddev)
 
     def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
-        """xi and eta in arcsec; NaN without data."""
-        from scipy.interpolate import RectBivariateSpline  # slow to import: only where there is a grid
+        """Components xi and eta in arcsec; NaN without data."""
+        # slow to import, and only needed with a grid
+        from scipy.interpolate import RectBivariateSpline
 
         north_m, east_m, stride = self._spacing_m(phi)
         for reach in REACHES:
@@ -67,7 +73,7 @@ class Geoid:
         return math.nan, math.nan
 
     def _roughness(self, phi: float, lam: float) -> float:
-        """How much the slope changes from node to node (root mean square around the place), arcsec; NaN without data."""
+        """Root mean square change of the slope from node to node around a place, arcsec; NaN without data."""
         phi = np.clip(phi, -ROUGH_NORTH_DEG, ROUGH_NORTH_DEG)
         north_m, east_m, stride = self._spacing_m(phi)
         up = int(np.clip(round(ROUGH_DEG / self.grid.step_latitude), *ROUGH_NODES))
@@ -80,9 +86,9 @@ class Geoid:
         return float(np.sqrt(np.mean(bends**2)) * north_m / ARCSEC) if bends.size else math.nan
 
     def _spacing_m(self, phi: float) -> tuple[float, float, int]:
-        """Of the nodes to the north and to the east, and the columns from one to the next.
+        """Distances (m) between nodes to the north and to the east, and the number of columns from one to the next.
 
-        Towards the poles, where columns come together until the file's millimetres make slopes, some are left out.
+        It is more than 1 near the poles, where columns are so close that the rounding of the file would make slopes.
         """
         prime, meridian = curvature_radii_m(np.radians(phi))
         north_m = meridian * np.radians(self.grid.step_latitude)
@@ -94,7 +100,7 @@ class Geoid:
     def _window(
         self, phi: float, lam: float, up: int, across: int, stride: int
     ) -> tuple[np.ndarray, float, float]:
-        """Undulations (2 up, 2 across), NaN where there are none, and the place as row and column in it."""
+        """Undulations (2 up, 2 across) around a place, NaN where unknown, and row and column of the place in them."""
         row, column = self.grid.locate(phi, lam)
         rows = np.arange(1 - up, 1 + up) + math.floor(row)
         columns = np.arange(1 - across, 1 + across) * stride + math.floor(column)
@@ -103,8 +109,8 @@ class Geoid:
 
 
 def read(path: Path | str) -> Geoid:
-    """A Geoid from a GTX or GeoTIFF file; a bare name is also looked for where PROJ keeps its grids.
+    """Read a Geoid from a GTX or GeoTIFF file; a file name without a folder is also looked for among PROJ's grids.
 
-    Raises GeoidError with the reason where it is none.
+    GeoidError says why a file cannot be used.
     """
     return Geoid(read_grid(path))

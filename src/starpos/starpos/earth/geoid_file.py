@@ -11,21 +11,28 @@ import numpy as np
 from starpos.earth.geotiff import read_geotiff
 from starpos.errors import GeoidError
 
-GTX_HEADER = struct.Struct(">4d2i")  # south, west, step in latitude, in longitude (deg), rows, columns
+# South, west, step in latitude, step in longitude (deg), rows, columns.
+GTX_HEADER = struct.Struct(">4d2i")
 GTX_NODATA = np.float32(-88.8888)
-MAX_NODES = 300_000_000  # 1 arcmin of the whole globe are 233 million
+# A grid of the whole globe with 1 arcmin has 233 million.
+MAX_NODES = 300_000_000
 LEAST_NODES = 4
 STEPS_DEG = (1e-4, 2.0)
-UNDULATION_LIMIT_M = 150.0  # the geoid's own are -107 to 86 m; what is beyond is a mark for "no data"
+# Undulations are -107 to 86 m; a value beyond this limit means "no data".
+UNDULATION_LIMIT_M = 150.0
 PROJ_FOLDERS = ("/usr/share/proj", "/usr/local/share/proj")
 TIFF_MAGIC = (b"II*\0", b"MM\0*")
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Geoid undulations in m (rows, columns) on WGS 84, southernmost row and westernmost column first, float32.
+    """Geoid undulations on WGS 84.
 
-    south, west: of the first node; the steps are positive.  All in deg.
+    values       (rows, columns) float32 m, southernmost row and westernmost column first
+    south, west  latitude and longitude of the first node, deg
+    step_...     distances between nodes, deg, positive
+
+    GeoidError if the grid cannot lie on the globe or holds no undulations.
     """
 
     values: np.ndarray
@@ -65,20 +72,20 @@ class Grid:
 
     @property
     def _around(self) -> int:
-        """Columns of a full turn, 0 where the grid does not go around the globe."""
+        """Number of columns in 360 deg; 0 if the grid does not go around the globe."""
         turn = round(360 / self.step_longitude)
         whole = abs(turn * self.step_longitude - 360) < 0.01 * self.step_longitude
         return turn if whole and self.values.shape[1] >= turn else 0
 
     def locate(self, latitude: float, longitude: float) -> tuple[float, float]:
-        """Row and column of a place in deg, with fractions; outside the grid negative or too large."""
+        """Row and column of a place in deg, with fractions; negative or too large outside the grid."""
         east = (longitude - self.west) % 360
         return (latitude - self.south) / self.step_latitude, east / self.step_longitude
 
     def undulations(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """(R, C) in m of rows (R,) and columns (C,), NaN where there are none.
+        """Undulations (R, C) in m at rows (R,) and columns (C,), NaN where there are none.
 
-        A grid around the globe goes on over its seam and, where its rows reach them, over the poles.
+        A grid around the globe continues across its seam, and across a pole if its rows reach it.
         """
         rows, over = self._over_the_poles(rows)
         columns = columns[None, :] + over[:, None] * (self._around // 2)
@@ -90,13 +97,13 @@ class Grid:
         return np.where(inside, self._known(taken), np.nan)
 
     def _over_the_poles(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The rows that those beyond a pole are, half a turn away, and which these are."""
+        """Rows (R,), with those beyond a pole replaced by the rows half a turn away, and which rows these are (R,)."""
         last = len(self.values) - 1
         if self._around % 2 or not self._around:
             return rows, np.zeros(rows.shape, bool)
         south, north = ((pole - 2 * self.south) / self.step_latitude for pole in (-180, 180))
         beyond = np.zeros(rows.shape, bool)
-        # 0 and 2 last: a row on the pole; one further: the pole half a row away
+        # a pole lies on a row (south is 0, north is 2 last) or half a row beyond it (south is -1, north is 2 last + 1)
         if min(abs(south), abs(south + 1)) < 0.01:
             beyond |= rows < 0
             rows = np.where(rows < 0, round(south) - rows, rows)
@@ -113,7 +120,7 @@ class Grid:
 
 
 def read_grid(path: Path | str) -> Grid:
-    """A Grid from a GTX or GeoTIFF file; GeoidError with the reason where it is none."""
+    """Read a Grid from a GTX or GeoTIFF file; GeoidError says why a file cannot be used."""
     path = find(path)
     try:
         with open(path, "rb") as file:
@@ -133,9 +140,10 @@ def read_grid(path: Path | str) -> Grid:
 
 
 def find(path: Path | str) -> Path:
-    """`path`, or, of a bare file name that is not here, where PROJ keeps its grids."""
+    """The path itself, or, for a file name without a folder that does not exist here, its place among PROJ's grids."""
     path = Path(path)
-    if len(path.parts) != 1 or os.path.exists(path):  # Path.exists raises where a name is too long
+    # not Path.exists, which raises if a name is too long
+    if len(path.parts) != 1 or os.path.exists(path):
         return path
     told = [
         folder for name in ("PROJ_DATA", "PROJ_LIB") for folder in os.environ.get(name, "").split(os.pathsep)
@@ -145,7 +153,10 @@ def find(path: Path | str) -> Path:
 
 
 def _read_gtx(path: Path, head: bytes, size: int) -> tuple[np.ndarray, float, float, float, float]:
-    """As NOAA's VDatum has it: big endian, rows from south to north.  The values stay in the file until they are used."""
+    """Values, south, west and steps of a GTX file (NOAA's VDatum): big endian, rows from south to north.
+
+    The values stay in the file until they are used.
+    """
     if len(head) < GTX_HEADER.size:
         raise GeoidError("it is shorter than a header")
     south, west, step_latitude, step_longitude, rows, columns = GTX_HEADER.unpack(head)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A GeoTIFF of one float band in geographic degrees: OpenCV decodes the pixels, this file reads where they lie.
+"""Read a GeoTIFF of one float band in geographic degrees: OpenCV decodes the pixels, this module reads their places.
 
-GeoTIFF 1.1 (OGC 19-008r4), and GDAL's two tags as PROJ's specification of geodetic TIFF grids has them.
+Sources: GeoTIFF 1.1 (OGC 19-008r4), and PROJ's specification of geodetic TIFF grids for two tags of GDAL.
 """
 
 import math
@@ -17,16 +17,18 @@ from starpos.frames.pictures import decode_picture
 WIDTH, HEIGHT, SAMPLES = 256, 257, 277
 PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
-MODEL_TYPE, RASTER_TYPE, GEOGRAPHIC, PIXEL_IS_POINT = 1024, 1025, 2, 2  # keys, and values of theirs
-KINDS = {1: "B", 2: "s", 3: "H", 4: "I", 12: "d"}  # BYTE, ASCII, SHORT, LONG, DOUBLE: all that these tags are
+# Two keys, and the value of each that is read.
+MODEL_TYPE, RASTER_TYPE, GEOGRAPHIC, PIXEL_IS_POINT = 1024, 1025, 2, 2
+# The types of these tags: BYTE, ASCII, SHORT, LONG, DOUBLE.
+KINDS = {1: "B", 2: "s", 3: "H", 4: "I", 12: "d"}
 MAX_BYTES = 1 << 30
 MAX_TAG_BYTES = 1 << 20
 
 
 def read_geotiff(path: Path, max_pixels: int) -> tuple[np.ndarray, float, float, float, float]:
-    """Values (rows, columns) float32; south and west of the first, steps in latitude and in longitude, deg.
+    """Values (rows, columns) float32, south and west of the first, and steps in latitude and in longitude, deg.
 
-    Rows from south to north, NaN where the file has no data.  Raises GeoidError with the reason.
+    Rows run from south to north; NaN where the file has no data. GeoidError says why a file cannot be used.
     """
     if path.stat().st_size > MAX_BYTES:
         raise GeoidError(f"it is larger than {MAX_BYTES >> 20} MB")
@@ -53,7 +55,7 @@ def read_geotiff(path: Path, max_pixels: int) -> tuple[np.ndarray, float, float,
 
 
 def _tags(data: bytes) -> dict[int, tuple]:
-    """Of the first directory, those that are known here; GeoidError where the file ends before they do."""
+    """The tags of the first directory that are needed here; GeoidError if the file ends too early."""
     order = "<" if data[:2] == b"II" else ">"
     try:
         (start,) = struct.unpack_from(order + "I", data, 4)
@@ -97,7 +99,7 @@ def _text(tags: dict, tag: int) -> str:
 
 
 def _corner(tags: dict, height: int) -> tuple[float, float, float, float]:
-    """South and west of the south-western pixel's centre, and the steps, deg."""
+    """Latitude and longitude of the south-western pixel's centre, and the steps in both, deg."""
     scale, tie = tags.get(PIXEL_SCALE, ()), tags.get(TIEPOINT, ())
     if len(scale) != 3 or len(tie) != 6 or not all(isinstance(v, float) for v in scale + tie):
         raise GeoidError(
@@ -114,7 +116,7 @@ def _corner(tags: dict, height: int) -> tuple[float, float, float, float]:
 
 
 def _metadata(tags: dict) -> tuple[float, float]:
-    """Scale and offset of the values; GeoidError where they are said to be something else than undulations."""
+    """Scale and offset of the values; GeoidError if the metadata say that they are not undulations."""
     text = _text(tags, GDAL_METADATA)
     items = dict(re.findall(r'<Item name="(\w+)"[^>]*>([^<]*)</Item>', text))
     kind = items.get("TYPE", "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL")

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A1: from ICRS to the Earth's own frame ITRS, as the IERS Conventions (2010) have it, through ERFA.
 
-Places are geocentric apparent ones (light deflection and annual aberration in them); what depends on the site, the
-diurnal aberration, is `station_velocity`, which the fix applies.  Offline: the IERS table that comes with astropy.
+Directions are geocentric apparent ones, with light deflection and annual aberration. Diurnal aberration depends on the
+site: it is `station_velocity`, which the fix applies. The IERS table is the one that comes with astropy, so no network is
+needed.
 """
 
 import warnings
@@ -20,7 +21,8 @@ from starpos.utc import utc_text
 
 UNIX_EPOCH_JD = 2440587.5
 TT_MINUS_TAI_S = 32.184
-TT_MINUS_UTC_S = 69.184  # since 2017; in 1900 it was 72 s less, which is 0.3 mas of aberration
+# Since 2017; in 1900 it was 72 s less, which changes the aberration by 0.3 mas.
+TT_MINUS_UTC_S = 69.184
 SPEED_OF_LIGHT = erfa.CMPS
 ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
 FIRST_MJD = 41684.0  # 1973-01-02: the first day of the IERS table
@@ -33,7 +35,10 @@ POLE_SIGMA_RAD = 0.2 * ARCSEC
 
 @dataclass(frozen=True, kw_only=True)
 class EarthOrientation:
-    """UT1-UTC (s) and the pole (rad) at an instant, with 1 sigma each; `extrapolated_days` beyond the table's end."""
+    """UT1-UTC (s) and the pole (rad) at an instant, with 1 sigma each.
+
+    extrapolated_days  how far the instant lies beyond the end of the table; 0 within it
+    """
 
     ut1_minus_utc_s: float
     ut1_sigma_s: float
@@ -45,9 +50,11 @@ class EarthOrientation:
 
 @dataclass(frozen=True)
 class EarthState:
-    """All that A1 needs at one instant, computed once a frame.
+    """All that A1 needs at one instant, computed once for a frame.
 
-    astrom: ERFA's geocentric star-independent parameters; cirs_to_itrs (3, 3); year: Julian, TT.
+    year          Julian year, TT
+    astrom        ERFA's geocentric star-independent parameters
+    cirs_to_itrs  (3, 3)
     """
 
     utc_unix_s: float
@@ -58,28 +65,28 @@ class EarthState:
 
     @property
     def velocity(self) -> np.ndarray:
-        """The Earth's barycentric velocity in units of c (3,), ICRS axes."""
+        """The Earth's barycentric velocity (3,) in units of c, ICRS axes."""
         return np.array(self.astrom["v"], float)
 
     @property
     def gcrs_to_itrs(self) -> np.ndarray:
-        """(3, 3): apparent directions, with aberration in them, from the axes of ICRS into ITRS."""
+        """Rotation (3, 3) of apparent directions, which include aberration, from the axes of ICRS into ITRS."""
         return self.cirs_to_itrs @ np.asarray(self.astrom["bpn"]).reshape(3, 3)
 
     def to_itrs(self, v: np.ndarray) -> np.ndarray:
-        """Geocentric apparent directions (N, 3) in ITRS of ICRS directions (N, 3) at this date (ERFA eraAtciqz)."""
+        """Turn ICRS directions (N, 3) into geocentric apparent ones (N, 3) in ITRS at this date (ERFA eraAtciqz)."""
         ra, dec = erfa.c2s(v)
         return erfa.s2c(*erfa.atciqz(ra, dec, self.astrom)) @ self.cirs_to_itrs.T
 
 
 def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) -> EarthState:
-    """EarthState at UTC seconds since 1970; TimeError where no Earth orientation is known.
+    """EarthState at UTC seconds since 1970; TimeError if the Earth orientation of that time is unknown.
 
-    IERS Conventions (2010) chapter 5, equation 5.1 with the CIO; precession-nutation IAU 2006/2000A.  orientation:
-    another than the table's.
+    IERS Conventions (2010) chapter 5, equation 5.1 with the CIO; precession-nutation IAU 2006/2000A. orientation is used
+    in place of the table's.
     """
     orientation = orientation or earth_orientation(utc_unix_s)
-    # sums of seconds: ERFA's UTC stretches a day that ends in a leap second, Unix time does not
+    # computed in seconds, because ERFA's UTC stretches a day that ends in a leap second, and Unix time does not
     tt = UNIX_EPOCH_JD, (utc_unix_s + _tai_minus_utc(utc_unix_s) + TT_MINUS_TAI_S) / DAY_S
     ut1 = UNIX_EPOCH_JD, (utc_unix_s + orientation.ut1_minus_utc_s) / DAY_S
     astrom, _ = erfa.apci13(*tt)  # TT serves as TDB: they differ by 2 ms
@@ -90,13 +97,14 @@ def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) 
 
 
 def earth_motion(utc_unix_s: float) -> tuple[float, np.ndarray]:
-    """Julian year (TT) and the Earth's barycentric velocity in units of c (3,), ICRS axes: all that a pointing needs.
+    """Julian year (TT) and the Earth's barycentric velocity (3,) in units of c, ICRS axes: enough to identify stars.
 
-    ERFA's eraEpv00, good for 1900 to 2100; no table, no leap seconds.  Raises TimeError outside those years.
+    From ERFA's eraEpv00, valid from 1900 to 2100, without tables or leap seconds. TimeError outside those years.
     """
     days = (utc_unix_s + TT_MINUS_UTC_S) / DAY_S
     year = 2000.0 + (UNIX_EPOCH_JD - erfa.DJ00 + days) / erfa.DJY
-    if not 1900 < year < 2100:  # NaN neither
+    # true for NaN too
+    if not 1900 < year < 2100:
         raise TimeError(
             f"{utc_text(utc_unix_s)} is not between 1900 and 2100: check the clock that stamps the frame"
         )
@@ -105,9 +113,9 @@ def earth_motion(utc_unix_s: float) -> tuple[float, np.ndarray]:
 
 
 def earth_orientation(utc_unix_s: float) -> EarthOrientation:
-    """UT1-UTC and the pole from the bundled IERS table; up to three years past its end carried on with a stated sigma.
+    """UT1-UTC and the pole from the IERS table; up to three years past its end extrapolated, with a larger sigma.
 
-    Raises TimeError before 1973 and later than that.
+    TimeError before 1973 and later than that.
     """
     if not np.isfinite(utc_unix_s):
         raise TimeError("the time of the frame is not a finite number: check the clock that stamps it")
@@ -146,7 +154,7 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
 
 @dataclass(frozen=True, kw_only=True)
 class _Table:
-    """Daily values (N,): mjd, TAI-UTC (s), UT1-TAI (s; free of leap seconds: it can be interpolated), pole (rad)."""
+    """Daily values (N,): mjd, TAI-UTC (s), UT1-TAI (s; without leap seconds, so it can be interpolated), pole (rad)."""
 
     mjd: np.ndarray
     tai_minus_utc: np.ndarray
@@ -155,19 +163,19 @@ class _Table:
     pole_x: np.ndarray
     pole_y: np.ndarray
     pole_sigma: np.ndarray
-    slope: float  # of UT1-TAI over the last year, s per day
+    slope: float  # s per day, of UT1-TAI over the last year
 
 
 @lru_cache(maxsize=1)
 def _table() -> _Table:
-    """finals2000A of the IERS as astropy-iers-data has it; astropy's own reader takes 0.6 s of a node's start."""
+    """Read finals2000A of the IERS from astropy-iers-data; astropy's own reader would take 0.6 s of a node's start."""
     from astropy_iers_data import IERS_A_FILE
 
     text = Path(IERS_A_FILE).read_bytes()
     lines = np.frombuffer(text, "S1").reshape(-1, text.index(b"\n") + 1)
 
     def column(first: int, last: int) -> np.ndarray:
-        """Numbers of these columns, counted from 1 (IERS, readme.finals2000A); NaN where they are blank."""
+        """Numbers in these columns, counted from 1 (IERS, readme.finals2000A); NaN where they are blank."""
         field = np.ascontiguousarray(lines[:, first - 1 : last]).view(f"S{last - first + 1}").ravel()
         return np.where(np.char.strip(field) == b"", b"nan", field).astype(float)
 
@@ -175,7 +183,8 @@ def _table() -> _Table:
     known = np.flatnonzero(np.isfinite(ut1_minus_utc))[-1] + 1
     mjd = mjd[:known]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of years that ERFA does not know the leap seconds of
+        # ERFA warns of years whose leap seconds it does not know
+        warnings.simplefilter("ignore")
         tai = erfa.utctai(2400000.5, mjd)
     leap = np.round((tai[1] - mjd) * DAY_S)
 
@@ -197,14 +206,14 @@ def _table() -> _Table:
 
 
 def _tai_minus_utc(utc_unix_s: float) -> float:
-    """Leap seconds of the day; beyond the table's end its last."""
+    """TAI - UTC (s) of the day; beyond the table's end its last value."""
     table = _table()
     day = int(utc_unix_s // DAY_S + UNIX_EPOCH_JD - 2400000.5 - table.mjd[0])
     return float(table.tai_minus_utc[min(max(day, 0), len(table.mjd) - 1)])
 
 
 def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
-    """Velocity of the turning ground in units of c (3,), ITRS, under the unit vector `zenith_itrs` (3,)."""
+    """Velocity (3,) of the rotating ground in units of c, ITRS, at the place whose zenith is zenith_itrs (3,)."""
     radius = EQUATOR_RADIUS_M / np.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
     return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
 

@@ -13,12 +13,13 @@ from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
 STANDARD_TEMPERATURE_C = 15.0
-MIN_COS_ZENITH = 0.05  # ERFA's own floor: below 3 deg of altitude the two-constant model has no meaning
+# ERFA's own limit: below 3 deg of altitude the two-constant model has no meaning.
+MIN_COS_ZENITH = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Atmosphere:
-    """The air at the instrument and how well it is known (1 sigma)."""
+    """The air at the instrument and how well it is known (1 sigma); InstrumentError for impossible values."""
 
     pressure_pa: float = STANDARD_PRESSURE_PA
     temperature_c: float = STANDARD_TEMPERATURE_C
@@ -44,8 +45,11 @@ class Atmosphere:
     def measured(
         cls, pressure_pa: float | None, temperature_c: float | None, humidity: float = 0.3
     ) -> "Atmosphere":
-        """The air as far as it was measured; None takes a middle of sea level to 3000 m, or of frost to summer, and a
-        sigma that covers them."""
+        """The air as far as it was measured.
+
+        An unknown pressure or temperature (None) becomes a middle value with a sigma that covers sea level to 3000 m, or
+        frost to summer.
+        """
         return cls(
             pressure_pa=90_000.0 if pressure_pa is None else pressure_pa,
             temperature_c=10.0 if temperature_c is None else temperature_c,
@@ -56,7 +60,7 @@ class Atmosphere:
 
     @property
     def relative_sigma(self) -> float:
-        """1 sigma of the refraction, as a fraction of it: it goes with pressure over absolute temperature."""
+        """Standard deviation of the refraction over the refraction, which is proportional to pressure / temperature."""
         if self.pressure_pa == 0:
             return 0.0
         return float(
@@ -67,20 +71,20 @@ class Atmosphere:
         )
 
     def refraction(self, factor: float = 1.0) -> "Refraction":
-        """The model at `factor` times its strength (1, or a step for a derivative)."""
+        """The model, with its bending multiplied by `factor` (1, or a step for a derivative)."""
         a, b = erfa.refco(self.pressure_pa / 100, self.temperature_c, self.humidity, self.wavelength_um)
         return Refraction(float(a) * factor, float(b) * factor)
 
 
 @dataclass(frozen=True)
 class Refraction:
-    """Bending A tan z + B tan^3 z of the observed zenith distance z (ERFA's eraRefco); a, b in rad."""
+    """Refraction a tan z + b tan^3 z at the observed zenith distance z (ERFA's eraRefco); a, b in rad."""
 
     a: float
     b: float
 
     def bend(self, v: np.ndarray) -> np.ndarray:
-        """Observed directions (N, 3) in L of unrefracted ones: raised toward +Z (ERFA's eraAtioq, one Newton step)."""
+        """Raise unrefracted directions v (N, 3) in L to the observed ones (ERFA's eraAtioq, one Newton step)."""
         horizontal = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-12)
         up = np.maximum(v[..., 2], MIN_COS_ZENITH)
         tan = horizontal / up
@@ -89,14 +93,14 @@ class Refraction:
         return _raise(v, horizontal, angle)
 
     def unbend(self, u: np.ndarray) -> np.ndarray:
-        """Unrefracted directions (N, 3) in L of observed ones."""
+        """Lower observed directions u (N, 3) in L to the unrefracted ones."""
         horizontal = np.maximum(np.hypot(u[..., 0], u[..., 1]), 1e-12)
         tan = horizontal / np.maximum(u[..., 2], MIN_COS_ZENITH)
         return _raise(u, horizontal, -(self.a + self.b * tan * tan) * tan)
 
 
 def _raise(v: np.ndarray, horizontal: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """v turned by `angle` toward +Z within its vertical plane."""
+    """Turn v by `angle` toward +Z within its vertical plane."""
     c, s = np.cos(angle), np.sin(angle)
     shrink = c - s * v[..., 2] / horizontal
     return np.stack([v[..., 0] * shrink, v[..., 1] * shrink, c * v[..., 2] + s * horizontal], -1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From astronomic to geodetic: the deflection of the vertical.
+"""The deflection of the vertical, which takes astronomic places and headings into geodetic ones.
 
 Signs and symbols: docs/frames_and_symbols.md#the-vertical.
 """
@@ -14,21 +14,20 @@ from starpos.errors import InstrumentError
 from starpos.rotation import full_turn
 from starpos.units import ARCSEC
 
-UNKNOWN_STDDEV_ARCSEC = (
-    6.0  # of each component where nothing is known: the root mean square over the continents
-)
+# Standard deviation of each component if nothing is known: the root mean square over the continents.
+UNKNOWN_STDDEV_ARCSEC = 6.0
 
 
 class Vertical(Protocol):
-    """What knows the deflection of the vertical: a Deflection, the same everywhere, or a geoid.Geoid."""
+    """A source of the deflection of the vertical: a Deflection, the same everywhere, or a geoid.Geoid."""
 
     def at(self, latitude: float, longitude: float) -> "Deflection":
-        """The Deflection at a place in rad, with its honest error; never an exception."""
+        """The Deflection at a place in rad, with its error; never raises."""
 
 
 @dataclass(frozen=True)
 class Deflection:
-    """xi (north) and eta (east) in arcsec, with the 1 sigma of each."""
+    """Components xi (north) and eta (east) in arcsec, with the 1 sigma of each; InstrumentError if not finite."""
 
     xi_arcsec: float = 0.0
     eta_arcsec: float = 0.0
@@ -44,15 +43,16 @@ class Deflection:
             )
 
     def at(self, latitude: float, longitude: float) -> "Deflection":
-        """Itself: it was given for the place."""
+        """The deflection itself, which is the same everywhere."""
         return self
 
 
 @dataclass(frozen=True)
 class Geodetic:
-    """Latitude, longitude, heading (rad) on WGS 84; covariance (3, 3) of east m, north m, heading rad.
+    """Latitude, longitude and heading (rad) on WGS 84.
 
-    deflection: what was taken off.
+    covariance  (3, 3) of east (m), north (m) and heading (rad)
+    deflection  the Deflection that was applied
     """
 
     latitude: float
@@ -63,7 +63,7 @@ class Geodetic:
 
 
 def astronomic(latitude: float, longitude: float, d: Deflection) -> tuple[float, float]:
-    """Astronomic latitude, longitude (rad) of a geodetic place: what `geodetic` undoes."""
+    """Astronomic latitude and longitude (rad) of a geodetic place; the inverse of `geodetic`."""
     east = d.eta_arcsec * ARCSEC / max(np.cos(latitude), 1e-9)
     return latitude + d.xi_arcsec * ARCSEC, longitude + east
 
@@ -71,7 +71,10 @@ def astronomic(latitude: float, longitude: float, d: Deflection) -> tuple[float,
 def geodetic(
     latitude: float, longitude: float, heading: float, covariance: np.ndarray, vertical: Vertical
 ) -> Geodetic:
-    """phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); its unknown part widens all three."""
+    """Turn an astronomic place and heading (rad) into geodetic ones; the deflection's error is added to the covariance.
+
+    phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi). covariance (3, 3) is that of Geodetic.
+    """
     d = vertical.at(latitude, longitude)
     phi = latitude - d.xi_arcsec * ARCSEC
     eta = d.eta_arcsec * ARCSEC

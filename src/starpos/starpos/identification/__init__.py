@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which catalogue star is which: from a prior, or lost in space from a frame's brightest stars.
+"""Identify a frame's stars with those of the catalogue: from a prior, or lost in space from the brightest stars.
 
-Triangles of the brightest stars are looked up by their shape; candidates that share a side support each other (the
-paper's search); the pose of each is fitted to the brightest stars that agree and weighed by its evidence, so that a match
-is accepted by its probability and never by a count, and then carried to the faintest stars seen.
+Triangles of the brightest stars are looked up by their shape. Candidates that share a side support each other (the
+paper's search). The pose of each is fitted to the brightest stars that agree, and its evidence is computed: a match is
+accepted by its probability, never by a number of stars. Then the fainter stars are matched too.
 """
 
 from starpos.identification.full import Identification

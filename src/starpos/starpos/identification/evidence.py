@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame's stars say for a pose against chance: the evidence that the frame shows this part of the sky.
+"""Evidence of a frame's stars that a pose is right, against chance.
 
-By chance they are random points anywhere on the frame.  If the frame shows the sky, each next detection, from the
-brightest down, is either a false star, as often as those before it (a rule of succession, from two right and one wrong),
-or the j-th brightest of the catalogue's stars not yet seen, with probability 1 / ((j + 1) (j + 2)), at its place to its
-error.  The ratio of the two probabilities, averaged over all poses that could be, has a mean of 1 under chance: it
-exceeds x at most once in x frames of random points, at whatever detection one stops (Ville's inequality) and however a
-pose was come by.  What the surroundings of one pose contribute to it is less than all of it; Laplace's method takes it to
-a factor of some, which the poses left out exceed by far: of random points the ratio exceeds 1 in one frame of a hundred.
+By chance the detections are random points anywhere on the frame. If the pose is right, each detection, from the brightest
+down, is one of two things. It is a false star, as often as those before it (a rule of succession that starts with two
+right and one wrong). Or it is the j-th brightest of the catalogue's stars not yet seen, with probability
+1 / ((j + 1) (j + 2)), at that star's place to within its error.
+
+The evidence is the ratio of the two probabilities, averaged over all possible poses. Under chance its mean is 1, so it
+exceeds x in at most one of x frames of random points, at whatever detection one stops (Ville's inequality) and however
+the pose was found. Here only the neighbourhood of one pose is counted, by Laplace's method. That is right to a small
+factor, but all other poses are left out, so the result is on the safe side: with random points it exceeds 1 in one frame
+of a hundred.
 """
 
 import math
@@ -19,23 +22,30 @@ import numpy as np
 from starpos.identification.pairs import close_pairs
 from starpos.identification.pose import Pose, slopes
 
-# The centroids' errors besides their own, px, and how often: none; a catalogue that is off; a lens nobody knows
+# Errors of the centroids beside their own (px) and their probabilities: none, errors of the catalogue, unknown lenses.
 ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0.1])
-SCALE_TOLERANCE = 0.03  # of the focal length
-SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)  # how far off its logarithm may be, and how often
-MIRRORED = 0.1  # of all frames
-# of all rotations, about each axis; of the likeliest focal lengths
+# The focal length may be off by this share.
+SCALE_TOLERANCE = 0.03
+# Limits on the error of its logarithm, and their probabilities.
+SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)
+# Probability that a frame is mirrored.
+MIRRORED = 0.1
+# Width of all rotations about each axis, and of the likeliest focal lengths.
 WIDTH = np.append(np.full(3, np.cbrt(8 * np.pi**2)), 2 * SCALES[0][0])
-TEST_STARS = 50  # the brightest of a frame, which decide
+# So many of a frame's brightest stars decide.
+TEST_STARS = 50
 EARLIER = np.tri(TEST_STARS, k=-1, dtype=bool)
-DOUBLE_PX = 3.0  # detections this close may be one star, and then say nothing new
+# Closer detections may be the same star, so the second says nothing new.
+DOUBLE_PX = 3.0
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the pose: log_density of one, per rad3 of rotation and unit of the focal length's logarithm, -inf
-    where it cannot be; width (4,): of where it can, rad about C's axes and of that logarithm, so that a frame that tells
-    less is given no more poses than there are.
+    """Prior knowledge of the pose.
+
+    log_density  of a pose, per rad3 of rotation and unit of the focal length's logarithm; -inf if the pose is impossible
+    width        (4,): size of the region of possible poses, rad about C's axes and in that logarithm. It limits the
+                 volume of poses where the stars of a frame tell little.
     """
 
     log_density: Callable[[Pose], float]
@@ -43,11 +53,12 @@ class Prior:
 
     @property
     def information(self) -> np.ndarray:
+        """Information matrix (4, 4) of a Gaussian of that width."""
         return np.diag(2 * np.pi / self.width**2)
 
 
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
-    """Lost in space with a focal length of about focal_px; rotations fill 8 pi2."""
+    """The Prior of a frame lost in space, with a focal length of about focal_px; rotations have a volume of 8 pi2."""
 
     def log_density(pose: Pose) -> float:
         scale = abs(math.log(pose.focal_px / focal_px))
@@ -70,8 +81,10 @@ def log_evidence(
 ) -> float:
     """Logarithm of the evidence for a pose that was fitted to matched stars.
 
-    xy (N, 2), sigma_px (N,): the brightest detections, brightest first, on a frame of area_px2.  star (M,): which of
-    them, ascending, are stars of the catalogue; rank (M,) of these in brightness on the frame; w (M, 3) their directions.
+    xy, sigma_px  (N, 2), (N,): the brightest detections, brightest first, on a frame of area_px2
+    star          (M,): which of them are matched, in ascending order
+    rank          (M,): brightness rank of their catalogue stars on the frame
+    w             (M, 3): directions of these
     """
     predicted, slope = slopes(pose, w)
     distance2 = np.square(xy[star] - predicted).sum(1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The accepted match carried to the faintest stars: all detections against all catalogue stars of the field."""
+"""Verify a pose by a frame's stars, and match all detections with all catalogue stars of the field."""
 
 from dataclasses import dataclass
 
@@ -13,24 +13,35 @@ from starpos.identification.sky import Sky
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import rows_near
 
-FEWEST_STARS = 4  # an identification has
-ENOUGH = np.log(1e9)  # a frame of nothing is taken for some part of the sky once in as many
+# An identification has at least so many stars.
+FEWEST_STARS = 4
+# Log-odds: at most one of 1e9 frames without stars is identified.
+ENOUGH = np.log(1e9)
 ROUNDS = 3
-# a star is within GATE_SIGMA of its place, and GATE_PX more
+# A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least LEAST_SPREAD_PX.
 LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
-FAINTEST_FIT = 2000  # stars that take part
-FLOOR_PX = 0.05  # what a centroid's own error does not tell: the catalogue, the lens
-BLEND_PX = 2.5  # closer stars make one image
+# So many of the brightest detections take part.
+FAINTEST_FIT = 2000
+# Errors of catalogue and lens, which a centroid's own error does not include.
+FLOOR_PX = 0.05
+# Closer stars make one image.
+BLEND_PX = 2.5
+
+Pairs = tuple[np.ndarray, np.ndarray]  # rows of the detections and of the stars matched with them
 
 
 @dataclass(frozen=True, kw_only=True)
 class Identification:
-    """Matched stars and the attitude they give.
+    """M matched stars and the attitude they give.
 
-    star (M,): rows of the input; catalogue (M,): indices of the star catalogue; attitude (3, 3): `Sky`'s directions
-    into C; blend_px (M,): how far unresolved neighbours may draw each star's image; focal_scale: factor on the camera's
-    focal length; residual_px: rms of one axis, bright stars counting more as they do in the fit; log_odds:
-    `log_evidence` of it; mirrored: the frame's rows run bottom-up, all of this holds for the frame flipped.
+    star         (M,): rows of the input
+    catalogue    (M,): rows of the star catalogue
+    blend_px     (M,): how far unresolved neighbours may move each star's image
+    attitude     (3, 3): `Sky`'s directions into C
+    focal_scale  factor on the camera's focal length
+    residual_px  rms along one axis, with the weights of the fit
+    log_odds     of the identification, by `log_evidence`
+    mirrored     whether the frame's rows run bottom-up; the attitude is that of the flipped frame
     """
 
     star: np.ndarray
@@ -45,8 +56,12 @@ class Identification:
 
 @dataclass(frozen=True)
 class OnFrame:
-    """The catalogue's stars on a frame, brightest first: index (S,), directions (S, 3), and how far fainter ones that
-    melt into them may draw them, blend_px (S,)."""
+    """S catalogue stars on a frame, brightest first.
+
+    index       (S,): rows of the star catalogue
+    directions  (S, 3)
+    blend_px    (S,): how far fainter stars that make one image with them may move it
+    """
 
     index: np.ndarray
     directions: np.ndarray
@@ -54,12 +69,13 @@ class OnFrame:
 
     @classmethod
     def of(cls, field: FrameStars, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
-        """As many as the brightest of the field's detections may be."""
+        """The stars that the field's brightest detections may be, at most `most_detections` of them."""
         catalogue, stars = sky.catalogue, min(len(field), most_detections)
         axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
         index = rows_near(catalogue.cell_start, axis, field.radius_rad)
         light = catalogue.vmag_centi[index]
-        most = 12 * stars + 300  # three times too many, as the cells reach beyond the frame
+        # three times too many, because the cells reach beyond the frame
+        most = 12 * stars + 300
         if len(index) > most:
             brightest = np.argpartition(light, most)[:most]
             index, light = index[brightest], light[brightest]
@@ -75,9 +91,9 @@ class OnFrame:
 def identified(
     field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior
 ) -> Identification | None:
-    """The stars within radius_px (N,) of where a pose has them, fitted, weighed, and carried to the faintest ones.
+    """Identify a frame's stars, starting from those within radius_px (N,) of their places by a pose near the right one.
 
-    None where these are not beyond doubt the stars they were taken for.
+    None unless the evidence is beyond doubt (ENOUGH).
     """
     xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
     stars = OnFrame.of(field, sky, near_pose, TEST_STARS)
@@ -89,7 +105,8 @@ def identified(
     log_odds = log_evidence(
         xy[:TEST_STARS], sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
     )
-    if not log_odds >= ENOUGH:  # nor where it is no number
+    # true for NaN too
+    if not log_odds >= ENOUGH:
         return None
     if len(xy) > TEST_STARS:
         stars = OnFrame.of(field, sky, pose, FAINTEST_FIT)
@@ -118,13 +135,16 @@ def _settled(
     pose: Pose,
     pair: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Pose, tuple[np.ndarray, np.ndarray], np.ndarray] | None:
-    """The pose fitted to its own pairs, these, their residuals (M, 2) px; None where they are fewer than FEWEST_STARS."""
+    """Fit a pose to pairs and match again, until the pairs no longer change.
+
+    Returns the pose, the pairs and their residuals (M, 2) px; None if there are fewer than FEWEST_STARS pairs.
+    """
     for _ in range(ROUNDS):
         star, near = pair
         if len(star) < FEWEST_STARS:
             return None
         w = stars.directions[near]
-        pose = _of_these(field.focal_px, pose.mirrored, xy[star], w, np.hypot(sigma[star], FLOOR_PX))
+        pose = _fitted_alone(field.focal_px, pose.mirrored, xy[star], w, np.hypot(sigma[star], FLOOR_PX))
         predicted = pose.project(stars.directions)
         residual = xy[star] - predicted[near]
         pair = mutual_nearest(xy, predicted, _gate(residual, sigma[: len(xy)]))
@@ -134,19 +154,22 @@ def _settled(
 
 
 def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """How far from its place a star may be (N,) px, where these are the residuals (M, 2) of some."""
-    middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]  # np.median, without its overhead
+    """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
+    # np.median, without its overhead
+    middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]
     return GATE_SIGMA * np.hypot(max(1.4826 * float(middling), LEAST_SPREAD_PX), sigma) + GATE_PX
 
 
 def _rms(residual: np.ndarray, sigma_px: np.ndarray) -> float:
-    """Of one axis of residuals (M, 2), each weighted as in the fit."""
+    """Root mean square of residuals (M, 2) along one axis, with the weights of the fit."""
     weight = 1 / np.square(sigma_px)
     return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
 
 
-def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> Pose:
-    """The pose of matched stars from them alone: to the last bit the same, from wherever the search came to them."""
+def _fitted_alone(
+    focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray
+) -> Pose:
+    """Fit the pose to matched stars without a starting pose, so that the result does not depend on the search."""
     v = directions(xy[None], np.array([focal_px]))[0]
     return Pose(rotation.best_rotation(w, v), focal_px, mirrored).fitted(xy, w, sigma_px)
 
@@ -154,12 +177,12 @@ def _of_these(focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray, si
 def _resolved(
     catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which stars (brightest first) do not melt into a brighter one (N,), and how far these draw it (N,) px."""
+    """Which stars (N,), brightest first, are not blended with a brighter one; how far fainter ones move them (px)."""
     single, drawn = np.ones(len(index), bool), np.zeros(len(index))
     brighter, fainter = close_pairs(pixel, BLEND_PX)
     if len(fainter):
         ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
-        # from the sky and rounded, so that it is the same at every pose
+        # from directions and rounded, so that it does not depend on the pose
         apart = np.round(focal_px * np.linalg.norm(w[fainter] - w[brighter], axis=1), 6)
         np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
         single[fainter] = False

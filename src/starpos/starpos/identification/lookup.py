@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Candidates: triangles of a frame's brightest stars that have the shape of catalogue triangles."""
+"""Candidates: pairs of a triangle of a frame's brightest stars and a catalogue triangle of the same shape."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,15 +11,21 @@ from starpos.identification.evidence import SCALE_TOLERANCE
 from starpos.identification.pose import FrameStars, directions
 from starpos.identification.triangles import TriangleCatalogue, angles, counter_clockwise, opposite_sides
 
-LOOSE_PX = 1.0  # above it a candidate must be supported by another
+# With larger errors of the centroids a candidate counts only if another one supports it.
+LOOSE_PX = 1.0
 TRIANGLE_SIGMA = 3.0
-MOST_CANDIDATES = 25_000  # to be expected of one look-up
+# A look-up is limited to triangles for which so many candidates are expected.
+MOST_CANDIDATES = 25_000
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Triangles, best supported first: star (K, 3), rows of the frame's; corner (K, 3), rows of the triangle catalogue's;
-    mirrored (K,): whether they turn the other way."""
+    """K candidates, best supported first.
+
+    star      (K, 3): rows of the frame's stars
+    corner    (K, 3): rows of the triangle catalogue's stars
+    mirrored  (K,): whether the two triangles have opposite orientations
+    """
 
     star: np.ndarray
     corner: np.ndarray
@@ -33,7 +39,7 @@ class Candidates:
 
 
 class Lookup:
-    """One frame's triangles: which were looked up already, at which error."""
+    """Look up a frame's triangles, none of them twice with the same error of the centroids."""
 
     def __init__(self, field: FrameStars, table: TriangleCatalogue) -> None:
         self.field, self.table = field, table
@@ -41,13 +47,13 @@ class Lookup:
         self._done: dict[float, int] = {}
 
     def candidates(self, stars: int, error_px: float) -> Candidates:
-        """Those of the `stars` brightest not yet tried at this error."""
+        """Candidates for those triangles of the `stars` brightest that were not yet looked up with this error."""
         done = self._done.get(error_px, 0)
         triples = _triples(stars)[done:]
         self._done[error_px] = done + len(triples)
         error = np.hypot(error_px, self.field.sigma[triples].max(1)) / self.field.focal_px
         star, shape, tolerance = _shapes(self.v, triples, error)
-        # poor centroids fit so many triangles that the brightest stars' are all that can be looked at
+        # poor centroids fit too many triangles: then only those of the brightest stars are looked up
         few = np.cumsum(self.table.expected(tolerance)) < MOST_CANDIDATES
         star, shape, tolerance = star[few], shape[few], tolerance[few]
         query, found = self.table.near(shape, tolerance)
@@ -65,7 +71,7 @@ class Lookup:
 
 @lru_cache(maxsize=32)
 def _triples(n: int) -> np.ndarray:
-    """All triples of 0..n-1 (T, 3), those of the brightest stars first."""
+    """All triples (T, 3) of 0..n-1, those of the brightest stars first."""
     t = np.array(list(combinations(range(n), 3)), int).reshape(-1, 3)
     return t[np.lexsort((t.sum(1), t.max(1)))]
 
@@ -73,10 +79,10 @@ def _triples(n: int) -> np.ndarray:
 def _shapes(
     v: np.ndarray, triples: np.ndarray, error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles as they are looked up: star (Q, 3), the corner of the largest angle first, of the smallest last; shape
-    and tolerance (Q, 3) for `TriangleCatalogue.near`.
+    """Queries for `TriangleCatalogue.near`: star (Q, 3), shape (Q, 3) and tolerance (Q, 3).
 
-    Where two angles are equal within the error both orders of corners are there.
+    The corner of the largest angle comes first, that of the smallest last. If two angles are equal within the error, both
+    orders of the corners are there.
     """
     side = opposite_sides(v[triples])
     angle = angles(side)
@@ -97,8 +103,8 @@ def _shapes(
 
 
 def _shared_sides(star: np.ndarray, corner: np.ndarray, mirrored: np.ndarray) -> np.ndarray:
-    """How many other candidates share a side (two stars with the same two identities) with each (M,)."""
-    # a detection and its identity as one scrambled number; a side is the sum of two, whichever comes first
+    """Number (M,) of other candidates that share a side (two stars with the same two identities) with each."""
+    # a detection and its identity become one scrambled number; a side is the sum of two, in either order
     mixed = (star.astype(np.uint64) << np.uint64(40)) | corner.astype(np.uint64)
     mixed = (mixed + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     mixed ^= mixed >> np.uint64(29)

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a frame that lie close to each other."""
+"""Find points of a frame that lie close to each other."""
 
 import numpy as np
 
-SMALL_TABLE = 100_000  # points times others
+# Up to so many distances a table of all is faster than two trees.
+SMALL_TABLE = 100_000
 
 
 def close_pairs(xy: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (M,), (M,) of the points xy (N, 2) that are closer than reach_px, the smaller row of each pair first."""
+    """Pairs of the points xy (N, 2) closer than reach_px: two arrays of rows (M,), the smaller row first."""
     order = np.argsort(xy[:, 0], kind="stable")
     x, y = xy[order].T
     left, right = [], []
-    # side by side in x, then every second one, ... : few of a frame's stars have a neighbour at all
+    # sorted by x, neighbours first, then every second one, and so on: few stars of a frame have a neighbour
     for k in range(1, len(x)):
         near = np.flatnonzero(x[k:] - x[:-k] < reach_px)
         if not len(near):
@@ -28,15 +29,16 @@ def close_pairs(xy: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray
 def mutual_nearest(
     xy: np.ndarray, predicted: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (row of xy, row of predicted) that are each other's nearest within radius (len(xy),) px."""
+    """Pairs of xy (N, 2) and predicted (S, 2) that are each other's nearest within radius (N,) px: two arrays of rows."""
     if not (len(xy) and len(predicted)):
         return np.zeros(0, int), np.zeros(0, int)
-    if len(xy) * len(predicted) < SMALL_TABLE:  # all distances at once are quicker than two trees
+    if len(xy) * len(predicted) < SMALL_TABLE:
         apart2 = np.square(xy[:, 0, None] - predicted[:, 0]) + np.square(xy[:, 1, None] - predicted[:, 1])
         nearest, back = apart2.argmin(1), apart2.argmin(0)
         distance = np.sqrt(apart2[np.arange(len(xy)), nearest])
     else:
-        from scipy.spatial import cKDTree  # slow to import, and seldom needed
+        # slow to import, and seldom needed
+        from scipy.spatial import cKDTree
 
         distance, nearest = cKDTree(predicted).query(xy)
         back = cKDTree(xy).query(predicted)[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's own triangle catalogue, counted again: its stars, its triangles and the one it prints the angles of."""
+"""Count the paper's triangle catalogue again: its stars, its triangles, and the triangle whose angles it prints."""
 
 from pathlib import Path
 
@@ -16,30 +16,31 @@ from starpos.units import MAS
 LIMIT_MAG = 7.0
 LONGEST_SIDE_DEG = 4.13  # the diagonal of 3.43 x 2.30 deg
 PRINTED_TRIANGLES = 951_181
-STARS, TRIANGLES = 15_236, 952_970  # what its data give
-ANGLES = (2.27327, 0.634202, 0.234213)  # rad, of the triangle it prints
-CORNERS = ("HIP 99002", "HIP 98753 A", "HIP 99145")  # which stars these are; the numbers it prints are others
+# The numbers that its data give.
+STARS, TRIANGLES = 15_236, 952_970
+# Angles (rad) of the triangle it prints, and its stars; the star numbers it prints are others.
+ANGLES = (2.27327, 0.634202, 0.234213)
+CORNERS = ("HIP 99002", "HIP 98753 A", "HIP 99145")
 EXCEPTIONS = Path(__file__).with_name("data") / "paper_stars.csv"
 
-# TYC 2682-3566-1, the brighter of a pair 1.9 arcsec apart that the catalogue merges: Tycho-2's observed place and epoch,
-# and the pair's motion
+# Component A of HIP 98753 is TYC 2682-3566-1, the brighter of a pair 1.9 arcsec apart that the catalogue merges. Its
+# observed place and epoch are Tycho-2's; the proper motion (mas/yr, in right ascension times cos(dec)) is the pair's.
 _A_RA_DEG, _A_DEC_DEG, _A_EPOCH = 300.87250833, 36.02515667, 1991.6
-_A_PM_RA, _A_PM_DEC = -10.7, -4.3  # mas/yr, the first times cos(dec)
-_A_SIGMA_MAS = np.hypot(
-    4.0, 2.6 * (EPOCH - _A_EPOCH)
-)  # its place's and the motion's, which is the pair's, not A's own
+_A_PM_RA, _A_PM_DEC = -10.7, -4.3
+# Errors of the place and of the motion, which is not that of A alone.
+_A_SIGMA_MAS = np.hypot(4.0, 2.6 * (EPOCH - _A_EPOCH))
 
 
 def plain_cut(catalogue: Catalogue) -> np.ndarray:
-    """Rows of all stars brighter than LIMIT_MAG with a HIP number: nearly the paper's."""
+    """Rows of all stars brighter than LIMIT_MAG with a HIP number, nearly the same as the paper's stars."""
     return np.flatnonzero((catalogue.vmag_centi < 100 * LIMIT_MAG) & (catalogue.hip > 0))
 
 
 def stars(catalogue: Catalogue) -> np.ndarray:
-    """Rows of the paper's stars, those of Tycho-2's main table; a merged pair of which it has both stars comes twice.
+    """Rows of the paper's stars, those of Tycho-2's main table; a merged pair comes twice if the paper has both stars.
 
-    EXCEPTIONS holds what the compact catalogue no longer knows; `tools/data/paper_stars.py` makes it from the
-    original files.
+    EXCEPTIONS holds the stars that the compact catalogue cannot distinguish; `tools/data/paper_stars.py` makes it from
+    the original files. CatalogueError if the catalogue lacks some of them.
     """
     *tyc, times = np.loadtxt(EXCEPTIONS, int, delimiter=",", skiprows=2, unpack=True)
     there = _number(catalogue.tyc.T.astype(int))
@@ -54,13 +55,15 @@ def stars(catalogue: Catalogue) -> np.ndarray:
 
 
 def _number(tyc: np.ndarray | list[np.ndarray]) -> np.ndarray:
+    """A single number for each Tycho identifier (3, N)."""
     return (tyc[0] * 100_000 + tyc[1]) * 10 + tyc[2]
 
 
 def count_triangles(v: np.ndarray, longest_side_rad: float) -> int:
-    """How many triples of the unit vectors v (N, 3) have all sides below longest_side_rad.
+    """Number of triples of the unit vectors v (N, 3) that have all sides below longest_side_rad.
 
-    Pairs run from the lower row to the higher, so that a path of two sides whose ends are a pair is one triangle.
+    Each pair is directed from the lower row to the higher one. So each triangle is counted once, as a path of two pairs
+    whose ends are a pair too.
     """
     pairs = cKDTree(v).query_pairs(2 * np.sin(longest_side_rad / 2), output_type="ndarray")
     near = csr_array((np.ones(len(pairs), np.int64), (pairs[:, 0], pairs[:, 1])), (len(v), len(v)))
@@ -68,9 +71,9 @@ def count_triangles(v: np.ndarray, longest_side_rad: float) -> int:
 
 
 def angles_of_printed(catalogue: Catalogue) -> tuple[np.ndarray, np.ndarray]:
-    """The angles (3,) in rad of the triangle whose angles the paper prints, at CORNERS, and their sigma (3,).
+    """Angles (3,) in rad, at CORNERS, of the triangle whose angles the paper prints, and their sigma (3,).
 
-    The sigma is that of component A's place at J2000, 22 mas.
+    The sigma comes from the place of component A at J2000, known to 22 mas.
     """
     first, last = (_named(catalogue, int(CORNERS[k].split()[1])) for k in (0, 2))
     ra, dec = np.radians([_A_RA_DEG, _A_DEC_DEG])

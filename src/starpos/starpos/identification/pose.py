@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pinhole camera among the stars, and the frame's stars as it sees them: pixels from the principal point."""
+"""The pose of a pinhole camera among the stars, and a frame's stars in pixels from the principal point."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,22 @@ import numpy as np
 from starpos import rotation
 from starpos.instrument.camera import Camera
 
-STEPS, SMALL_STEP = 2, 3e-5  # of a fit; rad
-LEAST_SIGMA_PX = 1e-3  # no centroid is better, whatever is said
+# Most steps of a fit; a step below this (rad) is the last one.
+STEPS, SMALL_STEP = 2, 3e-5
+# No centroid is better than this.
+LEAST_SIGMA_PX = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameStars:
-    """A frame's stars, brightest first.
+    """N stars of a frame, brightest first.
 
-    xy (2, N, 2): px from the principal point, as they are and with the frame's rows flipped; sigma (N,): their errors;
-    middle (2,): the frame's centre; half (2,): half its size; focal_px: as the camera is believed to be; area_px2: of
-    where detections are by chance, never too large.
+    xy        (2, N, 2) px from the principal point, as they are and with the frame's rows flipped
+    sigma     (N,) px, their errors along one axis
+    middle    (2,) px, the frame's centre
+    half      (2,) px, half its size
+    focal_px  approximate focal length
+    area_px2  area over which false detections are spread; never more than the true one
     """
 
     xy: np.ndarray
@@ -30,9 +35,9 @@ class FrameStars:
 
     @classmethod
     def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera, margin_px: int = 0) -> "FrameStars":
-        """From pixels (N, 2) of an ideal camera, whose frame has margins that few detections lie on.
+        """Make FrameStars from pixels xy (N, 2) of an ideal camera whose frame has margins with few detections.
 
-        ValueError where a pixel or an error is no finite number.
+        ValueError if a pixel or an error is not a finite number.
         """
         if not (np.isfinite(xy).all() and np.isfinite(sigma).all()):
             raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
@@ -52,36 +57,35 @@ class FrameStars:
 
     @property
     def whole_px2(self) -> float:
-        """Of the frame, and of its margins."""
+        """Area of the frame, including its margins."""
         return float(4 * self.half[0] * self.half[1])
 
     @property
     def radius_rad(self) -> float:
-        """Of a cone about the frame's centre that holds the frame."""
+        """Radius of a cone about the frame's centre that contains the frame."""
         return float(np.arctan(np.hypot(*self.half) / self.focal_px)) * 1.05 + 2e-4
 
     def holds(self, pixel: np.ndarray) -> np.ndarray:
-        """Which of pixels (N, 2) are on the frame (N,)."""
+        """Whether pixels (N, 2) are on the frame (N,)."""
         on = np.abs(pixel - self.middle) < self.half + 2
         return on[..., 0] & on[..., 1]
 
 
 @dataclass(frozen=True)
 class Pose:
-    """attitude (3, 3): Sky into C; focal length in px; whether the frame's rows run bottom-up."""
+    """A pose: attitude (3, 3), `Sky`'s directions into C; focal length in px; whether the frame's rows run bottom-up."""
 
     attitude: np.ndarray
     focal_px: float
     mirrored: bool
 
     def project(self, w: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of directions w (N, 3); far away for what is behind the camera."""
+        """Pixels (N, 2) of directions w (N, 3); directions behind the camera become pixels far away."""
         u = w @ self.attitude.T
         return u[:, :2] * (self.focal_px / np.maximum(u[:, 2:], 1e-6))
 
     def fitted(self, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> "Pose":
-        """Least squares for a small rotation and the focal length: pixels xy (N, 2), good to sigma_px (N,), of directions
-        w (N, 3)."""
+        """Fit attitude and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
         pose, weight = self, 1 / sigma_px[:, None]
         for _ in range(STEPS):
             pixel, slope = slopes(pose, w)
@@ -89,21 +93,26 @@ class Pose:
             residual = ((xy - pixel) * weight).ravel()
             try:
                 *turn, scale = np.linalg.solve(j.T @ j, j.T @ residual).tolist()
-            except np.linalg.LinAlgError:  # all stars in one place
+            # all stars in one place
+            except np.linalg.LinAlgError:
                 break
             step = max(map(abs, (*turn, scale)))
-            if not step < 1:  # nor where it is no number
+            # true for NaN too
+            if not step < 1:
                 break
             turned = rotation.from_vector(turn) @ pose.attitude
             pose = Pose(turned, pose.focal_px * (1 + scale), pose.mirrored)
-            if step < SMALL_STEP:  # whose square is what is left
+            # the remaining error is about its square
+            if step < SMALL_STEP:
                 break
         return pose
 
 
 def slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of directions w (N, 3), and how they go (N, 2, 4) with small rotations (rad) of C about its axes and
-    with the logarithm of the focal length."""
+    """Pixels (N, 2) of directions w (N, 3), and their derivatives (N, 2, 4).
+
+    The derivatives are by small rotations (rad) about C's axes and by the logarithm of the focal length.
+    """
     u = w @ pose.attitude.T
     x, y = (u[:, :2] / u[:, 2:]).T
     slope = np.empty((len(w), 2, 4))
@@ -115,7 +124,7 @@ def slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Poses:
-    """K of them: attitude (K, 3, 3), focal_px (K,), mirrored (K,)."""
+    """K poses: attitude (K, 3, 3), focal_px (K,), mirrored (K,)."""
 
     attitude: np.ndarray
     focal_px: np.ndarray
@@ -129,8 +138,10 @@ class Poses:
 
     @classmethod
     def of_triangles(cls, xy: np.ndarray, w: np.ndarray, focal_px: float, mirrored: np.ndarray) -> "Poses":
-        """The focal lengths that give triangles at pixels xy (K, 3, 2) the size they have among the stars, w (K, 3, 3),
-        and the rotations that bring them into place."""
+        """Poses that bring the stars of triangles, directions w (K, 3, 3), to the pixels xy (K, 3, 2).
+
+        The focal length makes a triangle's perimeter right, then the rotation brings it into place.
+        """
         wanted = _perimeter(w)
         focal = np.full(len(xy), float(focal_px))
         for _ in range(2):
@@ -139,7 +150,7 @@ class Poses:
 
 
 def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
-    """Unit vectors (K, N, 3) in C of pixels (K, N, 2) from the principal point, focal lengths (K,)."""
+    """Unit vectors (K, N, 3) in C of pixels xy (K, N, 2) from the principal point, with focal lengths (K,)."""
     v = np.empty((*xy.shape[:2], 3))
     v[..., :2] = xy
     v[..., 2] = focal_px[:, None]
@@ -147,6 +158,6 @@ def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
 
 
 def _perimeter(v: np.ndarray) -> np.ndarray:
-    """Of triangles (K, 3, 3), along the chords."""
+    """Perimeters (K,) of triangles of unit vectors (K, 3, 3), along the chords."""
     side = v - v[:, [1, 2, 0]]
     return np.sqrt(np.einsum("kni,kni->kn", side, side)).sum(1)

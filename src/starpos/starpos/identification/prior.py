@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to look first.  A prior only proposes; what it proposes is verified as everything else is."""
+"""Priors: where to look first. A prior only proposes poses; they are verified like all others."""
 
 import math
 from collections.abc import Iterator
@@ -14,25 +14,36 @@ from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.screen import MATCH_SIGMA
 from starpos.identification.sky import Sky
 
-ERROR_PX = 5.0  # how far off the stars may be where the prior is right
-STILL_PX = 6.0  # what has not moved has not moved by more, anywhere in the frame
-BRIGHTEST = 15  # stars of the frame that vote for a shift
-REACH = 0.05  # of the frame's width: how far the stars may have moved
-AGREE_PX = 3.0  # votes for the same shift
-MOST = 4  # proposals of a kind
-RING_STARS = 8  # of the frame that vote for an azimuth
-WIDEST_RAD = 0.1  # a zenith known worse says nothing of where to look
-EXACT = 1e-6  # to which rotations and unit vectors are such
-J2000_RAD = 2.5e-4  # aberration and most proper motions, which the beacons lack
-STANDS, WAS_MOVED = np.log(0.5), np.log(0.5)  # of the probability
+# The stars may be off by this where the prior is right.
+ERROR_PX = 5.0
+# If the camera has not moved, no star of the frame has moved by more.
+STILL_PX = 6.0
+# So many of the frame's stars vote for a shift.
+BRIGHTEST = 15
+# The stars may have moved by this share of the frame's width.
+REACH = 0.05
+# Votes that differ by less are for the same shift.
+AGREE_PX = 3.0
+# Most proposals of one kind.
+MOST = 4
+# So many of the frame's stars vote for an azimuth.
+RING_STARS = 8
+# A zenith that is known less well does not help.
+WIDEST_RAD = 0.1
+# Tolerance of checks of rotations and unit vectors.
+EXACT = 1e-6
+# Aberration and most proper motions, which the beacons' directions do not include.
+J2000_RAD = 2.5e-4
+# Logarithm of the probabilities that the camera has stayed as it was, and that it has moved.
+STANDS, WAS_MOVED = np.log(0.5), np.log(0.5)
 
-# A pose, how far off stars may be (N,) px, and the poses that could be
+# A pose, the distance (N,) px by which each star may be off, and the Prior it is judged by.
 Attempt = tuple[Pose, np.ndarray, Prior]
 
 
 @dataclass(frozen=True)
 class PointingPrior:
-    """The attitude (3, 3), `Sky`'s directions into C, is about this, the focal length focal_px."""
+    """An approximate attitude (3, 3), `Sky`'s directions into C, and focal length (px); ValueError if impossible."""
 
     attitude: np.ndarray
     focal_px: float
@@ -45,7 +56,7 @@ class PointingPrior:
             raise ValueError("a Pointing's focal length must be positive and finite")
 
     def attempts(self, field: FrameStars, sky: Sky, log_share: float) -> Iterator[Attempt]:
-        """That nothing has moved; then the shifts that most stars agree on."""
+        """Yield the pose if nothing has moved, then poses shifted as most stars agree; log_share is that of the Prior."""
         pose = Pose(self.attitude, self.focal_px, False)
         radius_px = np.hypot(MATCH_SIGMA * field.sigma, ERROR_PX)
         yield pose, radius_px, self._known(field, STILL_PX, log_share + STANDS)
@@ -61,7 +72,7 @@ class PointingPrior:
             yield replace(pose, attitude=turned), radius_px, prior
 
     def _known(self, field: FrameStars, reach_px: float, log_share: float) -> Prior:
-        """Poses that shift the frame by reach_px at most, and turn and stretch it by STILL_PX at its corners."""
+        """The Prior of poses that shift the frame by at most reach_px, and turn and stretch its corners by STILL_PX."""
         shift, turn = reach_px / self.focal_px, STILL_PX / np.hypot(*field.half)
         most = np.array([shift, shift, turn, turn])
         log_density = log_share - float(np.log(2 * most).sum())
@@ -76,8 +87,12 @@ class PointingPrior:
 
 @dataclass(frozen=True)
 class PlumbPrior:
-    """The zenith is known, zenith_sky (3,) among `Sky`'s directions and zenith_camera (3,) in C, to tolerance_rad; which
-    way the camera faces is not."""
+    """A known zenith, but an unknown azimuth of the camera; ValueError if impossible.
+
+    zenith_sky     (3,): unit vector among `Sky`'s directions
+    zenith_camera  (3,): the same in C
+    tolerance_rad  how far off they may be
+    """
 
     zenith_sky: np.ndarray
     zenith_camera: np.ndarray
@@ -90,7 +105,7 @@ class PlumbPrior:
             raise ValueError(f"a Plumb's tolerance must be from 0 to {WIDEST_RAD:g} rad")
 
     def attempts(self, field: FrameStars, sky: Sky, log_share: float) -> Iterator[Attempt]:
-        """`PointingPrior`s to the azimuths at which most stars are as far from the zenith as the catalogue's."""
+        """Yield poses at the azimuths for which most stars vote: stars as far from the zenith as in the catalogue."""
         camera, world = _frame_about(self.zenith_camera), _frame_about(self.zenith_sky)
         seen = directions(field.xy[:1, :RING_STARS], np.array([field.focal_px]))[0] @ camera.T
         distance = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
@@ -103,7 +118,8 @@ class PlumbPrior:
         turn = np.arctan2(seen[star, 1], seen[star, 0]) - np.arctan2(known[:, 1], known[:, 0])
         turn = np.sort(turn % (2 * np.pi))
         window = 2 * tolerance / max(np.sin(np.median(distance)), tolerance)
-        turn = np.concatenate([turn, turn[turn < window] + 2 * np.pi])  # the circle closes
+        # the circle closes
+        turn = np.concatenate([turn, turn[turn < window] + 2 * np.pi])
         votes = np.searchsorted(turn, turn + window) - np.arange(len(turn))
         pick: list[int] = []
         for k in np.argsort(-votes, kind="stable")[: 10 * MOST].tolist():
@@ -117,7 +133,7 @@ class PlumbPrior:
                 yield pose, radius_px, prior
 
     def _known(self, field: FrameStars, log_share: float) -> Prior:
-        """Poses that have the zenith near where it should be, at any azimuth."""
+        """The Prior of poses with the zenith near its place, at any azimuth."""
         reach = self.tolerance_rad + J2000_RAD + 2 * REACH * field.half[0] / field.focal_px
         rotations = np.pi * reach**2 * 2 * np.pi
         log_density = log_share - float(np.log(rotations * 2 * SCALE_TOLERANCE))
@@ -144,7 +160,7 @@ def _frame_about(pole: np.ndarray) -> np.ndarray:
 
 
 def _most_voted(agree: np.ndarray) -> list[int]:
-    """The rows of agree (P, P) with most votes, none of which votes for another."""
+    """At most MOST rows of agree (P, P) with most votes, no two of which vote for each other."""
     pick: list[int] = []
     left, votes = np.ones(len(agree), bool), agree.sum(1)
     while left.any() and len(pick) < MOST:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of many poses are worth a fit: how many bright stars of the frame are where bright ones of the catalogue are."""
+"""Find which of many poses are worth a fit, by the frame's bright stars that coincide with bright catalogue stars."""
 
 import numpy as np
 
@@ -7,17 +7,23 @@ from starpos.identification.pose import FrameStars, Poses
 from starpos.identification.sky import Sky
 from starpos.sky.zones import rows_near
 
-MATCH_SIGMA = 3.5  # a star is within so many of its error
-LOG_FALSE = np.log(0.35)  # of the detections that may be no catalogue star
-WORTH_A_FIT = 4.0  # log-odds
-MOST_STARS = 440  # of the catalogue, the brightest on the frame
-FAR = 1e7  # px, where no star is
+# A star lies within so many sigma of its place.
+MATCH_SIGMA = 3.5
+# Logarithm of the share of detections that may be false.
+LOG_FALSE = np.log(0.35)
+# Log-odds.
+WORTH_A_FIT = 4.0
+# So many of the brightest catalogue stars on the frame are looked at.
+MOST_STARS = 440
+# A coordinate (px) where no star is.
+FAR = 1e7
 
 
 def promising(field: FrameStars, sky: Sky, poses: Poses, star: np.ndarray, sigma_px: np.ndarray) -> list[int]:
-    """Rows of the K poses that are worth a fit, best first.
+    """Rows of those of the K poses that are worth a fit, best first.
 
-    They were made from the field's stars star (K, 3), and put the n = min(N, TEST_STARS) brightest to sigma_px (K, n).
+    star      (K, 3): the field's stars from which each pose was made
+    sigma_px  (K, n): how well each pose places the n = min(N, TEST_STARS) brightest stars
     """
     predicted, count = _expected(field, sky, poses)
     xy = field.xy[poses.mirrored.astype(int), : sigma_px.shape[1]]
@@ -31,9 +37,9 @@ def promising(field: FrameStars, sky: Sky, poses: Poses, star: np.ndarray, sigma
     distance2 = apart2[each, n, nearest] / variance
     by_chance = 2 * np.pi * variance * np.maximum(count, 1)[:, None] / field.whole_px2
     odds = np.where(mutual & (distance2 < MATCH_SIGMA**2), -0.5 * distance2 - np.log(by_chance), LOG_FALSE)
-    # what a pose was made from does not speak for it
+    # the stars from which a pose was made are no evidence for it
     odds[each, star] = 0.0
-    # from the brightest down to any
+    # the sum from the brightest star down to the one where it is largest
     worth = odds.cumsum(1).max(1)
     return [k for k in np.argsort(-worth, kind="stable").tolist() if worth[k] > WORTH_A_FIT]
 

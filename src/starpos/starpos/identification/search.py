@@ -15,11 +15,12 @@ from starpos.identification.screen import MATCH_SIGMA, promising
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
 
-# (brightest stars, their error in px); the last kinds are for lenses that distort
+# (number of brightest stars, their error in px); the last stages are for lenses with distortion.
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
 LOG_HALF = math.log(0.5)
-MOST_LOOKED_AT = 25  # candidates a stage
-# how far stars may lie beyond the frame as it is, and (share of it) as it becomes
+# Candidates looked at in each stage.
+MOST_LOOKED_AT = 25
+# Stars so far beyond the frame (px) need no margin; a margin is at most this share of the frame.
 EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
 Priors = Sequence[PointingPrior | PlumbPrior]
@@ -32,10 +33,13 @@ def identify(
     sky: Sky,
     priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
-    """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction taken off).
+    """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction removed).
 
-    sigma_px (N,): their errors, one axis.  The focal length may be off by SCALE_TOLERANCE.  Priors only say where to look
-    first.  None: no part of the sky is these stars beyond doubt.  ValueError where a pixel or an error is no number.
+    sigma_px  (N,): their errors along one axis
+    camera    its focal length may be off by SCALE_TOLERANCE
+    priors    where to look first
+
+    None if no part of the sky fits beyond doubt. ValueError if a pixel or an error is not a finite number.
     """
     return _identify(FrameStars.of(xy, sigma_px, camera), sky, priors)
 
@@ -47,13 +51,13 @@ def identify_directions(
     sky: Sky,
     priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
-    """`identify` from unit vectors (N, 3) in C, refraction taken off, as any `camera` gave them."""
-    # of square pixels, which is what identify fits
+    """Identify stars as `identify` does, from unit vectors (N, 3) in C, with refraction removed, of any camera."""
+    # a camera with square pixels, as `identify` needs
     squeeze = camera.fx / camera.fy
     width, height = camera.width, max(1, round(camera.height * squeeze))
     cx, cy = camera.cx, camera.cy * squeeze
     xy = Camera(width=width, height=height, fx=camera.fx, fy=camera.fx, cx=cx, cy=cy).project(directions)
-    # what a lens has drawn in from the sides lies beyond them without its distortion, and so do the catalogue's stars
+    # without distortion, stars that a lens has drawn in may lie beyond the frame: it gets a margin
     beyond = float(np.maximum(-xy, xy - (width - 1, height - 1)).max(initial=0.0))
     widest = WIDEST_MARGIN * max(width, height)
     margin = math.ceil(min(beyond - EDGE_PX, widest)) if beyond > EDGE_PX else 0
@@ -69,6 +73,7 @@ def identify_directions(
 
 
 def _identify(field: FrameStars, sky: Sky, priors: Priors) -> Identification | None:
+    """The first attempt that is accepted; None if there is none."""
     if len(field) < FEWEST_STARS:
         return None
     for pose, radius_px, prior in _attempts(field, sky, priors):
@@ -78,7 +83,7 @@ def _identify(field: FrameStars, sky: Sky, priors: Priors) -> Identification | N
 
 
 def _attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[Attempt]:
-    """What to try, in this order.  Half of the probability is the priors' where there are any."""
+    """Yield the attempts in their order. Half of the probability is that of the priors, if there are any."""
     for prior in priors:
         yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
     lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
@@ -87,6 +92,7 @@ def _attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[Attempt]:
 
 
 def _lost_in_space(field: FrameStars, sky: Sky) -> Iterator[tuple[Pose, np.ndarray]]:
+    """Yield poses from triangles, stage by stage, and the distance (N,) px by which each star may be off."""
     lookup = Lookup(field, sky.triangles)
     for stars, error_px in STAGES:
         candidates = lookup.candidates(min(stars, len(field)), error_px)
@@ -102,7 +108,7 @@ def _lost_in_space(field: FrameStars, sky: Sky) -> Iterator[tuple[Pose, np.ndarr
 
 
 def _of_triangles(field: FrameStars, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
-    """The poses that K triangles make, and how far off the field's brightest stars may be (K, n) px."""
+    """The poses of K candidates, and the distance (K, n) px by which the field's brightest stars may be off."""
     xy = field.xy[c.mirrored.astype(int), : min(len(field), TEST_STARS)]
     each = np.arange(len(c))[:, None]
     corners = xy[each, c.star]

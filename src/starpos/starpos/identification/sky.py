@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stars of the catalogue where they are seen at a date."""
+"""The stars of the catalogue in the directions in which they are seen at a date."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from starpos.sky.catalogue import EPOCH, Catalogue
 
 @dataclass(frozen=True)
 class Sky:
-    """The catalogue as it looks at a date: proper motion to `year`, aberration by `velocity` (3,) in units of c."""
+    """The catalogue at a date: with proper motion to `year` and aberration by `velocity` (3,) in units of c."""
 
     catalogue: Catalogue
     triangles: TriangleCatalogue
@@ -22,20 +22,20 @@ class Sky:
 
     @classmethod
     def at(cls, catalogue: Catalogue, triangles: TriangleCatalogue, utc_unix_s: float | None) -> "Sky":
-        """The sky of a time; of None, an unknown one, at J2000 without aberration."""
+        """The sky at a time; if it is unknown (None), at J2000 without aberration."""
         if utc_unix_s is None:
             return cls(catalogue, triangles)
         year, velocity = earth_motion(utc_unix_s)
         return cls(catalogue, triangles, year, tuple(velocity))
 
     def directions(self, index: np.ndarray) -> np.ndarray:
-        """Unit vectors (n, 3) of the catalogue's stars."""
+        """Unit vectors (n, 3) of the catalogue's rows `index` (n,)."""
         return normalised(self.catalogue.directions(index, self.year) + np.asarray(self.velocity))
 
     def bright(self, row: np.ndarray) -> np.ndarray:
-        """Unit vectors (n, 3) of rows of the triangle catalogue's stars."""
+        """Unit vectors (n, 3) of the triangle catalogue's rows `row` (n,)."""
         return self.directions(self.triangles.star[row])
 
     def unaberrated(self, v: np.ndarray) -> np.ndarray:
-        """ICRS directions (n, 3) of those seen at v (n, 3)."""
+        """ICRS directions (n, 3) of stars seen in the directions v (n, 3)."""
         return normalised(v - np.asarray(self.velocity))

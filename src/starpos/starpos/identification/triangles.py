@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spherical triangles: their angles (the paper's section 2.1.1), and the catalogue of them that is searched.
+"""Spherical triangles, their angles (the paper's section 2.1.1), and the catalogue of triangles that is searched.
 
-The angles hardly depend on the focal length, which is why the paper keys by them.  Stars are chosen by local density:
-every circle of the field's size gives its own brightest stars, so that every field of the instrument holds enough.
+Triangles are found by their angles, as in the paper, because these hardly depend on the focal length. Every circle of the
+field's size gives its own brightest stars, so that every field of the instrument has enough triangles.
 """
 
 import hashlib
@@ -30,23 +30,29 @@ from starpos.units import DAY_S
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-PREFIX = "triangles-9-"  # of the folders in the cache; the number is the format's
+# Names of folders in the cache; the number is that of the format.
+PREFIX = "triangles-9-"
 SCRATCH = "unfinished-"
-SHORTEST_SIDE = 0.03  # of the longest allowed: shorter sides make angles that a centroid's error blurs
+# Shortest side over the longest allowed one: the errors of centroids blur the angles of smaller triangles.
+SHORTEST_SIDE = 0.03
 # Shapes (largest angle 60..180 deg, smallest 0..60 deg, longest side 0..the longest allowed) are kept to 1/65536 of
 # these ranges; the highest bits of the three are a triangle's bin.
 CODES = 1 << 16
-CROWDED = 5.0  # how much denser than on average shapes lie where they are looked up
+# Density of shapes where they are looked up, over the mean density.
+CROWDED = 5.0
 BIN_BITS = (8, 7, 6)
 BINS = tuple(1 << bits for bits in BIN_BITS)
-POOL_PER_CIRCLE = 25  # stars brighter than the pool's limit in an average circle of the smallest kind
-BEACONS = 0.25  # of them, the brightest over the whole sky
-# Circles laid over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken).
-# The first fits into a field of 3:2 or 4:3, the last is the whole field's own.
+# Stars of the pool in an average circle of the smallest kind.
+POOL_PER_CIRCLE = 25
+# This share of the pool, the brightest over the whole sky, are beacons.
+BEACONS = 0.25
+# Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
+# first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
 MOST_IN_USE = 4
 BLOCK = 100_000
-MAX_TRIANGLES = 6_000_000  # before those that several circles share are counted once
+# Limit, counted before duplicates of overlapping circles are removed.
+MAX_TRIANGLES = 6_000_000
 
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
@@ -72,13 +78,17 @@ def angles(side: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleCatalogue:
-    """Triangles of the sky's brightest stars in bins of their shape.
+    """T triangles of the sky's S brightest stars, in bins of their shape.
 
-    The stars, in zones as the catalogue's: star (S,) index into the star catalogue; cell_start as `zones` has it;
-    rank (S,) in brightness over the sky; beacon (B,) rows of the brightest, beacons (B, 3) their directions at J2000.
-    The triangles: corners (T, 3) rows of `star`, the corner of the largest angle first, of the smallest last; whether
-    they turn counter-clockwise seen from within (T,); shape (T, 3) in CODES; longest_allowed (1,) rad; bin_start
-    (bins + 1,).
+    star               (S,): rows of the star catalogue, in its order
+    cell_start         first row of each cell, as `zones.cell_starts` returns it
+    rank               (S,): rank in brightness over the sky
+    beacon, beacons    (B,) rows of the brightest of these stars, (B, 3) their directions at J2000
+    corners            (T, 3): rows of `star`, the corner of the largest angle first, of the smallest last
+    counter_clockwise  (T,): orientation seen from within the sphere
+    shape              (T, 3): in CODES
+    longest_allowed    (1,): longest side, rad
+    bin_start          (bins + 1,): first triangle of each bin
     """
 
     star: np.ndarray
@@ -93,10 +103,10 @@ class TriangleCatalogue:
     bin_start: np.ndarray
 
     def near(self, shape: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Triangles within tolerance (Q, 3) of shape (Q, 3), the largest angle, the smallest, the longest side, rad.
+        """Triangles within tolerance (Q, 3) of shape (Q, 3): largest angle, smallest angle and longest side, rad.
 
-        Returns (query (M,), triangle (M,)) in any order.  The work goes with the answers, not with the catalogue: each
-        query reads the bins that its box touches.
+        Returns arrays of query (M,) and triangle (M,), in any order. Only the bins that a query touches are read, so the
+        time grows with the number of answers, not with the catalogue.
         """
         box = np.concatenate([shape - tolerance, shape + tolerance])
         low, high = _coded(box, self.longest_allowed[0]).reshape(2, -1, 3)
@@ -109,11 +119,12 @@ class TriangleCatalogue:
         query = query[of]
         code = self.shape[triangle]
         close = (code >= low[query]) & (code <= high[query])
-        close = close[:, 0] & close[:, 1] & close[:, 2]  # what all(1) is, sooner
+        # faster than all(1)
+        close = close[:, 0] & close[:, 1] & close[:, 2]
         return query[close], triangle[close]
 
     def expected(self, tolerance: np.ndarray) -> np.ndarray:
-        """About how many triangles (Q,) are within tolerance (Q, 3) of a shape."""
+        """Approximate number of triangles (Q,) within tolerance (Q, 3) of a shape."""
         ranges_rad = np.array([2 * np.pi / 3, np.pi / 3, self.longest_allowed[0]])
         return CROWDED * len(self.corners) * np.prod(np.minimum(2 * tolerance / ranges_rad, 1.0), axis=1)
 
@@ -123,19 +134,19 @@ class TriangleCatalogue:
 
 
 def _coded(shape: np.ndarray, longest_allowed: float) -> np.ndarray:
-    """Shapes (n, 3) in CODES; what is outside the ranges belongs to their edge."""
+    """Shapes (n, 3) in CODES, limited to the ranges."""
     part = shape - [np.pi / 3, 0.0, 0.0]
     part *= CODES / np.array([2 * np.pi / 3, np.pi / 3, longest_allowed])
     return np.minimum(np.maximum(part, 0).astype(np.int32), CODES - 1)
 
 
 def _bins(code: np.ndarray) -> np.ndarray:
-    """The bin (n, 3) of shapes (n, 3) in CODES."""
+    """Bins (n, 3) of shapes (n, 3) in CODES."""
     return code >> (16 - np.array(BIN_BITS))
 
 
 def counter_clockwise(v: np.ndarray) -> np.ndarray:
-    """Whether triangles (M, 3, 3) turn counter-clockwise seen from within the sphere."""
+    """Whether triangles (M, 3, 3) are counter-clockwise, seen from within the sphere."""
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.moveaxis(v, 0, -1)
     return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) < 0
 
@@ -179,9 +190,9 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
 
 
 def _apart(v: np.ndarray, nearest: float) -> np.ndarray:
-    """Which of the stars v (N, 3), brightest first, have no brighter one within `nearest` rad.
+    """Rows of the stars v (N, 3), brightest first, that have no brighter star within `nearest` rad.
 
-    Close groups, which make no triangles among themselves, would take the places of a circle.
+    Close groups make no triangles among themselves, but would use up the stars of a circle.
     """
     from scipy.spatial import cKDTree
 
@@ -192,7 +203,7 @@ def _apart(v: np.ndarray, nearest: float) -> np.ndarray:
 
 
 def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
-    """CIRCLES with as many stars less as a small field needs to keep MAX_TRIANGLES."""
+    """CIRCLES with fewer stars where a small field would exceed MAX_TRIANGLES."""
     taken = [most for _, _, most in CIRCLES]
     circles = np.array([_circles(radius * half_diagonal, spacing) for radius, spacing, _ in CIRCLES])
     while (made := circles * [comb(n, 3) for n in taken]).sum() > MAX_TRIANGLES:
@@ -218,12 +229,12 @@ def _triples_of_circles(tree: "cKDTree", radius: float, spacing: float, most: in
 
 
 def _circles(radius: float, spacing: float) -> int:
-    """How many circles of this radius (rad) lie spacing * radius apart on a sphere."""
+    """Number of circles of this radius (rad) on a sphere that lie spacing * radius apart."""
     return int(4 * np.pi / (spacing * radius) ** 2) + 50
 
 
 def _spread(n: int) -> np.ndarray:
-    """n nearly even unit vectors (n, 3) over the sphere, from south to north: a golden spiral."""
+    """Unit vectors (n, 3) spread almost evenly over the sphere, from south to north: a golden spiral."""
     k = np.arange(n)
     z = (2 * k + 1) / n - 1
     angle = k * (np.pi * (3 - np.sqrt(5)))
@@ -234,9 +245,9 @@ def _spread(n: int) -> np.ndarray:
 def _in_bins(
     v: np.ndarray, rows: np.ndarray, triples: np.ndarray, longest_side: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Usable triangles in order of their bins: the columns of `TriangleCatalogue` from `corners` on."""
+    """Usable triangles, sorted by their bins: the columns of `TriangleCatalogue` from `corners` on."""
     n, parts = len(rows), []
-    # a whole sky of triangles at once is 500 MB
+    # in blocks, because all triangles together would take 500 MB
     for key in np.array_split(triples, len(triples) // BLOCK + 1):
         corner = rows[np.stack([key // (n * n), key // n % n, key % n], -1)]
         parts.append(_measured(v, corner, longest_side))
@@ -250,7 +261,7 @@ def _in_bins(
 def _measured(
     v: np.ndarray, corner: np.ndarray, longest_side: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Those triangles (M, 3) whose sides serve, the corner of the largest angle first; their turn, shape and bin."""
+    """Triangles (M, 3) with usable sides, the corner of the largest angle first; their orientation, shape and bin."""
     length = opposite_sides(v[corner])
     good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)
     corner, length = corner[good], length[good]
@@ -267,18 +278,19 @@ def _measured(
 
 
 def cache_folder() -> Path:
-    """Where built triangle catalogues are kept: $XDG_CACHE_HOME/starpos, by default ~/.cache/starpos."""
+    """The folder where triangle catalogues are kept: $XDG_CACHE_HOME/starpos, by default ~/.cache/starpos."""
     given = os.environ.get("XDG_CACHE_HOME")
     try:
         return Path(given or Path.home() / ".cache") / "starpos"
-    except RuntimeError:  # a user without a home, as in some containers
+    # a user without a home, as in some containers
+    except RuntimeError:
         return Path(tempfile.gettempdir()) / f"starpos-{os.getuid()}"
 
 
 def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> TriangleCatalogue:
-    """The TriangleCatalogue for a field of this half diagonal: memory-mapped from the cache, built when it is not there.
+    """The TriangleCatalogue for a field of this half diagonal (rad), memory-mapped from the cache; built if missing.
 
-    The field is rounded up to steps of 5 %, so that a refined focal length does not build a new one.
+    The field is rounded up to steps of 5 %, so that a refined focal length does not need a new one.
     """
     half_diagonal = float(1.05 ** np.ceil(np.log(half_diagonal_rad) / np.log(1.05)))
     with _lock:
@@ -326,7 +338,7 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
 
 @contextmanager
 def _one_builder(cache: Path) -> Iterator[None]:
-    """Other processes that want to build there wait, where folders can be locked; a killed one holds none up."""
+    """Let one process build in the cache while others wait, if folders can be locked; a killed process holds no lock."""
     folder = None
     with suppress(OSError, ImportError):
         import fcntl
@@ -342,7 +354,7 @@ def _one_builder(cache: Path) -> Iterator[None]:
 
 
 def _store(triangles: TriangleCatalogue, folder: Path) -> None:
-    """Write all columns into a new folder, then name it: others, and a power cut, find all of it or nothing."""
+    """Write all columns into a new folder, then rename it, so that all of it is there or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     _clear(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=SCRATCH) as scratch:
@@ -363,7 +375,7 @@ def _store(triangles: TriangleCatalogue, folder: Path) -> None:
 
 
 def _clear(cache: Path) -> None:
-    """Remove what earlier versions of this program left there, and what was interrupted more than a day ago."""
+    """Remove the folders of earlier formats, and unfinished ones that are older than a day."""
     for old in cache.glob("triangles-*"):
         if not old.name.startswith(PREFIX):
             shutil.rmtree(old, ignore_errors=True)
@@ -374,7 +386,7 @@ def _clear(cache: Path) -> None:
 
 
 def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
-    """The stored catalogue; None where there is none or its parts do not fit together."""
+    """The stored catalogue; None if it is missing or its columns do not fit together."""
     try:
         columns = {
             f.name: np.asarray(np.load(folder / f"{f.name}.npy", mmap_mode="r", allow_pickle=False))
@@ -397,7 +409,7 @@ def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
         and t.longest_allowed[0] > 0
         and _rising(t.bin_start, count)
         and _rising(t.cell_start, stars)
-        and bool(np.all(np.diff(t.star) > 0))  # so that 0 to the last is what all are between
+        and bool(np.all(np.diff(t.star) > 0))  # so that the first and the last are the limits
         and (stars == 0 or 0 <= t.star[0] <= t.star[-1] < catalogue_stars)
         and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
         and bool(np.all(t.corners[:, 0] != t.corners[:, 1]))

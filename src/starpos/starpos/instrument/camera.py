@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels to unit vectors of the camera frame C and back: a pinhole with Brown-Conrady distortion.
+"""Turn pixels into unit vectors of the camera frame C and back: a pinhole with Brown-Conrady distortion.
 
 Pixel (0, 0) is the centre of the top-left pixel; C has x right, y down, z out along the optical axis.
 """
@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from starpos.errors import InstrumentError
 
@@ -17,7 +17,13 @@ MAX_NEWTON_STEPS = 30
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """Intrinsics as sensor_msgs/CameraInfo has them: sizes and focal lengths in px, `plumb_bob` distortion."""
+    """Intrinsics of a camera, as in sensor_msgs/CameraInfo; InstrumentError for impossible values.
+
+    width, height  px of the frame
+    fx, fy         focal lengths, px
+    cx, cy         principal point, px
+    distortion     `plumb_bob`: k1, k2, p1, p2, k3
+    """
 
     width: int
     height: int
@@ -25,7 +31,7 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
@@ -49,7 +55,7 @@ class Camera:
 
     @property
     def scale_arcsec(self) -> float:
-        """Plate scale on the axis, arcsec per px."""
+        """Plate scale on the optical axis, arcsec per px."""
         return float(np.degrees(1 / np.sqrt(self.fx * self.fy)) * 3600)
 
     @property
@@ -63,10 +69,10 @@ class Camera:
         return (self.width - 1) / 2, (self.height - 1) / 2
 
     def scaled(self, factor: float) -> "Camera":
-        """The same camera with its focal lengths multiplied by `factor`."""
+        """The camera with its focal lengths multiplied by `factor`."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
-    def directions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> np.ndarray:
+    def directions(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Unit vectors (N, 3) in C of pixels x, y (N,): W = (X, Y, f) / norm, after undistortion.
 
         The paper prints another third component; docs/the_paper.md#star-vectors says why it is f.
@@ -80,7 +86,7 @@ class Camera:
             v[..., :2] = self._undistort(v[..., :2])
         return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
-    def project(self, v: npt.ArrayLike) -> np.ndarray:
+    def project(self, v: ArrayLike) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind the camera."""
         v = np.asarray(v, float)
         z = np.where(v[..., 2] > 0, v[..., 2], np.nan)
@@ -90,9 +96,10 @@ class Camera:
         return plane * [self.fx, self.fy] + [self.cx, self.cy]
 
     def _undistort(self, target: np.ndarray) -> np.ndarray:
-        """Newton's method on the tangent plane; quadratic, so a few steps reach the last bit."""
+        """Invert the distortion on the tangent plane by Newton's method, which needs only a few steps."""
         plane = target.copy()
-        with np.errstate(all="ignore"):  # where it diverges, or meets a fold
+        # it may diverge, or meet a fold of the distortion
+        with np.errstate(all="ignore"):
             for _ in range(MAX_NEWTON_STEPS):
                 residual = _distort(plane, self.distortion) - target
                 if np.max(np.abs(residual), initial=0.0) < 1e-14:
@@ -100,7 +107,7 @@ class Camera:
                 (a, b), (c, d) = np.moveaxis(_distortion_jacobian(plane, self.distortion), (-2, -1), (0, 1))
                 u, v = np.moveaxis(residual, -1, 0)
                 plane = plane - np.stack([d * u - b * v, a * v - c * u], -1) / (a * d - b * c)[..., None]
-            # behind a fold lie further solutions, turned over or on the other side of the axis
+            # solutions beyond a fold are wrong: they are mirrored, or lie on the other side of the axis
             upright = np.linalg.det(_distortion_jacobian(plane, self.distortion)) > 0
             upright &= np.sum(plane * target, -1) >= 0
         if np.max(np.abs(residual), initial=0.0) < 1e-12 and upright.all():
@@ -111,7 +118,7 @@ class Camera:
 
 
 def _distort(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
-    """Brown-Conrady on tangent-plane coordinates (..., 2), OpenCV's `plumb_bob`."""
+    """Apply Brown-Conrady distortion (OpenCV's `plumb_bob`) to tangent-plane coordinates (..., 2)."""
     k1, k2, p1, p2, k3 = d
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y
@@ -126,7 +133,7 @@ def _distort(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
 
 
 def _distortion_jacobian(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
-    """d(distorted) / d(undistorted), (..., 2, 2)."""
+    """Derivatives (..., 2, 2) of the distorted coordinates by the undistorted ones."""
     k1, k2, p1, p2, k3 = d
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y

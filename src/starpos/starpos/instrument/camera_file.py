@@ -13,7 +13,7 @@ LARGEST_SIDE = 1_000_000  # px of a frame
 
 
 def read(path: Path) -> Camera:
-    """The camera of a calibration file; InstrumentError with the reason where it is none."""
+    """Read the camera from a calibration file; InstrumentError says why a file cannot be used."""
     content = yaml_file.load(path, "calibration file")
     try:
         model = content.get("distortion_model", "plumb_bob")
@@ -53,9 +53,9 @@ def _numbers(matrix: dict, count: int) -> tuple[float, ...]:
 
 
 def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
-    """Write a calibration file, whole or not at all; comment: lines for people, which every reader passes over.
+    """Write a calibration file, whole or not at all; `comment` is text for people that every reader ignores.
 
-    Raises InstrumentError where it cannot be written.
+    InstrumentError if the file cannot be written.
     """
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     content = {

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
 from starpos.units import ARCSEC
@@ -16,21 +16,33 @@ from starpos.units import ARCSEC
 LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
 SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
-NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20  # readings close in time that tell the noise
-OUTLIER_SIGMA, REST = 6.0, 6.0  # readings further out are left out; more scatter than this is no rest
+# The noise is measured from readings that are so close in time, if there are so many.
+NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20
+# Readings more than so many sigma away are left out; an instrument whose readings scatter so much more than their noise
+# is not at rest.
+OUTLIER_SIGMA, REST = 6.0, 6.0
 SIGMA_PER_MAD = 1.4826
-KEPT, KEPT_VARIANCE = 0.8, 0.4377  # the smaller part of a Gaussian's deviations, and the variance of that
-SIGNIFICANT = 4.0  # over sqrt(steps): three times the share by which `white_noise` of so many errs
-MAX_CSV_BYTES = 300_000_000  # a week at 10 Hz
+# The noise comes from the smallest 80 % of a Gaussian's deviations, which have this variance.
+KEPT, KEPT_VARIANCE = 0.8, 0.4377
+# Over sqrt(steps) it is three times the relative error of `white_noise`.
+SIGNIFICANT = 4.0
+# A week at 10 Hz.
+MAX_CSV_BYTES = 300_000_000
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
 @dataclass(frozen=True)
 class Tilt:
-    """Elevation of S's X' and Y' axes above the horizon, averaged over `samples` readings.
+    """Elevation of S's X' and Y' axes above the horizon, averaged over readings.
 
-    theta_x, theta_y: rad.  covariance: (2, 2) rad2 of the average.  utc_unix_s: the middle of the readings; times: of
-    each, where they are known.
+    theta_x, theta_y  rad
+    covariance        (2, 2) rad2 of the average
+    utc_unix_s        middle of the readings
+    samples           number of readings
+    temperature_c     NaN: unknown
+    times             Unix times of the readings, if they are known
+
+    TiltError if a value is not finite, TiltRangeError beyond LIMIT_RAD.
     """
 
     theta_x: float
@@ -57,10 +69,13 @@ class Tilt:
 
 @dataclass(frozen=True)
 class InclinometerErrors:
-    """How far an inclinometer is off, 1 sigma; the default is the SCA100T-D01 behind a good converter.
+    """Errors of an inclinometer, 1 sigma; the default is an SCA100T-D01 with a good converter.
 
-    noise_rad: white, of one reading.  quantum_rad: step of its readings.  drift_rad_per_sqrt_hour: how its zero wanders.
-    temperature_rad_per_c: the zero's, after what compensation there is.  scale: share of the angle itself.
+    noise_rad                white noise of one reading
+    quantum_rad              step of its readings
+    drift_rad_per_sqrt_hour  random walk of its zero
+    temperature_rad_per_c    change of its zero with temperature, after compensation
+    scale                    relative error of the angle
     """
 
     noise_rad: float = SCA100T_NOISE_RAD
@@ -77,9 +92,10 @@ class InclinometerErrors:
                 )
 
     def undithered_rad(self, tilt: Tilt) -> float:
-        """What rounding leaves in the mean of many readings: noise larger than half a step averages it away.
+        """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.
 
-        The first harmonic of a quantiser's mean error under Gaussian noise (Widrow and Kollar, Quantization Noise, 2008).
+        It is the first harmonic of a quantiser's mean error under Gaussian noise (Widrow and Kollar, Quantization Noise,
+        2008).
         """
         if self.quantum_rad == 0:
             return 0.0
@@ -87,7 +103,7 @@ class InclinometerErrors:
         return float(self.quantum_rad / np.sqrt(12) * np.exp(-2 * np.pi**2 * noise2))
 
     def steps(self, tilt: Tilt) -> tuple:
-        """The step its two readings stand on: as long as they do, rounding errs by the same."""
+        """The quantiser's steps on which the two readings stand; the error of rounding is the same while they stay."""
         if self.quantum_rad == 0:
             return ()
         return ((round(tilt.theta_x / self.quantum_rad), round(tilt.theta_y / self.quantum_rad)),)
@@ -113,7 +129,7 @@ def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
 
 
 def sca100t_angle(
-    volts: npt.ArrayLike,
+    volts: ArrayLike,
     offset_v: float = SCA100T_OFFSET_V,
     sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
 ) -> np.ndarray:
@@ -123,7 +139,7 @@ def sca100t_angle(
 
 
 def sca100t_volts(
-    angle: npt.ArrayLike,
+    angle: ArrayLike,
     offset_v: float = SCA100T_OFFSET_V,
     sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
 ) -> np.ndarray:
@@ -132,18 +148,18 @@ def sca100t_volts(
 
 
 def white_noise(steps: np.ndarray) -> np.ndarray:
-    """1 sigma (K,) of the white noise that readings differ by from one to the next: steps (N, K), N > 0.
+    """1 sigma (K,) of the white noise of readings, from their differences from one to the next, steps (N, K), N > 0.
 
-    A fifth of the steps may be leaps and outliers of any size. Readings that all stand on one step of a quantiser give 0.
+    A fifth of the differences may be outliers of any size. Readings that are all equal give 0.
     """
-    # without the largest, not by the median, which jumps from step to step of coarse readings
+    # the largest are left out; a median would jump between the steps of coarse readings
     size = np.sort(np.abs(steps), axis=0)[: int(np.ceil(KEPT * len(steps)))]
     return np.sqrt((size**2).mean(0) / KEPT_VARIANCE / 2)
 
 
 @dataclass(frozen=True)
 class TiltLog:
-    """Readings: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,), covariance (N, 2, 2) rad2 of each."""
+    """N readings: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,), covariance (N, 2, 2) rad2 of each."""
 
     utc_unix_s: np.ndarray
     theta_x: np.ndarray
@@ -160,7 +176,7 @@ class TiltLog:
         temperature_c: np.ndarray,
         noise_rad: float = SCA100T_NOISE_RAD,
     ) -> "TiltLog":
-        """Readings of one white noise, 1 sigma."""
+        """Make a log of readings (N,) that have the same white noise, 1 sigma."""
         return cls(
             utc_unix_s,
             theta_x,
@@ -171,7 +187,7 @@ class TiltLog:
 
     @classmethod
     def of_readings(cls, readings: Sequence[Tilt]) -> "TiltLog":
-        """Readings each with the covariance it states."""
+        """Make a log of readings, each with its own covariance."""
         return cls(
             np.array([r.utc_unix_s for r in readings]),
             np.array([r.theta_x for r in readings]),
@@ -182,7 +198,7 @@ class TiltLog:
 
     @cached_property
     def excess(self) -> float:
-        """How much larger the readings' noise is than stated, 1 or more: from what neighbours in time differ by."""
+        """Noise of the readings, from the differences of neighbours in time, over the stated noise; 1 or more."""
         order = np.argsort(self.utc_unix_s, kind="stable")
         apart = np.diff(self.utc_unix_s[order])
         near = (apart > 0) & (apart < NEIGHBOURS_S)
@@ -197,10 +213,10 @@ class TiltLog:
         return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
 
     def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:
-        """The mean tilt over an exposure; where no reading falls into it, the nearest within one second.
+        """The mean tilt over an exposure, or, if no reading lies in it, the nearest reading within one second.
 
-        A reading counts once.  One that lies far from the others is left out; where they scatter more than stated (wind,
-        footsteps), the covariance widens.  Raises TiltError with the distance in time where there is none.
+        Two readings of the same time count once. A reading far from the others is left out. If they scatter more than
+        stated (wind, footsteps), the covariance is larger. TiltError if there is no reading or the instrument moved.
         """
         use = self._of_exposure(mid_unix_s, exposure_s)
         theta = np.stack([self.theta_x[use], self.theta_y[use]], -1)
@@ -216,9 +232,8 @@ class TiltLog:
         theta, use = theta[sane], use[sane]
         n = len(use)
         covariance = self.covariance[use].mean(0) * self.excess**2
-        if (
-            n > 1
-        ):  # a small sample's scatter is itself uncertain: only what clearly exceeds the noise widens it
+        # the scatter of a few readings is uncertain: it counts only if it clearly exceeds the noise
+        if n > 1:
             scatter = theta.var(0, ddof=1) / np.diag(covariance)
             widen = np.sqrt(np.where(scatter > 1 + 2 * np.sqrt(2 / (n - 1)), scatter * (1 + 2 / n), 1.0))
             covariance = covariance * np.outer(widen, widen)
@@ -234,7 +249,7 @@ class TiltLog:
         )
 
     def _of_exposure(self, mid_unix_s: float, exposure_s: float) -> np.ndarray:
-        """Indices of the readings to take, one for each time."""
+        """Indices of the readings that `average` takes, one for each time."""
         apart = np.abs(self.utc_unix_s - mid_unix_s)
         finite = np.isfinite(self.theta_x) & np.isfinite(self.theta_y)
         half = max(exposure_s, 0.0) / 2 + 1e-6
@@ -252,14 +267,15 @@ class TiltLog:
 
 
 def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
-    """A TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if it is none."""
+    """Read a TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if impossible."""
     path = Path(path)
     cure = "give a CSV with a line of names, utc_unix_s,theta_x_deg,theta_y_deg[,temperature_c], and readings"
     try:
         if path.stat().st_size > MAX_CSV_BYTES:
             raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
         with path.open(encoding="utf-8-sig") as f, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # 'empty input file' is said below
+            # our own error says that a file is empty
+            warnings.simplefilter("ignore")
             names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
             rows = np.loadtxt(f, delimiter=",", ndmin=2)
     except FileNotFoundError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the instrument is: optics, how its parts are fixed to each other, and how well that is known."""
+"""Description of the instrument: its optics, how its parts are fixed to each other, and how well that is known."""
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -16,22 +16,24 @@ from starpos.utc import utc_text
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (docs/frames_and_symbols.md#frames)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-UNSTATED_CALIBRATION_ARCSEC = 5.0  # 1 sigma a axis of an A3 given without its error
-MOST_ARCSEC, MOST_C = (
-    1e7,
-    200.0,
-)  # an error of some turns says that nothing is known; no inclinometer is so hot
+# 1 sigma about each axis of an A3 that is given without its error.
+UNSTATED_CALIBRATION_ARCSEC = 5.0
+# An error of several turns means that nothing is known; no inclinometer is so hot.
+MOST_ARCSEC, MOST_C = 1e7, 200.0
 MOST_CLOCK_S = 86400.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A3, how well it is known, and as of when.
+    """A3, how well it is known, and when and how it was found; InstrumentError for impossible values.
 
-    misalignment_deg: A3 = R3(rz) R2(ry) R1(rx), active, C into S.  covariance_arcsec2 (3, 3): of A3 as a small rotation
-    about S's axes, the inclinometer's zero included.  utc_unix_s, temperature_c: when it was found and how warm the
-    inclinometer was, NaN where nobody knows; tilt_deg: how it leaned, from which on an error of its scale counts; from
-    `frames` frames; older than valid_days it is stale.
+    misalignment_deg    (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
+    covariance_arcsec2  (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
+    utc_unix_s          when it was found; NaN: unknown
+    temperature_c       temperature of the inclinometer then; NaN: unknown
+    tilt_deg            (x, y) tilt then; an error of the scale grows with the distance from it
+    frames              number of frames it was found from
+    valid_days          how long it may be used
     """
 
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -80,7 +82,7 @@ class Calibration:
         misalignment_deg: Sequence[float],
         stddev_arcsec: Sequence[float] = (UNSTATED_CALIBRATION_ARCSEC,) * 3,
     ) -> "Calibration":
-        """From three angles and the errors (3,) about S's axes; InstrumentError where they are none."""
+        """Make a Calibration from three angles and the standard deviations (3,) about S's axes."""
         if len(stddev_arcsec) != 3:
             raise InstrumentError("calibration_stddev_arcsec is three numbers")
         if not (
@@ -97,19 +99,19 @@ class Calibration:
 
     @property
     def a3(self) -> np.ndarray:
-        """(3, 3)."""
+        """The rotation A3 (3, 3), C into S."""
         rx, ry, rz = np.radians(self.misalignment_deg)
         return rotation.about_axis(2, rz) @ rotation.about_axis(1, ry) @ rotation.about_axis(0, rx)
 
     def turned_to(self, a3: np.ndarray) -> "Calibration":
-        """The same with another A3 (3, 3)."""
+        """The calibration with another A3 (3, 3)."""
         rx, ry = np.arctan2(a3[2, 1], a3[2, 2]), np.arcsin(np.clip(-a3[2, 0], -1, 1))
         rz = np.arctan2(a3[1, 0], a3[0, 0])
         return replace(self, misalignment_deg=tuple(float(x) for x in np.degrees([rx, ry, rz])))
 
     @property
     def angle_covariance_deg2(self) -> np.ndarray:
-        """(3, 3): of misalignment_deg, from that about S's axes; near ry = 90 deg it grows without bound."""
+        """Covariance (3, 3) of misalignment_deg; near ry = 90 deg it grows without bound."""
         step = 1e-7
         around = [
             [self.turned_to(rotation.from_vector(s * axis) @ self.a3).misalignment_deg for s in (-step, step)]
@@ -120,7 +122,7 @@ class Calibration:
         return slope @ np.asarray(self.covariance_arcsec2) @ slope.T / 3600**2
 
     def check_age(self, utc_unix_s: float) -> None:
-        """InstrumentError where it is too old, or too new, for a frame of that time."""
+        """Raise InstrumentError if it is too old, or too new, for a frame of that time."""
         age_days = abs(utc_unix_s - self.utc_unix_s) / DAY_S
         if age_days > self.valid_days:
             raise InstrumentError(
@@ -131,10 +133,14 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Instrument:
-    """The paper's instrument, or another.
+    """The instrument of the paper, or another one; InstrumentError for impossible values.
 
-    focal_px: focal length; camera: full intrinsics, None for an ideal camera of any size; link_to_camera (3, 3): the base
-    link's axes as C sees them.
+    focal_px        focal length, px
+    camera          full intrinsics; None: an ideal camera of any size
+    calibration     A3 and its errors
+    link_to_camera  (3, 3): base link into C
+    inclinometer    its errors
+    clock_stddev_s  standard deviation of the clock against UTC, s
     """
 
     focal_px: float
@@ -161,7 +167,8 @@ class Instrument:
             raise InstrumentError(
                 f"clock_stddev_s of the instrument is {self.clock_stddev_s:g}: it must be 0 or more, at most a day"
             )
-        if self.inclinometer.noise_rad <= 0:  # against 0 no instrument is ever at rest
+        # with noise 0 every instrument would count as moving
+        if self.inclinometer.noise_rad <= 0:
             raise InstrumentError(
                 f"the inclinometer's noise (tilt_noise_deg) is {np.degrees(self.inclinometer.noise_rad):g} deg: must be "
                 "positive (of one reading, SCA100T 0.0035)"
@@ -169,14 +176,14 @@ class Instrument:
         link = np.asarray(self.link_to_camera, float)
         if (
             link.shape != (3, 3)
-            or np.abs(link).max() > 2  # whose squares may be beyond floats
+            or np.abs(link).max() > 2  # squares must not overflow
             or not np.allclose(link @ link.T, np.eye(3), atol=1e-6)
             or np.linalg.det(link) < 0
         ):
             raise InstrumentError("link_to_camera must be a 3 x 3 rotation matrix")
 
     def camera_for(self, width: int, height: int) -> Camera:
-        """The camera of a frame of this size; InstrumentError where the intrinsics are of another size."""
+        """The camera for a frame of this size; InstrumentError if the intrinsics are for another size."""
         if self.camera is None:
             return Camera.from_focal(width, height, self.focal_px)
         if (self.camera.width, self.camera.height) != (width, height):

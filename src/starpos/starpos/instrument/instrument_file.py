@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrument file: YAML for people, nodes and the command line alike; format 1."""
+"""The instrument file: YAML, format 1, for people, nodes and the command line."""
 
 import math
 import reprlib
@@ -20,7 +20,8 @@ from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
 MOST_FRAMES = 1 << 31
-INCLINOMETER = {  # key, field, unit in rad or 1
+# By key of the file: field of InclinometerErrors, and unit (rad or 1).
+INCLINOMETER = {
     "tilt_noise_deg": ("noise_rad", math.radians(1)),
     "tilt_quantum_deg": ("quantum_rad", math.radians(1)),
     "tilt_drift_arcsec_per_sqrt_hour": ("drift_rad_per_sqrt_hour", ARCSEC),
@@ -40,7 +41,7 @@ KEYS = (
 
 
 def read(path: Path | str) -> Instrument:
-    """An Instrument from its YAML file (format below); InstrumentError with the reason where it is none.
+    """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used. The format:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
@@ -50,7 +51,7 @@ def read(path: Path | str) -> Instrument:
     calibration_covariance_arcsec2: [[..], [..], [..]]
     calibrated: {utc, temperature_c, tilt_deg, frames, valid_days}   which `starpos calibrate` writes
     link_to_camera: [[..], [..], [..]]
-    tilt_noise_deg: 0.0035                               of one reading; the others are of the zero and of the angle
+    tilt_noise_deg: 0.0035                               for one reading; the others are errors of zero and scale
     tilt_quantum_deg: 0.0005
     tilt_drift_arcsec_per_sqrt_hour: 2
     tilt_temperature_arcsec_per_c: 3
@@ -70,7 +71,10 @@ def read(path: Path | str) -> Instrument:
 
 
 def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
-    """Write a file that `read` makes the same of; InstrumentError where it cannot be written.  comment: for people."""
+    """Write a file that `read` turns into the same Instrument; InstrumentError if it cannot be written.
+
+    comment is text for people, written at the end of the file.
+    """
     c, camera = instrument.calibration, instrument.camera
     content: dict[str, Any] = {
         "starpos_instrument": FORMAT,
@@ -113,7 +117,7 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
 
 
 def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:
-    """Intrinsics, None where only the focal length (px) is given."""
+    """Intrinsics (None if only the focal length is given) and focal length (px)."""
     if not isinstance(camera, dict):
         raise InstrumentError(
             f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"
@@ -199,7 +203,8 @@ def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
 
 def _number(mapping: dict, key: str) -> float:
     try:
-        return float(mapping[key])  # float reads 1e-3 too, which YAML takes for text
+        # float also reads 1e-3, which YAML takes for text
+        return float(mapping[key])
     except KeyError:
         raise InstrumentError(f"{key} is missing: give a number") from None
     except (TypeError, ValueError, OverflowError):
@@ -207,7 +212,7 @@ def _number(mapping: dict, key: str) -> float:
 
 
 def _error(mapping: dict, key: str, unit: float) -> float:
-    """In rad, or as a share."""
+    """An error of the inclinometer, given in `unit`, in rad or as a share."""
     given = _number(mapping, key)
     if not 0 <= given * unit <= 1:
         raise InstrumentError(f"{key} is {given:g}: give a finite number from 0 to {1 / unit:.4g}")
@@ -221,7 +226,7 @@ def _row(numbers: list, key: str) -> tuple[float, ...]:
 
 
 def _short(value: object) -> str:
-    """What a file gives for a value, in a sentence; however deep it is."""
+    """A value of a file, short enough for a sentence, however deep it is."""
     if isinstance(value, int) and abs(value) > 1e18:
         return "a number beyond any sense"
     text = "missing" if value is None else reprlib.repr(value)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How camera, inclinometer and base link are fixed to each other, and how well that is known."""
+"""Rotations between camera, inclinometer and base link, as matrices with their errors."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,16 @@ from starpos.instrument.inclinometer import EXACT, InclinometerErrors
 
 @dataclass(frozen=True, kw_only=True)
 class Mounting:
-    """How the parts are fixed to each other: A3 (camera C into inclinometer S) and base link into C, (3, 3) each.
+    """Rotations between camera, inclinometer and base link, and how well they are known.
 
-    calibration_covariance (3, 3) rad2: of A3 as a small rotation about S's axes, the inclinometer's zero included
-    (only the sum of the two matters), as of calibrated_unix_s and calibrated_temperature_c; NaN: not known, then what the
-    zero wandered till now is taken for a part of it.  An error of the scale counts from calibrated_tilt on.
+    a3                        (3, 3): camera C into inclinometer S
+    link_to_camera            (3, 3): base link into C
+    calibration_covariance    (3, 3) rad2 of A3 as a small rotation about S's axes; it includes the inclinometer's zero,
+                              because only the sum of the two matters
+    inclinometer              its errors
+    calibrated_unix_s         time of the calibration; NaN: unknown, then the covariance includes the drift until now
+    calibrated_temperature_c  temperature of the inclinometer then; NaN: unknown
+    calibrated_tilt           its tilt then, rad; an error of its scale grows with the distance from it
     """
 
     a3: np.ndarray
@@ -23,4 +28,4 @@ class Mounting:
     inclinometer: InclinometerErrors = EXACT
     calibrated_unix_s: float = float("nan")
     calibrated_temperature_c: float = float("nan")
-    calibrated_tilt: tuple[float, float] = (0.0, 0.0)  # rad
+    calibrated_tilt: tuple[float, float] = (0.0, 0.0)

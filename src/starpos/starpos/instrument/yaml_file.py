@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files that hold a calibration: read as what they may be, anything; written whole or not at all."""
+"""YAML files that hold a calibration: whoever reads them checks the content; they are written whole or not at all."""
 
 import os
 import tempfile
@@ -12,11 +12,12 @@ SIZE_LIMIT = 1 << 20
 
 
 def load(path: Path, what: str) -> Any:
-    """The content of a file that should be `what` (for messages); InstrumentError where it cannot be read."""
+    """Read the content of a file, which may be of any kind; InstrumentError if it cannot be read as `what`."""
     import yaml
 
     try:
-        if path.exists() and not path.is_file():  # a pipe would be waited for
+        # reading a pipe would wait
+        if path.exists() and not path.is_file():
             raise InstrumentError(f"{path}: not a readable {what} (it is no regular file)")
         with path.open("rb") as file:
             text = file.read(SIZE_LIMIT + 1)
@@ -33,9 +34,9 @@ def load(path: Path, what: str) -> Any:
 
 
 def save(path: Path, content: dict, comment: str = "") -> None:
-    """Write a file so that at any moment there is the old or the new one, whole, even after a power cut.
+    """Write a file so that at any moment, even after a power cut, either the old or the new one is there, whole.
 
-    comment: lines for people at its end.  Raises InstrumentError where it cannot be written.
+    comment is text for people, written at its end. InstrumentError if the file cannot be written.
     """
     import yaml
 
@@ -49,7 +50,8 @@ def save(path: Path, content: dict, comment: str = "") -> None:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp's is for its owner alone
+        # mkstemp makes a file that only its owner may read
+        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
         temporary = None
         folder = os.open(path.parent, os.O_RDONLY)
@@ -57,7 +59,8 @@ def save(path: Path, content: dict, comment: str = "") -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+    # ValueError: the name contains a NUL
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InstrumentError(f"{path}: the file cannot be written there ({reason})") from None
     finally:

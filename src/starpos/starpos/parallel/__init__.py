@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same work on many frames: here, on several processes of this machine, or on a dask.distributed cluster.
+"""Do the same work on many frames: in this process, in several processes, or on a dask.distributed cluster.
 
-All three take calls (work, of), which are one frame's each, and give their answers back in the calls' order.
+All three take calls, one for each frame (a function and the file or files it works on), and return the answers in the
+order of the calls.
 """
 
-# What says how many threads a BLAS has when it is loaded. OpenBLAS (that of numpy 1.26 at least) solves a system of six
-# in another order with two threads than with one: the last digit differs, and nothing here is quicker for more than one.
+# Variables that set the number of threads when a BLAS is loaded. With two threads OpenBLAS (at least that of numpy 1.26)
+# solves a system of six in another order than with one, so that the last digit differs. More threads make nothing faster.
 BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

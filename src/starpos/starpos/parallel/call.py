@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One frame's work, wherever it is done: what goes there, and what comes back."""
+"""The work on one frame, wherever it is done: the call that is sent, and the answer that comes back."""
 
 import pickle
 import traceback
@@ -14,23 +14,31 @@ Call = tuple[Callable[[Any], Any], Files]
 
 
 class Workers(Protocol):
-    """Where calls are worked; a context manager that leaves nothing running."""
+    """A place where calls are done; a context manager that leaves nothing running."""
+
+    def __enter__(self) -> "Workers": ...
+
+    def __exit__(self, *_: object) -> None: ...
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """The answers in the order of the calls, each as soon as all before it are there.
+        """Yield the answers in the order of the calls, each as soon as all before it are there.
 
         A FrameError is an answer; any other StarposError of the work is raised.
         """
 
 
 def worked(work: Callable, of: Files) -> bytes:
-    """The answer, or the StarposError instead of one, pickled: an array that was a view of another may add up to another
-    last digit than its copy, so what is done here goes through this too."""
+    """Do the work and return its answer, or its StarposError, pickled.
+
+    Work in this process uses it too: the sum of an array that is a view of another may differ in the last digit from that
+    of its pickled copy, and the answers must be the same everywhere.
+    """
     try:
         answer = work(of)
     except StarposError as error:
         answer = error
-    except Exception as error:  # the other frames are worth having
+    # a failure on one frame must not lose the others
+    except Exception as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
         answer = FrameError(
             f"{of}: this program failed on it ({type(error).__name__}: {one_line(error)}; {at.filename}:{at.lineno}): "
@@ -40,22 +48,21 @@ def worked(work: Callable, of: Files) -> bytes:
 
 
 def answer_of(outcome: bytes) -> Any:
-    """What `worked` pickled; raises what is no frame's own failure."""
-    answer = pickle.loads(
-        outcome
-    )  # of this program's own processes, or of a cluster that could run anything anyway
+    """Unpickle what `worked` returned; a StarposError that is not a FrameError is raised."""
+    # from this program's own processes, or from a cluster that the user trusts to run code
+    answer = pickle.loads(outcome)
     if isinstance(answer, StarposError) and not isinstance(answer, FrameError):
         raise answer
     return answer
 
 
 def given_up(of: Files, why: str) -> FrameError:
-    """The answer for a frame that ends its workers."""
+    """The answer for a frame whose work ends the process that does it."""
     return FrameError(f"{of}: given up: {why}")
 
 
 class Here:
-    """In this process, one call after the other."""
+    """Workers in this process: one call after the other."""
 
     def __enter__(self) -> "Here":
         return self
@@ -64,5 +71,5 @@ class Here:
         pass
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """As Workers has it."""
+        """See Workers."""
         return (answer_of(worked(*call)) for call in calls)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dask.distributed cluster that works calls: its workers need the files under the same paths, and the same starpos."""
+"""Do calls on a dask.distributed cluster; its workers need the same files under the same paths and the same starpos."""
 
 import logging
 import os
@@ -19,12 +19,11 @@ from starpos.parallel.same import Same, differing, same_here
 
 PIP = "pip install distributed"
 ANSWER_WITHIN_S = 10
-AHEAD, FEWEST_AHEAD = (
-    3,
-    64,
-)  # calls a thread of the cluster, and calls, that are given to it before they are asked for
+# Calls sent to the cluster before their answers are asked for: so many for each thread, and at least so many.
+AHEAD, FEWEST_AHEAD = 3, 64
 SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")
-COUNT_EVERY = 100  # calls after which the cluster's threads are counted again
+# The cluster's threads are counted again after so many calls.
+COUNT_EVERY = 100
 
 
 class ClusterError(StarposError):
@@ -32,7 +31,7 @@ class ClusterError(StarposError):
 
 
 class Cluster:
-    """An existing cluster by its scheduler's address; it keeps nothing of ours on leaving."""
+    """An existing cluster, by its scheduler's address; on leaving nothing of ours stays there."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -46,7 +45,8 @@ class Cluster:
                 f"--scheduler works through dask.distributed, which is not here: {PIP}"
             ) from None
         for name in [n for n in logging.root.manager.loggerDict if n.split(".")[0] == "distributed"]:
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # what concerns us is said in a sentence
+            # our own errors say what matters
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         if not _is_address(self._address):
             raise ClusterError(f"--scheduler {self._address}: no address: give one as tcp://HOST:8786")
         if self._address.startswith("tls") and not (
@@ -59,7 +59,8 @@ class Cluster:
             self._client = distributed.Client(
                 self._address, timeout=ANSWER_WITHIN_S, set_as_default=False, name="starpos"
             )
-        except (OSError, ValueError, RuntimeError) as error:  # TimeoutError is an OSError
+        # a TimeoutError is an OSError
+        except (OSError, ValueError, RuntimeError) as error:
             raise ClusterError(
                 f"{self._address}: no scheduler of dask.distributed answers there ({one_line(error)}): start one, or "
                 "give another address"
@@ -75,7 +76,7 @@ class Cluster:
         self._client.close()
 
     def _check(self) -> None:
-        """ClusterError where a worker's starpos is not ours.  Those that come later are held to it call by call."""
+        """Raise ClusterError if a worker's starpos differs from ours; later workers are checked at each call."""
         here = same_here()
         there = self._client.run(same_here, on_error="return")
         if not there:
@@ -89,10 +90,10 @@ class Cluster:
                 raise ClusterError(f"{worker}: {differing(theirs, here)}")
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """As Workers has it.
+        """See Workers.
 
-        A call that the scheduler gives up, as its workers died, is worked again when no other of ours is: dask blames
-        all that waited on such a worker.  One that ends its workers then too is given up.
+        If a worker dies, dask also gives up the calls that only waited there. So each such call is done again while no
+        other call of ours is under way; if its worker dies again, it is given up.
         """
         calls, here = iter(calls), same_here()
         under_way: deque[tuple[Call, Any]] = deque()
@@ -112,13 +113,15 @@ class Cluster:
                 raise ClusterError(
                     f"{self._address}: the scheduler has gone ({one_line(error)}): start it and run this again"
                 ) from None
-            except (ImportError, AttributeError) as error:  # of a worker that came later
+            # from a worker that joined later
+            except (ImportError, AttributeError) as error:
                 raise ClusterError(
                     f"{self._address}: a worker cannot load this starpos ({one_line(error)}): install the same there"
                 ) from None
             yield answer_of(outcome)
 
     def _outcome(self, call: Call, future: Any, here: Same, others: list) -> bytes:
+        """The pickled answer of a call, done again alone if its worker died; others are the futures after it."""
         from distributed import KilledWorker
 
         if isinstance(future, bytes):
@@ -128,7 +131,8 @@ class Cluster:
         except KilledWorker:
             for other in others:
                 if not isinstance(other, bytes):
-                    other.exception()  # when it has ended
+                    # waits until it has ended
+                    other.exception()
         try:
             return self._begun(call, here).result()
         except KilledWorker as error:
@@ -137,7 +141,7 @@ class Cluster:
             )
 
     def _begun(self, call: Call, here: Same) -> Any:
-        """The call's future; its outcome, worked here, where its files are none that a worker could see."""
+        """Start a call and return its future, or its pickled answer if its files cannot be seen by a worker."""
         work, of = call
         files = {}
         for path in (*getattr(work, "files", ()), *([of] if isinstance(of, str) else ())):
@@ -149,13 +153,13 @@ class Cluster:
                 return worked(work, of)
             files[os.path.abspath(path)] = status.st_size
         of = os.path.abspath(of) if isinstance(of, str) else tuple(map(os.path.abspath, of))
-        # a worker cannot do without what it is sent, but what it unpickles itself it can fail at, and say so
+        # sent as bytes that the worker unpickles itself: so a failure to load them is an error that we are told
         return self._client.submit(pickle.loads, pickle.dumps(_Task(work, of, files, here)), pure=False)
 
 
 @dataclass(frozen=True)
 class _Task:
-    """Unpickled it is its outcome."""
+    """A call as it is sent to a worker; to unpickle it is to do it, and gives its pickled answer."""
 
     work: Callable
     of: object
@@ -167,7 +171,7 @@ class _Task:
 
 
 def _is_address(text: str) -> bool:
-    """What a Client may be made of: of others it complains while Python ends."""
+    """Whether a Client can be made of the text; with other texts it prints errors when Python ends."""
     try:
         parts = urlsplit(text if "://" in text else f"tcp://{text}")
         return parts.scheme in SCHEMES and bool(parts.hostname) and parts.port is not None
@@ -176,7 +180,7 @@ def _is_address(text: str) -> bool:
 
 
 def _on_worker(work: Callable, of: Files, files: dict[str, int], here: Same) -> bytes:
-    """`worked`, where this worker's starpos and files are those of the one who asks."""
+    """Do a call on this worker, if its starpos and its files are the same as those of the sender."""
     from distributed import get_worker
 
     name = get_worker().address
@@ -195,6 +199,7 @@ def _on_worker(work: Callable, of: Files, files: dict[str, int], here: Same) -> 
                     f"{path}: worker {name} {what}: its machine needs the same files under the same paths"
                 )
             )
-    if "cv2" in sys.modules:  # the worker's threads are what share its processors
+    # the worker's own threads already share its processors
+    if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
     return worked(work, of)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of this machine that work calls.
+"""Do calls in several processes of this machine.
 
-Not concurrent.futures: its pool breaks as a whole where one process dies, without a word on which call that was at, and
-its processes outlive a parent that was killed.
+concurrent.futures does not serve: if one process dies, its whole pool breaks and does not say at which call, and its
+processes go on after their parent was killed.
 """
 
 import os
@@ -19,10 +19,13 @@ from starpos.errors import StarposError
 from starpos.parallel import BLAS_THREADS
 from starpos.parallel.call import Call, answer_of, given_up, worked
 
-AHEAD = 4  # calls a process that may wait for one before them
-STILLBORN = 3  # processes in a row that may end before they can work
-DYING_S = 1.0  # for a process that no longer answers to be gone
-# a process a processor: the threads of numpy's and scipy's BLAS and of OpenCV would be too many
+# Calls for each process whose answers may wait for an earlier one.
+AHEAD = 4
+# So many processes in a row may end before they are ready.
+STILLBORN = 3
+# Time for a process that no longer answers to end.
+DYING_S = 1.0
+# There is a process for each processor, so the libraries need no threads of their own.
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 
@@ -30,19 +33,19 @@ Task = tuple[int, Call]  # a call and its number
 
 
 class ProcessError(StarposError):
-    """Processes do not start."""
+    """The processes do not start."""
 
 
 def processors() -> int:
-    """How many this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Processes:
     """A number of processes, started on entering and ended on leaving.
 
-    One that dies is replaced, and its call is worked again when no other is, so that it has the machine's memory to
-    itself; a call that ends its process then too is given up.
+    A process that dies is replaced. Its call is done again while no other is, so that it has all of the machine's memory;
+    if its process dies again, it is given up.
     """
 
     def __init__(self, number: int) -> None:
@@ -59,7 +62,7 @@ class Processes:
             worker.end()
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """As Workers has it."""
+        """See Workers."""
         board = _Board(calls, AHEAD * self._number)
         while True:
             yield from board.answers()
@@ -98,18 +101,18 @@ class Processes:
 
 
 class _Board:
-    """Which call is next, and the answers in order."""
+    """The calls that are still to do, and the answers in their order."""
 
     def __init__(self, calls: Iterable[Call], ahead: int) -> None:
         self._coming, self._ahead = enumerate(calls), ahead
         self._under_way: set[int] = set()
         self._again: deque[Task] = deque()
-        self._tried: set[int] = set()  # that have ended a process
+        self._tried: set[int] = set()  # calls that have ended a process
         self._done: dict[int, bytes] = {}
         self._given = self._told = 0
 
     def take(self) -> Task | None:
-        """A call to work, with its number; None where there is none, or none may be worked beside those under way."""
+        """The next task; None if there is none, or if it may not be done beside those under way."""
         if self._under_way & self._tried or (self._again and self._under_way):
             return None
         task: Task | None = None
@@ -143,12 +146,12 @@ class _Board:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left, where no call is under way and all answers are told."""
+        """Whether nothing is left to do; asked while no call is under way."""
         return not self._again and self._told == self._given
 
 
 class _Worker:
-    """A process; task: what it was given and has not answered; ready: whether it has said that it runs."""
+    """A process. task: the one it was given and has not answered; ready: whether it has started to work."""
 
     def __init__(self) -> None:
         self.pipe, theirs = get_context("spawn").Pipe()
@@ -159,7 +162,7 @@ class _Worker:
             self._process.start()
 
     def give(self, task: Task) -> bool:
-        """False where the process is no more."""
+        """Send a task; False if the process has died."""
         self.task = task
         try:
             self.pipe.send_bytes(pickle.dumps(task[1]))
@@ -168,7 +171,7 @@ class _Worker:
         return True
 
     def hear(self) -> bytes | None:
-        """The outcome; None for its first word.  EOFError or OSError where the process is no more."""
+        """Receive an answer; None for the first message, which says that it runs. EOFError or OSError if it has died."""
         said, outcome = pickle.loads(self.pipe.recv_bytes())
         for text in said:
             warnings.warn(text, stacklevel=2)
@@ -176,7 +179,7 @@ class _Worker:
         return outcome
 
     def end(self, within_s: float = 0.0) -> str:
-        """By itself if it does within that time, else killed; how it ended, in words."""
+        """End the process, killing it after within_s, and return in words how it ended."""
         self.pipe.close()
         self._process.join(within_s)
         self._process.kill()
@@ -192,10 +195,14 @@ class _Worker:
 
 @contextmanager
 def _for_one_that_starts() -> Iterator[None]:
-    """What a process inherits: one thread a library; and Ctrl-C, which a terminal sends to all, is for its parent."""
+    """Set what a new process inherits: one thread for each library, and SIGINT blocked.
+
+    A terminal sends Ctrl-C to all processes; only the parent is to react.
+    """
     before = dict(os.environ)
     os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
-    resource_tracker.ensure_running()  # which comes with the first process, and would let Ctrl-C through to it
+    # otherwise it starts with the first process, and unblocks SIGINT for it
+    resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -206,7 +213,7 @@ def _for_one_that_starts() -> Iterator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Work what comes until the other end is closed."""
+    """Do the calls that come through the pipe until its other end is closed."""
     with suppress(EOFError, OSError):
         pipe.send_bytes(pickle.dumps(((), None)))
         while True:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What machines must have in common to give the same answers."""
+"""The versions that must be equal on all machines, so that they give the same answers."""
 
 import hashlib
 from functools import lru_cache
@@ -9,12 +9,12 @@ from pathlib import Path
 import starpos
 from starpos.sky import catalogue
 
-Same = dict[str, str]  # what, and which of it
+Same = dict[str, str]  # version by name
 
 
 @lru_cache(maxsize=1)
 def same_here() -> Same:
-    """Of this process: starpos itself, its catalogue, the Earth's rotation."""
+    """Versions of starpos, its catalogue and the Earth orientation tables in this process."""
     root = Path(starpos.__file__).parent
     digest = hashlib.sha256()
     for source in sorted(root.rglob("*.py")):
@@ -27,6 +27,6 @@ def same_here() -> Same:
 
 
 def differing(there: Same, here: Same) -> str:
-    """A sentence on what is not the same."""
+    """Part of a sentence: the first version that differs, and what to do."""
     what = next(name for name in here if there.get(name) != here[name])
     return f"the {what} of this worker is {there.get(what)}, here it is {here[what]}: install the same there"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The star catalogue: a compact Tycho-2 in declination zones, its places at any date and their errors.
+"""The star catalogue: a compact Tycho-2 in declination zones, with directions at any date and their errors.
 
-The committed file holds every star with V < 11, which is what the instrument sees in half a second; half of the
-accuracy of the roll about the optical axis, and with it of the position, comes from the stars fainter than V = 9.5.
+The committed file holds all stars with V < 11, which the instrument sees in half a second. Stars fainter than V = 9.5
+give half of the accuracy of the roll about the optical axis, and so of the position.
 """
 
 import hashlib
@@ -12,21 +12,18 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from starpos.errors import CatalogueError
 from starpos.rotation import normalised
 from starpos.sky.zones import ZONES, cell_starts, rows_near
 from starpos.units import MAS, MAS_DEG
 
-EPOCH = 2000.0  # of ra, dec, Julian year
+EPOCH = 2000.0  # Julian year of ra and dec
 FORMAT = 3
 EPOCH_ZERO = 1900.0
-SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = (
-    1.0,
-    0.1,
-    1.03,
-)  # an error is the smallest times CODE_STEP ** code
+# A stored error is the smallest times CODE_STEP ** code.
+SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = 1.0, 0.1, 1.03
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
 Rows = np.ndarray | slice
@@ -34,11 +31,17 @@ Rows = np.ndarray | slice
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Catalogue:
-    """Stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
+    """N stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
 
-    ra_mas, dec_mas (N,) ICRS at J2000.0 in mas; pm_ra (times cos dec), pm_dec (N,) mas/yr; vmag_centi (N,) V in
-    0.01 mag; sigma_code, pm_sigma_code, epoch_code (N,): position error at the mean epoch, error of the motion, mean
-    epoch; tyc (N, 3); hip (N,) 0 where there is none; zone_start (181,).
+    ra_mas, dec_mas  (N,) ICRS at J2000.0, mas
+    pm_ra, pm_dec    (N,) mas/yr, pm_ra times cos(dec)
+    vmag_centi       (N,) V in 0.01 mag
+    sigma_code       (N,) code of the position's error at the mean epoch
+    pm_sigma_code    (N,) code of the proper motion's error
+    epoch_code       (N,) mean epoch, years after EPOCH_ZERO
+    tyc              (N, 3) Tycho identifier
+    hip              (N,) Hipparcos number, 0 for none
+    zone_start       (181,) first row of each zone of 1 deg of declination, and the end
     """
 
     ra_mas: np.ndarray
@@ -58,7 +61,7 @@ class Catalogue:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Equal for equal stars: what a table made from this catalogue is known by."""
+        """A digest that is equal for equal stars; tables made from the catalogue are stored under it."""
         digest = hashlib.sha256()
         for column in (self.ra_mas, self.dec_mas, self.vmag_centi):
             digest.update(np.ascontiguousarray(column).data)
@@ -66,17 +69,17 @@ class Catalogue:
 
     @cached_property
     def cell_start(self) -> np.ndarray:
-        """`zones.cell_starts` of the stars."""
+        """First row of each cell, as `zones.cell_starts` returns it."""
         return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
 
     def vmag(self, index: Rows = slice(None)) -> np.ndarray:
-        """Johnson V."""
+        """Johnson V magnitudes (n,) of the rows `index`."""
         return self.vmag_centi[index] * 0.01
 
     def directions(self, index: Rows, year: float = EPOCH) -> np.ndarray:
-        """ICRS unit vectors (n, 3), barycentric, at a Julian year: linear motion; parallax is left out.
+        """Barycentric ICRS unit vectors (n, 3) of the rows `index` at a Julian year, by linear motion.
 
-        It is 0.75 arcsec for the nearest star and below 0.03 for nearly all.
+        Parallax is left out: it is 0.75 arcsec for the nearest star and below 0.03 for nearly all.
         """
         ra, dec = self.ra_mas[index] * MAS, self.dec_mas[index] * MAS
         cr, sr, cd, sd = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
@@ -92,20 +95,20 @@ class Catalogue:
         return normalised(v)
 
     def sigma(self, index: Rows, year: float) -> np.ndarray:
-        """Error of a place at a Julian year, rad, one axis, 1 sigma (n,)."""
+        """Standard deviation (n,) of the places of the rows `index` along one axis at a Julian year, rad."""
         years = year - (EPOCH_ZERO + self.epoch_code[index])
         motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
         return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
     def names(self, index: Rows) -> list[str]:
-        """Designations: 'HIP 1234' where there is one, else 'TYC 1-2-3'."""
+        """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""
         return [
             f"HIP {h}" if h else "TYC {}-{}-{}".format(*t)
             for h, t in zip(self.hip[index].tolist(), self.tyc[index].tolist(), strict=True)
         ]
 
     def cone(self, centre: np.ndarray, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
-        """Indices of the stars within radius_rad of the unit vector `centre` at J2000, brightest first."""
+        """Rows of the stars within radius_rad of the unit vector `centre` (3,) at J2000, brightest first."""
         index = rows_near(self.cell_start, np.asarray(centre), radius_rad)
         if np.isfinite(limit_mag):
             index = index[self.vmag_centi[index] < limit_mag * 100]
@@ -114,24 +117,27 @@ class Catalogue:
 
 
 def pack(
-    tyc: npt.ArrayLike,
-    hip: npt.ArrayLike,
-    vmag: npt.ArrayLike,
-    ra_deg: npt.ArrayLike,
-    dec_deg: npt.ArrayLike,
-    pm_ra: npt.ArrayLike,
-    pm_dec: npt.ArrayLike,
-    sigma_mas: npt.ArrayLike,
-    sigma_pm: npt.ArrayLike,
-    epoch: npt.ArrayLike,
+    tyc: ArrayLike,
+    hip: ArrayLike,
+    vmag: ArrayLike,
+    ra_deg: ArrayLike,
+    dec_deg: ArrayLike,
+    pm_ra: ArrayLike,
+    pm_dec: ArrayLike,
+    sigma_mas: ArrayLike,
+    sigma_pm: ArrayLike,
+    epoch: ArrayLike,
 ) -> Catalogue:
-    """A Catalogue from plain columns: deg, mas/yr (pm_ra times cos dec), mas, Julian year; errors round up."""
+    """Make a Catalogue from columns (N,), tyc (N, 3), in deg, mas/yr (pm_ra times cos dec), mas and Julian years.
+
+    Errors are rounded up.
+    """
     dec_mas = np.round(np.asarray(dec_deg) * 3.6e6).astype(np.int32)
     ra_mas = (np.round(np.asarray(ra_deg) * 3.6e6) % 1_296_000_000).astype(np.uint32)
     zone = np.clip(dec_mas // 3_600_000 + 90, 0, ZONES - 1)
     order = np.lexsort((ra_mas, zone))
 
-    def column(values: npt.ArrayLike, dtype: type[np.integer]) -> np.ndarray:
+    def column(values: ArrayLike, dtype: type[np.integer]) -> np.ndarray:
         limits = np.iinfo(dtype)
         return np.clip(np.round(np.asarray(values)), limits.min, limits.max).astype(dtype)[order]
 
@@ -150,13 +156,13 @@ def pack(
     )
 
 
-def _code(sigma: npt.ArrayLike, smallest: float) -> np.ndarray:
-    """The code of an error, rounded up."""
+def _code(sigma: ArrayLike, smallest: float) -> np.ndarray:
+    """Codes of errors, rounded up."""
     return np.ceil(np.log(np.maximum(np.asarray(sigma, float), smallest) / smallest) / np.log(CODE_STEP))
 
 
 def save(catalogue: Catalogue, path: Path | str) -> None:
-    """Write the compact file: differences along right ascension and split bytes, which deflate packs well."""
+    """Write the compact file. Differences along right ascension and split bytes compress well."""
     c = catalogue
     step = np.diff(c.ra_mas.astype(np.int64), prepend=0).astype(np.uint32)
     within = (c.dec_mas - (np.repeat(np.arange(ZONES), np.diff(c.zone_start)) - 90) * 3_600_000).astype(
@@ -185,16 +191,17 @@ def save(catalogue: Catalogue, path: Path | str) -> None:
 
 
 def _split(column: np.ndarray) -> np.ndarray:
-    """Byte planes (bytes, N): the high bytes repeat and pack away."""
+    """Byte planes (bytes, N) of a column (N,): the high bytes repeat, so they compress well."""
     return np.ascontiguousarray(np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1).T)
 
 
 def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
+    """The column (N,) of byte planes; the inverse of `_split`."""
     return np.ascontiguousarray(planes.T).view(dtype)[:, 0]
 
 
 def read(path: Path | str) -> Catalogue:
-    """The catalogue of one compact file; CatalogueError where it is missing, broken or of another format."""
+    """Read the catalogue from a compact file; CatalogueError if it is missing, broken or of another format."""
     path = Path(path)
     try:
         # numpy leaves a file open that turns out to be none of its own
@@ -225,7 +232,8 @@ def read(path: Path | str) -> Catalogue:
         raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None
     except CatalogueError:
         raise
-    except Exception as e:  # a damaged zip raises many kinds
+    # a damaged zip file raises many kinds
+    except Exception as e:
         raise CatalogueError(
             f"{path}: not a readable catalogue ({e}): restore it or build it again"
         ) from None
@@ -233,5 +241,5 @@ def read(path: Path | str) -> Catalogue:
 
 @lru_cache(maxsize=2)
 def load_catalogue(path: str | None = None) -> Catalogue:
-    """The catalogue in use: `path`, else the file STARPOS_CATALOGUE names, else the committed one; read once."""
+    """The catalogue at `path`, else that named by STARPOS_CATALOGUE, else the committed one; each is read once."""
     return read(path or os.environ.get("STARPOS_CATALOGUE") or COMMITTED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sky seen from a known place: the forward direction of what the fix inverts."""
+"""The sky seen from a known place: the fix solves the inverse problem."""
 
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ from starpos.sky.catalogue import Catalogue
 
 @dataclass(frozen=True)
 class Site:
-    """A place by gravity: astronomic latitude, longitude in deg; and its air."""
+    """A place, by its astronomic latitude and longitude in deg, and its air."""
 
     latitude_deg: float
     longitude_deg: float
@@ -21,7 +21,7 @@ class Site:
 
     @property
     def enu(self) -> np.ndarray:
-        """(3, 3): ITRS into east, north, up."""
+        """Rotation (3, 3) of ITRS into east, north, up."""
         phi, lam = np.radians([self.latitude_deg, self.longitude_deg])
         return np.array(
             [
@@ -32,7 +32,7 @@ class Site:
         )
 
     def observed(self, catalogue: Catalogue, index: np.ndarray, state: EarthState) -> np.ndarray:
-        """Refracted directions (n, 3) in ENU of catalogue stars."""
+        """Refracted directions (n, 3) in ENU of the catalogue's rows `index` (n,)."""
         return self.refracted(catalogue.directions(index, state.year), state)
 
     def refracted(self, icrs: np.ndarray, state: EarthState) -> np.ndarray:
@@ -43,14 +43,14 @@ class Site:
     def overhead(
         self, catalogue: Catalogue, state: EarthState, toward: np.ndarray, radius: float, limit_mag: float
     ) -> np.ndarray:
-        """Catalogue indices within `radius` rad of an observed ENU direction (3,), brightest first."""
+        """Catalogue rows within `radius` rad of the observed direction `toward` (3,) in ENU, brightest first."""
         itrs = self.atmosphere.refraction().unbend(toward) @ self.enu
         # aberration and precession of the direction itself are far below the margin
         return catalogue.cone(itrs @ state.gcrs_to_itrs, radius + np.radians(0.05), limit_mag)
 
 
 def camera_to_enu(azimuth_deg: float, altitude_deg: float, roll_deg: float) -> np.ndarray:
-    """Attitude (3, 3) of a camera that looks at azimuth, altitude; at roll 0 its x axis is level, to the right."""
+    """Rotation (3, 3) of C into ENU for a camera that looks at azimuth and altitude; at roll 0 its x axis is level."""
     a, h = np.radians([azimuth_deg, altitude_deg])
     z = rotation.unit_vector(np.pi / 2 - a, h)
     x = np.array([np.cos(a), -np.sin(a), 0.0])

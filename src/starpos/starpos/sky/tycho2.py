@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build the compact catalogue from the original Tycho-2 files (CDS I/259): tyc2.dat.* and suppl_1.dat.
 
-Tycho-2: Hog et al. 2000, A&A 355, L27.  Byte positions as in the catalogue's own ReadMe.
+Sources: Tycho-2, Hog et al. 2000, A&A 355, L27; byte positions from the catalogue's own ReadMe.
 """
 
 import lzma
@@ -16,7 +16,8 @@ from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import EPOCH, Catalogue, pack
 
 SUPPLEMENT_EPOCH = 1991.25
-# 68 % of the measured proper motions of stars of magnitude V, one axis, are below: what an unmeasured one may be
+# 68 % of the measured proper motions of stars of magnitude V, along one axis, are below these: the sigma of an
+# unmeasured motion.
 MOTION_V = (3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 10.5)
 MOTION_MAS_YEAR = (79.0, 52.0, 41.0, 30.0, 23.0, 18.0, 14.0, 12.0)
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
@@ -35,10 +36,11 @@ _SUPPLEMENT = {
 
 
 def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> Catalogue:
-    """The catalogue of all stars with V < limit_mag from a folder (or Debian's tycho2_*.orig.tar.xz) of the originals.
+    """Build the catalogue of all stars with V < limit_mag from a folder of the originals, or Debian's tycho2_*.tar.xz.
 
-    Every star carries its own position error: mean position and motion where Tycho-2 has them, the observed place
-    with an unknown motion for pflag X, the photocentre once for each pflag P pair, epoch 1991.25 for supplement 1.
+    Every star has its own position error. It has the mean position and motion if Tycho-2 gives them; else (pflag X) the
+    observed place and an unknown motion. A pair with pflag P becomes one star at its photocentre. The epoch of
+    supplement 1 is 1991.25. CatalogueError if files are missing or damaged.
     """
     parts, seen = [], 0
     for name, text in _originals(Path(source)):
@@ -58,6 +60,7 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
 
 
 def _originals(source: Path) -> Iterator[tuple[str, bytes]]:
+    """Name and content of each original file in a folder or archive."""
     wanted = {f"tyc2.dat.{i:02d}" for i in range(20)} | {"suppl_1.dat"}
     try:
         if source.is_dir():
@@ -102,13 +105,13 @@ def _numbers(column: np.ndarray) -> np.ndarray:
 
 
 def johnson_v(bt: np.ndarray, vt: np.ndarray) -> np.ndarray:
-    """Johnson V from Tycho magnitudes: VT - 0.09 (BT - VT); a missing colour is taken as BT - VT = 0.7."""
+    """Johnson V from Tycho magnitudes, VT - 0.09 (BT - VT); without a colour BT - VT is taken as 0.7."""
     colour = np.where(np.isfinite(bt) & np.isfinite(vt), bt - vt, 0.7)
     return np.where(np.isfinite(vt), vt, bt - colour) - 0.09 * colour
 
 
 def _unmeasured_motion(t: dict) -> np.ndarray:
-    """1 sigma (mas/yr) of a proper motion that is not in the catalogue: bright stars are near and quick."""
+    """1 sigma (mas/yr) of proper motions that are not in the catalogue; bright stars are nearer and move faster."""
     return np.interp(johnson_v(t["bt"], t["vt"]), MOTION_V, MOTION_MAS_YEAR)
 
 
@@ -156,7 +159,7 @@ def _supplement_stars(t: dict) -> dict[str, np.ndarray]:
 
 
 def _merge_photocentres(stars: dict) -> dict[str, np.ndarray]:
-    """Each pflag P pair has one mean place in two rows: keep one row, with the light of both."""
+    """Keep one row, with the light of both, of each pair with pflag P: its two rows have the same mean place."""
     pair = np.flatnonzero(stars["photocentre"])
     place = np.stack([stars["ra_deg"][pair], stars["dec_deg"][pair]], -1)
     _, first, group = np.unique(place, axis=0, return_index=True, return_inverse=True)
