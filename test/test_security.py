@@ -11,7 +11,7 @@ from starpos.earth import geoid_file
 from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file, instrument_file
-from starpos.instrument.inclinometer import read_tilt_csv
+from starpos.instrument.tilt_log import read_tilt_csv
 from starpos.recording.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 
@@ -49,7 +49,7 @@ ALLOWED = {
 READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
     "starpos/earth/geotiff.py": "MAX_BYTES",
-    "starpos/instrument/inclinometer.py": "MAX_CSV_BYTES",
+    "starpos/instrument/tilt_log.py": "MAX_CSV_BYTES",
     "starpos/parallel/same.py": "our own source",
     "starpos/identification/paper.py": "of the package",
     "starpos/frames/files.py": "MAX_BYTES",

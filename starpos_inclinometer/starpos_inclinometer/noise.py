@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from starpos.instrument.inclinometer import ENOUGH_NEIGHBOURS, SIGNIFICANT, white_noise
+from starpos.instrument.tilt_log import ENOUGH_NEIGHBOURS, SIGNIFICANT, white_noise
 
 BLOCK_S = 0.1  # a sensor of 18 Hz remembers 9 ms: means over this are independent
 APART_S = 3.0  # blocks further apart than this tell of drift rather than noise

@@ -11,7 +11,8 @@ from starpos.averaging.slip import slip_s
 from starpos.errors import TiltError
 from starpos.fix.fix import Fix
 from starpos.frames.stars import Stars
-from starpos.instrument.inclinometer import Tilt, TiltLog
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_log import TiltLog
 
 MOST_POSES = 36
 MOST_TILTS = 64  # of a pose, the newest

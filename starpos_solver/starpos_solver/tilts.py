@@ -6,7 +6,8 @@ from collections import deque
 import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
-from starpos.instrument.inclinometer import Tilt, TiltLog
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_log import TiltLog
 from starpos.recording.messages import OUT_OF_RANGE, SATURATED, UNUSABLE, message_to_tilt, stamp_to_unix
 from starpos_interfaces import msg
 

@@ -35,14 +35,14 @@ _HOMES = {
     "Stars": "frames.stars",
     "Status": "fix.solver",
     "Tilt": "instrument.inclinometer",
-    "TiltLog": "instrument.inclinometer",
+    "TiltLog": "instrument.tilt_log",
     "average": "averaging.average",
     "calibrate_at": "calibration.misalignment",
     "detect": "detection",
     "geodetic": "earth.vertical",
     "load_catalogue": "sky.catalogue",
     "read_frame": "frames.reading",
-    "read_tilt_csv": "instrument.inclinometer",
+    "read_tilt_csv": "instrument.tilt_log",
     "turn": "calibration.turning",
 }
 __all__ = list(_HOMES)

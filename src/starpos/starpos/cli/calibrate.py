@@ -18,8 +18,9 @@ from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import TiltLog, a2_matrix, read_tilt_csv
+from starpos.instrument.inclinometer import a2_matrix
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog, read_tilt_csv
 from starpos.sky import catalogue
 
 NOTHING = 1  # exit status

@@ -14,8 +14,8 @@ from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
-from starpos.instrument.inclinometer import TiltLog
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.sky.site import Site
 

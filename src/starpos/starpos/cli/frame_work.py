@@ -20,8 +20,8 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.instrument.inclinometer import TiltLog, read_tilt_csv
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog, read_tilt_csv
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:

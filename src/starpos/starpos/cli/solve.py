@@ -19,7 +19,7 @@ from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
-from starpos.instrument.inclinometer import TiltLog
+from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt, TiltLog
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_log import TiltLog
 from starpos.progress import Progress
 from starpos.recording.bag import PACKAGE, BagReader
 from starpos.recording.messages import UNUSABLE, message_to_camera, message_to_tilt

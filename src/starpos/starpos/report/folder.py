@@ -12,7 +12,8 @@ from starpos.detection import detect
 from starpos.errors import FrameError, TiltError
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
-from starpos.instrument.inclinometer import Tilt, read_tilt_csv
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_log import read_tilt_csv
 from starpos.report.night import Truth
 
 TILTS, TRUTH = "tilt.csv", "truth.json"

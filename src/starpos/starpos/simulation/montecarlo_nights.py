@@ -23,8 +23,9 @@ from starpos.errors import StarposError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import InclinometerErrors, TiltLog
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
 from starpos.simulation.scene import Scene, TiltErrors, detected, expose, read_tilt
 from starpos.sky.catalogue import EPOCH, Catalogue

@@ -12,8 +12,8 @@ from starpos.averaging.average import average
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
-from starpos.instrument.inclinometer import read_tilt_csv
 from starpos.instrument.instrument import Instrument, focal_px_of
+from starpos.instrument.tilt_log import read_tilt_csv
 from starpos.simulation.scene import scene_of
 from starpos.units import ARCSEC
 

@@ -17,8 +17,9 @@ from starpos.errors import TiltError
 from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import EXACT, Tilt, TiltLog
+from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.tilt_log import TiltLog
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
 from starpos_testing.skies.scenes import (

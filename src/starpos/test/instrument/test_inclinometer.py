@@ -4,26 +4,11 @@ import warnings
 import numpy as np
 import pytest
 
-from starpos.errors import TiltError, TiltRangeError
-from starpos.instrument.inclinometer import (
-    SCA100T_NOISE_RAD,
-    Tilt,
-    TiltLog,
-    a2_matrix,
-    read_tilt_csv,
-    sca100t_angle,
-    sca100t_volts,
-)
+from starpos.errors import TiltError
+from starpos.instrument.inclinometer import Tilt, a2_matrix, sca100t_angle, sca100t_volts
 
 DEG = np.pi / 180
 NO_ERROR = np.zeros((2, 2))
-
-
-def log(theta_x_deg, rate_hz=10.0, start=1000.0, **more):
-    """A TiltLog of these x readings, y the negative of them."""
-    theta = np.asarray(theta_x_deg, float) * DEG
-    t = start + np.arange(len(theta)) / rate_hz
-    return TiltLog.of(t, theta, -theta, np.full(len(theta), 15.0), **more)
 
 
 def test_a2_turns_up_as_the_sensor_feels_it_into_z(rng):
@@ -62,110 +47,6 @@ def test_sca100t_d02_and_beyond_one_g():
         assert np.isnan(sca100t_angle([6.6, -2.0])).all()
 
 
-def test_average_over_an_exposure(rng):
-    noise = rng.normal(0, SCA100T_NOISE_RAD, 100)
-    reading = log(3 + noise / DEG)
-    tilt = reading.average(1005.0, 2.0)
-    assert tilt.samples == 21
-    assert tilt.theta_x == pytest.approx(np.mean(reading.theta_x[40:61]), abs=1e-15)
-    assert tilt.theta_y == pytest.approx(-tilt.theta_x)
-    np.testing.assert_allclose(tilt.covariance, np.eye(2) * SCA100T_NOISE_RAD**2 / 21)
-    assert tilt.utc_unix_s == pytest.approx(1005.0)
-    assert tilt.temperature_c == 15.0
-
-
-def test_averages_err_as_their_covariance_says(rng):
-    pulls = []
-    for _ in range(300):
-        tilt = log(3 + rng.normal(0, SCA100T_NOISE_RAD, 12) / DEG).average(1000.55, 1.2)
-        pulls.append((tilt.theta_x - 3 * DEG) / np.sqrt(tilt.covariance[0, 0]))
-    assert 0.85 < np.std(pulls) < 1.15
-
-
-def test_a_mount_that_shakes_widens_the_covariance(rng):
-    shaken = rng.normal(0, 2.2 * SCA100T_NOISE_RAD, 60)
-    shaken = np.clip(shaken, -5 * SCA100T_NOISE_RAD, 5 * SCA100T_NOISE_RAD)
-    tilt = log(3 + shaken / DEG).average(1002.95, 6.0)
-    assert tilt.samples == 60
-    assert np.diag(tilt.covariance) == pytest.approx(np.var(shaken, ddof=1) / 60 * np.ones(2), rel=0.4)
-
-
-@pytest.mark.parametrize("factor", [1.0, 2.0, 3.0, 4.0])
-def test_more_noise_than_stated_is_paid_for(factor, rng):
-    """A night of exposures of five readings whose noise nobody stated."""
-    mids = 1000.0 + 10.0 * np.arange(200)
-    t = (mids[:, None] + 0.1 * np.arange(-2, 3)).ravel()
-    x, y = 3 * DEG + rng.normal(0, factor * SCA100T_NOISE_RAD, (2, len(t)))
-    night = TiltLog.of(t, x, y, np.full(len(t), 15.0))
-    tilts = [night.average(mid, 0.5) for mid in mids]
-    pulls = [(tilt.theta_x - 3 * DEG) / np.sqrt(tilt.covariance[0, 0]) for tilt in tilts]
-    assert 0.75 < np.std(pulls) < 1.2
-
-
-def test_a_reading_given_twice_counts_once():
-    once = log([1.0, 1.001, 0.999])
-    twice = TiltLog.of(
-        *(np.repeat(c, 7) for c in (once.utc_unix_s, once.theta_x, once.theta_y, once.temperature_c))
-    )
-    a, b = (reading.average(1000.1, 0.5) for reading in (once, twice))
-    assert (a.samples, a.theta_x, a.times) == (b.samples, b.theta_x, b.times)
-    np.testing.assert_array_equal(a.covariance, b.covariance)
-
-
-def test_each_axis_keeps_its_stated_error_and_their_correlation():
-    stated = np.array([[1e-6, 9e-7], [9e-7, 1e-6]])
-    t = 1000 + 0.1 * np.arange(5)
-    zeros = np.zeros(5)
-    tilt = TiltLog(t, zeros, zeros, zeros, np.tile(stated, (5, 1, 1))).average(1000.2, 0.5)
-    np.testing.assert_allclose(tilt.covariance, stated / 5)
-
-
-def test_a_wild_reading_does_not_move_the_average():
-    calm = np.full(11, 2.0)
-    wild = calm.copy()
-    wild[4] = 25.0
-    tilt = log(wild).average(1000.5, 1.0)
-    assert tilt.samples == 10
-    assert tilt.theta_x == pytest.approx(2 * DEG, abs=1e-12)
-
-
-def test_readings_that_are_no_numbers_are_left_out():
-    broken = log([1.0, np.nan, 1.0, 1.0, np.inf])
-    assert broken.average(1000.2, 1.0).samples == 3
-
-
-@pytest.mark.parametrize("mid", [1000.55, 999.2, 1001.9])
-def test_without_a_reading_in_the_exposure_the_nearest_within_a_second_counts(mid):
-    reading = log(np.linspace(0, 0.01, 11))
-    tilt = reading.average(mid, 0.01)
-    assert tilt.samples <= 2
-    nearest = np.argmin(np.abs(reading.utc_unix_s - mid))
-    assert tilt.theta_x == pytest.approx(reading.theta_x[nearest], abs=0.001 * DEG)
-
-
-@pytest.mark.parametrize("mid", [990.0, 1020.0, float("nan"), float("inf")])
-def test_no_reading_near_the_exposure(mid):
-    with pytest.raises(TiltError, match="no tilt reading within"):
-        log(np.zeros(10)).average(mid, 0.5)
-
-
-def test_nothing_but_nan_and_nothing_at_all():
-    for empty in (log([np.nan] * 5), log([])):
-        with pytest.raises(TiltError, match="no tilt reading"):
-            empty.average(1000.2, 0.5)
-
-
-def test_an_instrument_that_moves_during_the_exposure():
-    with pytest.raises(TiltError, match="not at rest"):
-        log(np.linspace(0, 5, 11)).average(1000.5, 1.0)
-
-
-def test_out_of_range_is_a_kind_of_its_own():
-    with pytest.raises(TiltRangeError, match=r"beyond \+-30 deg"):
-        log([31.0] * 11).average(1000.5, 1.0)
-    assert Tilt(30 * DEG, -30 * DEG, NO_ERROR, utc_unix_s=0.0).theta_x == 30 * DEG
-
-
 @pytest.mark.parametrize(
     "values",
     [(np.nan, 0.0, NO_ERROR, 0.0), (0.0, np.inf, NO_ERROR, 0.0), (0.0, 0.0, NO_ERROR, np.nan),
@@ -174,58 +55,3 @@ def test_out_of_range_is_a_kind_of_its_own():
 def test_a_tilt_that_is_no_tilt(values):
     with pytest.raises(TiltError):
         Tilt(*values[:3], utc_unix_s=values[3])
-
-
-def test_csv(tmp_path):
-    path = tmp_path / "tilt.csv"
-    path.write_text(
-        "utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n12.5,1,-2,20.5\n10.5,0.5,nan,20\nnan,1,1,20\n"
-    )
-    read = read_tilt_csv(path)
-    assert read.utc_unix_s.tolist() == [10.5, 12.5]  # sorted, and only those with a time
-    assert read.theta_x / DEG == pytest.approx([0.5, 1])
-    assert read.theta_y[1] / DEG == pytest.approx(-2)
-    assert read.temperature_c.tolist() == [20, 20.5]
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["theta_y_deg,utc_unix_s,theta_x_deg\n-2,10,1\n", "# utc_unix_s, theta_x_deg, theta_y_deg\n10, 1, -2\n"],
-)
-def test_csv_in_any_order_without_temperature(tmp_path, text):
-    path = tmp_path / "tilt.csv"
-    path.write_text(text)
-    tilt = read_tilt_csv(path).average(10.0, 0.1)
-    assert (tilt.theta_x, tilt.theta_y) == pytest.approx((DEG, -2 * DEG))
-    assert np.isnan(tilt.temperature_c)
-
-
-HOSTILE = {
-    "empty": b"",
-    "header only": b"utc_unix_s,theta_x_deg,theta_y_deg\n",
-    "no header": b"1,2,3\n4,5,6\n",
-    "binary": bytes(range(256)) * 8,
-    "ragged": b"utc_unix_s,theta_x_deg,theta_y_deg\n1,2\n1,2,3,4\n",
-    "words": b"utc_unix_s,theta_x_deg,theta_y_deg\none,two,three\n",
-    "half a row": b"utc_unix_s,theta_x_deg,theta_y_deg\n1,2,3\n2,3",
-    "no commas": b"utc_unix_s theta_x_deg theta_y_deg\n1 2 3\n",
-    "nul": b"utc_unix_s,theta_x_deg,theta_y_deg\n1,2,\x00\n",
-    "a column twice": b"utc_unix_s,theta_x_deg,theta_y_deg,theta_x_deg\n1,2,3,4\n",
-}
-
-
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_hostile_csv_gives_one_sentence_that_names_the_file(tmp_path, kind):
-    path = tmp_path / "tilt.csv"
-    path.write_bytes(HOSTILE[kind])
-    with warnings.catch_warnings(), pytest.raises(TiltError) as e:
-        warnings.simplefilter("error")  # a warning would reach the user's screen
-        read_tilt_csv(path).average(1.0, 1.0)
-    assert "\n" not in str(e.value)
-    assert str(path) in str(e.value) or "tilt reading" in str(e.value)
-
-
-def test_missing_csv_and_folder(tmp_path):
-    for path in (tmp_path / "none.csv", tmp_path):
-        with pytest.raises(TiltError, match=r"no such file|not a readable table"):
-            read_tilt_csv(path)

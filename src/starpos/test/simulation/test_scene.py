@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.frames.reading import read_frame
-from starpos.instrument.inclinometer import a2_matrix, read_tilt_csv
+from starpos.instrument.inclinometer import a2_matrix
+from starpos.instrument.tilt_log import read_tilt_csv
 from starpos.simulation.night_on_disk import write_night
 from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render
 from starpos.sky.site import Site, camera_to_enu
