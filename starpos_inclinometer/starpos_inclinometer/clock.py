@@ -1,27 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The MCU's milliseconds to the time of a sample, without the jitter of the serial line and of the scheduler.
+"""Time of a sample from the MCU's milliseconds, free of the jitter of the serial line and of the scheduler.
 
-A line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the
-two clocks, and what lies above it is delay. The envelope is a line, because the clocks' rates differ: the
-lower hull's edge over the window's middle, the linear-programming fit of Moon, Skelly and Towsley (1999).
+A line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the two
+clocks, and whatever lies above it is delay. The envelope is a straight line with a slope, because the rates of the
+clocks differ. It is the edge of the lower hull at the middle of the window: the linear-programming fit of Moon, Skelly
+and Towsley (1999).
 """
 
 from collections import deque
+from collections.abc import Iterable
 
 WINDOW_S = 30.0
-MIN_SPAN_S = 10.0  # less says too little about the rate
+# A shorter span says too little about the rate.
+MIN_SPAN_S = 10.0
 REFIT_S = 1.0
-MAX_RATE_ERROR = 0.05  # an RC oscillator, not a crystal, and then some
-EARLY_S = 0.2  # a sample so far ahead of the envelope: the MCU's clock jumped
-LATE_S = 2.0  # so far behind: it was reset, or stood still
+# More than the error of an RC oscillator, let alone of a crystal.
+MAX_RATE_ERROR = 0.05
+# With a sample so far ahead of the envelope the MCU's clock has jumped.
+EARLY_S = 0.2
+# With a sample so far behind it the MCU was reset, or stood still.
+LATE_S = 2.0
 MAX_POINTS = 4096
 
 
 class ArrivalFilter:
-    """How late each sample arrived beyond the shortest delay seen lately. Starts anew after an MCU reset."""
+    """Finds how late each sample arrived beyond the shortest recent delay; starts again after a reset of the MCU."""
 
-    def __init__(self):
-        self.restarts = -1  # of the filter; the first sample starts it
+    def __init__(self) -> None:
+        # How often the filter started again; its first sample makes it 0.
+        self.restarts = -1
         self._points: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
         self._last_ms = 0
         self._time = 0.0
@@ -30,17 +37,18 @@ class ArrivalFilter:
 
     @property
     def rate_ppm(self) -> float:
-        """How much the MCU's clock is slow against the host's, 1e-6; 0 until it is known."""
+        """How slow the MCU's clock is against the host's, 1e-6; 0 until it is known."""
         return self._slope * 1e6
 
-    def restart(self):
-        """Forget the MCU's clock: it was reset, or may have been while nobody listened."""
+    def restart(self) -> None:
+        """Forget the MCU's clock: it was reset, or may have been reset while nobody listened."""
         self._points.clear()
 
     def delay(self, milliseconds: int, arrival_s: float) -> float:
-        """Seconds (>= 0) by which this sample arrived later than the line is quick.
+        """Delay of this sample in s (>= 0) beyond the shortest delay of the line.
 
-        milliseconds: the sample's, 32 bits.  arrival_s: of a clock that does not step (time.monotonic).
+        milliseconds: the MCU's time of the sample, 32 bits.
+        arrival_s: when it arrived, on a clock that does not step (time.monotonic).
         """
         if not self._points:
             return self._restart(milliseconds, arrival_s)
@@ -73,7 +81,7 @@ class ArrivalFilter:
         self._next_fit = REFIT_S
         return 0.0
 
-    def _fit(self):
+    def _fit(self) -> None:
         points = self._points
         first, last = points[0][0], points[-1][0]
         if last - first >= MIN_SPAN_S:
@@ -85,8 +93,8 @@ class ArrivalFilter:
         self._level = min(offset - self._slope * time for time, offset in points)
 
 
-def _lower_hull(points) -> list[tuple[float, float]]:
-    """The lower convex hull of points in the order of time (Andrew's monotone chain)."""
+def _lower_hull(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Find the lower convex hull of points in the order of time (Andrew's monotone chain)."""
     hull: list[tuple[float, float]] = []
     for t, o in points:
         if hull and t == hull[-1][0]:

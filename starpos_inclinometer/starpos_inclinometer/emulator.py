@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """An emulated inclinometer: the microcontroller's side of the protocol, byte for byte, on a pseudo-terminal.
 
-`Mcu` is the device without any I/O, its time given from outside; `Pty` is the cable; `Emulator` runs one
-on the other in real time.
+`Mcu` is the device without I/O; the caller gives it the time. `Pty` is the cable. `Emulator` runs an `Mcu` on a `Pty`
+in real time.
 """
 
 import argparse
@@ -24,15 +24,18 @@ from starpos_inclinometer.sources import mcu_protocol, sca100t
 FIRMWARE = 0x0100
 UNIT = 0x53494D00
 DEFAULT_RATE_HZ = 10
-ADC_NOISE_CODES = 27.0  # 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV a code
+# 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV per code.
+ADC_NOISE_CODES = 27.0
 LINE_S = mcu_protocol.SAMPLE_LINE * 10 / mcu_protocol.BAUD
-WINDOW_MS = 20  # of a burst of conversions; a sample is the mean of those of its period, as the firmware's
-POLL_S = 0.2  # how soon a stop is noticed while nothing is due
+# Length of a burst of conversions. As in the firmware, a sample is the mean of the bursts in its period.
+WINDOW_MS = 20
+# How soon a stop is noticed while nothing is due.
+POLL_S = 0.2
 
 
 @dataclass(frozen=True)
 class Faults:
-    """Probabilities a line, but flip: a bit."""
+    """Probabilities of faults: per line, except `flip`, which is per bit."""
 
     garbage: float = 0.0  # random bytes before the line
     drop: float = 0.0  # the line is lost
@@ -41,7 +44,7 @@ class Faults:
     flip: float = 0.0
 
     def apply(self, line: bytes, rng: random.Random) -> bytes:
-        """The bytes that arrive for a line that is sent."""
+        """Return the bytes that arrive when a line is sent."""
         if not any((self.garbage, self.drop, self.truncate, self.double, self.flip)):
             return line
         if rng.random() < self.drop:
@@ -59,15 +62,16 @@ class Faults:
 
 
 def delay_ms(rate_hz: int) -> int:
-    """From the middle of a sample to its line, as the firmware has it."""
+    """Time from the middle of a sample to its line, as in the firmware."""
     bursts = 1000 // WINDOW_MS // rate_hz
     return bursts * WINDOW_MS // 2 + 4
 
 
 class Mcu:
-    """The device: tilts in, bytes out. Times are seconds of one clock that does not step.
+    """The device: it takes tilts and gives bytes. Times are seconds of one clock that does not step.
 
-    tilt: called with a sample's time, returns (x, y) rad.  noise_rad: white, on each axis.
+    tilt: called with the time of a sample, returns (x, y) rad.
+    noise_rad: standard deviation of the white noise on each axis.
     """
 
     def __init__(
@@ -79,7 +83,7 @@ class Mcu:
         drift_ppm: float = 0.0,
         seed: int | None = None,
         calibration: sca100t.Sca100tCalibration | None = None,
-    ):
+    ) -> None:
         self.tilt = tilt
         self.noise_rad = noise_rad
         self.temperature_c = temperature_c
@@ -93,7 +97,7 @@ class Mcu:
         self.reset(0.0)
 
     def reset(self, now: float) -> bytes:
-        """Power up; what it sends first."""
+        """Power up and return the first bytes that it sends."""
         self._boot = now
         self._rate_hz = self._power_up_rate
         self._sequence = 0
@@ -103,16 +107,16 @@ class Mcu:
 
     @property
     def _period(self) -> float:
-        """From one sample to the next, which its own clock tells."""
+        """Time from one sample to the next, as its own clock runs."""
         return 1 / (self._rate_hz * self._tick)
 
     @property
     def due(self) -> float:
-        """When the next line has been sent."""
+        """Time at which the next line has been sent."""
         return self._next + delay_ms(self._rate_hz) * 1e-3 + LINE_S
 
     def sample(self) -> bytes:
-        """The next line."""
+        """Take the next sample and return its line."""
         at = self._next
         self._next = at + self._period
         if not self.frozen:
@@ -125,15 +129,15 @@ class Mcu:
         self._status = mcu_protocol.SampleStatus(0)
         return line
 
-    def skip_to(self, now: float):
-        """Forget what was due before `now`: the host was asleep, or nobody ran this."""
+    def skip_to(self, now: float) -> None:
+        """Drop the lines that were due long before `now`: the host was asleep, or nobody ran this."""
         if self.due < now - 1.0:
             missed = int((now - self.due) / self._period)
             self._sequence += missed
             self._next += missed * self._period
 
     def receive(self, data: bytes) -> bytes:
-        """The answers to what the host sends."""
+        """Return the answers to bytes from the host."""
         return b"".join(self._answer(body, right) for body, right in self._commands.feed(data))
 
     def _answer(self, body: bytes, right: bool) -> bytes:
@@ -165,20 +169,20 @@ class Mcu:
 
 
 class Pty:
-    """A pseudo-terminal, the host's end under `path` (and under the symbolic link, if one is asked for)."""
+    """A pseudo-terminal; `path` is the host's end (a symbolic link to it is made if one is asked for)."""
 
-    def __init__(self, link: str | None = None):
+    def __init__(self, link: str | None = None) -> None:
         self._link = link
         self.fd, host = os.openpty()
         tty.setraw(host)
         self.path = os.ttyname(host)
-        # With the host's end closed, poll tells whether anyone listens: a cable keeps nothing for later.
+        # With the host's end closed here, poll tells whether anyone listens: a cable stores no bytes.
         os.close(host)
         os.set_blocking(self.fd, False)
         if link:
             self._make_link(link)
 
-    def _make_link(self, link: str):
+    def _make_link(self, link: str) -> None:
         if os.path.lexists(link) and not os.path.islink(link):
             os.close(self.fd)
             raise FileExistsError(errno.EEXIST, "exists and is no symbolic link", link)
@@ -192,21 +196,21 @@ class Pty:
         poll.register(self.fd, select.POLLIN)
         return not any(event & select.POLLHUP for _, event in poll.poll(0))
 
-    def write(self, data: bytes):
-        """Send; what nobody reads is lost."""
+    def write(self, data: bytes) -> None:
+        """Send bytes; they are lost if nobody reads them."""
         if data and self.connected:
             with contextlib.suppress(BlockingIOError):
                 os.write(self.fd, data)
 
     def read(self) -> bytes:
-        """What the host has sent; empty where there is nothing, or nobody."""
+        """Return the bytes that the host has sent; empty if there are none, or no host."""
         try:
             return os.read(self.fd, 4096)
         except OSError:
             return b""
 
-    def close(self):
-        """Pull the cable."""
+    def close(self) -> None:
+        """Close the cable and remove its link."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
@@ -215,19 +219,19 @@ class Pty:
 
 
 class Emulator:
-    """An Mcu on a Pty in real time."""
+    """Runs an Mcu on a Pty in real time."""
 
     def __init__(
         self, mcu: Mcu, link: str | None = None, faults: Faults = Faults(), reset_every_s: float = 0.0
-    ):
+    ) -> None:
         self._mcu = mcu
         self._faults = faults
         self._reset_every_s = reset_every_s
         self._rng = random.Random(0)
         self.pty = Pty(link)
 
-    def run(self, stopped: Callable[[], bool]):
-        """Until stopped() is true, which is asked at least every POLL_S; leaves the cable pulled."""
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Run until stopped() is true, which is asked at least every POLL_S; then close the cable."""
         mcu, pty = self._mcu, self.pty
         try:
             pty.write(mcu.reset(time.monotonic()))
@@ -245,15 +249,15 @@ class Emulator:
         finally:
             pty.close()
 
-    def _wait(self, seconds: float):
-        """Until the time has come or the host has sent something."""
-        # Without a host the master is readable (hung up) all the time, so there only the time is waited for.
+    def _wait(self, seconds: float) -> None:
+        """Wait for the time, or until the host has sent something."""
+        # Without a host the master end is always readable (hung up), so only the time counts then.
         watched = [self.pty.fd] if self.pty.connected else []
         select.select(watched, [], [], max(seconds, 0.0))
 
 
-def main(arguments: list[str], stopped: list) -> int:
-    """The command `emulator`; ends when `stopped`, filled by a signal handler, is not empty."""
+def main(arguments: list[str], stopped: list[int]) -> int:
+    """Run the command `emulator` until a signal handler puts something into `stopped`."""
     options = _parser().parse_args(arguments)
     tilt = (math.radians(options.tilt_x), math.radians(options.tilt_y))
     mcu = Mcu(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The host's clock beside the monotonic one: when something was read, and whether the host's clock was stepped."""
+"""The host's clock and the monotonic clock read together: when bytes were read, and steps of the host's clock."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from starpos_common.system_clock import StepWatch
 
-QUICK_S = 1e-3  # the two clocks are read together within that, or again
+# If reading both clocks takes longer, they are read again.
+QUICK_S = 1e-3
 TRIES = 4
 
 
@@ -28,10 +29,11 @@ class Step:
 
 
 class HostClock:
-    """Reads both clocks as one and notices steps; to be read several times a second, by one thread.
+    """Reads both clocks at one moment and notices steps; one thread has to read it several times a second.
 
-    now_ns: the host's clock.  simulated: whether that is a simulation's, which goes as it likes and is not judged.
-    monotonic_ns: the one that is never set.
+    now_ns: the host's clock.
+    simulated: whether the host's clock is that of a simulation; no steps are looked for then.
+    monotonic_ns: the clock that is never set.
     """
 
     def __init__(
@@ -39,20 +41,21 @@ class HostClock:
         now_ns: Callable[[], int] = time.time_ns,
         simulated: Callable[[], bool] = lambda: False,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
-    ):
-        self.step: Step | None = None  # the last one
+    ) -> None:
+        self.step: Step | None = None  # the last step
         self.now_ns = now_ns
         self._monotonic_ns = monotonic_ns
         self._simulated = simulated
-        self._moment = Moment(0.0, 0)  # the last one
-        self._watch: StepWatch | None = None  # of these moments; none over a simulation's
+        self._moment = Moment(0.0, 0)  # the last moment
+        # Finds steps between the moments; None while the clock is simulated.
+        self._watch: StepWatch | None = None
 
     def monotonic_s(self) -> float:
-        """The monotonic clock alone; any thread may ask."""
+        """Read the monotonic clock alone; any thread may ask."""
         return self._monotonic_ns() * 1e-9
 
     def read(self) -> Moment:
-        """Now."""
+        """Read both clocks."""
         for _ in range(TRIES):
             before = self._monotonic_ns()
             host_ns = self.now_ns()
@@ -62,7 +65,8 @@ class HostClock:
         self._moment = Moment(before * 1e-9, host_ns)
         if self._simulated():
             self._watch = None
-        elif took_s < QUICK_S:  # what was interrupted between the clocks tells nothing
+        elif took_s < QUICK_S:
+            # A reading that was interrupted between the two clocks says nothing of a step.
             self._watch = self._watch or StepWatch(self._clocks)
             if step_s := self._watch.step_s():
                 self.step = Step(step_s, self._moment.monotonic_s)

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executables. The imports inside are heavy; they come after the signal handlers (see starpos_common)."""
+"""The executables. Their imports are heavy, so they come after the signal handlers (see starpos_common)."""
 
 import signal
 import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 
 def inclinometer() -> int:
-    """The node."""
+    """Run the node."""
     from starpos_common.node_main import run
 
-    def make_nodes():
+    def make_nodes() -> "Iterator[Node]":
         from starpos_inclinometer.node import InclinometerNode
 
         yield InclinometerNode()
@@ -18,8 +23,8 @@ def inclinometer() -> int:
 
 
 def emulator() -> int:
-    """The emulated microcontroller, until SIGINT or SIGTERM."""
-    stopped = []
+    """Run the emulated microcontroller until SIGINT or SIGTERM."""
+    stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     from starpos_inclinometer.emulator import main

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `inclinometer`: readings of one source to `tilt`."""
+"""The node `inclinometer`: publishes the readings of one source on `tilt`."""
 
 import time
 
 from rclpy.node import Node
 from rclpy.time import Time
 
+from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher
-from starpos_inclinometer.host_clock import HostClock
+from starpos_inclinometer.host_clock import HostClock, Step
 from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.report import Reporter, step_sentence
 from starpos_inclinometer.sources.reading import Health, Phase, Reading
@@ -21,30 +22,30 @@ from starpos_interfaces.msg import Tilt
 class InclinometerNode(Node):
     """Publishes starpos_interfaces/Tilt on `tilt`; see README.md."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("inclinometer")
         self._values = declare(self, PARAMETERS, apply=self._apply, check=lambda values, _: refusal(values))
         self._publisher = publisher(self, Tilt, "tilt", 100)
         self._logged: tuple[Phase, str] | None = None
-        self._logged_step = None
+        self._logged_step: Step | None = None
         self._reporter = Reporter()
         self._wake = self.create_guard_condition(self._on_wake)
         self.host_clock = HostClock(
-            lambda: self.get_clock().now().nanoseconds, lambda: self.get_clock().ros_time_is_active
+            lambda: self.get_clock().now().nanoseconds, lambda: time_is_simulated(self)
         )
         host = Surroundings(self, self.host_clock, self._wake.trigger)
         self._source = SOURCES[self._values["source"]](host, self._values)
         self._diagnostics = Diagnostics(self, {"Link": self._report}, self._source.name)
         self._source.start()
 
-    def destroy_node(self):
+    def destroy_node(self) -> None:
         self._source.stop()
         super().destroy_node()
 
-    def _apply(self, names: frozenset[str]):
+    def _apply(self, names: frozenset[str]) -> None:
         self._source.configure(self._values)
 
-    def _on_wake(self):
+    def _on_wake(self) -> None:
         urgent = False
         for reading in self._source.take():
             self._publisher.publish(self._message(reading))
@@ -67,7 +68,7 @@ class InclinometerNode(Node):
         return message
 
     def _log(self, health: Health) -> bool:
-        """One line for each change; whether there was one."""
+        """Log a line for each change; return whether there was one."""
         step, changed = health.step, (health.phase, health.sentence) != self._logged
         self._logged = (health.phase, health.sentence)
         # rclpy ties a severity to the line it is called from, so each has its own.
@@ -75,11 +76,11 @@ class InclinometerNode(Node):
             self.get_logger().info(health.sentence)
         elif changed:
             self.get_logger().warning(health.sentence)
-        stepped = step is not None and step != self._logged_step
-        if stepped:
-            self._logged_step = step
-            self.get_logger().warning(step_sentence(step.seconds))
-        return changed or stepped
+        if step is None or step == self._logged_step:
+            return changed
+        self._logged_step = step
+        self.get_logger().warning(step_sentence(step.seconds))
+        return True
 
     def _report(self) -> Diagnosis:
         health = self._source.health()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noise of samples, from the samples themselves."""
+"""Noise of the samples, estimated from the samples themselves."""
 
 import math
 from collections import deque
@@ -8,37 +8,44 @@ import numpy as np
 
 from starpos.instrument.tilt_log import ENOUGH_NEIGHBOURS, SIGNIFICANT, white_noise
 
-BLOCK_S = 0.1  # a sensor of 18 Hz remembers 9 ms: means over this are independent
-APART_S = 3.0  # blocks further apart than this tell of drift rather than noise
-LONG, SHORT = 200, 30  # differences of blocks: the estimate, and what notices that the noise has grown
+# A sensor of 18 Hz remembers 9 ms, so means over this time are independent.
+BLOCK_S = 0.1
+# Blocks further apart than this differ by drift rather than by noise.
+APART_S = 3.0
+# Numbers of block differences: the long run gives the estimate, the short one notices that the noise has grown.
+LONG, SHORT = 200, 30
 
 
 class NoiseTracker:
-    """The white noise, 1 sigma of one sample of each axis, as which averages of samples scatter.
+    """Estimates the white noise of each axis: `sigma` in rad for one sample, as averages of samples show it.
 
-    Neighbouring samples of a sensor with a bandwidth are alike, so it takes means over BLOCK_S, what they differ by from
-    one to the next, and the noise of one sample that a mean of so many independent ones would show.
+    Neighbouring samples of a sensor with a limited bandwidth are alike. So it takes the means over BLOCK_S and the
+    differences of successive means, and scales them to the noise of one sample as if the samples were independent.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._differences: deque[tuple[float, float]] = deque(maxlen=LONG)
         self.restart()
 
-    def restart(self):
-        """What comes is of another kind: another rate."""
-        self.sigma: tuple[float, float] | None = None  # None: too few samples yet
+    def restart(self) -> None:
+        """Start again, because the samples are of another kind now, such as another rate."""
+        # None: too few samples yet.
+        self.sigma: tuple[float, float] | None = None
         self._differences.clear()
         self.interrupt()
 
-    def interrupt(self):
-        """What comes does not go on from what came."""
-        self._before: tuple[float, int, float, float] | None = None  # begin, samples, means
-        self._block: list[float] | None = None  # begin, samples, sums
+    def interrupt(self) -> None:
+        """Begin a new block, because the next sample does not continue the last one."""
+        # Begin, number of samples, means.
+        self._before: tuple[float, float, float, float] | None = None
+        # Begin, number of samples, sums.
+        self._block: list[float] | None = None
 
-    def add(self, time_s: float, x: float, y: float):
-        """A sample at `time_s` of a clock that does not step."""
+    def add(self, time_s: float, x: float, y: float) -> None:
+        """Take a sample (rad) at `time_s` of a clock that does not step."""
         block = self._block
-        if block is not None and time_s - block[0] < 0.95 * BLOCK_S:  # samples each 0.1 s are a block each
+        # With the factor, samples that come every 0.1 s are one block each.
+        if block is not None and time_s - block[0] < 0.95 * BLOCK_S:
             block[1] += 1
             block[2] += x
             block[3] += y
@@ -47,7 +54,7 @@ class NoiseTracker:
             self._close(block)
         self._block = [time_s, 1, x, y]
 
-    def _close(self, block: list[float]):
+    def _close(self, block: list[float]) -> None:
         begin, n, x, y = block
         mean = (begin, n, x / n, y / n)
         before, self._before = self._before, mean
@@ -67,7 +74,7 @@ class NoiseTracker:
 
 
 def noise_text(sigma: tuple[float, float] | None) -> str:
-    """1 sigma rad of both axes, in arcsec."""
+    """Write the noise of both axes (1 sigma, rad) in arcsec."""
     if sigma is None:
         return "not known yet"
     return ", ".join(f"{math.degrees(s) * 3600:.2f}" for s in sigma)

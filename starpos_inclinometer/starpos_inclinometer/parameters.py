@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the node `inclinometer`; those of a source stand in its module."""
+"""Parameters of the node `inclinometer`; those of a source are in the module of the source."""
 
 import math
 from collections.abc import Mapping
@@ -43,12 +43,12 @@ COMMON = (
         maximum=10.0,
     ),
 )
-# sources may share parameters, as those on a serial port do
+# Two sources may share a parameter, as the two on a serial port do.
 PARAMETERS = tuple(
     {p.name: p for p in (*COMMON, *(p for s in SOURCES.values() for p in s.parameters))}.values()
 )
 
 
 def refusal(values: Mapping[str, Any]) -> str | None:
-    """Why the chosen source cannot be made of these values, in one sentence; None where it can."""
+    """Say in a sentence why the chosen source cannot be made of these values; None if it can."""
     return SOURCES[values["source"]].refusal(values)

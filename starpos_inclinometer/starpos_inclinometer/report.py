@@ -1,27 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A source's health and the flags of its samples as one line of /diagnostics."""
+"""Diagnostic of a source: its health and the flags of its samples as one line of /diagnostics."""
 
 from collections import Counter
 
 from starpos_common.diagnostics import Diagnosis, Level
 from starpos_inclinometer.sources.reading import OUT_OF_RANGE, SATURATED, STUCK, Counts, Health, Phase
 
-BAD_SHARE = 0.05  # of lines corrupted or lost since the last report, above which the link is worth a warning
+# Above this share of corrupted or lost lines since the last report the link gets a warning.
+BAD_SHARE = 0.05
 STEP_SHOWN_S = 30.0
 FLAGS = {"stuck": STUCK, "saturated": SATURATED, "out of range": OUT_OF_RANGE}
 
 
 class Reporter:
-    """Makes reports; each counts what has come since the one before."""
+    """Makes reports; each counts the samples since the report before."""
 
-    def __init__(self):
-        self._flags = Counter()
+    def __init__(self) -> None:
+        self._flags: Counter[str] = Counter()
         self._samples = 0
         self._counts = Counts()
-        self._known = 0  # flags the last report told of
+        # The flags that are already reported.
+        self._known = 0
 
     def count(self, flags: int) -> bool:
-        """A sample's flags; whether one is set that the last report did not tell of."""
+        """Count the flags of a sample; return whether one of them was not reported yet."""
         self._samples += 1
         for name, bit in FLAGS.items():
             self._flags[name] += bool(flags & bit)
@@ -30,7 +32,7 @@ class Reporter:
         return bool(new)
 
     def report(self, health: Health, now_s: float) -> Diagnosis:
-        """now_s: monotonic."""
+        """Make the report of a source; now_s is monotonic."""
         counts, before, self._counts = health.counts, self._counts, health.counts
         flags, self._flags = self._flags, Counter()
         samples, self._samples = self._samples, 0

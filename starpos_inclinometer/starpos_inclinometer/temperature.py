@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sensor's temperature out of coarse readings, some of which are missing; and how well it is known."""
+"""Temperature of the sensor and its error, from coarse readings of which some are missing."""
 
 import math
 
-SMOOTHING_S = 60.0  # the sensor's body warms no faster
-STEP_C = 0.92  # of the readings
-AGEING_C_PER_S = 2.0 / 60  # how far it may go while nobody reads it
-UNKNOWN_STDDEV_C = 40.0  # nothing is known: anywhere from -40 to 125 deg C
+# The body of the sensor warms no faster.
+SMOOTHING_S = 60.0
+# Step from one reading to the next possible one.
+STEP_C = 0.92
+# How fast the temperature may drift while nobody reads it.
+AGEING_C_PER_S = 2.0 / 60
+# Without any reading the temperature may be anywhere from -40 to 125 deg C.
+UNKNOWN_STDDEV_C = 40.0
 
 
 class Temperature:
-    """Smooths readings that are STEP_C apart, and knows its error, which grows while they are missing."""
+    """Smooths readings in steps of STEP_C; its error grows while readings are missing."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._value = math.nan
         self._read_s = self._now_s = 0.0
 
-    def add(self, time_s: float, celsius: float):
-        """A reading at `time_s` of a clock that does not step; NaN where it is missing."""
+    def add(self, time_s: float, celsius: float) -> None:
+        """Take a reading at `time_s` of a clock that does not step; NaN for a missing one."""
         elapsed = max(time_s - self._read_s, 0.0)
         self._now_s = time_s
         if math.isnan(celsius):
@@ -29,12 +33,12 @@ class Temperature:
         self._read_s = time_s
 
     def celsius(self, otherwise: float) -> float:
-        """The newest known, or `otherwise` where none is."""
+        """The newest known temperature, or `otherwise` if there is none."""
         return otherwise if math.isnan(self._value) else self._value
 
     @property
     def stddev_c(self) -> float:
-        """1 sigma of what `celsius` says."""
+        """Standard deviation of the temperature that `celsius` gives."""
         if math.isnan(self._value):
             return UNKNOWN_STDDEV_C
         age_s = max(self._now_s - self._read_s, 0.0)

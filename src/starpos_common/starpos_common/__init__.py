@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every starpos node shares: clean exits, validated parameters, diagnostics, message conversions."""
+"""Code that all starpos nodes share: clean exits, validated parameters, diagnostics, message conversions."""

@@ -4,22 +4,31 @@
 import time
 from collections.abc import Callable
 
+from rclpy.clock import ROSClock
 from rclpy.node import Node
 
 from starpos_common import system_clock
 from starpos_common.diagnostics import Diagnosis, Level
 
-TOLD_S = 30.0  # how long a step is told
+# How long a step stays in the report.
+TOLD_S = 30.0
 ARCSEC_PER_S = 15.041  # of longitude
 
 
-class ClockReport:
-    """Whether stamps can be believed; a step is logged once. `matters`: False while no stamp comes from this clock.
+def time_is_simulated(node: Node) -> bool:
+    """Tell whether the node takes its time from /clock (use_sim_time)."""
+    clock = node.get_clock()
+    return isinstance(clock, ROSClock) and clock.ros_time_is_active
 
-    `watch`: of the system's clock, asked with every report, once a second.
+
+class ClockReport:
+    """Reports whether stamps can be trusted, once a second, and logs each step of the clock once.
+
+    matters: returns False while no stamp comes from this clock.
+    watch: finds the steps of the system's clock.
     """
 
-    def __init__(self, node: Node, matters: Callable[[], bool] = lambda: True):
+    def __init__(self, node: Node, matters: Callable[[], bool] = lambda: True) -> None:
         self._node = node
         self._matters = matters
         self.watch = system_clock.StepWatch()
@@ -27,16 +36,17 @@ class ClockReport:
         self._stepped_at = -TOLD_S  # monotonic, s
 
     def __call__(self) -> Diagnosis:
-        if self._node.get_clock().ros_time_is_active:
+        if time_is_simulated(self._node):
             return Diagnosis(Level.OK, "time is simulated (use_sim_time).")
         now = time.monotonic()
         set_s = self.watch.set_s()
         step, self._set_s = set_s - self._set_s, set_s
-        if abs(step) > system_clock.STEP_S:  # not what was set and set back at once
+        # A clock that was set and set back between two reports made no step.
+        if abs(step) > system_clock.STEP_S:
             self._step_s, self._stepped_at = step, now
             self._node.get_logger().warning(f"{self._said(step)}.")
         state = system_clock.read()
-        values = {"last step (s)": self._step_s}
+        values: dict[str, object] = {"last step (s)": self._step_s}
         if state is not None:
             values |= {
                 "synchronised": state.synchronised,

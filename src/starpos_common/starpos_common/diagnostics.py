@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/diagnostics once a second, in diagnostic_updater's conventions (which PyPI's ROS does not carry)."""
+"""Publishing of /diagnostics once a second, in diagnostic_updater's conventions (which PyPI's ROS does not carry)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a task has to say: a level, a sentence, and named values (numbers, strings, booleans)."""
+    """Result of a diagnostic task: a level, a sentence, and named values (numbers, strings, booleans)."""
 
     level: Level
     message: str
@@ -32,12 +32,14 @@ class Diagnosis:
 class Diagnostics:
     """Publishes one DiagnosticStatus `node: Task` for every task, at 1 Hz of real time.
 
-    In a namespace it is `/namespace/node: Task`, as of diagnostic_updater with use_fqn: the topic is everybody's.
-    Real time, because a health report must not stop with a paused simulation or flood a fast replay; the
-    stamp is the node's own time. `hardware_id` may be changed at any time.
+    In a namespace the name is `/namespace/node: Task`, as diagnostic_updater writes it with use_fqn, because all
+    nodes share the topic. The rate is in real time: a health report must not stop with a paused simulation, nor
+    flood a fast replay. The stamp is the node's own time. `hardware_id` may be changed at any time.
     """
 
-    def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Diagnosis]], hardware_id: str = "none"):
+    def __init__(
+        self, node: Node, tasks: Mapping[str, Callable[[], Diagnosis]], hardware_id: str = "none"
+    ) -> None:
         self.hardware_id = hardware_id
         self._node = node
         self._name = node.get_name() if node.get_namespace() == "/" else node.get_fully_qualified_name()
@@ -46,8 +48,8 @@ class Diagnostics:
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(PERIOD_S, self.publish, clock=self._steady)
 
-    def publish(self):
-        """Publish now, besides the 1 Hz; for changes that should not wait."""
+    def publish(self) -> None:
+        """Publish at once, for a change that should not wait for the timer."""
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [self._status(name, task) for name, task in self._tasks.items()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that takes seconds, in a thread beside the node, which goes on meanwhile."""
+"""Jobs of several seconds, done in a thread while the node goes on."""
 
 import threading
 import traceback
@@ -17,16 +17,16 @@ from starpos.errors import StarposError
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job returned, or the sentence that says why it has not."""
+    """The value that a job returned, or the sentence that says why it failed."""
 
     value: Any = None
     trouble: str = ""
 
 
 class JobRunner:
-    """One job at a time; its end comes back into the node's executor."""
+    """Runs one job at a time and gives its outcome back in the node's executor."""
 
-    def __init__(self, node: Node):
+    def __init__(self, node: Node) -> None:
         self._node = node
         self._ended = node.create_guard_condition(self._on_ended)
         self._future: Future | None = None
@@ -37,23 +37,26 @@ class JobRunner:
         return self._future is not None
 
     def run(self, job: Callable[[], Any]) -> Future:
-        """Start a job; a Future of its Outcome, to await or to hang a callback on.  Not while it is busy."""
+        """Start a job and return the Future of its Outcome. Must not be called while a job runs."""
         assert self._future is None
         self._future = Future()
         threading.Thread(target=self._work, args=(job,), daemon=True).start()
         return self._future
 
-    def _work(self, job):
+    def _work(self, job: Callable[[], Any]) -> None:
         try:
             self._outcome = Outcome(job())
         except StarposError as e:
             self._outcome = Outcome(trouble=str(e))
-        except Exception as e:  # a defect costs this job, not the node
+        except Exception as e:
+            # A defect ends this job, not the node.
             self._node.get_logger().error(traceback.format_exc())
             self._outcome = Outcome(trouble=f"it failed ({type(e).__name__}: {e})")
-        with suppress(InvalidHandle):  # the node has ended meanwhile
+        # The node may have ended meanwhile.
+        with suppress(InvalidHandle):
             self._ended.trigger()
 
-    def _on_ended(self):
+    def _on_ended(self) -> None:
         future, self._future = self._future, None
+        assert future is not None
         future.set_result(self._outcome)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""starpos' types as messages; `starpos.recording.messages` is the way back."""
+"""Conversion of starpos' types to messages; `starpos.recording.messages` converts back."""
 
 import array
 import sys
@@ -21,9 +21,9 @@ MAX_UNIX_S = 2**31 - 1e-6  # the end of Time.sec, in January 2038
 
 
 def unix_to_stamp(unix_s: float | None) -> Time:
-    """The inverse, rounded to the microsecond (a double holds no more); 0 for None.
+    """Convert a Unix time (s) to a stamp, rounded to the microsecond (a double holds no more); None gives 0.
 
-    TimeError outside 1970 .. 2038.
+    Raises TimeError outside 1970 .. 2038.
     """
     if unix_s is None:
         return Time()
@@ -34,7 +34,7 @@ def unix_to_stamp(unix_s: float | None) -> Time:
 
 
 def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
-    """A StarArray."""
+    """Convert stars to a StarArray."""
     covariance = stars.covariance.reshape(-1, 4)
     columns = zip(
         stars.x.tolist(),
@@ -57,7 +57,7 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
 
 
 def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0) -> msg.Tilt:
-    """A starpos_interfaces/Tilt."""
+    """Convert a tilt to starpos_interfaces/Tilt."""
     return msg.Tilt(
         header=Header(stamp=unix_to_stamp(tilt.utc_unix_s), frame_id=frame_id),
         x=float(tilt.theta_x),
@@ -70,7 +70,7 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
 
 
 def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None) -> CameraInfo:
-    """A CameraInfo with the plumb_bob model and no rectification."""
+    """Convert a camera to a CameraInfo with the plumb_bob model and no rectification."""
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     return CameraInfo(
         header=Header(stamp=unix_to_stamp(unix_s), frame_id=frame_id),
@@ -85,16 +85,17 @@ def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None
 
 
 def encoding_of(frame: Frame) -> str:
-    """What sensor_msgs/Image calls such pixels."""
+    """The name in sensor_msgs/Image for a frame's pixels, such as mono16 or bayer_rggb8."""
     layout = "bgr" if frame.pixels.ndim == 3 else f"bayer_{frame.pattern}" if frame.pattern else "mono"
     return f"{layout}{8 * frame.pixels.itemsize}"
 
 
 def frame_to_message(frame: Frame, frame_id: str) -> Image:
-    """An Image; the pixels are copied once."""
+    """Convert a frame to an Image; the pixels are copied once."""
     pixels = np.ascontiguousarray(frame.pixels)
-    data = array.array("B")  # rclpy takes this as it is and copies, or checks byte by byte, anything else
-    data.frombytes(memoryview(pixels).cast("B"))
+    # rclpy takes an array of bytes as it is; anything else it copies, or checks byte by byte.
+    data = array.array("B")
+    data.frombytes(pixels.data.cast("B"))
     return Image(
         header=Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=frame_id),
         width=frame.width,

@@ -1,45 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.
 
-Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up is a clean
-exit too; an executable's module therefore imports its node inside `make_nodes`.
+Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up also gives a
+clean exit. The module of an executable therefore imports its node inside `make_nodes`.
 """
 
 import os
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-# rclpy's signal handler wakes the executor at once, except now and then when two signals come together (7.1).
+# rclpy's signal handler wakes the executor at once, but rarely misses it when two signals come together (rclpy 7.1).
+# So the main loop looks itself that often.
 NOTICE_S = 0.5
 
 
-def run(make_nodes, args=None) -> int:
-    """Run the nodes that `make_nodes()` yields until they are told to stop; the process's exit status.
+def run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None = None) -> int:
+    """Run the nodes that `make_nodes()` yields until they are told to stop; return the process's exit status.
 
-    make_nodes: a generator, begun after rclpy.init; may raise StarposError or one of rclpy's parameter errors to refuse
-    to start.  args: the command line, by default sys.argv.
+    make_nodes: a generator, started after rclpy.init; it may raise StarposError or one of rclpy's parameter errors to
+    refuse to start.
+    args: the command line, by default sys.argv.
 
-    0 after SIGINT (once or twice) or SIGTERM; 1 with one line on standard error when the start is refused.
-    Anything else a callback raises is a defect and leaves with its traceback.
+    The status is 0 after SIGINT (once or twice) or SIGTERM, and 1 with one line on standard error when the start is
+    refused. Any other exception of a callback is a defect: it ends the process with its traceback.
     """
-    stopped = []
+    stopped: list[int] = []
     for number in SIGNALS:
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     try:
         return _run(make_nodes, args, stopped)
     finally:
-        # launch sends a second SIGINT: it must not meet the default handler while the interpreter ends.
+        # launch sends a second SIGINT: the default handler must not get it while the interpreter ends.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
 
 def leave(status: int) -> int:
-    """The status, for an executable whose node has threads; where one still works, end the process with it at once.
+    """Return the status; if a thread of the node still works, end the process with that status at once.
 
-    The interpreter would stop such a thread in the middle of compiled code, which may abort the process.
+    At a normal exit the interpreter stops such a thread in the middle of compiled code, which may abort the process.
     """
     if len(threading.enumerate()) > 1:
         sys.stdout.flush()
@@ -48,7 +55,7 @@ def leave(status: int) -> int:
     return status
 
 
-def _run(make_nodes, args, stopped) -> int:
+def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, stopped: list[int]) -> int:
     import rclpy
     from rclpy._rclpy_pybind11 import RCLError
     from rclpy.exceptions import ParameterException
@@ -63,15 +70,17 @@ def _run(make_nodes, args, stopped) -> int:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:
-        # A bad command line or parameter file; rcl has an error class for each.
+        # The command line or a parameter file is wrong; rcl has an error class for each.
         return 0 if stopped else _refuse(error)
-    nodes, made = [], False
+    nodes: list[Node] = []
+    made = False
     try:
         for node in make_nodes():
             nodes.append(node)
         made = True
         warn_of_unknown(nodes)
-        # rclpy's handlers shut the context down, which would trip over a node half made; ours run as well.
+        # rclpy's handlers shut the context down, which fails while a node is half made: they come only now.
+        # Our own handlers still run.
         install_signal_handlers(SignalHandlerOptions.ALL)
         executor = SingleThreadedExecutor()
         for node in nodes:
@@ -86,7 +95,7 @@ def _run(make_nodes, args, stopped) -> int:
         if not stopped and rclpy.ok():
             raise
     except Exception:
-        # With the context gone, whatever a callback was about to do fails: that is part of stopping.
+        # Without the context a callback that still runs fails: that is part of stopping.
         if not stopped and rclpy.ok():
             raise
     finally:

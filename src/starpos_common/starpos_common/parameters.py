@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters from one table: declared with descriptors, validated in sentences, applied once they are set."""
+"""Parameters from one table: declared with descriptors, refused with a sentence, applied once they are set."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ class ParameterError(StarposError):
 
 @dataclass(frozen=True)
 class Form:
-    """What a text must look like. `constraint` is the rest of the sentence 'NAME must be ...'."""
+    """Rule for a text. `constraint` is the rest of the sentence 'NAME must be ...'."""
 
     constraint: str
     fits: Callable[[str], bool]
@@ -37,13 +37,14 @@ FRAME_NAME = Form(
 class Parameter:
     """One parameter of a node.
 
-    default      bool, int, float, str, or a tuple of one of these; it fixes the type, and a tuple its length.
-                 NaN: the parameter may be NaN, which means unset. Else NaN is refused; infinity always is.
+    default      bool, int, float, str, or a tuple of one of these; it fixes the type, and the length of a tuple.
+                 With a NaN default the parameter may be NaN, which means unset. Otherwise NaN is refused; infinity
+                 is always refused.
     description  what it is, and what goes wrong when it is wrong
     unit         '' for a bare number or a text
-    minimum, maximum   inclusive, of numbers (of each number of a tuple); None: unbounded
+    minimum, maximum   inclusive bounds of a number (of each number of a tuple); None: unbounded
     choices      the allowed values; () for any
-    form         of a text; None for any
+    form         the rule for a text; None for any
     read_only    cannot be changed while the node runs
     """
 
@@ -60,7 +61,7 @@ class Parameter:
 
     @property
     def items(self) -> tuple:
-        """The default as a tuple, of one for a scalar."""
+        """The default as a tuple; a scalar gives a tuple of one."""
         return self.default if isinstance(self.default, tuple) else (self.default,)
 
     @property
@@ -89,10 +90,10 @@ class Parameter:
             text = f"{len(self.default)} values, each {text}"
         return text + (", or nan for unset" if self.may_be_nan else "")
 
-    def convert(self, value):
-        """`value` as this parameter's type (whole numbers become floats where floats are meant).
+    def convert(self, value: Any) -> Any:
+        """Convert a value to this parameter's type (a whole number becomes a float where the default is one).
 
-        Raises ParameterError with the constraint where it is not allowed.
+        Raises ParameterError with the constraint if the value is not allowed.
         """
         if isinstance(self.default, tuple):
             sequence = not isinstance(value, (str, bytes)) and isinstance(value, (Sequence, memoryview))
@@ -102,7 +103,7 @@ class Parameter:
             return tuple(self._convert_item(item, value) for item in values)
         return self._convert_item(value, value)
 
-    def _convert_item(self, item, whole):
+    def _convert_item(self, item: Any, whole: Any) -> Any:
         kind = type(self.items[0])
         if kind is float and type(item) is int:
             item = float(item)
@@ -120,12 +121,12 @@ class Parameter:
             raise self._error(whole)
         return item
 
-    def _error(self, value) -> ParameterError:
+    def _error(self, value: Any) -> ParameterError:
         shown = value.tolist() if hasattr(value, "tolist") else value
         return ParameterError(f"parameter {self.name} must be {self.constraint}; {shown!r:.200} was given.")
 
     def descriptor(self) -> ParameterDescriptor:
-        """Its descriptor. With a NaN default it leaves out the native range, which would refuse NaN."""
+        """Make its descriptor, without the range of ROS where the default is NaN, because that range would refuse NaN."""
         unit = f" [{self.unit}]" if self.unit else ""
         descriptor = ParameterDescriptor(
             name=self.name,
@@ -137,28 +138,28 @@ class Parameter:
         bounded = self.minimum is not None or self.maximum is not None
         kind = type(self.default)
         if bounded and kind is int:
-            low = INT64_MIN if self.minimum is None else int(self.minimum)
-            high = INT64_MAX if self.maximum is None else int(self.maximum)
-            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=0)]
+            first = INT64_MIN if self.minimum is None else int(self.minimum)
+            last = INT64_MAX if self.maximum is None else int(self.maximum)
+            descriptor.integer_range = [IntegerRange(from_value=first, to_value=last, step=0)]
         elif bounded and kind is float and not self.may_be_nan:
             low = -math.inf if self.minimum is None else float(self.minimum)
             high = math.inf if self.maximum is None else float(self.maximum)
             descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
         return descriptor
 
-    def ros_value(self, value):
-        """`value` as rclpy wants it: lists for tuples."""
+    def ros_value(self, value: Any) -> Any:
+        """Convert a value to the type that rclpy wants: a tuple to a list."""
         return list(value) if isinstance(value, tuple) else value
 
 
-class Values(Mapping):
-    """The parameters' present values by name; tuples for lists."""
+class Values(Mapping[str, Any]):
+    """The present values of the parameters by name; a list is a tuple here."""
 
-    def __init__(self, node: Node, table: Mapping[str, Parameter]):
+    def __init__(self, node: Node, table: Mapping[str, Parameter]) -> None:
         self._node = node
         self._table = table
 
-    def __getitem__(self, name: str):
+    def __getitem__(self, name: str) -> Any:
         return self._table[name].convert(self._node.get_parameter(name).value)
 
     def __iter__(self) -> Iterator[str]:
@@ -174,17 +175,17 @@ def declare(
     apply: Callable[[frozenset[str]], None] | None = None,
     check: Callable[[Mapping[str, Any], frozenset[str]], str | None] | None = None,
 ) -> Values:
-    """Declare a node's parameters; a live view of their values.
+    """Declare a node's parameters and return a live view of their values.
 
-    apply: called with the names that were set, after a successful change at run time (not here).
-    check: called with all values as they would be, and the names that are set (here: all); a sentence where they do not
-    fit together, or None.
-    Raises ParameterError where a value given at start-up (command line, YAML) is not allowed.
+    apply: called with the names that were set, after a successful change at run time (not for the values at start-up).
+    check: called with all values as they would be, and the names that are set (at start-up: all); returns a sentence if
+    the values do not fit together, otherwise None.
+    Raises ParameterError if a value given at start-up (command line, YAML) is not allowed.
     """
     table = {p.name: p for p in parameters}
     values = Values(node, table)
     for p in parameters:
-        # Any type is taken first: rclpy would refuse `5` for a float, and its errors name no constraint.
+        # Any type is accepted first: rclpy would refuse `5` for a float, and its errors name no constraint.
         node.declare_parameter(p.name, p.ros_value(p.default), ParameterDescriptor(dynamic_typing=True))
         value = p.convert(node.get_parameter(p.name).value)
         node.set_parameters([rclpy.parameter.Parameter(p.name, value=p.ros_value(value))])
@@ -203,13 +204,14 @@ def declare(
         wanted = {c.name: table[c.name].convert(c.value) for c in changes if c.name in table}
         try:
             reason = check({**values, **wanted}, frozenset(wanted)) if check and wanted else None
-        except Exception as error:  # a defect costs this change, not the night
+        except Exception as error:
+            # A defect costs this change only; the node goes on.
             reason = f"the new values could not be checked ({type(error).__name__}: {str(error)[:200]})"
         return SetParametersResult(successful=not reason, reason=reason or "")
 
-    def applied(changes: list[rclpy.parameter.Parameter]):
+    def applied(changes: list[rclpy.parameter.Parameter]) -> None:
         names = frozenset(c.name for c in changes if c.name in table)
-        if names:
+        if apply and names:
             apply(names)
 
     node.add_pre_set_parameters_callback(prepare)
@@ -220,10 +222,11 @@ def declare(
 
 
 def warn_of_unknown(nodes: Sequence[Node]) -> None:
-    """A line in the log for each parameter given to one of a process's nodes that it does not have, once all are made.
+    """Log a warning for each parameter that was given to a node of this process and that the node does not have.
 
-    ROS drops them without a word, and a mistyped one would stay at its default. `-p NAME:=VALUE` reaches every node of a
-    process: what one of them has, and was given as well, is meant for that one.
+    ROS drops such a parameter silently, and a mistyped one would stay at its default. `-p NAME:=VALUE` reaches every
+    node of a process: if another node was given the parameter and has it, no warning is needed.
+    Call it when all nodes are made.
     """
     for node in nodes:
         known = node.list_parameters([], 0).names
@@ -238,17 +241,18 @@ def warn_of_unknown(nodes: Sequence[Node]) -> None:
 
 
 def _given(node: Node) -> Mapping[str, Any]:
-    return node._parameter_overrides  # rclpy has no public way to what was given
+    # rclpy has no public access to what was given.
+    return node._parameter_overrides
 
 
 class _Refused(rclpy.parameter.Parameter):
-    """Stands for a change that is not allowed, with the present value, until the sentence can be answered.
+    """Takes the place of a change that is not allowed, with the present value, until the change can be refused.
 
-    Between the callbacks rclpy checks types and ranges by itself, in words that name neither the unit nor, where the type
-    is wrong, the parameter.
+    Between the two callbacks rclpy checks types and ranges itself. Its messages lack the unit, and the name of a
+    parameter of a wrong type; with the present value its checks pass, and `validate` refuses with our sentence.
     """
 
-    def __init__(self, present: rclpy.parameter.Parameter, reason: str):
+    def __init__(self, present: rclpy.parameter.Parameter, reason: str) -> None:
         super().__init__(present.name, present.type_, present.value)
         self.reason = reason
 
@@ -256,7 +260,7 @@ class _Refused(rclpy.parameter.Parameter):
 def _prepared(
     node: Node, parameter: Parameter, change: rclpy.parameter.Parameter
 ) -> rclpy.parameter.Parameter:
-    """Whole numbers as floats where floats are meant, so that `ros2 param set ... 5` works."""
+    """Convert a whole number to a float where the parameter is one, so that `ros2 param set ... 5` works."""
     try:
         return rclpy.parameter.Parameter(
             change.name, value=parameter.ros_value(parameter.convert(change.value))
@@ -266,7 +270,7 @@ def _prepared(
 
 
 def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
-    """A parameter file with every default, each under a comment with its meaning, unit and constraint."""
+    """Write a parameter file with every default, each below a comment with its meaning, unit and constraint."""
     lines = ["# SPDX-License-Identifier: Apache-2.0", f"/**/{node_name}:", "  ros__parameters:"]
     for p in parameters:
         fixed = "; fixed while the node runs" if p.read_only else ""
@@ -275,7 +279,7 @@ def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _yaml(value) -> str:
+def _yaml(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(map(_yaml, value)) + "]"
     if isinstance(value, bool):
@@ -283,12 +287,8 @@ def _yaml(value) -> str:
     if isinstance(value, str):
         return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
     if isinstance(value, float):
-        # rcl's YAML reads 1e5 as a text without the point.
-        return (
-            ".nan"
-            if math.isnan(value)
-            else repr(value)
-            if "e" not in repr(value)
-            else f"{value:.17f}".rstrip("0")
-        )
+        if math.isnan(value):
+            return ".nan"
+        # rcl's YAML parser reads 1e5, which has no point, as a text.
+        return repr(value) if "e" not in repr(value) else f"{value:.17f}".rstrip("0")
     return str(value)

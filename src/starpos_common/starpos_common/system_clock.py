@@ -1,25 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the kernel says of this machine's clock: whether anything keeps it to UTC, and how far off it may be.
+"""State of this machine's clock from the kernel: whether anything keeps it to UTC, and how far off it may be.
 
-Source: adjtimex(2); maxerror is in NTP's sense, the most the clock may be off (RFC 5905, root distance), and grows by
-500 ppm while nobody corrects it. chrony, systemd-timesyncd, ntpd and linuxptp all keep it.
+Source: adjtimex(2). maxerror has NTP's meaning: the largest possible error of the clock (RFC 5905, root distance). It
+grows by 500 ppm while nothing corrects the clock. chrony, systemd-timesyncd, ntpd and linuxptp all maintain it.
 """
 
 import ctypes
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from starpos.units import DAY_S
 
 STA_UNSYNC = 0x0040
-TIME_ERROR = 5  # adjtimex's answer of a clock that is not synchronised
-UNIFORM = math.sqrt(3)  # bound over standard deviation of what is as likely anywhere within it
+TIME_ERROR = 5  # adjtimex's answer if the clock is not synchronised
+# Ratio of the bound to the standard deviation of a uniform distribution.
+UNIFORM = math.sqrt(3)
 STEP_S = 0.1
 QUICK_S, TRIES = 1e-3, 10
-UNKNOWN_S = DAY_S / math.sqrt(12)  # any time of the day
-SLEW = 0.1  # the quickest slewing in use (chrony's maxslewrate is 0.083): more than this is a step
+# Standard deviation of a time that may be any time of the day.
+UNKNOWN_S = DAY_S / math.sqrt(12)
+# More than the quickest slewing in use (chrony's maxslewrate is 0.083); anything quicker is a step.
+SLEW = 0.1
 
 
 class _Timex(ctypes.Structure):
@@ -43,7 +47,7 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True)
 class SystemClock:
-    """max_error_s, est_error_s: the kernel's bound and estimate of what the clock is off UTC."""
+    """Whether the clock is kept to UTC, and the kernel's bound and estimate of its error."""
 
     synchronised: bool
     max_error_s: float
@@ -51,9 +55,9 @@ class SystemClock:
 
     @property
     def stddev_s(self) -> float:
-        """Standard deviation to claim: of anything within the bound.
+        """Standard deviation of the clock's error, taken as uniform within the bound.
 
-        Where nothing keeps the clock there is no bound (the kernel's own number stops at 16 s): any time of the day.
+        While nothing keeps the clock there is no bound (the kernel's number stops at 16 s): any time of day is possible.
         """
         if not self.synchronised:
             return UNKNOWN_S
@@ -70,7 +74,7 @@ class SystemClock:
 
 
 def read() -> SystemClock | None:
-    """The state of now; None where the system does not tell (a container may forbid it)."""
+    """Read the present state; None if the system does not tell it (a container may forbid it)."""
     state = _Timex()
     try:
         answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(state))
@@ -83,7 +87,7 @@ def read() -> SystemClock | None:
 
 
 def both_clocks() -> tuple[float, float]:
-    """UTC and the monotonic clock at one moment (s): read again where something came between the two."""
+    """Read UTC and the monotonic clock at one moment (s), again if something delayed the second reading."""
     for _ in range(TRIES):
         before = time.monotonic()
         utc = time.time()
@@ -93,32 +97,33 @@ def both_clocks() -> tuple[float, float]:
 
 
 class StepWatch:
-    """Tells when the system's clock was set: moved against the clock that nobody sets, faster than any slewing.
+    """Finds steps of the system's clock: it moved against the monotonic clock faster than any slewing.
 
-    To be asked often, once a second or more: over a long time slewing moves a clock as far as a step does.
-    clocks: gives (UTC, monotonic) in s at one moment.
+    Ask at least once a second: over a long time slewing moves a clock as far as a step does.
+    clocks: returns (UTC, monotonic) in s at one moment.
     """
 
-    def __init__(self, clocks=both_clocks):
+    def __init__(self, clocks: Callable[[], tuple[float, float]] = both_clocks) -> None:
         self._clocks = clocks
-        self._lock = threading.Lock()  # one thread takes frames, another reports
+        # One thread takes frames, another reports.
+        self._lock = threading.Lock()
         self._utc, self._monotonic = clocks()
         self._set_s = 0.0
 
     def step_s(self) -> float:
-        """How far it was set since the last call, ahead counts positive; 0 where it was not."""
+        """How far the clock was set since the last call (ahead is positive); 0 if it was not set."""
         with self._lock:
             before = self._set_s
             self._look()
             return self._set_s - before
 
     def set_s(self) -> float:
-        """How far it was set in all since this watch began: what another thread asked meanwhile is in it."""
+        """How far the clock was set in total since this watch began, whichever thread asked meanwhile."""
         with self._lock:
             self._look()
             return self._set_s
 
-    def _look(self):
+    def _look(self) -> None:
         utc, monotonic = self._clocks()
         elapsed = monotonic - self._monotonic
         moved = (utc - self._utc) - elapsed

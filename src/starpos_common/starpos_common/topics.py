@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers and subscriptions whose QoS the user may override, each by itself (parameters `qos_overrides.TOPIC...`)."""
+"""Publishers and subscriptions whose QoS the user may override for each topic (parameters `qos_overrides.TOPIC...`)."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.node import Node
@@ -13,13 +14,16 @@ from rclpy.subscription import Subscription
 from starpos_common.parameters import ParameterError
 
 MOST_DEPTH = 100_000
+T = TypeVar("T")
 
 
 def publisher(node: Node, kind: type, topic: str, depth: int) -> Publisher:
-    """RELIABLE, the newest `depth` kept. ParameterError where an override is not allowed."""
-    return _made(
-        node, topic, lambda: node.create_publisher(kind, topic, QoSProfile(depth=depth), **_options())
-    )
+    """Make a RELIABLE publisher that keeps the newest `depth` messages; ParameterError if an override is not allowed."""
+
+    def make() -> Publisher:
+        return node.create_publisher(kind, topic, QoSProfile(depth=depth), qos_overriding_options=_options())
+
+    return _made(node, topic, make)
 
 
 def subscription(
@@ -31,19 +35,23 @@ def subscription(
     reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
     raw: bool = False,
 ) -> Subscription:
-    """Volatile, the newest `depth` kept. ParameterError where an override is not allowed.
+    """Make a volatile subscription that keeps the newest `depth` messages; ParameterError if an override is not allowed.
 
     raw: the callback takes bytes.
     """
-    # rclpy writes the overrides into the profile: one that were shared would carry them to the next topic
+    # rclpy writes the overrides into the profile: a shared profile would carry them to the next topic.
     qos = QoSProfile(depth=depth, reliability=reliability)
-    return _made(
-        node, topic, lambda: node.create_subscription(kind, topic, callback, qos, raw=raw, **_options())
-    )
+
+    def make() -> Subscription:
+        return node.create_subscription(
+            kind, topic, callback, qos, raw=raw, qos_overriding_options=_options()
+        )
+
+    return _made(node, topic, make)
 
 
-def _options() -> dict[str, QoSOverridingOptions]:
-    return {"qos_overriding_options": QoSOverridingOptions.with_default_policies(callback=_checked)}
+def _options() -> QoSOverridingOptions:
+    return QoSOverridingOptions.with_default_policies(callback=_checked)
 
 
 def _checked(qos: QoSProfile) -> QosCallbackResult:
@@ -53,11 +61,12 @@ def _checked(qos: QoSProfile) -> QosCallbackResult:
     return result
 
 
-def _made(node: Node, topic: str, make: Callable):
+def _made(node: Node, topic: str, make: Callable[[], T]) -> T:
     try:
         return make()
     except RCLError:
         raise
-    except (RuntimeError, InvalidQosOverridesError) as error:  # a word that is none of the policy's; a depth
+    except (RuntimeError, InvalidQosOverridesError) as error:
+        # The policy has no such value, or the depth is not allowed.
         name = f"qos_overrides.{node.resolve_topic_name(topic)}"
         raise ParameterError(f"{name}: {error}.") from None

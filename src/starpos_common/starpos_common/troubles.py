@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong again and again as one line in the log, and one when it is over."""
+"""Logging of a trouble that repeats: one line when it begins, and one when it is over."""
 
 import re
 import time
@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 
 from rclpy.node import Node
 
-QUIET_S = 10.0  # that long nothing went wrong: it is over with the next that is right
-MOST_KINDS = 8  # of sentences logged of one trouble; words of theirs may come from outside
+# A trouble is over when something goes right after so long without a failure.
+QUIET_S = 10.0
+# Most sentences logged for one trouble: their words may come from outside, in any number.
+MOST_KINDS = 8
 
 
 @dataclass
 class _Trouble:
-    """Since when nothing went wrong (s, monotonic), what was wrong last, and the sentences that were logged."""
+    """The time of the last failure (s, monotonic), its sentence, and the kinds of sentences that were logged."""
 
     since_s: float
     sentence: str
@@ -21,14 +23,14 @@ class _Trouble:
 
 
 class Troubles:
-    """Of a node, by the name of what they are of, such as a topic."""
+    """Keeps the troubles of a node, each by the name of what fails, such as a topic."""
 
-    def __init__(self, node: Node):
+    def __init__(self, node: Node) -> None:
         self._log = node.get_logger()
         self._troubles: dict[str, _Trouble] = {}
 
     def wrong(self, what: str, sentence: str) -> None:
-        """Something went wrong, now; logged where it is of another kind than before. Numbers make no kind."""
+        """Note a failure; log it if it is of a new kind. Sentences that differ only in numbers are of one kind."""
         trouble = self._troubles.setdefault(what, _Trouble(0.0, ""))
         trouble.since_s, trouble.sentence = time.monotonic(), sentence
         kind = re.sub(r"[\d.e+-]+", "", sentence)
@@ -37,13 +39,13 @@ class Troubles:
             self._log.warning(sentence)
 
     def right(self, what: str) -> None:
-        """It went right, now."""
+        """Note a success; log it if it ends a trouble."""
         trouble = self._troubles.get(what)
         if trouble and time.monotonic() - trouble.since_s > QUIET_S:
             del self._troubles[what]
             self._log.info(f"{what}: in order again")
 
     def lately(self, within_s: float) -> list[str]:
-        """The last sentence of each that went wrong within that time."""
+        """The last sentences of the troubles within that time."""
         now = time.monotonic()
         return [t.sentence for t in self._troubles.values() if now - t.since_s < within_s]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where readings come from: a module a sensor."""
+"""Sources of readings: a module for each sensor."""

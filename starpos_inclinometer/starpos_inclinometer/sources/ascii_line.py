@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `ascii`: digital tiltmeters that send lines of text, told apart by a regular expression."""
+"""The source `ascii`: digital tiltmeters that send lines of text, which a regular expression describes."""
 
 import math
 import re
@@ -17,7 +17,7 @@ from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Surroundings
+from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 MAX_LINE = 256  # bytes
 NEAR_RAD = math.radians(0.05)
@@ -31,7 +31,8 @@ ANGLES_RAD = {
     "mrad": 1e-3,
     "urad": 1e-6,
 }
-SINES = {"g": 1.0, "mg": 1e-3, "percent_g": 1e-2}  # what an accelerometer feels: the sine of the tilt
+# An accelerometer measures the sine of the tilt.
+SINES = {"g": 1.0, "mg": 1e-3, "percent_g": 1e-2}
 UNITS = (*ANGLES_RAD, *SINES)
 NUMBER = r"[-+]?\d+\.?\d*"
 MAX_REQUEST = 256
@@ -89,21 +90,23 @@ _END = re.compile(rb"[\r\n]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """What one line says: rad, the step of its last digit in rad, deg C or NaN; None for what it does not tell."""
+    """Content of one line: x, y and the step of the last digit in rad; None where the line says nothing."""
 
     x: float
     y: float
     step: float
-    temperature_c: float = field(compare=False)  # NaN is not equal to itself
+    # NaN if the line does not tell it; not compared, because NaN is not equal to itself.
+    temperature_c: float = field(compare=False)
     sequence: int | None
-    milliseconds: int | None  # 32 bits, of the device's clock
-    number: int = 0  # tells equal lines apart that are no doubled ones
+    milliseconds: int | None  # of the device's clock, 32 bits
+    # Distinguishes two equal lines of a device without sequence and clock from a line that came twice.
+    number: int = 0
     lost: int = 0  # samples lost just before this one
-    broken: bool = False  # claims no continuity with the ones before
+    broken: bool = False  # true: it does not continue the lines before
 
 
 def pattern_error(pattern: str) -> str | None:
-    """Why a pattern cannot be used, in one sentence; None if it can."""
+    """Say in a sentence why a pattern cannot be used; None if it can."""
     try:
         groups = set(re.compile(pattern).groupindex)
     except (re.error, OverflowError, RecursionError) as error:
@@ -120,11 +123,13 @@ def pattern_error(pattern: str) -> str | None:
 
 
 class LineDecoder:
-    """A device's text to believed samples.
+    """Turns a device's text into the samples that are believed.
 
-    pattern: must match a whole line without the blanks around it; see `pattern_error`.  unit: of UNITS.
-    resolution: step of the values, in the unit; NaN: of the last digit each line shows.  period_s: from line to line.
-    request: what to send to be answered, once a period; empty: nothing.
+    pattern: must match a whole line without the blanks around it; see `pattern_error`.
+    unit: one of UNITS.
+    resolution: step of the values in the unit; NaN takes the last digit of each line.
+    period_s: time from line to line.
+    request: text to send once a period, for a device that speaks when asked; empty: nothing.
     """
 
     answered = False
@@ -132,7 +137,7 @@ class LineDecoder:
 
     def __init__(
         self, pattern: str, unit: str, resolution: float = math.nan, period_s: float = 1.0, request: str = ""
-    ):
+    ) -> None:
         self.period_s = self.command_period_s = period_s
         self._pattern = re.compile(pattern)
         self._unit = unit
@@ -155,7 +160,7 @@ class LineDecoder:
             implausible=self._gate.rejected,
         )
 
-    def resume(self):
+    def resume(self) -> None:
         self._lines.forget()
         self._gate.reset()
         self._broken = self._last is not None
@@ -181,8 +186,9 @@ class LineDecoder:
         if match is None:
             return None
         said = {name: value for name, value in match.groupdict().items() if value}
+        # float() would accept an underscore.
         if any("_" in value for value in said.values()):
-            return None  # which float takes
+            return None
         try:
             (x, step_x), (y, step_y) = self._angle(said["x"]), self._angle(said["y"])
             temperature = float(said.get("temperature", "nan"))
@@ -208,7 +214,7 @@ class LineDecoder:
         )
 
     def _angle(self, text: str) -> tuple[float, float]:
-        """rad of a value and of its last digit."""
+        """Convert a value and the step of its last digit to rad."""
         value, step = float(text), self._resolution
         if math.isnan(step):
             step = 10.0 ** int(Decimal(text).as_tuple().exponent)
@@ -224,22 +230,23 @@ class LineDecoder:
         if last is None or last.sequence is None or line.sequence is None:
             return replace(line, broken=broken)
         ahead = line.sequence - last.sequence
-        if ahead < 1:  # it was reset, or the number wrapped
+        if ahead < 1:
+            # The device was reset, or its number wrapped.
             return replace(line, broken=True)
         self._lost += ahead - 1
         return replace(line, lost=ahead - 1, broken=broken)
 
 
 class TextLines:
-    """Lines of at most MAX_LINE bytes, ended by CR or LF or both, out of arbitrary chunks of bytes."""
+    """Collects lines of at most MAX_LINE bytes, ended by CR or LF or both, from chunks of bytes."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.garbage_bytes = 0
         self._rest = b""
         self._overlong = False
 
     def feed(self, data: bytes) -> list[str]:
-        """The lines that end in `data`, without the blanks around them; empty and overlong ones are left out."""
+        """Return the lines that end in `data`, stripped of blanks; empty and overlong lines are left out."""
         *ended, rest = _END.split(self._rest + data)
         lines = []
         for line in ended:
@@ -255,16 +262,16 @@ class TextLines:
         self._rest = rest
         return lines
 
-    def forget(self):
-        """Drop a half-received line: what follows comes from another connection."""
+    def forget(self) -> None:
+        """Drop a half-received line, because the next bytes come from another connection."""
         self.garbage_bytes += len(self._rest)
         self._rest = b""
-        # What comes first may be the rest of a line.
+        # The first bytes may be the rest of a line.
         self._overlong = True
 
 
 def _follows(a: Arrival, b: Arrival) -> bool:
-    """Whether a Line may come after another, by what it says of number and time."""
+    """Whether the second line may follow the first, judged by number and time."""
     first, second = a.sample, b.sample
     if None not in (first.sequence, second.sequence) and second.sequence <= first.sequence:
         return False
@@ -275,12 +282,12 @@ def _follows(a: Arrival, b: Arrival) -> bool:
     return elapsed > 0 and abs(elapsed * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
 
 
-class AsciiSource:
-    """Lines of a digital tiltmeter as readings."""
+class AsciiSource(TiltSource):
+    """Reads the lines of a digital tiltmeter."""
 
     parameters = PARAMETERS
 
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]):
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         self.name = values["port"]
         self._baud = values["baud"]
         self._decoder = LineDecoder(
@@ -305,13 +312,13 @@ class AsciiSource:
             return f"ascii.request must be at most {MAX_REQUEST} ASCII characters."
         return port_refusal(values) or pattern_error(values["ascii.pattern"])
 
-    def start(self):
+    def start(self) -> None:
         self._link.start()
 
-    def stop(self):
+    def stop(self) -> None:
         self._link.stop()
 
-    def configure(self, values: Mapping[str, Any]):
+    def configure(self, values: Mapping[str, Any]) -> None:
         self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
         self._latency = 0.0 if math.isnan(values["latency"]) else values["latency"]
         self._stuck_samples = values["ascii.stuck_samples"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `imu`: sensor_msgs/Imu at rest to tilts. An accelerometer at rest feels g upward (REP 145)."""
+"""The source `imu`: tilts from sensor_msgs/Imu at rest. An accelerometer at rest measures g upward (REP 145)."""
 
 import math
 from collections import deque
@@ -16,19 +16,26 @@ from starpos_common.parameters import Parameter
 from starpos_common.topics import subscription
 from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
-from starpos_inclinometer.sources.source import Surroundings
+from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 TOPIC = "imu/data"
-STANDARD_GRAVITY = 9.80665  # m/s2; 0.3 % off anywhere on the ground
-LEAST = 3  # messages of an average: fewer tell no scatter
-COVERED = 0.5  # of the time of an average, at least
-FUTURE_S = 0.1  # two hosts' clocks differ by less
-NEW_TIME_S = 1.0  # stamps that go back further are of a clock that was set
-LEAST_STDDEV_RAD = 1e-6  # an accelerometer without noise is a simulated one
+# m/s2; true within 0.3 % everywhere on the ground
+STANDARD_GRAVITY = 9.80665
+# An average needs so many messages: fewer show no scatter.
+LEAST = 3
+# Share of the time of an average that its messages must cover.
+COVERED = 0.5
+# A stamp further ahead is wrong: the clocks of two hosts differ by less.
+FUTURE_S = 0.1
+# If stamps go back further than this, the clock was set.
+NEW_TIME_S = 1.0
+# A floor, for a simulated accelerometer may have no noise.
+LEAST_STDDEV_RAD = 1e-6
 MAX_MESSAGES = 10_000  # of an average
 QUEUE = 512
 RATE_WINDOW_S = 5.0
-PATIENCE_S = 0.8  # and a report a second: told within 2 s
+# Silence is reported within 2 s, with a report every second.
+PATIENCE_S = 0.8
 
 
 PARAMETERS = (
@@ -62,29 +69,31 @@ PARAMETERS = (
 
 @dataclass(frozen=True, slots=True)
 class Felt:
-    """One message at rest or not."""
+    """Content of one message, at rest or not."""
 
     stamp_ns: int
     force: tuple[float, float, float]  # specific force, m/s2
-    rotation: float  # rad/s; 0 where it is not measured
+    rotation: float  # rad/s; 0 if it is not measured
     variance: tuple[float, float, float]  # m2/s4 of each axis; 0: not stated
 
 
 class BadMessage(ValueError):
-    """What is wrong with a message."""
+    """A message cannot be used; the text says what is wrong with it."""
 
 
 def felt(message: Imu) -> Felt:
-    """A message's content; BadMessage where it has no time or is no number."""
+    """Read a message; BadMessage if it has no stamp or holds NaN, infinity or a negative variance."""
     stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
     if stamp_ns <= 0:
         raise BadMessage("has no stamp")
     a, w = message.linear_acceleration, message.angular_velocity
     force = (a.x, a.y, a.z)
-    # -1 as the first element of a covariance: what it belongs to is not measured. The forces are held against g anyway.
-    rotation = (0.0,) if message.angular_velocity_covariance[0] == -1 else (w.x, w.y, w.z)
+    # A covariance that begins with -1 says that the quantity is not measured. The force is checked against g anyway.
+    rotation: tuple[float, ...] = (0.0,) if message.angular_velocity_covariance[0] == -1 else (w.x, w.y, w.z)
     stated = message.linear_acceleration_covariance
-    variance = (0.0,) * 3 if stated[0] == -1 else tuple(float(stated[i]) for i in (0, 4, 8))
+    variance = (float(stated[0]), float(stated[4]), float(stated[8]))
+    if stated[0] == -1:
+        variance = (0.0, 0.0, 0.0)
     if not all(map(math.isfinite, (*force, *rotation, *variance))) or min(variance) < 0:
         raise BadMessage("holds NaN, infinity or a negative variance")
     return Felt(stamp_ns, force, math.hypot(*rotation), variance)
@@ -92,12 +101,12 @@ def felt(message: Imu) -> Felt:
 
 @dataclass(frozen=True)
 class MeanForce:
-    """Messages of one span of time: (N, 3) forces; see `Felt`."""
+    """The messages of one span of time; forces is (N, 3), see `Felt`."""
 
     forces: np.ndarray
     mid_ns: int
     rotation: float  # rms, rad/s
-    variance: np.ndarray  # (3,) m2/s4, stated for one message
+    variance: np.ndarray  # (3,) m2/s4, as stated for one message
 
     @classmethod
     def of(cls, messages: list[Felt]) -> "MeanForce":
@@ -113,7 +122,7 @@ class MeanForce:
         return self.forces.mean(0)
 
     def unrest(self, max_force_error: float, max_rotation: float) -> str:
-        """Why it tells no tilt: a share of g, rad/s; empty where it does."""
+        """Say why it gives no tilt (limits: a share of g, rad/s); empty if it gives one."""
         strength = float(np.linalg.norm(self.force))
         if abs(strength / STANDARD_GRAVITY - 1) > max_force_error:
             return f"it feels {strength:.3g} m/s2 where gravity is 9.81"
@@ -122,12 +131,12 @@ class MeanForce:
         return ""
 
     def tilt(self) -> tuple[float, float]:
-        """rad."""
+        """Tilt of x and y, rad."""
         x, y, _ = (self.force / np.linalg.norm(self.force)).tolist()
         return math.asin(x), math.asin(y)
 
     def covariance(self) -> np.ndarray:
-        """(2, 2) rad2 of the tilt: from what the forces scatter by, or what is stated where that is more."""
+        """Covariance of the tilt, (2, 2) rad2, from the scatter of the forces, or the stated variance if that is more."""
         scatter = np.cov(self.forces, rowvar=False)
         more = np.sqrt(np.maximum(self.variance, np.diag(scatter)))
         stddev = np.sqrt(np.diag(scatter))
@@ -142,17 +151,18 @@ class MeanForce:
 
 
 class ForceAverager:
-    """Messages to averages of a given length, in order of their stamps; counts what it drops."""
+    """Averages messages over a given time, in the order of their stamps; counts the messages it drops."""
 
-    def __init__(self, seconds: float):
+    def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self.duplicates = self.disordered = 0
-        self.breaks = 0  # of the sequence of averages
+        # How often the sequence of averages was interrupted.
+        self.breaks = 0
         self._messages: list[Felt] = []
         self._last_ns = 0
 
     def add(self, message: Felt) -> MeanForce | None:
-        """The average that has ended with this message's coming, if one has and is well covered."""
+        """Take a message; return the average that it ends, if it ends one that has enough messages."""
         last_ns, messages = self._last_ns, self._messages
         if message.stamp_ns == last_ns:
             self.duplicates += 1
@@ -175,12 +185,12 @@ class ForceAverager:
         return MeanForce.of(messages)
 
 
-class ImuSource:
-    """Averages of what a node's subscription to TOPIC brings, as readings."""
+class ImuSource(TiltSource):
+    """Averages the messages on TOPIC to readings."""
 
     parameters, name = PARAMETERS, TOPIC
 
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]):
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         node = host.node
         self._clock, self._wake = host.clock, host.wake
         self._now_ns = lambda: node.get_clock().now().nanoseconds
@@ -200,13 +210,13 @@ class ImuSource:
     def refusal(values: Mapping[str, Any]) -> str | None:
         return None
 
-    def start(self):
+    def start(self) -> None:
         pass
 
-    def stop(self):
+    def stop(self) -> None:
         pass
 
-    def configure(self, values: Mapping[str, Any]):
+    def configure(self, values: Mapping[str, Any]) -> None:
         self._averager.seconds = values["imu.average"]
         self._max_force_error = values["imu.max_force_error"]
         self._max_rotation = math.radians(values["imu.max_rotation"])
@@ -218,7 +228,7 @@ class ImuSource:
         self._readings.clear()
         return taken
 
-    def _hear(self, message: Imu):
+    def _hear(self, message: Imu) -> None:
         self._heard_s = self._clock.read().monotonic_s
         self._frame = message.header.frame_id
         try:
@@ -236,7 +246,7 @@ class ImuSource:
             self._tell(average)
         self._gap |= self._averager.breaks != breaks
 
-    def _tell(self, average: MeanForce):
+    def _tell(self, average: MeanForce) -> None:
         before, self._unrest = self._unrest, average.unrest(self._max_force_error, self._max_rotation)
         if self._unrest:
             self._sequence += 1
@@ -274,12 +284,13 @@ class ImuSource:
         if still and (self._has_noise or average.variance.any()):
             flags |= STUCK
         self._has_noise |= not still
-        if max(abs(x), abs(y)) > LIMIT_RAD or average.force[2] <= 0:  # upside down it would look level
+        # An instrument upside down would look level.
+        if max(abs(x), abs(y)) > LIMIT_RAD or average.force[2] <= 0:
             flags |= OUT_OF_RANGE
         return flags
 
     def _covariance(self, average: MeanForce) -> np.ndarray:
-        """Of the messages within, or of what averages differ by where that is more: an IMU's noise is not white."""
+        """Covariance from the messages, or from the scatter of the averages if that is more (IMU noise is not white)."""
         covariance = average.covariance()
         found = np.sqrt(np.diag(covariance))
         least = np.maximum(self._noise.sigma or (0.0, 0.0), self._floor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `serial`: the microcontroller's lines to tilts, and what it is told."""
+"""The source `serial`: tilts from the microcontroller's lines, and the commands that it gets."""
 
 import math
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
 from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Surroundings
+from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 BITS_PER_BYTE = 10  # 8N1
 NEAR_CODES = 11_000  # 0.05 deg, ten times the noise
-DEFAULT_DELAY_MS = 54  # of the firmware at its default rate, until it has said its own
-
-
-SMALLEST_DETERMINANT = 0.5  # of the cross-axis matrix: less, and the axes are no two axes
+# The firmware's delay at its default rate, used until the firmware tells its own.
+DEFAULT_DELAY_MS = 54
+# Below this determinant of the cross-axis matrix the two axes are not independent.
+SMALLEST_DETERMINANT = 0.5
 PARAMETERS = (
     *SERIAL_PARAMETERS,
     Parameter(
@@ -111,7 +111,7 @@ PARAMETERS = (
 
 
 def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
-    """The sensor's calibration that the parameters say."""
+    """Make the calibration of the sensor from the parameters."""
     floor = values["noise_stddev"]
     return Sca100tCalibration(
         offset_volts=values["offset_volts"],
@@ -127,16 +127,17 @@ def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
 
 
 class McuDecoder:
-    """The MCU's bytes to believed samples, and the commands that keep it at the rate that is wanted."""
+    """Turns the MCU's bytes into the samples that are believed, and asks the MCU for the wanted rate."""
 
     command_period_s = 1.0  # PROTOCOL.md
     hint = "check the baud rate, and that this is the inclinometer."
 
-    def __init__(self, rate_hz: int):
+    def __init__(self, rate_hz: int) -> None:
         self.wanted_rate_hz = rate_hz
         self.identity: Identity | None = None
         self.answered = False
-        self._ask = True  # who it is and at which rate
+        # Whether to ask the MCU for its identity and rate.
+        self._ask = True
         self._refused_rate: int | None = None
         self._parser = mcu_protocol.LineParser()
         self._gate = Gate(self._follows, NEAR_CODES)
@@ -165,7 +166,7 @@ class McuDecoder:
         """Whether the MCU refused the rate that is wanted."""
         return self._refused_rate == self.wanted_rate_hz
 
-    def resume(self):
+    def resume(self) -> None:
         self.identity = None
         self._ask = True
         self._refused_rate = None
@@ -202,7 +203,8 @@ class McuDecoder:
             for a in self._gate.admit(arrival)
         ]
         if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
-            # After a reset it is at the default rate, perhaps with another firmware; so it may be where nobody saw one.
+            # After a reset the MCU runs at its default rate, perhaps with another firmware; samples that do not fit may
+            # come from a reset that nobody saw.
             self._ask = True
         return believed
 
@@ -211,9 +213,9 @@ class McuDecoder:
 
 
 class McuTilts:
-    """Believed samples to readings."""
+    """Converts believed samples to readings."""
 
-    def __init__(self, values: Mapping[str, Any]):
+    def __init__(self, values: Mapping[str, Any]) -> None:
         self.sensor = Sensor()
         self.arrivals = ArrivalFilter()
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
@@ -221,20 +223,22 @@ class McuTilts:
         self._rate_hz = 0
         self.configure(values)
 
-    def configure(self, values: Mapping[str, Any]):
+    def configure(self, values: Mapping[str, Any]) -> None:
         self.sensor.calibration = calibration(values)
         self._latency_s = values["latency"]
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
-        """The readings of what an `McuDecoder` believed, in order."""
+        """Convert the arrivals that an `McuDecoder` believed, in order."""
         return [self._reading(arrival) for arrival in arrivals]
 
-    def _follow(self, identity: Identity):
-        """What the MCU had said of itself when it sent the sample that comes next."""
-        if identity.rate_hz != self._rate_hz:  # a slower sample is a mean of more conversions
+    def _follow(self, identity: Identity) -> None:
+        """Take over the rate and delay that the MCU had told when it sent the next sample."""
+        # At a lower rate a sample is the mean of more conversions, so its noise is another.
+        if identity.rate_hz != self._rate_hz:
             self._rate_hz = identity.rate_hz
             self.sensor.noise.restart()
-        if identity.delay_ms != self._delay_ms:  # all that comes from now on is so much later, or earlier
+        # From now on all lines come later, or earlier, by the difference.
+        if identity.delay_ms != self._delay_ms:
             self._delay_ms = identity.delay_ms
             self.arrivals.restart()
 
@@ -258,12 +262,12 @@ class McuTilts:
         )
 
 
-class McuSource:
+class McuSource(TiltSource):
     """The starpos microcontroller on a serial port; see `McuTilts`."""
 
     parameters = PARAMETERS
 
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]):
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         self.name = values["port"]
         self._decoder = McuDecoder(values["rate"])
         self._link = SerialLink(values["port"], values["baud"], self._decoder, host.clock, host.wake)
@@ -279,13 +283,13 @@ class McuSource:
             )
         return port_refusal(values)
 
-    def start(self):
+    def start(self) -> None:
         self._link.start()
 
-    def stop(self):
+    def stop(self) -> None:
         self._link.stop()
 
-    def configure(self, values: Mapping[str, Any]):
+    def configure(self, values: Mapping[str, Any]) -> None:
         self._tilts.configure(values)
         self._decoder.wanted_rate_hz = values["rate"]
 

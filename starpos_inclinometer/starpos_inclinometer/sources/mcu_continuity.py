@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples belong together: the ones that fit no others are dropped, the lost ones counted.
+"""Check that samples fit one another: those that do not are dropped, and lost ones are counted.
 
-A 16-bit checksum lets one corrupted line in 65,536 pass, a line without checksum far more. What passes does not
-fit the samples around it: its number, its time or its tilt is off.
+A 16-bit checksum lets one corrupted line in 65,536 pass, and a line without a checksum passes far more often. Such a
+sample does not fit the samples around it: its number, its time or its tilt is wrong.
 """
 
 from collections.abc import Callable
@@ -11,25 +11,33 @@ from dataclasses import replace
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
 from starpos_inclinometer.sources.reading import Arrival
 
-TOLERANCE_OF_CHANGE = 8.0  # times the usual change from sample to sample is still near
-CHANGE_SHARE = 1 / 8  # of a sample in the usual change
-WITNESSES = 3  # samples in a row that are believed though no two are near each other: the instrument moves
+# So many times the usual change from sample to sample is still near.
+TOLERANCE_OF_CHANGE = 8.0
+# Weight of a new sample in the usual change.
+CHANGE_SHARE = 1 / 8
+# So many samples in a row are believed even if no two are near each other: the instrument moves.
+WITNESSES = 3
 
-PERIOD_TOLERANCE_MS = 2  # both ends are floored to ms
-SHORTEST_MS, LONGEST_MS = 20, 1000  # periods of the rates there are
-TEMPERATURE_TOLERANCE = 3  # counts: 2.8 deg C from one sample to the next
+# Both ends of a period are rounded down to ms.
+PERIOD_TOLERANCE_MS = 2
+# Periods of the highest and the lowest rate.
+SHORTEST_MS, LONGEST_MS = 20, 1000
+# Counts; 2.8 deg C from one sample to the next.
+TEMPERATURE_TOLERANCE = 3
 FAULTS = SampleStatus.ADC_TIMEOUT | SampleStatus.NO_REFERENCE
-HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE = 3.0, 0.05  # a stalled host, an MCU's RC oscillator
+# The host may stall for a time; the MCU's RC oscillator may be wrong by a share.
+HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE = 3.0, 0.05
 
 
 class Gate:
-    """Lets samples pass that fit the last one; others wait until the ones after them bear them out, or are dropped.
+    """Lets samples pass that fit the last one; others wait until later samples confirm them, or are dropped.
 
-    follows: whether the second arrival may come after the first, by all but `x` and `y`.  tolerance: how far these may
-    go from one sample to the next without suspicion; what the instrument does lately is none either.
+    follows: whether the second arrival may come after the first, judged by everything except `x` and `y`.
+    tolerance: change of `x` and `y` between two samples that is always accepted; changes like the recent ones are
+    accepted too.
     """
 
-    def __init__(self, follows: Callable[[Arrival, Arrival], bool], tolerance: float):
+    def __init__(self, follows: Callable[[Arrival, Arrival], bool], tolerance: float) -> None:
         self.rejected = self.duplicates = 0
         self._follows = follows
         self._tolerance = tolerance
@@ -37,13 +45,13 @@ class Gate:
         self._last: Arrival | None = None
         self._waiting: list[Arrival] = []
 
-    def reset(self):
-        """Trust nothing from before: the connection was opened anew."""
+    def reset(self) -> None:
+        """Forget the samples so far, because the connection was opened again."""
         self._last = None
         self._waiting = []
 
     def admit(self, arrival: Arrival) -> list[Arrival]:
-        """The arrivals that are believed now that this one is there, in order."""
+        """Take an arrival; return those that are believed now, in order."""
         last, waiting = self._last, self._waiting
         newest = waiting[-1] if waiting else last
         if newest is not None and newest.sample == arrival.sample:
@@ -66,7 +74,7 @@ class Gate:
     def _believe(self, arrivals: list[Arrival]) -> list[Arrival]:
         for arrival in arrivals:
             if self._last is not None:
-                # One leap is no habit: it counts as four times what is near.
+                # A single leap must not make leaps usual, so its size is limited.
                 limit = 4 * max(self._tolerance, TOLERANCE_OF_CHANGE * self._change)
                 self._change += CHANGE_SHARE * (min(_change(self._last, arrival), limit) - self._change)
             self._last = arrival
@@ -79,16 +87,17 @@ def _change(a: Arrival, b: Arrival) -> float:
 
 
 def mcu_follows(a: Arrival, b: Arrival, period_ms: float | None) -> bool:
-    """Whether a Sample may come after another of the same run of the MCU, at its rate (None: not known).
+    """Whether one sample may follow another in the same run of the MCU (period None: its rate is not known).
 
-    By number, MCU's time, host's time, temperature and status.
+    Judged by number, the MCU's time, the host's time, temperature and status.
     """
     ahead = (b.sample.sequence - a.sample.sequence) & 0xFFFF
     elapsed = (b.sample.milliseconds - a.sample.milliseconds) & 0xFFFFFFFF
     if not ahead or b.sample.status & SampleStatus.FIRST:
         return False
+    # The end of a fault must be confirmed by a second sample.
     if _temperature_leaps(a.sample, b.sample) or a.sample.status & FAULTS & ~b.sample.status:
-        return False  # that a fault is over has to be said twice
+        return False
     low, high = (SHORTEST_MS, LONGEST_MS) if period_ms is None else (period_ms, period_ms)
     if not low * ahead - PERIOD_TOLERANCE_MS <= elapsed <= high * ahead + PERIOD_TOLERANCE_MS:
         return False
@@ -102,26 +111,26 @@ def _temperature_leaps(a: Sample, b: Sample) -> bool:
 
 
 class Continuity:
-    """Sequence numbers that count on over wraps and resets of the MCU, and what was lost on the way."""
+    """Continues the sequence numbers over wraps and resets of the MCU, and counts the lost samples."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.lost = self.restarts = 0
         self._last: Sample | None = None
         self._last_raw_sequence = 0
         self._resumed = False
 
-    def resume(self):
-        """The connection was opened anew: what comes next claims no continuity."""
+    def resume(self) -> None:
+        """Note that the connection was opened again: the next sample does not continue the last one."""
         self._resumed = self._last is not None
 
     def follow(self, sample: Sample) -> Sample:
-        """The sample with its continued sequence, `lost`, `restarted`, `resumed`."""
+        """Return the sample with its continued sequence, and `lost`, `restarted` and `resumed` filled in."""
         last = self._last
         lost, restarted, step = 0, False, 1
         if last is not None:
             elapsed = (sample.milliseconds - last.milliseconds) & 0xFFFFFFFF
             ahead = (sample.sequence - self._last_raw_sequence) & 0xFFFF
-            # A serial line does not reorder: a clock that went back, or a first sample, is a reset.
+            # A serial line keeps the order: a clock that goes back, or a first sample, means a reset.
             restarted = bool(sample.status & SampleStatus.FIRST) or elapsed >= 1 << 31
             if restarted:
                 self.restarts += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial line's protocol, as PROTOCOL.md defines it: framing, parsing, counting. No I/O, no clock."""
+"""The protocol of the serial line, as PROTOCOL.md defines it: framing, parsing, counting. No I/O, no clock."""
 
 import re
 from binascii import crc_hqx
@@ -11,10 +11,10 @@ BAUD = 38400
 MIN_RATE_HZ, MAX_RATE_HZ = 1, 50
 MAX_LINE = 48  # bytes with '$' and CR LF, in both directions
 SAMPLE_LINE = 43  # bytes of a `$T` line
-MAX_SENDING_MS = 50  # a line is sent within its sample's period and that
+# A line is sent within the period of its sample and this time.
+MAX_SENDING_MS = 50
 
 _LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
-SAMPLE_FIELDS = ("sequence", "milliseconds", "x", "y", "temperature", "status")
 _SAMPLE = re.compile(
     rb"T,([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{6}),([0-9A-F]{6}),([0-9A-F]{2}),([0-9A-F]{2})"
 )
@@ -24,13 +24,13 @@ _RATE = re.compile(rb"R,([0-9A-F]{2})")
 
 
 class SampleStatus(IntFlag):
-    """Status bits of a sample; unknown bits are for later versions and ignored."""
+    """Status bits of a sample; unknown bits belong to later versions and are ignored."""
 
-    ADC_TIMEOUT = 0x01  # a channel did not convert in time: its code is the one before
-    NO_REFERENCE = 0x02  # the AD7730's NOREF bit: codes mean nothing
+    ADC_TIMEOUT = 0x01  # a channel did not convert in time: its code is that of the sample before
+    NO_REFERENCE = 0x02  # the AD7730's NOREF bit: the codes mean nothing
     NO_TEMPERATURE = 0x04
     FIRST = 0x08  # the first sample since the reset
-    WATCHDOG = 0x10  # that reset was the watchdog's
+    WATCHDOG = 0x10  # the watchdog made that reset
     OVERRUN = 0x20  # at least one sample before this one was not sent
 
 
@@ -44,9 +44,10 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
-    """One `$T` line, and what `Continuity` knows of the lines before it."""
+    """One `$T` line, and what `Continuity` adds from the lines before it."""
 
-    sequence: int  # 16 bits as sent; from `Continuity` it counts on over wraps and resets: a jump of n + 1 is n lost
+    # 16 bits as sent. `Continuity` continues it over wraps and resets: a jump of n + 1 means n lost samples.
+    sequence: int
     milliseconds: int  # the MCU's clock at the middle of the conversions, 32 bits
     x: int  # AD7730 codes, 24-bit offset binary: 0x800000 is no input
     y: int
@@ -54,18 +55,18 @@ class Sample:
     status: int  # of SampleStatus
     lost: int = 0  # samples lost just before this one
     restarted: bool = False  # the MCU was reset since the sample before
-    resumed: bool = False  # the first one after the connection was opened anew
+    resumed: bool = False  # the first sample after the connection was opened again
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The answer to both commands."""
+    """The MCU's answer to both commands."""
 
     version: int  # of the protocol
     firmware: int  # 0x0102 is 1.2
     unit: int  # serial number, 0 for none
     rate_hz: int
-    delay_ms: int  # from a sample's milliseconds to the first byte of its line
+    delay_ms: int  # from the time of a sample to the first byte of its line
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +75,12 @@ class Refusal:
 
 
 def checksum(body: bytes) -> int:
-    """CRC-16/XMODEM (polynomial 0x1021, start 0) of the bytes between '$' and '*'."""
+    """Compute the CRC-16/XMODEM (polynomial 0x1021, start 0) of the bytes between '$' and '*'."""
     return crc_hqx(body, 0)
 
 
 def frame(body: bytes) -> bytes:
-    """The line of a body: `$body*CRC` CR LF."""
+    """Make the line of a body: `$body*CRC` CR LF."""
     return b"$%s*%04X\r\n" % (body, checksum(body))
 
 
@@ -93,7 +94,7 @@ def rate_command(rate_hz: int) -> bytes:
 
 
 def sample_line(sequence: int, milliseconds: int, x: int, y: int, temperature: int, status: int) -> bytes:
-    """A `$T` line; sequence and milliseconds wrap at 16 and 32 bits."""
+    """Make a `$T` line; sequence and milliseconds wrap at 16 and 32 bits."""
     numbers = (sequence & 0xFFFF, milliseconds & 0xFFFFFFFF, x, y, temperature, status)
     return frame(b"T,%04X,%08X,%06X,%06X,%02X,%02X" % numbers)
 
@@ -108,14 +109,14 @@ def refusal_line(reason: Reason) -> bytes:
 
 
 class LineSplitter:
-    """Framed lines out of arbitrary chunks of bytes; keeps at most one line; nothing that comes in raises."""
+    """Collects framed lines from chunks of bytes; keeps at most one line; never raises, whatever comes."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.garbage_bytes = 0
         self._rest = b""
 
     def feed(self, data: bytes) -> list[tuple[bytes, bool]]:
-        """The bodies of the lines that end in `data`, each with whether its checksum is right."""
+        """Return the bodies of the lines that end in `data`, each with whether its checksum is right."""
         buffer = self._rest + data
         lines = []
         end = 0
@@ -123,7 +124,7 @@ class LineSplitter:
             self.garbage_bytes += match.start() - end
             end = match.end()
             lines.append((match[1], checksum(match[1]) == int(match[2], 16)))
-        # A '$' can only be the first byte of a line: nothing before the last one becomes a line any more.
+        # A '$' can only be the first byte of a line, so bytes before the last '$' cannot become a line any more.
         start = buffer.rfind(b"$", end)
         if start < 0 or len(buffer) - start >= MAX_LINE:
             start = len(buffer)
@@ -131,16 +132,16 @@ class LineSplitter:
         self._rest = buffer[start:]
         return lines
 
-    def forget(self):
-        """Drop a half-received line: what follows comes from another connection."""
+    def forget(self) -> None:
+        """Drop a half-received line, because the next bytes come from another connection."""
         self.garbage_bytes += len(self._rest)
         self._rest = b""
 
 
 class LineParser:
-    """What the MCU sends, out of arbitrary chunks of bytes, counted."""
+    """Parses and counts the MCU's messages from chunks of bytes."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.good = self.crc_errors = self.malformed = 0
         self._splitter = LineSplitter()
 
@@ -149,8 +150,8 @@ class LineParser:
         return self._splitter.garbage_bytes
 
     def feed(self, data: bytes) -> list[Sample | Identity | Refusal]:
-        """The messages completed by `data`, in order; never one with a wrong checksum or an impossible field."""
-        messages = []
+        """Return the messages that `data` completes, in order; none with a wrong checksum or an impossible field."""
+        messages: list[Sample | Identity | Refusal] = []
         for body, right in self._splitter.feed(data):
             if not right:
                 self.crc_errors += 1
@@ -161,15 +162,17 @@ class LineParser:
                 messages.append(message)
         return messages
 
-    def forget(self):
-        """Drop a half-received line: what follows comes from another connection."""
+    def forget(self) -> None:
+        """Drop a half-received line, because the next bytes come from another connection."""
         self._splitter.forget()
 
 
 def _parse(body: bytes) -> Sample | Identity | Refusal | None:
     if match := _SAMPLE.fullmatch(body):
-        values = (int(group, 16) for group in match.groups())
-        sample = Sample(**dict(zip(SAMPLE_FIELDS, values, strict=True)))
+        sequence, milliseconds, x, y, temperature, status = (int(group, 16) for group in match.groups())
+        sample = Sample(
+            sequence=sequence, milliseconds=milliseconds, x=x, y=y, temperature=temperature, status=status
+        )
         return None if sample.status & SampleStatus.FIRST and sample.sequence else sample
     if match := _IDENTITY.fullmatch(body):
         identity = Identity(*(int(group, 16) for group in match.groups()))
@@ -185,7 +188,7 @@ def _possible(identity: Identity) -> bool:
 
 
 def parse_command(body: bytes) -> tuple[str, int] | Reason:
-    """The MCU's side of a command: ('Q', 0), ('R', rate in Hz), or why it is refused."""
+    """Read a command as the MCU does: ('Q', 0), ('R', rate in Hz), or the reason of its refusal."""
     if body == b"Q":
         return "Q", 0
     if match := _RATE.fullmatch(body):

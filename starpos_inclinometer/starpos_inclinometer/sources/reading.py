@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sources give: readings, and how they stand."""
+"""The results of a source: readings, and the state of the source."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,22 +16,22 @@ GAP = 8
 
 
 class Phase(Enum):
-    """How a source stands."""
+    """State of a source."""
 
-    ABSENT = "absent"  # the port cannot be opened, or it went; nobody publishes
+    ABSENT = "absent"  # the port cannot be opened, or it went away; nobody publishes
     SILENT = "silent"  # open, but nothing comes
-    GARBLED = "garbled"  # something comes, but no samples
-    MOVING = "moving"  # what comes cannot tell the tilt, the instrument being on the move
+    GARBLED = "garbled"  # bytes come, but no samples
+    MOVING = "moving"  # samples come, but the instrument moves and they give no tilt
     RECEIVING = "receiving"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
-    """What has come in since the source was made; lines, or messages of a topic."""
+    """Numbers of the lines, or of the messages of a topic, since the source was made."""
 
     good: int = 0  # with the right checksum and form
     crc_errors: int = 0  # framed lines with the wrong checksum
-    malformed: int = 0  # lines that are none of these, messages with NaN or without a time
+    malformed: int = 0  # lines of another form, messages with NaN or without a stamp
     garbage_bytes: int = 0  # outside of lines
     lost: int = 0  # samples missing in the sequence
     duplicates: int = 0  # samples that came twice; dropped
@@ -45,12 +45,16 @@ class Arrival:
 
     sample: Any
     moment: Moment
-    identity: Any = None  # what the device had said of itself when it sent this
+    identity: Any = None  # what the device had told about itself when it sent this
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """A tilt as it is published: ns of the host's time, rad (always finite), rad2 (xx, xy, yx, yy), deg C or NaN."""
+    """A tilt as it is published.
+
+    stamp_ns: the host's time.  x, y: rad, always finite.  covariance: rad2 (xx, xy, yx, yy).
+    temperature_c: deg C, or NaN if it is not known.
+    """
 
     stamp_ns: int
     x: float
@@ -63,12 +67,12 @@ class Reading:
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
-    """How a source stands, as a person wants to know it."""
+    """State of a source, for a person to read."""
 
     phase: Phase
     sentence: str
-    rate_hz: float = 0.0  # of the samples, lately
+    rate_hz: float = 0.0  # of the recent samples
     counts: Counts = field(default_factory=Counts)
-    complaint: str = ""  # what is not as it should be though samples come
-    step: Step | None = None  # of the host's clock, the last one
+    complaint: str = ""  # what is wrong although samples come
+    step: Step | None = None  # the last step of the host's clock
     values: Mapping[str, object] = field(default_factory=dict)

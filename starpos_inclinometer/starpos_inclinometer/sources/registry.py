@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sources by the name that the parameter `source` gives them; a new sensor is a module here and a line below."""
+"""The sources by their name in the parameter `source`. A new sensor needs a module here and a line below."""
 
 from starpos_inclinometer.sources.ascii_line import AsciiSource
 from starpos_inclinometer.sources.imu import ImuSource

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ADC codes to angles: AD7730, divider, SCA100T-D01; and what is wrong with a sample.
+"""Angles from ADC codes (AD7730, divider, SCA100T-D01), their covariance, and the faults of a sample.
 
 Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (Analog Devices rev. A).
 """
@@ -30,34 +30,35 @@ DIVIDER = 31.0
 TEMPERATURE_ZERO_COUNTS = 197
 TEMPERATURE_COUNTS_PER_C = -1.083
 
-# 24-bit codes of a living converter have noise of tens of counts: so many equal ones in a row are not chance,
-# nor are so many where both axes repeat theirs.
+# The 24-bit codes of a working converter have noise of tens of counts. So many equal codes in a row on one axis are no
+# chance, and neither are so many on both axes.
 STUCK_SAMPLES, STUCK_PAIRS = 10, 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sca100tCalibration:
-    """What lies between the codes and the angles; pairs are (x, y).
+    """Calibration from codes to angles; pairs are (x, y).
 
-    The ADC's AIN(-) and the divider's foot lie at half the reference, which is also the sensor's supply; so
-    the codes do not depend on the supply, and the voltages here are those of a supply of reference_volts.
+    The ADC's AIN(-) and the foot of the divider are at half the reference, which is also the supply of the sensor. So
+    the codes do not depend on the supply; the voltages here hold for a supply of reference_volts.
     """
 
     offset_volts: tuple[float, float] = (SCA100T_OFFSET_V, SCA100T_OFFSET_V)
     sensitivity_volts_per_g: tuple[float, float] = (SCA100T_SENSITIVITY_V_PER_G, SCA100T_SENSITIVITY_V_PER_G)
     divider: float = DIVIDER
     reference_volts: float = ADC_NOMINAL_REFERENCE_V
-    # (xx, xy, yx, yy): the axes' g into those of S
+    # (xx, xy, yx, yy): matrix from the g of the sensor's axes to the g of the axes of S.
     cross_axis: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
-    # of t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3), for x and for y
+    # With t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3), for x and y.
     temperature_reference_c: float = 25.0
-    offset_per_c: tuple[tuple[float, float, float], ...] = ((0.0,) * 3,) * 2
-    sensitivity_per_c: tuple[tuple[float, float, float], ...] = ((0.0,) * 3,) * 2
-    noise_floor_rad: float = 0.0  # of one sample; what the samples show is never taken for less
+    offset_per_c: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 2
+    sensitivity_per_c: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 2
+    # Smallest noise of one sample, even if the samples show less.
+    noise_floor_rad: float = 0.0
 
     @property
     def volts_per_code(self) -> float:
-        """The sensor's output voltage that one code stands for."""
+        """Change of the sensor's output voltage for one code."""
         full_scale = ADC_RANGE_V * self.reference_volts / ADC_NOMINAL_REFERENCE_V
         return self.divider * full_scale / CODE_ZERO
 
@@ -67,37 +68,37 @@ class Sca100tCalibration:
         return any(any(c) for c in (*self.offset_per_c, *self.sensitivity_per_c))
 
     def volts(self, code: int) -> float:
-        """The sensor's output voltage."""
+        """Convert a code to the sensor's output voltage."""
         return self.reference_volts / 2 + (code - CODE_ZERO) * self.volts_per_code
 
     def code(self, volts: float) -> int:
-        """The inverse, limited to what the converter can say."""
+        """Convert an output voltage to a code, limited to the range of the converter."""
         code = CODE_ZERO + round((volts - self.reference_volts / 2) / self.volts_per_code)
         return min(max(code, 0), CODE_MAX)
 
     def offset_and_sensitivity(self, axis: int, temperature_c: float) -> tuple[float, float]:
-        """V and V/g of an axis at a temperature."""
+        """Offset (V) and sensitivity (V/g) of an axis at a temperature."""
         t = temperature_c - self.temperature_reference_c
         share = 1.0 + _cubic(self.sensitivity_per_c[axis], t)
-        # A polynomial far outside of where it was fitted must not turn the axis round.
+        # A polynomial far outside its fitted range must not reverse the axis.
         share = min(max(share, 0.5), 2.0)
         offset = self.offset_volts[axis] + _cubic(self.offset_per_c[axis], t)
         return offset, self.sensitivity_volts_per_g[axis] * share
 
     def axis_g(self, axis: int, code: int, temperature_c: float) -> float:
-        """What an axis feels, in g, limited to +-1: beyond there is no angle, and the sample is out of range anyway."""
+        """Acceleration of an axis in g, limited to +-1; beyond, it has no angle and the sample is out of range anyway."""
         offset, sensitivity = self.offset_and_sensitivity(axis, temperature_c)
         return min(max((self.volts(code) - offset) / sensitivity, -1.0), 1.0)
 
     def angles(self, gx: float, gy: float) -> tuple[float, float]:
-        """rad of S's axes above the horizon, from what the sensor's axes feel."""
+        """Elevation of S's axes above the horizon in rad, from the g of the sensor's axes."""
         xx, xy, yx, yy = self.cross_axis
         return _asin(xx * gx + xy * gy), _asin(yx * gx + yy * gy)
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A sample in units: x, y rad (always finite), covariance rad2 (xx, xy, yx, yy), deg C or NaN, flags of Tilt.msg."""
+    """A sample in units: x, y rad (always finite), covariance rad2 (xx, xy, yx, yy), deg C or NaN, Tilt.msg's flags."""
 
     x: float
     y: float
@@ -107,19 +108,19 @@ class Measured:
 
 
 def temperature_c(counts: int) -> float:
-    """deg C of the SCA100T's temperature counts."""
+    """Convert the SCA100T's temperature counts to deg C."""
     return (counts - TEMPERATURE_ZERO_COUNTS) / TEMPERATURE_COUNTS_PER_C
 
 
 def temperature_counts(celsius: float) -> int:
-    """The inverse, limited to 8 bits."""
+    """Convert deg C to temperature counts, limited to 8 bits."""
     return min(max(round(TEMPERATURE_ZERO_COUNTS + TEMPERATURE_COUNTS_PER_C * celsius), 0), 255)
 
 
 class Sensor:
-    """Samples of one MCU to tilts; remembers the codes before, the temperature and the noise."""
+    """Converts the samples of one MCU to tilts; remembers the last codes, the temperature and the noise."""
 
-    def __init__(self, calibration: Sca100tCalibration = Sca100tCalibration()):
+    def __init__(self, calibration: Sca100tCalibration = Sca100tCalibration()) -> None:
         self.calibration = calibration
         self.noise = NoiseTracker()
         self.temperature = Temperature()
@@ -127,7 +128,7 @@ class Sensor:
         self._run = [0, 0]
 
     def measure(self, sample: Sample, time_s: float) -> Measured:
-        """time_s: the sample's, of a clock that does not step."""
+        """Convert a sample taken at `time_s` of a clock that does not step."""
         flags = self._flags(sample)
         measured = math.nan
         if not sample.status & SampleStatus.NO_TEMPERATURE:
@@ -157,12 +158,17 @@ class Sensor:
             flags |= SATURATED
         return flags
 
-    def _covariance(self, sample, g, angles, at) -> tuple[float, float, float, float]:
-        """Noise and quantisation of each axis, through the cross-axis matrix; and what the temperature leaves open."""
+    def _covariance(
+        self, sample: Sample, g: tuple[float, float], angles: tuple[float, float], at: float
+    ) -> tuple[float, float, float, float]:
+        """Covariance from noise and quantisation of each axis, through the cross-axis matrix, and temperature error.
+
+        at: the temperature, deg C.
+        """
         c = self.calibration
         noise = self.noise.sigma or (SCA100T_NOISE_RAD, SCA100T_NOISE_RAD)
         step = [c.volts_per_code / c.sensitivity_volts_per_g[axis] for axis in range(2)]
-        # of what each axis feels, g^2; an angle's noise is g's over the cosine
+        # Variances of each axis in g^2; the noise of an angle is that of g over the cosine.
         vx, vy = (
             max(noise[i], c.noise_floor_rad) ** 2 * (1 - g[i] ** 2) + step[i] ** 2 / 12 for i in range(2)
         )
@@ -176,8 +182,8 @@ class Sensor:
             cxx, cxy, cyy = cxx + dx * dx, cxy + dx * dy, cyy + dy * dy
         return cxx, cxy, cxy, cyy
 
-    def _temperature_error(self, sample, at) -> tuple[float, float]:
-        """rad, 1 sigma: what the tilt changes by at the worse end of where the temperature may be."""
+    def _temperature_error(self, sample: Sample, at: float) -> tuple[float, float]:
+        """Change of the tilt (rad) if the temperature is 1 sigma off, to the side with the larger change."""
         c, sigma = self.calibration, self.temperature.stddev_c
         here, low, high = (
             c.angles(c.axis_g(0, sample.x, t), c.axis_g(1, sample.y, t)) for t in (at, at - sigma, at + sigma)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial port: a thread that opens and reads it, and comes back when the device does."""
+"""The serial port: a thread opens and reads it, and opens it again when the device comes back."""
 
 import contextlib
 import errno
@@ -19,18 +19,20 @@ from starpos_inclinometer.host_clock import HostClock, Moment, Step
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.reading import Arrival, Counts, Phase
 
-RETRY_S = 0.4  # so that a device that came back is read again within a second
-READ_TIMEOUT_S = 0.1  # how soon a stop, a command or silence is noticed
+# A device that came back is read again within a second.
+RETRY_S = 0.4
+# How soon a stop, a command or silence is noticed.
+READ_TIMEOUT_S = 0.1
 MIN_SILENCE_S, SILENT_PERIODS = 1.0, 1.5
-UNFIT_PATIENCES = 3.0  # so many times longer lines may come of which none is believed
+# Lines of which none is believed are reported after so many times the patience with silence.
+UNFIT_PATIENCES = 3.0
 READ_BYTES = 4096
 QUEUE_SAMPLES = 512  # 10 s at the highest rate
 RATE_WINDOW_S = 5.0
 PTY_MAJORS = range(136, 144)  # pseudo-terminals, Linux's devices.txt
 
-# pyserial raises its own error, passes some of the system's through, and a TypeError where its fd has gone.
+# pyserial raises its own error, passes on some errors of the system, and raises TypeError if its descriptor is gone.
 PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueError)
-
 
 SERIAL_PARAMETERS = (
     Parameter(
@@ -53,61 +55,62 @@ SERIAL_PARAMETERS = (
 
 
 def port_refusal(values: Mapping[str, Any]) -> str | None:
-    """A sentence where no port is named."""
+    """Say in a sentence that no port is named; None if one is."""
     if values["port"].strip():
         return None
     return "parameter port must name the serial port, such as /dev/serial/by-id/...; it is empty."
 
 
 class Decoder(Protocol):
-    """What a device's bytes mean, and what it is to be told. Used by the link's thread; `counts` is read by any."""
+    """Decodes the bytes of a device and makes its commands. The link's thread uses it; any thread may read `counts`."""
 
-    hint: str  # what to do where bytes come but no lines
+    # What to do if bytes come but no lines.
+    hint: str
 
     @property
     def counts(self) -> Counts: ...
 
     @property
     def period_s(self) -> float:
-        """From one sample to the next."""
+        """Time from one sample to the next."""
 
     def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
-        """The samples that are complete and believed with these bytes, read at that moment; never raises."""
+        """Take bytes that were read at that moment; return the samples that are believed now; never raises."""
 
-    def resume(self):
-        """The connection was opened anew."""
+    def resume(self) -> None:
+        """Start again, because the connection was opened again."""
 
     def command(self) -> bytes:
-        """What to tell the device now so that it is as it should be; empty where it is."""
+        """The command that the device needs now; empty if it needs none."""
 
     @property
     def command_period_s(self) -> float:
-        """From one command to the next, unless it was answered."""
+        """Time from one command to the next, unless it was answered."""
 
     @property
     def answered(self) -> bool:
-        """Whether a command was answered with the last bytes: the next need not wait."""
+        """Whether the last bytes answered a command, so that the next command need not wait."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkState:
-    """The link as a person wants to know it."""
+    """State of the link, for a person to read."""
 
     phase: Phase = Phase.ABSENT
     sentence: str = "the port has not been opened yet"
     counts: Counts = field(default_factory=Counts)
     connections: int = 0  # how often the port was opened
-    dropped: int = 0  # samples nobody fetched in time
-    rate_hz: float = 0.0  # as they came in lately
-    step: Step | None = None  # of the host's clock
+    dropped: int = 0  # samples that nobody fetched in time
+    rate_hz: float = 0.0  # of the recent samples
+    step: Step | None = None  # the last step of the host's clock
 
 
 class SerialLink:
     """Reads samples from `port` until `stop`.
 
     port: use a stable path (/dev/serial/by-id/...); it is resolved at each opening, and opened exclusively.
-    clock: read once for each chunk of bytes.  wake: called from the reader's thread when there are samples to
-    take or the phase changed; must be quick.
+    clock: read once for each chunk of bytes.
+    wake: called from the reader's thread when there are samples to take or the phase changed; it must be quick.
     """
 
     def __init__(
@@ -116,8 +119,8 @@ class SerialLink:
         baud: int,
         decoder: Decoder,
         clock: HostClock,
-        wake: Callable[[], None] = lambda: None,
-    ):
+        wake: Callable[[], object] = lambda: None,
+    ) -> None:
         self._port = port
         self._baud = baud
         self._decoder = decoder
@@ -133,17 +136,17 @@ class SerialLink:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="serial link", daemon=True)
 
-    def start(self):
+    def start(self) -> None:
         self._thread.start()
 
-    def stop(self):
+    def stop(self) -> None:
         """Close the port and end the thread; takes at most a few READ_TIMEOUT_S."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
     def take(self) -> list[Arrival]:
-        """The samples that have come since the last call, in order."""
+        """Return the samples since the last call, in order."""
         taken = []
         with self._lock:
             while self._queue:
@@ -165,9 +168,9 @@ class SerialLink:
                 step=self._clock.step,
             )
 
-    # The rest runs in the thread.
+    # All that follows runs in the reader's thread.
 
-    def _run(self):
+    def _run(self) -> None:
         while not self._stop.is_set():
             device = None
             try:
@@ -185,14 +188,14 @@ class SerialLink:
         device = serial.Serial(
             self._port, self._baud, timeout=READ_TIMEOUT_S, write_timeout=0.5, exclusive=True
         )
-        # pyserial's lock binds only who asks for it; this binds all but root. A pseudo-terminal would stay closed after
-        # a reader that was killed, for as long as its other end is open.
+        # pyserial's lock stops only programs that ask for it; this stops all but root's. A pseudo-terminal is left out:
+        # it would stay locked after a reader was killed, as long as its other end is open.
         if os.major(os.fstat(device.fileno()).st_rdev) not in PTY_MAJORS:
             fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
         return device
 
-    def _serve(self, device: serial.Serial):
-        """Read until the link is stopped or the path leads elsewhere; raises when something goes wrong."""
+    def _serve(self, device: serial.Serial) -> None:
+        """Read until the link is stopped or the path leads to another device; raises when something goes wrong."""
         with self._lock:
             self._connections += 1
             self._decoder.resume()
@@ -230,7 +233,7 @@ class SerialLink:
                 )
 
     def _receive(self, data: bytes, moment: Moment) -> tuple[bool, bool]:
-        """Whether there were valid lines among the data, and samples."""
+        """Take bytes; return whether they held valid lines, and samples."""
         with self._lock:
             before = self._decoder.counts.good
             arrivals = self._decoder.feed(data, moment)
@@ -247,10 +250,10 @@ class SerialLink:
         return lines, bool(arrivals)
 
     def _moved(self, device: serial.Serial) -> bool:
-        """Whether the path now leads to another device than the open one; OSError where it leads nowhere."""
+        """Whether the path now leads to another device than the open one; OSError if it leads nowhere."""
         return os.stat(self._port).st_rdev != os.fstat(device.fileno()).st_rdev
 
-    def _enter(self, phase: Phase, sentence: str):
+    def _enter(self, phase: Phase, sentence: str) -> None:
         with self._lock:
             changed = (phase, sentence) != (self._phase, self._sentence)
             self._phase, self._sentence = phase, sentence
@@ -271,7 +274,7 @@ class SerialLink:
         return f"{self._port} is no usable serial port ({text}): set `port` to the device; it is retried."
 
 
-def _close(device: serial.Serial):
-    # Where the device has gone there is nothing left to close.
+def _close(device: serial.Serial) -> None:
+    # If the device is gone there is nothing left to close.
     with contextlib.suppress(*PORT_ERRORS):
         device.close()

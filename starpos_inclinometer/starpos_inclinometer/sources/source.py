@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sensor is to the node. Each is a TiltSource; a new one is a module here and a line in `registry`."""
+"""Interface between the node and a sensor. A new sensor is a TiltSource in a module here, and a line in `registry`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from starpos_inclinometer.sources.reading import Health, Reading
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a source has of its node: the node itself, for its topics; the host's clock; `wake`, called by any thread."""
+    """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call."""
 
     node: Node
     clock: HostClock
@@ -22,31 +22,32 @@ class Surroundings:
 
 
 class TiltSource(Protocol):
-    """Where tilts come from. Made as SourceClass(host, values), of the node's parameters.
+    """A source of tilts, made as SourceClass(host, values) from the node's parameters.
 
-    One thread, the node's, calls it.
+    Only the node's thread calls it.
     """
 
     parameters: Sequence[Parameter]
-    name: str  # of the device, for diagnostics: its port or topic
+    # The port or topic of the device, for diagnostics.
+    name: str
 
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]): ...
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None: ...
 
     @staticmethod
     def refusal(values: Mapping[str, Any]) -> str | None:
-        """A sentence where a source with these parameters cannot be made."""
+        """Say in a sentence why a source cannot be made of these parameters; None if it can."""
 
-    def start(self):
+    def start(self) -> None:
         """Begin to listen."""
 
-    def stop(self):
-        """End all that `start` began; takes at most a second."""
+    def stop(self) -> None:
+        """End everything that `start` began; takes at most a second."""
 
-    def configure(self, values: Mapping[str, Any]):
-        """Take over the parameters that may change at run time."""
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """Apply the parameters that may change at run time."""
 
     def take(self) -> list[Reading]:
-        """The readings since the last call, in order."""
+        """Return the readings since the last call, in order."""
 
     def health(self) -> Health:
-        """How it stands, as a person wants to know it."""
+        """State of the source, for a person to read."""
