@@ -78,18 +78,22 @@ class Simulator:
         while not log or "Uvicorn running" not in log[-1]:
             log.append(self._process.stderr.readline())
             assert log[-1], "".join(log)
-        threading.Thread(target=self._process.stderr.read, daemon=True).start()  # a full pipe would stop it
+        self._reader = threading.Thread(target=self._process.stderr.read)  # a full pipe would stop it
+        self._reader.start()
 
     def kill(self):
         if self._process:
             self._process.kill()
             self._process.wait()
+            self._reader.join()
+            self._process.stderr.close()
+            self._process = None
 
     def client(self, number: int = 0):
         """Another program that uses the camera."""
         from alpaca.camera import Camera
 
-        return Camera(width=self.address, height=number)
+        return Camera(self.address, number)
 
 
 def image_bytes(pixels: np.ndarray, sent_as: int, **changes) -> bytes:

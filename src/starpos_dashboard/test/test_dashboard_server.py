@@ -265,6 +265,8 @@ def test_junk_ends_its_own_connection_only(server, junk):
     assert ask(server)[0] == 200
 
 
+# tornado leaves the socket that it could not bind to the garbage collector
+@pytest.mark.filterwarnings("ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning")
 def test_a_port_in_use_is_said_in_a_sentence(server):
     from starpos_dashboard.server import DashboardError, listen
 

@@ -115,4 +115,4 @@ class Process:
         """Whatever a test has left of it."""
         if self._process.poll() is None:
             self._process.kill()
-            self._process.communicate()
+        self._process.communicate()  # which closes the pipe

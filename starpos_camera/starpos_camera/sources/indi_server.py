@@ -67,9 +67,11 @@ class IndiServer:
 
     def close(self):
         """Cancel the work, which may still tell the device of it, and leave the server."""
+        leaving = self._leave()
         try:
-            asyncio.run_coroutine_threadsafe(self._leave(), self._loop)
+            asyncio.run_coroutine_threadsafe(leaving, self._loop)
         except RuntimeError:  # the loop has ended
+            leaving.close()
             return
         self._thread.join(2 * LEAVE_S)
 

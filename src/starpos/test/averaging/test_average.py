@@ -94,6 +94,7 @@ def test_half_a_turn_takes_the_calibration_off_the_position(rng):
     assert np.all(sigmas(a, "calibration")[:2] < 60)
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("calibration", [0.0, 15.0])
 def test_an_average_errs_as_its_covariance_says(calibration, rng):
     position, heading = [], []
@@ -303,6 +304,7 @@ def slipped(f, seconds):
     )
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("seconds", [1.0, -1.0, 60.0, 3600.0])
 @pytest.mark.parametrize("at", [0, 7, 24])
 def test_a_wrong_time_stamp_does_not_move_it(seconds, at, rng):

@@ -17,6 +17,7 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField
 
+pytestmark = pytest.mark.montecarlo
 STATE = earth_state(UTC)
 NOISE, A3_ERROR = 12.6 * ARCSEC, 5.0 * ARCSEC
 EARTH_RAD_S = 7.292115e-5

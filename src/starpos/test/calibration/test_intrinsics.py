@@ -49,6 +49,7 @@ def test_a_camera_is_recovered_to_what_it_claims(field, rng):
     check_sound(fit, ideal(field))
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("field", FIELDS)
 def test_over_many_cameras_the_errors_are_those_claimed(field, rng):
     z, off, claimed, corner = [], [], [], np.zeros((1, 2))

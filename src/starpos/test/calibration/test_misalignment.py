@@ -87,6 +87,7 @@ def test_two_leans_tell_all_of_a3(catalogue, rng, given):
     assert metres < 4 * sigma_m(elsewhere) < 4 * 1200
 
 
+@pytest.mark.montecarlo
 def test_a3_errs_as_its_covariance_says(catalogue):
     """Chi-squares of 30 calibrations average to the 3 that three angles have."""
     chi2 = []
@@ -96,6 +97,7 @@ def test_a3_errs_as_its_covariance_says(catalogue):
     assert np.mean(chi2) == pytest.approx(3, abs=3.5 * np.sqrt(6 / 30))
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("off_deg", [0.02, 0.1, 1.0, -20.0])
 @pytest.mark.parametrize("which", [0, 4, 9])
 def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, off_deg, which):
@@ -127,6 +129,7 @@ def test_frames_that_do_not_agree(catalogue, rng, bad):
     assert "\n" not in str(e.value)
 
 
+@pytest.mark.montecarlo
 def test_frames_that_scatter_more_than_they_say_claim_less(catalogue):
     """A mount that creeps by 24 arcsec from frame to frame, which nobody told."""
     calm, creeping = (shots(catalogue, np.random.default_rng(3), [0.0] * 8) for _ in range(2))

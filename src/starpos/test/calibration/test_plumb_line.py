@@ -96,6 +96,7 @@ TURNS = {
 }
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("noise", [SCA100T, QUIET])
 @pytest.mark.parametrize("kind", TURNS)
 def test_level_errs_as_it_says(kind, noise):
@@ -199,6 +200,7 @@ def test_frames_of_two_places_scatter():
         assert hang(made, truth.given, truth.zenith, 0.0, np.pi).scatter < 3
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("noise", [SCA100T, QUIET])
 @pytest.mark.parametrize("bad", [(0,), (3, 10), (17,)])
 def test_misread_tilts_stand_out_and_pull_no_harder_than_three_sigma(bad, noise):
@@ -225,6 +227,7 @@ HUNG = {
 }
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("site", [0.0, 20 * ARCSEC])
 @pytest.mark.parametrize("noise", [SCA100T, QUIET])
 @pytest.mark.parametrize("kind", HUNG)

@@ -59,8 +59,7 @@ def test_solve_gives_the_same_however_many_processes(more, archive, capfd):
     assert one[0] == 2  # of the broken frame
     assert one[1].count('"status": "ok"') == 8 + 1
     assert one[2].count("stars_0002b.csv") == 1
-    for jobs in (2, 3):
-        assert run(capfd, solve(archive / "turned", "--json", "--jobs", jobs, *more)) == one
+    assert run(capfd, solve(archive / "turned", "--json", "--jobs", 3, *more)) == one
     assert run(capfd, solve(archive / "turned", "--jobs", "auto", *more)) == run(
         capfd, solve(archive / "turned", *more)
     )
@@ -177,7 +176,7 @@ def started(archive, **options):
     The answers are more than a pipe holds: it cannot have ended before somebody reads them.
     """
     night = archive / "turned"
-    many = [p for p in frames(night) if "2b" not in p] * 20
+    many = [p for p in frames(night) if "2b" not in p] * 13
     command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *WIDE, "--json", "--jobs", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     process = subprocess.Popen(

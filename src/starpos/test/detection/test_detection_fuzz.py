@@ -93,6 +93,7 @@ def is_answered(pixels, rng):
     return len(found) > 0
 
 
+@pytest.mark.montecarlo
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("make", "least", "most"),

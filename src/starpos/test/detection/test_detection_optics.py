@@ -82,6 +82,7 @@ def test_corners_without_a_star_to_learn_from_are_no_worse_than_the_rest(rng):
     assert rms(error[~middle[index >= 0]]) < 1.3 * rms([bound(700.0, f) for f in (2.0, 2.8)])
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("electrons", [3000, 30000, 100000])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_one_two_and_three_stars_are_measured_as_well_as_they_say(count, electrons, rng):

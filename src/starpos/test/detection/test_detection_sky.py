@@ -140,6 +140,7 @@ def test_stars_far_over_the_full_well_are_found_where_they_are(rng):
     assert np.all(np.abs(error[full]) < 0.1)
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("pattern", ["", "rggb"])
 @pytest.mark.parametrize("ratio", [1.0, 0.3])
 @pytest.mark.parametrize("fwhms", [0.8, 1.0, 1.25, 1.3, 1.4, 1.6, 2.0, 2.7])

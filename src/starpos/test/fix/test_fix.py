@@ -141,6 +141,7 @@ def test_scatter_beyond_the_centroids_errors_widens_the_fix(rng):
     assert ratio == pytest.approx(8, rel=0.2)
 
 
+@pytest.mark.montecarlo
 def test_few_stars_do_not_claim_what_they_cannot_tell(rng):
     """Four of unknown scatter: their errors go as Student's t of four, 63 % within the likeliest sigma; 77 within its."""
     within = []
@@ -245,6 +246,7 @@ SOURCES = {
 }
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("source", SOURCES)
 def test_errors_are_as_large_as_their_covariance_says(source, rng):
     """Each error drawn from its sigma: chi-squares of position, heading and attitude average to their freedom."""

@@ -43,6 +43,7 @@ def largest(fields, rng, catalogue, weighed, priors=tuple):
     return np.array(best)
 
 
+@pytest.mark.montecarlo
 def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rng, weighed):
     """Ville: a likelihood ratio exceeds x at most once in x, all hypotheses of a frame taken together."""
     best = largest(80, rng, catalogue, weighed)
@@ -52,6 +53,7 @@ def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rn
     assert np.mean(best > -8) > 0.05  # or the test would not see anything
 
 
+@pytest.mark.montecarlo
 def test_a_prior_raises_it_no_further(catalogue, rng, weighed):
     def priors():
         return PointingPrior(random_attitude(rng), SMALL.fx), PlumbPrior(

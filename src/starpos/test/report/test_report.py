@@ -65,6 +65,7 @@ def numbers_after(page, text):
     return [float(n) for n in re.findall(r"[+-]?\d+\.?\d*", found.group(1))]
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_the_page_says_what_solve_says(still, tmp_path, capsys):
     status, page, errors = report(capsys, still, tmp_path / "out")
     want = solved(capsys, still, *OPTICS, *AIR)
@@ -110,6 +111,7 @@ def test_one_tilt_for_all_takes_the_inclinometers_noise_away(still, catalogue):
     assert np.abs(own).max() > 3.0
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_turned_night_has_no_mean_heading_but_that_of_the_truth(turned, tmp_path, capsys):
     misalignment = ("--misalignment", 0.5, -0.3, 0.2)
     status, page, _ = report(capsys, turned, tmp_path / "out", *misalignment)
@@ -118,6 +120,7 @@ def test_a_turned_night_has_no_mean_heading_but_that_of_the_truth(turned, tmp_pa
     assert "last heading" in page.text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_self_calibration_is_said(turned, tmp_path, capsys):
     status, page, errors = report(capsys, turned, tmp_path / "out", "--self-calibrate")
     want = solved(capsys, turned, *OPTICS, *AIR, "--self-calibrate")
@@ -209,6 +212,7 @@ def test_what_is_no_night_is_refused_in_one_line(kind, still, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_file_of_somebody_else_is_not_overwritten(still, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
@@ -228,6 +232,7 @@ def test_its_own_report_is_overwritten_whole(drawn, turned, tmp_path, capsys):
     assert not [p for p in out.iterdir() if p.name.startswith(".")]
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_where_nothing_can_be_written_one_line_says_so(still, tmp_path, capsys):
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, no folder")

@@ -75,6 +75,7 @@ def test_a_bag_gives_what_solve_gives_of_the_same_night(plugin, night, lists, ti
         assert_drawn(png)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_one_file_of_a_bag_is_a_bag(night, lists, tilts, tmp_path, capsys):
     bag = record(tmp_path / "bag", lists, tilts)
     (file,) = bag.glob("*.mcap")
@@ -83,6 +84,7 @@ def test_one_file_of_a_bag_is_a_bag(night, lists, tilts, tmp_path, capsys):
     assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_the_recorded_night_of_the_repository(tmp_path, capsys):
     if not RECORDED.is_dir():
         pytest.skip("the repository's bag is not beside this package")
@@ -99,6 +101,7 @@ def test_the_recorded_night_of_the_repository(tmp_path, capsys):
     assert float(longitude.strip(" ,")) == pytest.approx(truth["longitude_deg"], abs=4e-4)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_of_several_instruments_one_is_chosen(night, lists, tilts, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         for bag.namespace in ("/north", "/far/south"):
@@ -150,6 +153,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
         assert_drawn(png)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_the_mean_of_recorded_solutions_claims_no_more_than_one(said, lists, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         for stars, one in zip(lists, said, strict=True):
@@ -159,6 +163,7 @@ def test_the_mean_of_recorded_solutions_claims_no_more_than_one(said, lists, tmp
     assert f"± {sigma[1]:.0f} m N {sigma[0]:.0f} m E" in page.text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_solver_that_said_something_else_is_remarked(said, lists, tilts, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         bag.camera(FOCAL_PX, 1000, 700)
@@ -173,6 +178,7 @@ def test_a_solver_that_said_something_else_is_remarked(said, lists, tilts, tmp_p
     assert "another A3" in page.text and "another A3" in errors[0]
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_stars_without_tilts_give_no_fix_and_say_why(lists, tmp_path, capsys):
     bag = record(tmp_path / "bag", lists[:2], None)
     status, page, errors = report(capsys, bag, tmp_path / "out")
@@ -180,6 +186,7 @@ def test_stars_without_tilts_give_no_fix_and_say_why(lists, tmp_path, capsys):
     assert "no usable tilt in it" in page.text and "2 no tilt" in page.text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         bag.camera(FOCAL_PX, 1000, 700)
@@ -205,6 +212,7 @@ def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, ca
     assert f"{len(wrong) * len(lists)} tilts of the bag were left out" in errors[0]
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_bag_without_a_camera_takes_the_options(night, lists, tilts, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         bag.tilts(tilts)
@@ -229,6 +237,7 @@ def without_definitions(bag):
     return bag
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_definitions_a_bag_lacks_come_from_the_workspace(night, lists, tilts, tmp_path, capsys, monkeypatch):
     bag = without_definitions(record(tmp_path / "bag", lists, tilts, plugin=StoragePlugin.SQLITE3))
     monkeypatch.setenv("AMENT_PREFIX_PATH", "")
@@ -264,6 +273,7 @@ def test_what_is_no_bag_is_refused_in_one_line(damage, lists, tilts, tmp_path, c
     assert ("mcap recover" in errors[0]) == (damage == "cut")
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_recording_that_was_killed_says_how_to_get_it_back(lists, tilts, tmp_path, capsys):
     bag = record(tmp_path / "bag", lists, tilts)
     (bag / "metadata.yaml").unlink()  # both come at the end
@@ -277,6 +287,7 @@ def test_a_recording_that_was_killed_says_how_to_get_it_back(lists, tilts, tmp_p
             assert ("mcap recover bag.mcap" in errors[0]) == (left > 0), left
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_broken_star_lists_cost_their_frame_only(night, lists, tilts, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         bag.camera(FOCAL_PX, 1000, 700)

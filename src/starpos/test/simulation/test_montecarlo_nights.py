@@ -29,6 +29,7 @@ def outcomes(catalogue):
     }
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("kind", KINDS)
 def test_claims_are_true(kind, outcomes):
     """Of 12 nights the normalised errors squared scatter by 0.6 about their 2: 4.3 is four sigma up.
@@ -43,6 +44,7 @@ def test_claims_are_true(kind, outcomes):
     assert 0.2 < np.mean([o.heading_nees for o in outcomes[kind]]) < 1 + 4 * np.sqrt(2 / 12)
 
 
+@pytest.mark.montecarlo
 def test_the_ground_is_less_well_known_than_the_plumb_line(outcomes):
     """By the 6 arcsec, 185 m, of a deflection nobody knows."""
     for o in outcomes["turned"]:
@@ -51,6 +53,7 @@ def test_the_ground_is_less_well_known_than_the_plumb_line(outcomes):
         assert 0 < np.linalg.norm(o.off_ground[:2] - o.off[:2]) < 5 * 185
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_seed_is_a_night(kind, catalogue, outcomes):
     seeds = np.random.SeedSequence(4).spawn(2)
@@ -136,6 +139,7 @@ def test_the_papers_nights(run, monkeypatch):
     assert all_of_them["mean_abs_latitude_arcsec"] == pytest.approx(all_of_them["mean_abs_north_m"] / 30.87)
 
 
+@pytest.mark.montecarlo
 def test_whether_claims_are_honest(run):
     args = ("honesty", "--nights", 4, "--seed", 2)
     status, said, errors = run(*args, "--jobs", 1, "--json")

@@ -25,8 +25,10 @@ def star(size, x, y, fwhm, trail=(0.0, 0.0)):
 
 
 def field(size, stars, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gains=None):
-    """Noiseless electrons (float64) of stars (N, 3): x, y, electrons; fwhm (N,) and trail (N, 2) of each, or of all;
-    gains (N + 1, 2, 2): each star's mosaic and last the sky's."""
+    """Draw the noiseless electrons (float64) of stars (N, 3): x, y, electrons.
+
+    fwhm (N,) and trail (N, 2): of each, or of all; gains (N + 1, 2, 2): each star's mosaic and last the sky's.
+    """
     image = np.zeros(size)
     fwhm, trail = np.broadcast_to(fwhm, len(stars)), np.broadcast_to(trail, (len(stars), 2))
     reach = int(np.max(4 * fwhm + np.hypot(*trail.T), initial=0)) + 3
@@ -58,7 +60,10 @@ def noisy(image, rng, top=65535, dtype=np.uint16):
 
 
 def bound(electrons, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gain=None):
-    """Cramer-Rao bound (sigma_x, sigma_y) px of one star; gain (2, 2): behind a mosaic of known colours."""
+    """Sigmas in x and y, px, of one star at the limit of Cramer and Rao.
+
+    gain (2, 2): behind a mosaic of known colours.
+    """
     size, x, y, h = (41, 41), 20.2, 19.9, 1e-3
     mosaic = np.ones(size) if gain is None else np.tile(gain, (21, 21))[:41, :41]
     value = star(size, x, y, fwhm, trail)
