@@ -18,52 +18,81 @@ REFIT_S = 1.0
 MAX_RATE_ERROR = 0.05
 # With a sample so far ahead of the envelope the MCU's clock has jumped.
 EARLY_S = 0.2
-# With a sample so far behind it the MCU was reset, or stood still.
+# So far behind a sample is of a backlog, or of a clock that stood still.
 LATE_S = 2.0
+# Samples that are read so late, and fast, are of a backlog.
+BACKLOG_S = 0.25
+# Samples that follow each other faster than this share of their pace are read from a backlog
+SLOWEST_PACE, FASTEST_PACE = 0.5, 1.5
+# By which a line may be late on a busy machine, and still be taken to come at its pace
+JITTER_S = 0.05
+# A clock that stood still shows after so long
+STANDING_S = 1.0
 MAX_POINTS = 4096
+# The usual time between lines is the median of so many.
+USUAL_OF = 21
 
 
 class ArrivalFilter:
-    """Finds how late each sample arrived beyond the shortest recent delay; starts again after a reset of the MCU."""
+    """By how much each sample arrived later than the shortest delay of late, from the device's own milliseconds.
+
+    A backlog, which this process reads after it stood still, keeps the times that its samples were taken at. Where those
+    cannot be known there is no answer: at the first sample, and after a reset, until samples come at the pace at which
+    they are taken; and at a leap, until it shows whether a backlog follows or the device's clock stood still.
+    """
 
     def __init__(self) -> None:
-        # How often the filter started again; its first sample makes it 0.
-        self.restarts = -1
+        self.restarts = -1  # of the filter; the first sample starts it
         self._points: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
         self._last_ms = 0
+        self._last_arrival_s = 0.0
         self._time = 0.0
         self._level = self._slope = 0.0
         self._next_fit = 0.0
+        # a sample has come at its pace since the start
+        self._live = False
+        # what comes now is read from a backlog
+        self._backlog = False
+        # time and arrival of the first sample of those that are too late
+        self._leap: tuple[float, float] | None = None
 
     @property
     def rate_ppm(self) -> float:
-        """How slow the MCU's clock is against the host's, 1e-6; 0 until it is known."""
+        """How much the device's clock is slow against the host's, 1e-6; 0 until it is known."""
         return self._slope * 1e6
 
     def restart(self) -> None:
-        """Forget the MCU's clock: it was reset, or may have been reset while nobody listened."""
+        """Forget the device's clock: it was reset, or may have been while nobody listened."""
         self._points.clear()
 
-    def delay(self, milliseconds: int, arrival_s: float) -> float:
-        """Delay of this sample in s (>= 0) beyond the shortest delay of the line.
+    def delay(self, milliseconds: int, arrival_s: float) -> float | None:
+        """Seconds (>= 0) by which this sample arrived later than the line is quick; None where nobody can know.
 
-        milliseconds: the MCU's time of the sample, 32 bits.
-        arrival_s: when it arrived, on a clock that does not step (time.monotonic).
+        milliseconds: the sample's, 32 bits.  arrival_s: of a clock that does not step (time.monotonic).
         """
-        if not self._points:
-            return self._restart(milliseconds, arrival_s)
         elapsed = (milliseconds - self._last_ms) & 0xFFFFFFFF
-        if elapsed >= 1 << 31:
-            return self._restart(milliseconds, arrival_s)
-        time = self._time + elapsed * 1e-3
+        if not self._points or elapsed >= 1 << 31:
+            return self._start(milliseconds, arrival_s)
+        time, apart_s = self._time + elapsed * 1e-3, arrival_s - self._last_arrival_s
         offset = arrival_s - time
         late = offset - (self._level + self._slope * time)
-        if not -EARLY_S <= late <= LATE_S:
-            return self._restart(milliseconds, arrival_s)
-        self._last_ms, self._time = milliseconds, time
-        self._points.append((time, offset))
-        while self._points[0][0] < time - WINDOW_S:
-            self._points.popleft()
+        if late < -EARLY_S and self._live:
+            return self._start(milliseconds, arrival_s)
+        catching_up = apart_s < SLOWEST_PACE * elapsed * 1e-3
+        self._last_ms, self._last_arrival_s, self._time = milliseconds, arrival_s, time
+        if not self._live:
+            self._level = min(self._level, offset)
+            self._live = not catching_up and apart_s <= FASTEST_PACE * elapsed * 1e-3 + JITTER_S
+            self._keep(time, offset)
+            return max(offset - self._level, 0.0) if self._live else None
+        if late > LATE_S:
+            return self._too_late(late, arrival_s, catching_up)
+        self._leap = None
+        # a backlog tells nothing of the line's delay, and would drive out what does
+        self._backlog = catching_up and (self._backlog or late > BACKLOG_S)
+        if self._backlog:
+            return max(late, 0.0)
+        self._keep(time, offset)
         if time >= self._next_fit:
             self._next_fit = time + REFIT_S
             self._fit()
@@ -72,14 +101,31 @@ class ArrivalFilter:
             self._level += late
         return max(late, 0.0)
 
-    def _restart(self, milliseconds: int, arrival_s: float) -> float:
+    def _too_late(self, late: float, arrival_s: float, catching_up: bool) -> float | None:
+        """The answer for a sample that is later than a line can be: of a backlog, or of a clock that stood still."""
+        self._backlog = True
+        if self._leap is None:
+            self._leap = self._time, arrival_s
+        since = self._time - self._leap[0]
+        if since >= STANDING_S and arrival_s - self._leap[1] >= SLOWEST_PACE * since:
+            self._start(self._last_ms, arrival_s)
+            self._live = True
+            return 0.0
+        return late if catching_up else None
+
+    def _keep(self, time: float, offset: float) -> None:
+        self._points.append((time, offset))
+        while self._points[0][0] < time - WINDOW_S:
+            self._points.popleft()
+
+    def _start(self, milliseconds: int, arrival_s: float) -> None:
         self.restarts += 1
-        self._last_ms, self._time = milliseconds, 0.0
+        self._last_ms, self._last_arrival_s, self._time = milliseconds, arrival_s, 0.0
         self._level, self._slope = arrival_s, 0.0
         self._points.clear()
         self._points.append((0.0, arrival_s))
         self._next_fit = REFIT_S
-        return 0.0
+        self._live, self._backlog, self._leap = False, False, None
 
     def _fit(self) -> None:
         points = self._points
@@ -91,6 +137,29 @@ class ArrivalFilter:
             (t0, o0), (t1, o1) = hull[index - 1], hull[index]
             self._slope = min(max((o1 - o0) / (t1 - t0), -MAX_RATE_ERROR), MAX_RATE_ERROR)
         self._level = min(offset - self._slope * time for time, offset in points)
+
+
+class PaceWatch:
+    """Whether lines without a clock of their own come when they are sent: not after a silence, as from a backlog."""
+
+    def __init__(self) -> None:
+        self._spacings: deque[float] = deque(maxlen=USUAL_OF)
+        self._last_s: float | None = None
+        self._doubtful = False
+
+    def on_time(self, arrival_s: float) -> bool:
+        """Whether this line was sent about when it arrived, as far as the pace of the lines tells."""
+        if self._last_s is None:
+            self._last_s = arrival_s
+            return True
+        apart_s, self._last_s = arrival_s - self._last_s, arrival_s
+        usual_s = sorted(self._spacings)[len(self._spacings) // 2] if self._spacings else apart_s
+        silence = apart_s > 2 * usual_s + JITTER_S
+        if not silence and not self._doubtful:
+            self._spacings.append(apart_s)
+        # the line that ends a silence may be the first of a backlog; those that follow too fast are of one
+        self._doubtful = silence or (self._doubtful and apart_s < SLOWEST_PACE * usual_s)
+        return not self._doubtful
 
 
 def _lower_hull(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -13,7 +13,7 @@ from rcl_interfaces.srv import DescribeParameters
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
-from starpos_inclinometer.sources import sca100t
+from starpos_inclinometer.sources import reading
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
@@ -128,7 +128,7 @@ def test_frozen_converter_and_steep_tilt_are_flagged_and_reported(bench, start, 
     mcu = Mcu(lambda now: (0.55, 0.0), seed=1)
     bench.plug(mcu)
     node = start(f"port:={bench.path}", "rate:=50")
-    listener.wait(lambda: listener.links and "30 deg" in listener.links[-1].message)
+    listener.wait(lambda: listener.tilts and listener.links and "30 deg" in listener.links[-1].message)
     assert listener.tilts[-1].flags == Tilt.OUT_OF_RANGE and listener.links[-1].level == b"\x01"
     mcu.frozen = True
     listener.wait(lambda: "stuck" in listener.links[-1].message)
@@ -161,5 +161,5 @@ def test_readme_names_every_parameter():
 
 
 def test_flags_are_those_of_the_message():
-    for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "GAP"):
-        assert getattr(sca100t, name) == getattr(Tilt, name)
+    for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "GAP", "TIME_UNKNOWN"):
+        assert getattr(reading, name) == getattr(Tilt, name)

@@ -267,5 +267,5 @@ def test_images_that_do_not_fit_together_are_refused(change, word, heard):
 
 
 def test_the_flags_that_the_reader_knows_are_the_messages():
-    for name in ("OUT_OF_RANGE", "STUCK", "SATURATED"):
+    for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "TIME_UNKNOWN"):
         assert getattr(reading, name) == getattr(msg.Tilt, name)

@@ -11,11 +11,20 @@ from typing import Any
 from starpos.instrument.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
 from starpos.units import ARCSEC
 from starpos_common.parameters import Parameter
-from starpos_inclinometer.clock import ArrivalFilter
+from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
 from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
-from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.reading import (
+    GAP,
+    OUT_OF_RANGE,
+    STUCK,
+    TIME_UNKNOWN,
+    Arrival,
+    Counts,
+    Health,
+    Reading,
+)
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
@@ -298,7 +307,7 @@ class AsciiSource(TiltSource):
             values["ascii.request"],
         )
         self._link = SerialLink(values["port"], self._baud, self._decoder, host.clock, host.wake)
-        self._arrivals = ArrivalFilter()
+        self._arrivals, self._pace = ArrivalFilter(), PaceWatch()
         self._noise = NoiseTracker()
         self._equal = 0
         self._last = (math.nan, math.nan)
@@ -328,12 +337,15 @@ class AsciiSource(TiltSource):
 
     def _read(self, arrival: Arrival) -> Reading:
         line, moment = arrival.sample, arrival.moment
-        late = 0.0
-        if line.milliseconds is not None:
+        known_s: float | None
+        if line.milliseconds is None:
+            known_s = 0.0 if self._pace.on_time(moment.monotonic_s) else None
+        else:
             if line.broken:
                 self._arrivals.restart()
-            late = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
-        flags = self._flags(line)
+            known_s = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
+        late = known_s or 0.0
+        flags = self._flags(line) | (TIME_UNKNOWN if known_s is None else 0)
         if flags & GAP:
             self._noise.interrupt()
         if not flags & (OUT_OF_RANGE | STUCK):

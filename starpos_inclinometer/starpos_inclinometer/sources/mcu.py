@@ -12,7 +12,7 @@ from starpos_inclinometer.noise import noise_text
 from starpos_inclinometer.sources import mcu_protocol, sca100t
 from starpos_inclinometer.sources.mcu_continuity import Continuity, Gate, mcu_follows
 from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
-from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.reading import TIME_UNKNOWN, Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
@@ -248,7 +248,8 @@ class McuTilts:
             self._follow(arrival.identity)
         if sample.restarted or sample.resumed:
             self.arrivals.restart()
-        late_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        known_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        late_s = known_s or 0.0
         delay_s = self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s
         measured = self.sensor.measure(sample, moment.monotonic_s - late_s)
         return Reading(
@@ -258,7 +259,7 @@ class McuTilts:
             covariance=measured.covariance,
             temperature_c=measured.temperature_c,
             sequence=sample.sequence,
-            flags=measured.flags,
+            flags=measured.flags | (TIME_UNKNOWN if known_s is None else 0),
         )
 
 

@@ -13,6 +13,7 @@ OUT_OF_RANGE = 1
 STUCK = 2
 SATURATED = 4
 GAP = 8
+TIME_UNKNOWN = 16
 
 
 class Phase(Enum):

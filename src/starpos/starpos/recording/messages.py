@@ -16,8 +16,8 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 
 # bits of Tilt.flags, as starpos_interfaces defines them
-OUT_OF_RANGE, STUCK, SATURATED = 1, 2, 4
-UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED
+OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16
+UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
 # encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
 ENCODINGS = {
     "mono8": (np.uint8, 1, ""),
