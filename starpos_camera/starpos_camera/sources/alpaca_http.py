@@ -76,8 +76,9 @@ class Session(requests.Session):
         self.max_redirects = 0
         self.mount("http://", _Adapter())
 
-    def request(self, *args: Any, stream: bool = False, **kwargs: Any) -> requests.Response:
-        response = super().request(*args, stream=True, **kwargs)
+    def request(self, *args: Any, **kwargs: Any) -> requests.Response:
+        stream, kwargs["stream"] = kwargs.get("stream", False), True
+        response = super().request(*args, **kwargs)
         if not stream:
             with response:
                 body = response.raw.read(MAX_REPLY + 1, decode_content=True)
