@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector's annotated image: made only while somebody subscribes, one frame at a time."""
+"""Annotated image of the detector, made only while somebody subscribes, one frame at a time."""
 
 import math
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -20,8 +21,10 @@ from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Solution
 
-PATIENCE_S = 2.0  # for a frame's solution; then it is shown without
-NAME_LETTERS, SENTENCE_LETTERS = 24, 300  # of a text from outside, at most
+# A frame waits so long for its solution; then it is shown without one.
+PATIENCE_S = 2.0
+# Most letters of a text from outside.
+NAME_LETTERS, SENTENCE_LETTERS = 24, 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +39,18 @@ class Subject:
 class Annotator:
     """Publishes sensor_msgs/Image on `~/image_annotated` for a node that detects stars.
 
-    The frame waits for its solver/solution, where there is a solver; frames that come meanwhile pass by, so that one
-    is kept at most, and none while nobody subscribes. The node calls `take` and `stop` in its executor.
+    If there is a solver, the frame waits for its solver/solution. Frames that come meanwhile are left out, so that at
+    most one is kept, and none while nobody subscribes. The node calls `take` and `stop` in its executor.
     """
 
-    def __init__(self, node: Node):
+    def __init__(self, node: Node) -> None:
         self._node = node
         self._troubles = Troubles(node)
         self._publisher = publisher(node, Image, "~/image_annotated", 1)
-        self._solutions = None  # the subscription, while somebody looks
-        node.destroy_subscription(
-            self._subscribe_solutions()
-        )  # a bad qos_override is refused now, not by a viewer
+        # The subscription, while somebody looks at the image.
+        self._solutions: Subscription | None = None
+        # Subscribe once now, so that a wrong qos_override is refused at the start.
+        node.destroy_subscription(self._subscribe_solutions())
         self._waiting: Subject | None = None
         self._drawing = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -55,10 +58,10 @@ class Annotator:
         self._worker = Worker(_draw, node.create_guard_condition(self._on_wake).trigger, "annotation")
         self._worker.start()
 
-    def stop(self):
+    def stop(self) -> None:
         self._worker.stop()
 
-    def take(self, frame: Frame, stars: Stars, header: Header):
+    def take(self, frame: Frame, stars: Stars, header: Header) -> None:
         """Offer a frame whose stars have just been published under `header`."""
         if not self._publisher.get_subscription_count():
             self._forget()
@@ -73,25 +76,26 @@ class Annotator:
         else:
             self._begin(Identified(), ["no solver"])
 
-    def _subscribe_solutions(self):
+    def _subscribe_solutions(self) -> Subscription:
         return subscription(self._node, Solution, "solver/solution", self._on_solution, 10)
 
-    def _forget(self):
+    def _forget(self) -> None:
         self._patience.cancel()
         self._waiting = None
         if self._solutions is not None:
             self._node.destroy_subscription(self._solutions)
             self._solutions = None
 
-    def _on_solution(self, message: Solution):
+    def _on_solution(self, message: Solution) -> None:
         if self._waiting and message.header.stamp == self._waiting.header.stamp:
             self._begin(_identified(message, len(self._waiting.stars)), _remarks(message))
 
-    def _give_up(self):
-        if self._waiting:  # the solution may have come in the same turn of the executor
+    def _give_up(self) -> None:
+        # The solution may have come in the same turn of the executor.
+        if self._waiting:
             self._begin(Identified(), [f"no solution within {PATIENCE_S:g} s"])
 
-    def _begin(self, identified: Identified, remarks: list[str]):
+    def _begin(self, identified: Identified, remarks: list[str]) -> None:
         """Draw the frame that waits."""
         self._patience.cancel()
         subject, self._waiting = self._waiting, None
@@ -99,7 +103,7 @@ class Annotator:
             self._drawing = True
             self._worker.offer((subject, identified, remarks))
 
-    def _on_wake(self):
+    def _on_wake(self) -> None:
         for result in self._worker.fetch():
             self._drawing = False
             if isinstance(result, Image):
@@ -114,7 +118,7 @@ class Annotator:
 
 
 def _draw(job: tuple[Subject, Identified, list[str]]) -> Image:
-    """In the worker's thread."""
+    """Draw a frame, in the worker's thread."""
     subject, identified, remarks = job
     picture = annotate(subject.frame, subject.stars, identified, remarks)
     message = frame_to_message(Frame(picture), "")
@@ -123,7 +127,7 @@ def _draw(job: tuple[Subject, Identified, list[str]]) -> Image:
 
 
 def _identified(message: Solution, count: int) -> Identified:
-    """What a solution says of `count` stars; nobody where it does not hold together."""
+    """Read the names of `count` stars from a solution; no names if it is inconsistent."""
     rows = np.array(message.indices, int)
     if not len(rows) == len(message.ids) == len(message.magnitudes) or np.any(rows >= count):
         return Identified()
@@ -131,7 +135,7 @@ def _identified(message: Solution, count: int) -> Identified:
 
 
 def _remarks(message: Solution) -> list[str]:
-    """Fix and heading, or why there are none."""
+    """Write fix and heading, or why there are none."""
     if message.status != Solution.OK:
         return [message.status_text[:SENTENCE_LETTERS]]
     north, east = message.latitude_geodetic, message.longitude_geodetic

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `camera`: frames from a source to `~/image_raw`, each with its intrinsics and how it was taken."""
+"""The node `camera`: publishes the frames of a source on `~/image_raw`, with intrinsics and how each was taken."""
 
 import math
 import os
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import rclpy.parameter
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.timer import Timer
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
@@ -26,7 +29,7 @@ from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common import system_clock
-from starpos_common.clock_report import ClockReport
+from starpos_common.clock_report import ClockReport, time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import camera_to_message, frame_to_message, unix_to_stamp
 from starpos_common.parameters import declare
@@ -36,8 +39,10 @@ from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 
-SHOWN_S = 5.0  # diagnostics are seen once a second
-IMAGE_DEPTH = 2  # frames of 42 MB that the middleware keeps for slow readers
+# A trouble is shown so long; diagnostics come once a second.
+SHOWN_S = 5.0
+# Frames (of 42 MB) that the middleware keeps for slow readers.
+IMAGE_DEPTH = 2
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
 
 
@@ -45,7 +50,7 @@ STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated"
 class Taken:
     """A frame with its Capture, the intrinsics and the remark of its source, and how long it took.
 
-    The message of it where somebody subscribes.
+    image: its message, None while nobody subscribes.
     """
 
     frame: Frame
@@ -57,30 +62,31 @@ class Taken:
 
 
 class Taker(Protocol):
-    """Who takes frames in this process."""
+    """A receiver of frames in the same process."""
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody listens to what it makes of them."""
+        """Whether somebody listens to its results."""
 
-    def submit(self, frame: Frame, header: Header):
-        """Take one; returns at once."""
+    def submit(self, frame: Frame, header: Header) -> None:
+        """Take a frame; returns at once."""
 
 
 class CameraNode(Node):
     """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
 
-    def __init__(self, **options):
-        """options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
+    def __init__(self, **options: Any) -> None:
+        """Make the node; options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("camera", **options)
         self._values = declare(
             self, PARAMETERS, apply=self._apply, check=lambda values, _: _complaint(values)
         )
-        self._calibration_path = None
+        self._calibration_path: Path | None = None
         self._calibration: Camera | None = None
         if self._values["calibration_url"]:
             self._calibration_path = path_of(self._values["calibration_url"])
-            if os.path.exists(self._calibration_path):  # Path.exists raises where a name is too long
+            # Path.exists would raise if a name is too long.
+            if os.path.exists(self._calibration_path):
                 self._calibration = camera_file.read(self._calibration_path)
             else:
                 self.get_logger().warning(
@@ -91,7 +97,8 @@ class CameraNode(Node):
 
         self._frames = self._failed = self._skipped = 0
         self._skipped_before = 0  # at the last report
-        self._last: Taken | None = None  # without its pixels
+        self._last: Capture | None = None  # of the last frame
+        self._last_took_s = 0.0
         self._size: tuple[int, int] | None = None  # of the frames
         self._takers: list[Taker] = []
         self._ended = False
@@ -106,51 +113,52 @@ class CameraNode(Node):
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._take, self._wake.trigger, "capture")
         self._clock_report = ClockReport(self, self._stamped_by_system)
-        tasks = {"Capture": self._report, "Clock": self._clock_report}
+        tasks: dict[str, Callable[[], Diagnosis]] = {"Capture": self._report, "Clock": self._clock_report}
         self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
-        self._timer = None
+        self._timer: Timer | None = None
         self._start_timer()
         self._worker.start()
         if lack := self._source.lacking():
             self._say(Level.WARN, lack)
 
-    def destroy_node(self):
+    def destroy_node(self) -> None:
         self._worker.retire()
-        self._source.close()  # an exposure may have an hour to go
+        # An exposure may last another hour.
+        self._source.close()
         self._worker.stop()
         super().destroy_node()
 
-    def hand_to(self, taker: Taker):
-        """Give it each frame as it is, in the executor's thread: a detector in this process."""
+    def hand_to(self, taker: Taker) -> None:
+        """Give each frame to a detector in this process too, without a copy, in the executor's thread."""
         self._takers.append(taker)
 
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
     def _stamped_by_system(self) -> bool:
-        return self._last is None or self._last.capture.stamp_source in OF_SYSTEM_CLOCK
+        return self._last is None or self._last.stamp_source in OF_SYSTEM_CLOCK
 
-    def _start_timer(self):
+    def _start_timer(self) -> None:
         if self._timer is not None:
             self.destroy_timer(self._timer)
-        # The system's clock may be stepped, and a timer on it would wait; a simulated one is what we play by.
-        clock = self.get_clock()
-        if not clock.ros_time_is_active:
-            clock = Clock(clock_type=ClockType.STEADY_TIME)
+        # Simulated time sets the pace of a replay. The system's clock may be stepped, and a timer on it would wait.
+        simulated = time_is_simulated(self)
+        clock = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
 
-    def _apply(self, names: frozenset[str]):
+    def _apply(self, names: frozenset[str]) -> None:
         if "cadence" in names:
             self._start_timer()
         self._source.update(self._values)
 
-    def _tick(self):
+    def _tick(self) -> None:
         if self._ended:
             return
         if not self._worker.idle:
             self._skipped += 1
         elif self._source.waits_for_listener and not self._frames and not self._heard():
-            lack = self._source.lacking()  # comes first, for a subscriber would not help
+            # What is lacking is said first, because a subscriber would not help.
+            lack = self._source.lacking()
             waiting = f"waiting for a subscriber of {self._images.topic_name}{' or of the stars' * bool(self._takers)}."
             self._say(Level.WARN if lack else Level.OK, lack or waiting)
         else:
@@ -160,13 +168,13 @@ class CameraNode(Node):
         return self._images.get_subscription_count() > 0 or any(t.wanted for t in self._takers)
 
     def _take(self, settings: CaptureSettings) -> Taken:
-        """In the worker's thread: a frame, ready to be published."""
+        """Take a frame and make it ready to be published, in the worker's thread."""
         begin = time.monotonic()
-        if self.get_clock().ros_time_is_active:
+        if time_is_simulated(self):
             exposure, clock = self._source.capture(settings), None
         else:
             exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
-            # a source that knows the error has the clock of another machine
+            # If the source states an error, the clock is that of another machine.
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
         frame = replace(exposure.frame, clock_stddev_s=clock.stddev_s) if clock else exposure.frame
@@ -178,7 +186,8 @@ class CameraNode(Node):
             clock_stddev=frame.clock_stddev_s,
             stamp_source=exposure.stamp_source,
         )
-        heard = self._images.get_subscription_count()  # a message is a copy of the frame
+        # A message is a copy of the frame, so it is made only for subscribers.
+        heard = self._images.get_subscription_count()
         image = frame_to_message(frame, header.frame_id) if heard else None
         return Taken(
             frame=frame,
@@ -189,27 +198,27 @@ class CameraNode(Node):
             seconds=time.monotonic() - begin,
         )
 
-    def _on_wake(self):
+    def _on_wake(self) -> None:
         for result in self._worker.fetch():
             if isinstance(result, SourceEnded):
                 self._ended = True
                 self._say(Level.OK, str(result))
             elif isinstance(result, NothingYet):
-                # between two frames it is no news, and what is wrong is shown for a while
+                # Waiting between two frames is normal; a trouble is shown for a while before it.
                 if self._state[0] is not Level.OK and time.monotonic() > self._said_s + SHOWN_S:
                     self._say(Level.OK, str(result))
             elif isinstance(result, StarposError):
                 self._failed += 1
                 self._say(Level.ERROR, str(result))
             elif isinstance(result, Exception):
-                # One frame that no code foresaw must not end the instrument's night.
+                # A defect costs this frame only; the node goes on.
                 self._failed += 1
                 kind = type(result).__name__
                 self._say(Level.ERROR, f"a frame was given up ({kind}: {result}); keep it and report this.")
             else:
                 self._publish(result)
 
-    def _publish(self, taken: Taken):
+    def _publish(self, taken: Taken) -> None:
         frame, camera = taken.frame, self._camera(taken)
         info = camera_to_message(camera, taken.capture.header.frame_id)
         info.header = taken.capture.header
@@ -220,7 +229,8 @@ class CameraNode(Node):
         for taker in self._takers:
             taker.submit(frame, taken.capture.header)
         self._frames += 1
-        self._last, self._size = replace(taken, frame=None, image=None), (frame.width, frame.height)
+        self._last, self._last_took_s = taken.capture, taken.seconds
+        self._size = frame.width, frame.height
         if (camera.width, camera.height) != self._size:
             self._say(
                 Level.ERROR,
@@ -233,35 +243,37 @@ class CameraNode(Node):
             self._say(Level.OK, f"taking frames of {frame.width} x {frame.height} px.")
 
     def _camera(self, taken: Taken) -> Camera:
-        if self._calibration or taken.camera:
-            return self._calibration or taken.camera
+        if known := self._calibration or taken.camera:
+            return known
         focal_px = focal_px_of(self._values["focal_mm"], self._values["pixel_um"])
         return Camera.from_focal(taken.frame.width, taken.frame.height, focal_px)
 
-    def _say(self, level: Level, sentence: str):
-        """The state from now on; logged where it is another than before."""
+    def _say(self, level: Level, sentence: str) -> None:
+        """Set the state; log it if it differs from the last logged one."""
         self._state, self._said_s = (level, sentence), time.monotonic()
         if sentence == self._logged:
             return
         self._logged = sentence
-        # rclpy ties a severity to the line it is called from, so each has its own.
+        # rclpy ties a severity to the calling line, so each severity has its own line.
         if level is Level.OK:
             self.get_logger().info(sentence)
         else:
             self.get_logger().warning(sentence)
 
-    def _on_set_camera_info(self, request, response):
+    def _on_set_camera_info(
+        self, request: SetCameraInfo.Request, response: SetCameraInfo.Response
+    ) -> SetCameraInfo.Response:
         try:
             camera = message_to_camera(request.camera_info, "set_camera_info")
-            if self._size not in (None, (camera.width, camera.height)):
+            if self._size is not None and self._size != (camera.width, camera.height):
                 raise InstrumentError(
                     f"set_camera_info: the calibration is of {camera.width} x {camera.height} px but the frames "
                     f"have {self._size[0]} x {self._size[1]} px: calibrate with whole frames."
                 )
-            # What cannot be kept is still right: it holds for this session, and the answer says so.
+            # A calibration that cannot be written still holds for this session, and the answer says so.
             self._calibration = camera
             if self._calibration_path is not None:
-                self._keep(camera)
+                self._keep(self._calibration_path, camera)
                 response.status_message = f"written to {self._calibration_path}."
             else:
                 response.status_message = "holds for this session; set calibration_url to keep it."
@@ -275,15 +287,17 @@ class CameraNode(Node):
             self.get_logger().warning(response.status_message)
         return response
 
-    def _keep(self, camera: Camera):
+    def _keep(self, path: Path, camera: Camera) -> None:
         try:
-            camera_file.write(self._calibration_path, camera, self.get_name())
+            camera_file.write(path, camera, self.get_name())
         except InstrumentError as error:
             raise InstrumentError(f"{error}; the calibration holds for this session only.") from None
 
-    def _on_set_capture(self, request, response):
+    def _on_set_capture(
+        self, request: SetCapture.Request, response: SetCapture.Response
+    ) -> SetCapture.Response:
         wanted = {"gain": request.gain, "exposure": request.exposure, "cadence": request.cadence}
-        # 0 s is neither an exposure nor a cadence, and a gain of 0 is no wish of those who have none
+        # 0 means unset for an exposure and a cadence, and for a gain if none is set now.
         unset = [
             name for name, value in wanted.items() if math.isnan(value) or (value == 0 and name != "gain")
         ]
@@ -295,7 +309,8 @@ class CameraNode(Node):
             if name not in unset
         ]
         refusal = ""
-        if changes:  # rclpy refuses to change nothing
+        # rclpy refuses an empty list of changes.
+        if changes:
             result = self.set_parameters_atomically(changes)
             refusal = "" if result.successful else result.reason or "the parameters were refused."
         response.success = not refusal
@@ -312,9 +327,9 @@ class CameraNode(Node):
             sentence = (
                 f"a frame takes longer than the cadence of {cadence:g} s: {skipped} skipped; lengthen it."
             )
-        if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds:
+        if time_is_simulated(self) and not self.get_clock().now().nanoseconds:
             level, sentence = Level.WARN, "use_sim_time is set but no /clock has come yet."
-        values = {
+        values: dict[str, object] = {
             "source": self._values["source"],
             "frames": self._frames,
             "failed": self._failed,
@@ -322,21 +337,22 @@ class CameraNode(Node):
             "cadence (s)": cadence,
             "calibrated": self._calibration is not None,
         }
-        if last:
+        if last is not None and self._size is not None:
+            width, height = self._size
             values |= {
-                "size (px)": "{} x {}".format(*self._size),
-                "exposure (s)": last.capture.exposure,
-                "stamp from": STAMP_SOURCES[last.capture.stamp_source],
-                "stamp error (s)": last.capture.stamp_stddev,
-                "taking one frame (s)": last.seconds,
+                "size (px)": f"{width} x {height}",
+                "exposure (s)": last.exposure,
+                "stamp from": STAMP_SOURCES[last.stamp_source],
+                "stamp error (s)": last.stamp_stddev,
+                "taking one frame (s)": self._last_took_s,
             }
         return Diagnosis(level, sentence, values)
 
 
-def _settings(values) -> CaptureSettings:
+def _settings(values: Mapping[str, Any]) -> CaptureSettings:
     exposure_s, gain = (None if math.isnan(values[name]) else values[name] for name in ("exposure", "gain"))
     return CaptureSettings(exposure_s, gain, values["cadence"])
 
 
-def _complaint(values) -> str | None:
+def _complaint(values: Mapping[str, Any]) -> str | None:
     return SOURCES[values["source"]].refusal(values, _settings(values))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the node `camera`; those of a source stand in its module."""
+"""Parameters of the node `camera`; those of a source are in the module of the source."""
 
 import math
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `detector`: frames in, `stars` out."""
+"""The node `detector`: finds the stars of frames and publishes `stars`."""
 
 import math
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock
@@ -26,10 +27,13 @@ from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
 
-IMAGE_DEPTH = 1  # the newest wins; each more is another 42 MB
+# Only the newest frame is kept; each more would take another 42 MB.
+IMAGE_DEPTH = 1
 CAPTURES_KEPT = 16
-CAPTURE_PATIENCE_S = 0.5  # an image waits so long for its Capture, which two topics may bring after it
-MIN_SILENCE_S = 5.0  # without a frame, and three times as long as between the last two, before it is reported
+# An image waits so long for its Capture, which comes on another topic and may come later.
+CAPTURE_PATIENCE_S = 0.5
+# Silence is reported after so long, and after three times the interval between the last two frames.
+MIN_SILENCE_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +46,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class DetectedFrame:
-    """What became of a frame: its stars, ready to be published, and what it took. The frame goes once they are."""
+    """Stars of a frame, ready to be published, and the time it took. The frame is dropped once they are published."""
 
     frame: Frame | None
     message: StarArray
@@ -52,24 +56,26 @@ class DetectedFrame:
 
 
 class DetectorNode(Node):
-    """Publishes starpos_interfaces/StarArray on `stars`, and what is seen on `~/image_annotated`; see README.md."""
+    """Publishes starpos_interfaces/StarArray on `stars`, and frames with marks on `~/image_annotated`; see README.md."""
 
-    def __init__(self, **options):
-        """options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
+    def __init__(self, **options: Any) -> None:
+        """Make the node; options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("detector", **options)
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = self._detection_settings()
         self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
-        self._held: Job | None = None  # the newest frame, while its Capture has not come
+        self._held: Job | None = None  # the newest frame, until its Capture comes
         self._frames = self._bad = self._dropped = 0
-        self._sequence: int | None = None  # the publisher's, of the last image; None: the middleware has none
+        # Sequence number of the last image; None: the middleware gives none.
+        self._sequence: int | None = None
         self._troubles = Troubles(self)
         self._complaint = ""  # about a frame since the last report
         self._last: DetectedFrame | None = None
         self._size = ""  # of the last frame, in words
-        self._last_frame_s = self._interval_s = None  # monotonic
+        self._last_frame_s: float | None = None  # monotonic
+        self._interval_s: float | None = None
         self._publisher = publisher(self, StarArray, "stars", 10)
-        self._where = ""  # frames come from, for messages
+        self._where = ""  # where frames come from, for messages
         self._annotator = Annotator(self)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
@@ -77,15 +83,15 @@ class DetectorNode(Node):
         _warm_up()
         self._worker.start()
 
-    def listen(self):
-        """Take the frames of `camera/image_raw`; beside a camera in this process `submit` is called instead."""
+    def listen(self) -> None:
+        """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
         self._captures_come = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=steady, autostart=False)
         images = subscription(self, Image, "camera/image_raw", self._on_image, IMAGE_DEPTH)
         self._where = f" on {images.topic_name}"
 
-    def destroy_node(self):
+    def destroy_node(self) -> None:
         self._worker.stop()
         self._annotator.stop()
         super().destroy_node()
@@ -95,10 +101,10 @@ class DetectorNode(Node):
         """Whether somebody subscribes to the stars."""
         return self._publisher.get_subscription_count() > 0
 
-    def submit(self, frame: Frame, header: Header):
-        """Have a frame's stars published under `header`; it replaces one that still waits.
+    def submit(self, frame: Frame, header: Header) -> None:
+        """Detect and publish the stars of a frame under `header`; it replaces a frame that still waits.
 
-        What the subscription does; a camera node in the same process hands its pixels over as they are.
+        The subscription calls this, and a camera node in the same process, which hands its pixels over without a copy.
         """
         self._arrived()
         size = f"{frame.width} x {frame.height} px, {encoding_of(frame)}"
@@ -108,7 +114,7 @@ class DetectorNode(Node):
         if self._worker.offer(Job(frame, header)):
             self._dropped += 1
 
-    def _arrived(self):
+    def _arrived(self) -> None:
         now = time.monotonic()
         if self._last_frame_s is not None:
             self._interval_s = now - self._last_frame_s
@@ -124,17 +130,17 @@ class DetectorNode(Node):
             saturation_dn=saturation,
         )
 
-    def _apply(self, names: frozenset[str]):
+    def _apply(self, names: frozenset[str]) -> None:
         self._settings = self._detection_settings()
 
-    def _on_capture(self, message: Capture):
+    def _on_capture(self, message: Capture) -> None:
         if len(self._captures) >= CAPTURES_KEPT:
             del self._captures[next(iter(self._captures))]
         self._captures[_key(message.header)] = message
         if self._held is not None and _key(self._held.header) == _key(message.header):
             self._go_on()
 
-    def _on_image(self, message: Image, info: dict):
+    def _on_image(self, message: Image, info: dict[str, Any]) -> None:
         self._count_overwritten(info["publication_sequence_number"])
         try:
             _check_stamp(message.header)
@@ -146,66 +152,70 @@ class DetectorNode(Node):
         if self._held is not None:
             self._go_on()
         self._held = Job(frame, message.header)
-        # of the first image the sender may be known already, and not yet that it sends Captures
+        # At the first image the sender's Captures may not have been discovered yet.
         expected = self._last_frame_s is None or self._captures_come.get_publisher_count()
         if expected and _key(message.header) not in self._captures:
             self._late.reset()
         else:
             self._go_on()
 
-    def _go_on(self):
-        """With the frame that is held, and what is known of it by now."""
+    def _go_on(self) -> None:
+        """Submit the frame that is held, with its Capture if that has come."""
         self._late.cancel()
         job, self._held = self._held, None
         if job is None:
             return
         try:
-            frame = replace(job.frame, **self._taken(job.header))
-        except StarposError as error:  # of what no exposure and no clock has
+            frame = self._with_capture(job)
+        except StarposError as error:
+            # The Capture has values that no exposure and no clock can have.
             self._arrived()
             self._complain(str(error))
             return
         self.submit(frame, job.header)
 
-    def _count_overwritten(self, sequence: int | None):
-        """Count the frames that newer ones replaced in the middleware; a lower number is another publisher's."""
+    def _count_overwritten(self, sequence: int | None) -> None:
+        """Count the frames that newer ones replaced in the middleware; a lower number comes from another publisher."""
         if sequence is not None and self._sequence is not None and sequence > self._sequence:
             self._dropped += sequence - self._sequence - 1
         self._sequence = sequence
 
-    def _taken(self, header: Header) -> dict[str, float | None]:
-        """What its Capture says of a frame, by the names that Frame has for it."""
-        capture = self._captures.pop(_key(header), None) or Capture()
+    def _with_capture(self, job: Job) -> Frame:
+        """Add exposure and errors of the Capture to its frame."""
+        capture = self._captures.pop(_key(job.header), None) or Capture()
         told = (capture.exposure, capture.stamp_stddev, capture.clock_stddev)
         exposure, stamp, clock = (v if math.isfinite(v) and v > 0 else 0.0 for v in told)
         exposure = exposure or self._values["exposure"] or None
-        return {"exposure_s": exposure, "stamp_stddev_s": stamp, "clock_stddev_s": clock}
+        return replace(job.frame, exposure_s=exposure, stamp_stddev_s=stamp, clock_stddev_s=clock)
 
     def _detect(self, job: Job) -> DetectedFrame:
-        """In the worker's thread."""
-        begin, cpu = time.monotonic(), time.thread_time()  # other threads may be drawing, or rendering
+        """Find the stars of a frame, in the worker's thread."""
+        # The CPU time of this thread alone: others may draw or render meanwhile.
+        begin, cpu = time.monotonic(), time.thread_time()
         detection = detect(job.frame, self._settings)
         message = stars_to_message(detection.stars, job.header.frame_id)
-        message.header = job.header  # to the nanosecond: it is what goes with a frame finds it by
+        # The stamp must be the frame's to the nanosecond, because others match messages by it.
+        message.header = job.header
         cpu_ms = (time.thread_time() - cpu) * 1e3
         return DetectedFrame(job.frame, message, detection, cpu_ms, time.monotonic() - begin)
 
-    def _on_wake(self):
+    def _on_wake(self) -> None:
         for result in self._worker.fetch():
             if isinstance(result, DetectedFrame):
                 self._publisher.publish(result.message)
                 self._frames += 1
                 self._troubles.right("frames")
-                self._annotator.take(result.frame, result.detection.stars, result.message.header)
+                if result.frame is not None:
+                    self._annotator.take(result.frame, result.detection.stars, result.message.header)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
                 self._complain(str(result))
             else:
-                # One frame that no code foresaw must not end the instrument's night.
+                # A defect costs this frame only; the node goes on.
                 kind = type(result).__name__
                 self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
 
-    def _complain(self, sentence: str):
+    def _complain(self, sentence: str) -> None:
         self._bad += 1
         self._complaint = sentence
         self._troubles.wrong("frames", sentence)
@@ -224,7 +234,11 @@ class DetectorNode(Node):
         elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
             level = Level.WARN
             sentence = f"no frame for {silence_s:.0f} s{self._where}: is the camera running?"
-        values = {"frames": self._frames, "bad frames": self._bad, "dropped": self._dropped}
+        values: dict[str, object] = {
+            "frames": self._frames,
+            "bad frames": self._bad,
+            "dropped": self._dropped,
+        }
         if last:
             values |= {
                 "stars": len(last.message.stars),
@@ -242,8 +256,8 @@ def _key(header: Header) -> tuple[int, int]:
     return header.stamp.sec, header.stamp.nanosec
 
 
-def _check_stamp(header: Header):
-    """TimeError where the stamp is not set, or no time."""
+def _check_stamp(header: Header) -> None:
+    """Raise TimeError if the stamp is not set, or is no time."""
     sec, nanosec = _key(header)
     if not sec and not nanosec:
         raise TimeError(
@@ -255,8 +269,8 @@ def _check_stamp(header: Header):
         )
 
 
-def _warm_up():
-    """Run everything once on a small frame with a few stars, so that the first real one is not slow."""
+def _warm_up() -> None:
+    """Run everything once on a small frame with a few stars, so that the first real frame is not slow."""
     y, x = np.mgrid[:128, :128]
     light = np.random.default_rng(0).normal(500.0, 10.0, x.shape)
     for cx, cy in ((30.2, 40.7), (80.5, 30.1), (60.9, 95.4), (100.3, 101.8)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the node `detector`."""
+"""Parameters of the node `detector`."""
 
 import math
 

@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executables. The imports inside are heavy; they come after the signal handlers (see starpos_common)."""
+"""The executables. Their imports are heavy, so they come after the signal handlers (see starpos_common)."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 
 def camera() -> int:
-    """The node `camera`."""
+    """Run the node `camera`."""
     from starpos_common.node_main import run
 
-    def make_nodes():
+    def make_nodes() -> "Iterator[Node]":
         from starpos_camera.camera import CameraNode
 
         yield CameraNode()
@@ -15,10 +21,10 @@ def camera() -> int:
 
 
 def detector() -> int:
-    """The node `detector`."""
+    """Run the node `detector`."""
     from starpos_common.node_main import run
 
-    def make_nodes():
+    def make_nodes() -> "Iterator[Node]":
         from starpos_camera.detector import DetectorNode
 
         node = DetectorNode()
@@ -29,10 +35,10 @@ def detector() -> int:
 
 
 def camera_detector() -> int:
-    """Both in one process: frames go from one to the other as they are, not through the middleware."""
+    """Run both nodes in one process: frames go from one to the other directly, not through the middleware."""
     from starpos_common.node_main import run
 
-    def make_nodes():
+    def make_nodes() -> "Iterator[Node]":
         from starpos_camera.camera import CameraNode
         from starpos_camera.detector import DetectorNode
 

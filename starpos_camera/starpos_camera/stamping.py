@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which stamps the system's clock made, and whether it can be believed."""
+"""Check of the stamps that the system's clock made: the clock must not be set during an exposure."""
 
 from collections.abc import Callable
 
@@ -11,9 +11,9 @@ OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)
 
 
 def in_one_time(capture: Callable[[], CapturedFrame], watch: StepWatch) -> CapturedFrame:
-    """What `capture` gives; CaptureError where the system's clock, which stamped it, was set meanwhile.
+    """Take a frame with `capture`; CaptureError if the system's clock stamped it and was set meanwhile.
 
-    watch: one that is asked every second, also while the capture lasts.
+    watch: a StepWatch that another thread asks every second, also during the capture.
     """
     before_s = watch.set_s()
     exposure = capture()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The place of the standing instrument from all its frames, for `fix_averaged`."""
+"""Average place of an instrument that stands, from all its frames, for `fix_averaged`."""
 
+import math
 from enum import Enum, auto
 
 import numpy as np
@@ -12,13 +13,16 @@ from starpos.fix.fix import Fix
 from starpos.units import ARCSEC
 from starpos_common.diagnostics import Diagnosis, Level
 
-WIDE_RAD = 600 * ARCSEC  # its square, which a linear filter does not know of, is 2 arcsec
-ELSEWHERE_SIGMA = 3.0  # from the place of a turn; wrongly taken for another place it only costs precision
-JUST_MOVED = 10  # fixes; the diagnostics say so as long
+# With a larger error of A3 its square, which a linear filter leaves out, exceeds 2 arcsec.
+WIDE_RAD = 600 * ARCSEC
+# A place so far from that of a turn is another one. A false alarm only costs precision.
+ELSEWHERE_SIGMA = 3.0
+# For so many fixes the diagnostics say that the instrument has moved.
+JUST_MOVED = 10
 
 
 class News(Enum):
-    """What a fix was taken for."""
+    """What a new fix did to the average."""
 
     USED = auto()
     LEFT_OUT = auto()
@@ -26,47 +30,51 @@ class News(Enum):
 
 
 class Averaging:
-    """An Averager that begins anew where it must; or the place of a turn on the spot, as long as the instrument stays.
+    """An Averager that starts again when it must, or the place of a turn on the spot while the instrument stays there.
 
-    Later frames hold the A3 that the turn has found: they tell no more of its place, but whether they are of it.
+    Frames after a turn are solved with the A3 that the turn found. So they add nothing to the place of the turn; they
+    only show whether the instrument is still there.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """The instrument, the air or the clock are others now, or the place is."""
+        """Start again, because the instrument, the air, the clock or the place has changed."""
         self._averager = Averager()
         self._turned: Average | None = None
-        self._pose: Fix | None = None  # its first
-        self._elsewhere = False  # it seems so, against the place of the turn
+        self._pose: Fix | None = None  # the first fix of the present pose
+        self._elsewhere = False  # whether the fixes seem to be of another place than the turn
         self._news = News.USED
         self._moved = 0
 
     def turned_on_the_spot(self, place: Average) -> None:
-        """The place that a turn has told; fixes from now on are solved with its A3."""
+        """Take the place that a turn has found; later fixes are solved with its A3."""
         self.begin_anew()
         self._turned = place
 
     @property
     def place(self) -> Average | None:
-        """None before the first fix."""
+        """The average place; None before the first fix."""
         return self._averager.average if self._turned is None or self._elsewhere else self._turned
 
     @property
     def began_unix_s(self) -> float:
-        """The first fix of this place."""
-        return self._averager.average.began_unix_s
+        """Time of the first fix of this place; -inf before there is one."""
+        place = self._averager.average
+        return -math.inf if place is None else place.began_unix_s
 
     def add(self, fix: Fix) -> News:
-        """One more fix, later than all before."""
+        """Take a fix that is later than all before."""
         if self._pose is None or slip_s(fix, self._pose) != 0:
             self._pose = fix
             if self._turned is not None or _is_wide(fix):
                 self._averager = Averager()
         before = self._averager.average
         self._averager.add(fix)
-        self._news = self._judged(before, self._averager.average)
+        after = self._averager.average
+        assert after is not None
+        self._news = self._judged(before, after)
         self._moved += self._news is News.MOVED
         return self._news
 
@@ -82,13 +90,13 @@ class Averaging:
         return News.MOVED
 
     def report(self) -> Diagnosis:
-        """For /diagnostics."""
+        """Make the diagnostic `Average`."""
         place = self.place
         if place is None:
             return Diagnosis(Level.OK, "no fix yet", {"moved": self._moved})
         east, north, _ = place.covariance.diagonal() ** 0.5
         here = self._averager.average or place
-        values = {
+        values: dict[str, object] = {
             "frames": place.frames,
             "poses": place.poses,
             "left out": here.left_out,
@@ -106,7 +114,7 @@ class Averaging:
 
 
 def _is_wide(fix: Fix) -> bool:
-    """Whether A3 may be so wrong that a linear filter does not tell its error from the place, heading by heading."""
+    """Whether A3 may be so wrong that a linear filter cannot separate its error from the place."""
     calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name == "calibration")
     return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's own calibration: at a known place, or from headings on the spot, by service or by itself; and the average.
+"""Calibration by the solver itself, at a known place or from headings on the spot, and the average of the fixes.
 
-Both share what they must forget, and when: an average is of one instrument, poses are of one place.
+Both are here because they must forget at the same events: an average holds for one instrument, poses for one place.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -28,10 +29,13 @@ from starpos_interfaces.srv import Calibrate, SelfCalibrate
 from starpos_solver.averaging import Averaging, News
 from starpos_solver.memory import PoseMemory, RecentFrames, Seen, tilts_of
 
-# Fewer headings hold no check that they are of one place; a service's caller says that they are.
+# Fewer headings cannot show that they are of one place. The caller of the service asserts it, so it needs one less.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
-LATE_FRAMES = 3  # so many older ones in their own order are no late ones: a bag is played again
-BETTER = 0.8  # of its error, by which a calibration must be to take the place of one that the solver has found itself
+# So many old frames in a row, in order, are not late: a bag is played again.
+LATE_FRAMES = 3
+# A calibration replaces one that the solver has found itself only if its error is smaller by this factor.
+BETTER = 0.8
+R = TypeVar("R", Calibrate.Response, SelfCalibrate.Response)
 OF_CALIBRATION = {"misalignment", "misalignment_stddev", "calibration_url"}
 OF_AVERAGE = OF_CALIBRATION | {
     "self_calibration",
@@ -45,21 +49,22 @@ OF_AVERAGE = OF_CALIBRATION | {
 
 @dataclass(frozen=True)
 class Turned:
-    """What headings on the spot tell: A3 and the place."""
+    """Result of headings on the spot: A3 and the place."""
 
     calibrated: Calibrated
     place: Average
 
 
 class Calibrating:
-    """`found` is the calibration that frames have told, None as long as that of the parameters holds.
+    """Keeps the calibration from frames: `found`, None while that of the parameters holds.
 
-    solver: the one in use, or an InstrumentError that says why there is none.  changed: called when `found` is another.
+    solver: returns the solver in use, or raises an InstrumentError that says why there is none.
+    changed: called when `found` changes.
     """
 
     def __init__(
         self, node: Node, values: Mapping, solver: Callable[[], Solver], changed: Callable[[], None]
-    ):
+    ) -> None:
         self.found: Calibration | None = None
         self.average = Averaging()
         self._log = node.get_logger()
@@ -67,14 +72,20 @@ class Calibrating:
         self._recent = RecentFrames(values["calibration_frames"])
         self._poses = PoseMemory()
         self._newest_unix_s = self._late_unix_s = -math.inf
-        self._late = 0  # frames in a row that are older than the newest, each younger than the one before
-        self._plumb_arcsec = math.nan  # how well `found` has the plumb line; nan: it is not known
-        self._era = 0  # what was begun in an older one is of another instrument or place
+        # Number of frames in a row that are older than the newest, each younger than the one before.
+        self._late = 0
+        # Standard deviation of the plumb line in `found`; nan: not known.
+        self._plumb_arcsec = math.nan
+        # Grows when the instrument or the place changes; a job of an older era is out of date.
+        self._era = 0
         self._worker = JobRunner(node)
         self._running: Future | None = None
-        self._asked = self._again = False  # by a service; to turn once more when there is time
-        self._about = self._said = ""  # of `found`; of the last turn by itself
-        group = ReentrantCallbackGroup()  # so that an answer which is awaited holds up nothing
+        self._asked = False  # whether a service waits for a job
+        self._again = False  # whether to calibrate by itself again when there is time
+        self._about = ""  # a sentence about `found`
+        self._said = ""  # why the last calibration by itself was not taken
+        # A service that awaits its job must not block the other callbacks.
+        group = ReentrantCallbackGroup()
         node.create_service(Calibrate, "solver/calibrate", self._on_calibrate, callback_group=group)
         node.create_service(
             SelfCalibrate, "solver/self_calibrate", self._on_self_calibrate, callback_group=group
@@ -82,20 +93,20 @@ class Calibrating:
 
     @property
     def unknown(self) -> bool:
-        """Whether fixes carry the error of an A3 of which nothing is known."""
+        """Whether A3 is unknown, so that fixes carry its error."""
         given = self.found is None and not self._values["self_calibration"]
         return not self._is_told and not given
 
     @property
     def _is_told(self) -> bool:
-        """Whether frames have told how A3 is, and how well."""
+        """Whether A3 and its error come from frames."""
         return not math.isnan(self._plumb_arcsec)
 
-    # what happens to the node ----------------------------------------------------------------------------------------
+    # events of the node ----------------------------------------------------------------------------------------------
 
     def learn(self, seen: Seen, fix: Fix | None) -> bool:
-        """From one more frame, and the fix it gave; whether the average is of this frame too."""
-        mid = seen.stars.mid_unix_s
+        """Take a frame and its fix; return whether the average includes this frame."""
+        mid = seen.mid_unix_s
         if mid == self._newest_unix_s or self._came_late(mid):
             return False
         self._newest_unix_s = mid
@@ -103,7 +114,7 @@ class Calibrating:
         if fix is None:
             return False
         news = self.average.add(fix)
-        # while A3 is not known to be right, turning looks like moving
+        # While A3 is not known, turning looks like moving.
         if self._is_told and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
@@ -115,7 +126,7 @@ class Calibrating:
         return news is not News.LEFT_OUT
 
     def _came_late(self, mid_unix_s: float) -> bool:
-        """Whether a frame is older than one before it; where many are, time has begun anew, and so does all here."""
+        """Whether a frame is older than an earlier one; after several such frames time has started again: forget all."""
         if mid_unix_s > self._newest_unix_s:
             self._late = 0
             return False
@@ -126,13 +137,13 @@ class Calibrating:
         self.forget()
         return False
 
-    def _moved_on(self, since_unix_s: float):
+    def _moved_on(self, since_unix_s: float) -> None:
         self._era += 1
         self._poses.forget_before(since_unix_s)
         self.average.begin_anew()
 
     def forget(self) -> None:
-        """The frames and the place; not what they have told of the instrument."""
+        """Forget the frames and the place, but not the calibration from them."""
         self._era += 1
         self._newest_unix_s, self._late = -math.inf, 0
         self._recent.clear()
@@ -140,14 +151,14 @@ class Calibrating:
         self.average.begin_anew()
 
     def camera_changed(self) -> None:
-        """A3 is that of the other camera."""
+        """Drop A3, because it belongs to the other camera."""
         self.forget()
         if self.found is not None:
             self._log.warning("another camera_info: the calibration found with the other one is unknown now")
             self._drop(Calibration.of(self.found.misalignment_deg, UNKNOWN_ARCSEC))
 
     def parameters_set(self, names: frozenset[str]) -> None:
-        """Some of them, to whatever values."""
+        """Apply a change of these parameters."""
         if "calibration_frames" in names:
             self._recent.keep(self._values["calibration_frames"])
         if names & OF_AVERAGE:
@@ -158,12 +169,12 @@ class Calibrating:
         if by_itself:
             self._turn_by_itself()
 
-    def _drop(self, instead: Calibration | None):
+    def _drop(self, instead: Calibration | None) -> None:
         self._era += 1
         self.found, self._plumb_arcsec = instead, math.nan
         self._about = self._said = ""
 
-    def _adopt(self, calibrated: Calibrated):
+    def _adopt(self, calibrated: Calibrated) -> None:
         self._era += 1
         self.found = calibrated.instrument.calibration
         self._plumb_arcsec = calibrated.plumb_stddev_arcsec
@@ -174,7 +185,9 @@ class Calibrating:
 
     # at a known place ------------------------------------------------------------------------------------------------
 
-    async def _on_calibrate(self, request, response):
+    async def _on_calibrate(
+        self, request: Calibrate.Request, response: Calibrate.Response
+    ) -> Calibrate.Response:
         response.misalignment_deg, response.covariance_deg2 = [math.nan] * 3, [math.nan] * 9
         outcome = await self._asked_for(lambda: self._at_known_place(request))
         response.message = outcome.trouble
@@ -184,8 +197,8 @@ class Calibrating:
         response.success, response.message = True, self._about
         return _with_a3(response, outcome.value)
 
-    def _at_known_place(self, request) -> Callable[[], Calibrated]:
-        """The job; StarposError where the request or what is here does not do."""
+    def _at_known_place(self, request: Calibrate.Request) -> Callable[[], Calibrated]:
+        """Make the job; StarposError if the request is wrong or the frames here do not suffice."""
         latitude, longitude, most = request.latitude, request.longitude, self._values["calibration_frames"]
         if not (abs(latitude) <= 90 and abs(longitude) <= 360):
             raise InstrumentError(
@@ -209,7 +222,9 @@ class Calibrating:
 
     # turning on the spot ---------------------------------------------------------------------------------------------
 
-    async def _on_self_calibrate(self, request, response):
+    async def _on_self_calibrate(
+        self, request: SelfCalibrate.Request, response: SelfCalibrate.Response
+    ) -> SelfCalibrate.Response:
         response.misalignment_deg, response.covariance_deg2 = [math.nan] * 3, [math.nan] * 9
         response.latitude = response.longitude = response.plumb_stddev = math.nan
         response.covariance = [math.nan] * 4
@@ -230,7 +245,7 @@ class Calibrating:
         return _with_a3(response, turned.calibrated)
 
     def _on_the_spot(self) -> Callable[[], Turned]:
-        """The job; StarposError where there is nothing to do it with."""
+        """Make the job; StarposError if there are too few poses or no solver."""
         poses = self._poses.frames()
         if len(poses) < 2:
             raise FixError(
@@ -241,8 +256,8 @@ class Calibrating:
         turn_deg = self._values["calibration_turn_stddev"]
         return lambda: _turn(solver, poses, turn_deg)
 
-    def _turn_by_itself(self):
-        """From the poses there are; when it is busy, from those there are then."""
+    def _turn_by_itself(self) -> None:
+        """Calibrate from the present poses; if a job runs, do it afterwards, from the poses of that time."""
         self._again = self._worker.busy or self._asked
         if self._again:
             return
@@ -256,7 +271,7 @@ class Calibrating:
             return
         self._run(job).add_done_callback(lambda future: self._turned_by_itself(future.result(), era))
 
-    def _turned_by_itself(self, outcome: Outcome, era: int):
+    def _turned_by_itself(self, outcome: Outcome, era: int) -> None:
         if era == self._era:
             said = outcome.trouble or self._why_not(outcome.value, FEWEST_BY_ITSELF)
             if not said and not self._is_better(outcome.value.calibrated):
@@ -264,13 +279,14 @@ class Calibrating:
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
-            elif outcome.trouble and self._is_told:  # the newest heading is where it no longer holds together
+            elif outcome.trouble and self._is_told:
+                # The newest heading does not fit the others: the place has changed.
                 self._moved_on(self._newest_unix_s)
         if self._again:
             self._turn_by_itself()
 
     def _why_not(self, turned: Turned, fewest: int) -> str:
-        """Why A3 is not taken from it; '' where it is."""
+        """Say in a sentence why A3 is not taken from a turn; '' if it is."""
         found, limit = turned.calibrated.plumb_stddev_arcsec, self._values["self_calibration_limit"]
         if turned.place.frames < fewest:
             return (
@@ -285,8 +301,11 @@ class Calibrating:
         return ""
 
     def _is_better(self, calibrated: Calibrated) -> bool:
-        """Than what is in use, whose zero wanders; by so much that the average should begin anew for it."""
-        if not self._is_told:
+        """Whether it is so much better than the calibration in use that the average should start again for it.
+
+        The zero of the inclinometer drifts, so the calibration in use gets worse with time.
+        """
+        if self.found is None or not self._is_told:
             return True
         now = calibrated.instrument.calibration.utc_unix_s
         hours = abs(now - self.found.utc_unix_s) / 3600
@@ -295,19 +314,19 @@ class Calibrating:
             self._plumb_arcsec, drift * math.sqrt(hours)
         )
 
-    def _adopt_turned(self, turned: Turned):
+    def _adopt_turned(self, turned: Turned) -> None:
         self._adopt(turned.calibrated)
         self.average.turned_on_the_spot(turned.place)
 
     # work ------------------------------------------------------------------------------------------------------------
 
     async def _asked_for(self, prepare: Callable[[], Callable[[], object]]) -> Outcome:
-        """What a service's job gave; `prepare` makes it, or raises a StarposError."""
+        """Run the job of a service and return its outcome; `prepare` makes the job, or raises a StarposError."""
         if self._asked:
             return Outcome(trouble="another calibration is being worked out: call again when it has answered")
         self._asked = True
         try:
-            if self._worker.busy:
+            if self._worker.busy and self._running is not None:
                 await self._running
             job, era = prepare(), self._era
             outcome = await self._run(job)
@@ -325,11 +344,11 @@ class Calibrating:
         return self._running
 
     def report(self) -> Diagnosis:
-        """For /diagnostics."""
-        values = {"frames kept": len(self._recent), "headings": len(self._poses)}
+        """Make the diagnostic `Calibration`."""
+        values: dict[str, object] = {"frames kept": len(self._recent), "headings": len(self._poses)}
         values |= {"self-calibration": self._values["self_calibration"], "working": self._worker.busy}
         values |= {"last turn on the spot": self._said}
-        if self._is_told:
+        if self._is_told and self.found is not None:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
             sentence = "camera against inclinometer is not known: " + (self._said or "turn it on the spot")
@@ -338,7 +357,7 @@ class Calibrating:
 
 
 def _turn(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
-    """FixError where the poses are not of one place or tell none."""
+    """Calibrate from poses on the spot; FixError if they give no place, or more than one."""
     calibrated = turn(solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg)
     if not calibrated.fixes:
         raise FixError(f"no heading has a fix: {calibrated.solutions[0].message}")
@@ -357,10 +376,12 @@ def _turn(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
 
 def _newest_is_off(fixes: list[Fix]) -> bool:
     averager = Averager()
+    before = after = averager.average
     for fix in sorted(fixes, key=lambda f: f.utc_unix_s):
-        before = averager.average
+        before = after
         averager.add(fix)
-    return before is not None and averager.average.left_out > before.left_out
+        after = averager.average
+    return before is not None and after is not None and after.left_out > before.left_out
 
 
 def _about(found: Calibrated) -> str:
@@ -368,17 +389,19 @@ def _about(found: Calibrated) -> str:
     turn_deg = math.sqrt(np.linalg.eigvalsh(np.asarray(c.covariance_arcsec2))[-1]) / 3600
     without = sum(s.fix is None for s in found.solutions)
     left_out = f", {without} more had no fix" if without else ""
+    rx, ry, rz = c.misalignment_deg
     return (
-        "A3 of {} frames is {:.5f} {:.5f} {:.5f} deg{}; the plumb line in the camera is known to {:.2f} arcsec, the turn "
-        "about it, which counts at another lean, to {:.2g} deg"
-    ).format(c.frames, *c.misalignment_deg, left_out, found.plumb_stddev_arcsec, turn_deg)
+        f"A3 of {c.frames} frames is {rx:.5f} {ry:.5f} {rz:.5f} deg{left_out}; the plumb line in the camera is known to "
+        f"{found.plumb_stddev_arcsec:.2f} arcsec, the turn about it, which counts at another lean, to {turn_deg:.2g} deg"
+    )
 
 
 def _headings(count: int) -> str:
     return f"{count} heading{'s' if count != 1 else ''}"
 
 
-def _with_a3(response, found: Calibrated):
+def _with_a3(response: R, found: Calibrated) -> R:
+    """Fill the calibration into the response of a service."""
     c = found.instrument.calibration
     response.misalignment_deg = list(c.misalignment_deg)
     response.covariance_deg2 = c.angle_covariance_deg2.ravel()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes to the solver: when, and what was refused of it."""
+"""Inputs of the solver: when messages came, and which were refused."""
 
 import time
 
@@ -13,30 +13,30 @@ NAMES = ("camera_info", "stars", "tilt")
 
 
 class Inputs:
-    """To be told of each message, by its topic's relative name."""
+    """Keeps account of the messages, by the relative name of their topic."""
 
-    def __init__(self, node: Node):
+    def __init__(self, node: Node) -> None:
         self.refused = 0
         self._came_s: dict[str, float] = {}
         self._troubles = Troubles(node)
 
     def came(self, name: str) -> None:
-        """A message, and it is sound as far as is known."""
+        """Note a message that is sound as far as is known."""
         self._came_s[name] = time.monotonic()
         self._troubles.right(name)
 
     def refuse(self, name: str, sentence: str) -> None:
-        """The one that came, for that reason."""
+        """Note a message that is refused, with the reason."""
         self._came_s[name] = time.monotonic()
         self.refused += 1
         self._troubles.wrong(name, sentence)
 
     def report(self, tilts_kept: int) -> Diagnosis:
-        """For /diagnostics."""
+        """Make the diagnostic `Inputs`."""
         now = time.monotonic()
         ages_s = {name: now - came for name, came in self._came_s.items()}
         missing = [name for name in NAMES if ages_s.get(name, STALE_S) >= STALE_S]
-        values = {f"{name} age (s)": age for name, age in ages_s.items()}
+        values: dict[str, object] = {f"{name} age (s)": age for name, age in ages_s.items()}
         values |= {"tilts kept": tilts_kept, "refused": self.refused}
         refusals = self._troubles.lately(STALE_S)
         if missing:

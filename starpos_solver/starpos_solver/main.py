@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable. The imports inside are heavy; they come after the signal handlers (see starpos_common)."""
+"""The executable. Its imports are heavy, so they come after the signal handlers (see starpos_common)."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 
 def solver() -> int:
-    """The node."""
+    """Run the node."""
     from starpos_common.node_main import leave, run
 
-    def make_nodes():
+    def make_nodes() -> "Iterator[Node]":
         from starpos_solver.node import SolverNode
 
         yield SolverNode()
 
-    return leave(run(make_nodes))  # the triangles may be in the making
+    # A thread may still build triangles.
+    return leave(run(make_nodes))

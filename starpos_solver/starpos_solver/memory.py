@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What frames leave behind for a calibration: the newest of them, and one for each pose; bounded for good."""
+"""Frames kept for a calibration: the newest ones, and one for each pose; their number is bounded."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -15,21 +15,28 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog
 
 MOST_POSES = 36
-MOST_TILTS = 64  # of a pose, the newest
+# The newest tilts of a pose.
+MOST_TILTS = 64
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The stars of a frame, which have a time, with the tilt."""
+    """The stars of a frame that has a time, with its tilt."""
 
     stars: Stars
     tilt: Tilt
+
+    @property
+    def mid_unix_s(self) -> float:
+        """Middle of the exposure."""
+        assert self.stars.mid_unix_s is not None
+        return self.stars.mid_unix_s
 
 
 class RecentFrames:
     """The newest frames with stars and a tilt."""
 
-    def __init__(self, most: int):
+    def __init__(self, most: int) -> None:
         self._frames: deque[Seen] = deque(maxlen=most)
 
     def __len__(self) -> int:
@@ -40,11 +47,11 @@ class RecentFrames:
             self._frames.append(seen)
 
     def keep(self, most: int) -> None:
-        """From now on so many; of those here the newest stay."""
+        """Keep so many frames from now on; the newest of the present ones stay."""
         self._frames = deque(self._frames, maxlen=most)
 
     def newest(self, count: int) -> list[Seen]:
-        """In the order they came; fewer where there are fewer."""
+        """Return the newest frames in the order they came; fewer if there are not so many."""
         return list(self._frames)[max(0, len(self._frames) - count) :]
 
     def clear(self) -> None:
@@ -53,7 +60,7 @@ class RecentFrames:
 
 @dataclass
 class _Pose:
-    """A camera that stands still against the Earth since `first`."""
+    """A camera that has stood still on the Earth since `first`."""
 
     first: Fix
     newest: Seen
@@ -67,16 +74,16 @@ class _Pose:
 
 
 class PoseMemory:
-    """The stars of the last frame of each pose, with the mean tilt of its frames; the oldest pose goes."""
+    """Keeps the stars of the last frame of each pose, with the mean tilt of its frames; drops the oldest poses."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._poses: deque[_Pose] = deque(maxlen=MOST_POSES)
 
     def __len__(self) -> int:
         return len(self._poses)
 
     def add(self, seen: Seen, fix: Fix) -> bool:
-        """One more frame; whether this is worth a look at all of them: a new pose, or one with twice the frames."""
+        """Add a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
         if not self._poses or slip_s(fix, self._poses[-1].first) != 0:
             self._poses.append(_Pose(fix, seen))
         pose = self._poses[-1]
@@ -84,18 +91,19 @@ class PoseMemory:
         return pose.frames & (pose.frames - 1) == 0
 
     def frames(self) -> list[Seen]:
-        """One for each pose whose tilts agree, the oldest first."""
+        """Return a frame for each pose whose tilts agree, the oldest first."""
         made = []
         for pose in self._poses:
             try:
                 made.append(replace(pose.newest, tilt=mean_tilt(pose.tilts)))
-            except TiltError:  # two that contradict each other: nobody knows which is right
+            except TiltError:
+                # The tilts contradict each other, and nobody knows which is right.
                 continue
         return made
 
     def forget_before(self, utc_unix_s: float) -> None:
-        """The instrument has moved then."""
-        while self._poses and self._poses[0].newest.stars.mid_unix_s < utc_unix_s:
+        """Drop the poses before that time, because the instrument has moved then."""
+        while self._poses and self._poses[0].newest.mid_unix_s < utc_unix_s:
             self._poses.popleft()
 
     def clear(self) -> None:
@@ -103,7 +111,7 @@ class PoseMemory:
 
 
 def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
-    """Of an instrument at rest; one far from the others is left out.  TiltError where they contradict each other."""
+    """Average the tilts of an instrument at rest without outliers; TiltError if the tilts contradict each other."""
     times = np.array([t.utc_unix_s for t in tilts])
     log = TiltLog(
         times,
@@ -117,6 +125,6 @@ def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
 
 
 def tilts_of(seen: Sequence[Seen]) -> Callable[[float, float], Tilt]:
-    """What `starpos.calibration.misalignment` asks for the tilt of an exposure."""
-    by_time = {s.stars.mid_unix_s: s.tilt for s in seen}
+    """Make the function that `starpos.calibration.misalignment` calls for the tilt of an exposure."""
+    by_time = {s.mid_unix_s: s.tilt for s in seen}
     return lambda mid_unix_s, _: by_time[mid_unix_s]

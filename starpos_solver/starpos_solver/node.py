@@ -1,57 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `solver`: stars and tilts in, `fix`, `heading/imu` and `solver/solution` out."""
+"""The node `solver`: takes stars and tilts, publishes `fix`, `heading/imu` and `solver/solution`."""
 
 import math
 import traceback
 from collections import deque
 from dataclasses import dataclass, replace
 
+from builtin_interfaces.msg import Time
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
-from std_msgs.msg import Header
+from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
-from starpos.averaging.average import Average
 from starpos.earth.orientation import earth_state
-from starpos.earth.vertical import Geodetic
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
+from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
 from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.sky import catalogue
+from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.job import JobRunner, Outcome
 from starpos_common.paths import path_of
-from starpos_common.topics import publisher, subscription
+from starpos_common.topics import subscription
 from starpos_interfaces import msg
 from starpos_interfaces.srv import SaveCalibration, Solve
-from starpos_solver import outputs, reports, saving
+from starpos_solver import reports, saving
 from starpos_solver.calibrating import Calibrating
 from starpos_solver.clock_doubt import ClockDoubt
 from starpos_solver.inputs import Inputs
 from starpos_solver.memory import Seen
+from starpos_solver.publishing import SolutionPublishers
 from starpos_solver.settings import SolverSettings
 from starpos_solver.tilts import TiltBuffer
 
-WAITING = 4  # frames that wait for their tilts or for the triangles; older ones are dropped
+# Most frames that wait for their tilts or for the triangles; older ones are dropped.
+WAITING = 4
 POLL_S = 0.02
-ANOTHER_TIME_S = 3600.0  # clocks that differ by more are not those of one evening
+# Times that differ by more are not of the same evening.
+ANOTHER_TIME_S = 3600.0
 J2000_UNIX_S = 946_728_000.0
-CLOCK_STEP_NS = 50_000_000  # a clock that goes back by so much was set
-CLOCK_SIGMAS = 6.0  # beyond the stated error, and AHEAD_S, a stamp in the future is wrong
+# A clock that goes back by so much was set.
+CLOCK_STEP_NS = 50_000_000
+# A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
+CLOCK_SIGMAS = 6.0
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """A frame's stars, as they came and as they are.
+    """A frame that waits: its message, and its stars with the error of their time.
 
-    `since` in ns of the steady clock; by how much the middle of the exposure lay ahead of this node's clock when it came;
-    whether its stars speak against its time.
+    since_ns: when it came, on the steady clock.
+    ahead_s: how far the middle of its exposure was ahead of this node's clock then.
+    doubted: whether its stars contradict its time.
     """
 
     message: msg.StarArray
@@ -62,18 +68,18 @@ class Waiting:
 
 
 class SolverNode(Node):
-    """See README.md."""
+    """Publishes the place and the attitude of the instrument; see README.md."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("solver")
         self._camera: Camera | None = None
         self._settings = SolverSettings(self, lambda: self._camera, self._apply)
         self._values = self._settings.values
         self._catalogue = catalogue.load_catalogue()
-        # reads the tables of the Earth's rotation, so that the first frame is not slow
+        # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._was_ns = 0  # this node's clock, when something came last
+        self._was_ns = 0  # this node's clock when the last message came
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
         self._solver: Solver | None = None
@@ -81,18 +87,15 @@ class SolverNode(Node):
         self._trouble = ""  # why there is no solver
         self._latest: Waiting | None = None
         self._answer: Solution | None = None
-        self._hint: Hint | None = None  # of the last fix
+        self._hint: Hint | None = None  # from the last fix
         self._doubt = ClockDoubt()
         self._counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
         self._inputs = Inputs(self)
         self._logged: object = None
         self._connect()
 
-    def _connect(self):
-        self._fix = publisher(self, NavSatFix, "fix", 10)
-        self._fix_averaged = publisher(self, NavSatFix, "fix_averaged", 10)
-        self._imu = publisher(self, Imu, "heading/imu", 10)
-        self._solution = publisher(self, msg.Solution, "solver/solution", 10)
+    def _connect(self) -> None:
+        self._outputs = SolutionPublishers(self, self._settings)
         subscription(self, CameraInfo, "camera/camera_info", self._on_camera, 10)
         subscription(self, msg.Tilt, "tilt", self._on_tilt, 1000)
         subscription(self, msg.StarArray, "stars", self._on_stars, 10)
@@ -115,15 +118,15 @@ class SolverNode(Node):
 
     # parameters ------------------------------------------------------------------------------------------------------
 
-    def _apply(self, names: frozenset[str]):
+    def _apply(self, names: frozenset[str]) -> None:
         self._diagnostics.hardware_id = self._values["frame_id"]
         if "clock_stddev" in names:
             self._doubt.clear()
         self._calibrating.parameters_set(names)
         self._remake_solver()
 
-    def _remake_solver(self):
-        """With the parameters and the calibration of now."""
+    def _remake_solver(self) -> None:
+        """Make the solver again with the present parameters and calibration."""
         if self._camera is None or self._preparing.busy:
             return
         if self._solver is None:
@@ -136,7 +139,7 @@ class SolverNode(Node):
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def _on_camera(self, message: CameraInfo):
+    def _on_camera(self, message: CameraInfo) -> None:
         try:
             camera = message_to_camera(message)
         except StarposError as e:
@@ -152,8 +155,8 @@ class SolverNode(Node):
         if not self._preparing.busy:
             self._prepare(camera)
 
-    def _prepare(self, camera: Camera):
-        """Have the triangles of this field ready; they may have to be built, which must not hold up the node."""
+    def _prepare(self, camera: Camera) -> None:
+        """Prepare the triangles of this field in a thread, because building them takes seconds."""
 
         def work() -> Solver:
             solver = self._make_solver(camera)
@@ -162,22 +165,24 @@ class SolverNode(Node):
 
         self._preparing.run(work).add_done_callback(lambda f: self._on_prepared(camera, f.result()))
 
-    def _on_prepared(self, camera: Camera, made: Outcome):
-        if camera != self._camera:  # another one has come meanwhile
+    def _on_prepared(self, camera: Camera, made: Outcome) -> None:
+        if self._camera is not None and camera != self._camera:
+            # Another camera_info has come meanwhile.
             self._prepare(self._camera)
             return
         self._solver, self._trouble = made.value, made.trouble
         if self._trouble:
             self._log_change(self._trouble, good=False)
         else:
-            self._remake_solver()  # with the parameters of now
+            # The parameters may have changed meanwhile.
+            self._remake_solver()
         self._work()
 
-    def _on_tilt(self, message: msg.Tilt):
+    def _on_tilt(self, message: msg.Tilt) -> None:
         self._watch_clock()
         try:
             ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
-            # when its time has come the instrument may lean otherwise
+            # The instrument may lean otherwise when the time of its stamp comes.
             if ahead_s > reports.AHEAD_S:
                 raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
             self._tilts.add(message, self._settings.tilt_stddev_rad)
@@ -187,17 +192,17 @@ class SolverNode(Node):
         if self._waiting:
             self._work()
 
-    def _on_stars(self, message: msg.StarArray):
+    def _on_stars(self, message: msg.StarArray) -> None:
         self._inputs.came("stars")
         self._watch_clock()
         try:
             stars = message_to_stars(message)
-            # who sets it knows better than the camera's host
+            # If the user sets clock_stddev, it replaces the error that the camera's host states.
             if not math.isnan(self._values["clock_stddev"]):
                 stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             self._publish(
-                message.header,
+                message.header.stamp,
                 Solution(
                     Status.BAD_INPUT,
                     str(e),
@@ -214,29 +219,29 @@ class SolverNode(Node):
             self._counts["dropped frames"] += 1
         self._work()
 
-    def _watch_clock(self):
-        """Where this node's clock has gone back it was ahead, and so were the tilts that came by it."""
+    def _watch_clock(self) -> None:
+        """Drop the tilts from the future if this node's clock was set back."""
         now_ns = self.get_clock().now().nanoseconds
         if now_ns < self._was_ns - CLOCK_STEP_NS:
             self._tilts.forget_after(now_ns * 1e-9)
         self._was_ns = now_ns
 
     def _ahead_s(self, unix_s: float | None) -> float:
-        """By how much a time is ahead of this node's clock; 0 where one of them is not known (no /clock yet).
+        """How far a time is ahead of this node's clock (s); 0 if one of them is not known (no /clock yet).
 
-        0 too where it is of another time altogether: a night that is played without /clock, or a robot that does not know
-        the date.
+        It is also 0 if the two are not of the same evening: a night is played without /clock, or the robot does not
+        know the date.
         """
         now_ns = self.get_clock().now().nanoseconds
         if unix_s is None or not now_ns:
             return 0.0
         ahead_s = unix_s - now_ns * 1e-9
-        return 0.0 if ahead_s > ANOTHER_TIME_S and not self.get_clock().ros_time_is_active else ahead_s
+        return 0.0 if ahead_s > ANOTHER_TIME_S and not time_is_simulated(self) else ahead_s
 
     # work ------------------------------------------------------------------------------------------------------------
 
-    def _work(self):
-        """Solve what has all it needs; poll only while something waits."""
+    def _work(self) -> None:
+        """Solve the frames that have everything they need; poll only while a frame waits."""
         while self._waiting and self._ready(self._waiting[0]):
             self._solve(self._waiting.popleft())
         if self._waiting and self._poll.is_canceled():
@@ -246,34 +251,31 @@ class SolverNode(Node):
 
     def _ready(self, frame: Waiting) -> bool:
         waited_s = (self._steady.now().nanoseconds - frame.since_ns) * 1e-9
+        mid = frame.stars.mid_unix_s
         if self._preparing.busy:
             return False
-        if self._solver is None or frame.stars.mid_unix_s is None:
-            return (
-                waited_s > self._values["tilt_timeout"]
-                or frame.stars.mid_unix_s is None
-                or bool(self._trouble)
-            )
-        return waited_s > self._values["tilt_timeout"] or self._tilts.complete(
-            frame.stars.mid_unix_s, self._span(frame.stars)
-        )
+        if mid is None or waited_s > self._values["tilt_timeout"]:
+            return True
+        if self._solver is None:
+            return bool(self._trouble)
+        return self._tilts.complete(mid, self._span(frame.stars))
 
     def _span(self, stars: Stars) -> float:
         return stars.exposure_s or self._values["tilt_window"]
 
-    def _solve(self, frame: Waiting):
+    def _solve(self, frame: Waiting) -> None:
         answer = self._answer_to(frame, self._hint)
-        if answer.ok:
-            frame, answer = self._with_doubt(frame, answer)
+        if answer.ok and answer.fix is not None:
+            frame, answer = self._with_doubt(frame, answer, answer.fix)
         self._latest = frame
-        self._publish(frame.message.header, answer)
+        self._publish(frame.message.header.stamp, answer)
         if self._solver is not None:
             self._learn(frame, answer)
 
-    def _with_doubt(self, frame: Waiting, answer: Solution) -> tuple[Waiting, Solution]:
-        """The frame, and its answer, with the error of its time that the stars of earlier frames tell."""
-        stated_s = math.hypot(self._solver.clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s)
-        self._doubt.add(answer.fix, stated_s)
+    def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
+        """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
+        stated_s = math.hypot(self._solver_now().clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s)
+        self._doubt.add(fix, stated_s)
         if self._doubt.seconds <= stated_s:
             return frame, answer
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self._doubt.seconds), doubted=True)
@@ -282,7 +284,7 @@ class SolverNode(Node):
         return frame, self._answer_to(frame, answer.hint)
 
     def _solver_now(self) -> Solver:
-        """InstrumentError with the reason while there is none."""
+        """Return the solver; InstrumentError with the reason while there is none."""
         if self._solver is not None:
             return self._solver
         topic = self.resolve_topic_name("camera/camera_info")
@@ -303,91 +305,77 @@ class SolverNode(Node):
             return answer
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
-        except Exception as e:  # a defect costs this frame, not the night
+        except Exception as e:
+            # A defect costs this frame only; the node goes on.
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
             return Solution.failed(
                 stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
             )
 
-    def _learn(self, frame: Waiting, answer: Solution):
-        """What a calibration and the average take from a frame, also from one that a stale calibration refuses.
+    def _learn(self, frame: Waiting, answer: Solution) -> None:
+        """Give a frame to the calibration and the average, even one that a stale calibration refuses.
 
-        One whose time is in doubt teaches nothing.  fix_averaged comes with the frames that are of it.
+        A frame whose time is in doubt is left out. fix_averaged is published with each frame that the average includes.
         """
         stars = frame.stars
-        if frame.doubted or (answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S):
+        if stars.mid_unix_s is None or frame.doubted:
+            return
+        if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
             return
         try:
-            tilt = answer.tilt or self._tilts.average(stars.mid_unix_s or math.nan, self._span(stars))
+            tilt = answer.tilt or self._tilts.average(stars.mid_unix_s, self._span(stars))
         except StarposError:
             return
         try:
             used = self._calibrating.learn(Seen(stars, tilt), answer.fix)
-            message = self._averaged(frame.message.header, self._calibrating.average.place) if used else None
-        except Exception:  # fix and heading go on without
+            place = self._calibrating.average.place if used else None
+            message = None if place is None else self._outputs.average(frame.message.header.stamp, place)
+        except Exception:
+            # Fix and heading go on without the average; data that cause a defect must not stay.
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=60.0)
-            self._calibrating.forget()  # what cannot be worked with must not stay
+            self._calibrating.forget()
             return
         if message is not None:
-            self._fix_averaged.publish(message)
+            self._outputs.publish_average(message)
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
-    def _publish(self, about: Header, answer: Solution):
+    def _publish(self, stamp: Time, answer: Solution) -> None:
         self._answer = answer
         self._counts["frames"] += 1
         self._counts["fixes"] += answer.ok
         self._hint = answer.hint or self._hint
-        header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
-        message, fix, imu = self._messages(header, answer)
-        self._fix.publish(fix)
-        if imu is not None:
-            self._imu.publish(imu)
-        self._solution.publish(message)
+        self._outputs.publish(stamp, answer, self._no_camera)
         self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
 
-    def _messages(self, header: Header, answer: Solution):
-        ground = outputs.on_ground(answer, self._settings.vertical)
-        message = outputs.solution(header, answer, ground)
-        if self._solver is None and self._camera is None:
-            message.status = msg.Solution.NO_CAMERA
-        return (
-            message,
-            self._nav_sat_fix(header, ground),
-            outputs.imu(header, answer, ground) if ground else None,
-        )
+    @property
+    def _no_camera(self) -> bool:
+        return self._solver is None and self._camera is None
 
-    def _averaged(self, about: Header, place: Average) -> NavSatFix:
-        header = Header(stamp=about.stamp, frame_id=self._values["frame_id"])
-        vertical = self._settings.vertical
-        return self._nav_sat_fix(header, outputs.average_on_ground(place, vertical))
-
-    def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
-        return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
-
-    def _log_change(self, sentence: str, good: bool, state: object = None):
+    def _log_change(self, sentence: str, good: bool, state: object = None) -> None:
         state = state or sentence
         if state == self._logged:
             return
         self._logged = state
-        # rclpy ties a severity to the line it is called from, so each has its own
+        # rclpy ties a severity to the calling line, so each severity has its own line.
         if good:
             self.get_logger().info(sentence)
         else:
             self.get_logger().warning(sentence)
 
-    def _on_solve(self, request, response):
+    def _on_solve(self, request: Solve.Request, response: Solve.Response) -> Solve.Response:
         if self._latest is None:
             response.message = "no frame has arrived yet: start the camera and the detector"
             response.solution = msg.Solution(status=msg.Solution.BAD_INPUT, status_text=response.message)
             return response
-        answer = self._answer_to(self._latest, None)  # from scratch: what was before has no say
-        header = Header(stamp=self._latest.message.header.stamp, frame_id=self._values["frame_id"])
-        response.solution = self._messages(header, answer)[0]
+        # Without a hint the frame is identified anew, whatever was found before.
+        answer = self._answer_to(self._latest, None)
+        stamp = self._latest.message.header.stamp
+        response.solution = self._outputs.solution(stamp, answer, self._no_camera)
         response.success, response.message = answer.ok, answer.message
         return response
 
-    def _on_reset(self, request, response):
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._tilts.clear()
         self._waiting.clear()
         self._latest = self._answer = self._hint = None
@@ -397,7 +385,9 @@ class SolverNode(Node):
         response.message = "tilts, frames and the place are forgotten; a calibration that was found is not"
         return response
 
-    def _on_save_calibration(self, request, response):
+    def _on_save_calibration(
+        self, request: SaveCalibration.Request, response: SaveCalibration.Response
+    ) -> SaveCalibration.Response:
         url = self._values["calibration_url"]
         try:
             instrument = self._solver_now().instrument
@@ -407,7 +397,8 @@ class SolverNode(Node):
         except StarposError as e:
             response.message = str(e)
             return response
-        if written == path_of(url):  # what a restart would read
+        # A restart would read this file.
+        if written == path_of(url):
             self._settings.saved(instrument)
         response.success, response.message = True, f"{written}: the calibration in use is written"
         return response

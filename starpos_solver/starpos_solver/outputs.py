@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a solution becomes on the wire: NavSatFix, Imu, Solution."""
+"""Messages of a solution: NavSatFix, Imu, Solution."""
 
 import math
 
@@ -10,6 +10,7 @@ from std_msgs.msg import Header
 from starpos import rotation
 from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Status
 from starpos.units import ARCSEC
 from starpos_common.messages import tilt_to_message
@@ -25,26 +26,28 @@ STATUS = {
     Status.BAD_INPUT: msg.Solution.BAD_INPUT,
     Status.POOR_FIT: msg.Solution.POOR_FIT,
 }
-DEFLECTION = "deflection"  # in the budget, though of the geodetic position only
-UNKNOWN_ALTITUDE_VARIANCE = 1e8  # m2; a NaN would make consumers drop the whole matrix
+# An entry of the error budget that concerns the geodetic position only.
+DEFLECTION = "deflection"
+# m2; with a NaN consumers would drop the whole matrix.
+UNKNOWN_ALTITUDE_VARIANCE = 1e8
 NAN = math.nan
 
 
 def on_ground(answer: Solution, vertical: Vertical) -> Geodetic | None:
-    """The geodetic position of an answer; None without a fix."""
+    """Convert the fix of an answer to a geodetic position; None without a fix."""
     fix = answer.fix
     return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical) if fix else None
 
 
 def average_on_ground(place: Average, vertical: Vertical) -> Geodetic:
-    """The geodetic position of an average."""
+    """Convert an average to a geodetic position."""
     return geodetic(place.latitude, place.longitude, place.heading, place.covariance, vertical)
 
 
 def nav_sat_fix(
     header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float
 ) -> NavSatFix:
-    """The position on WGS 84; without one a NO_FIX with NaN, so that a consumer sees that the instrument lives."""
+    """Make a NavSatFix on WGS 84; without a position NO_FIX with NaN, so that consumers see the instrument at work."""
     message = NavSatFix(header=header)
     message.status.service = 0  # no satellites
     if ground is None:
@@ -63,9 +66,8 @@ def nav_sat_fix(
     return message
 
 
-def imu(header: Header, answer: Solution, ground: Geodetic) -> Imu:
-    """The attitude of the base link in true-north ENU; rates and accelerations are not measured."""
-    fix = answer.fix
+def imu(header: Header, fix: Fix, ground: Geodetic) -> Imu:
+    """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
     to_geodetic_north = rotation.about_axis(
         2, ground.deflection.eta_arcsec * ARCSEC * math.tan(ground.latitude)
     )
@@ -73,9 +75,8 @@ def imu(header: Header, answer: Solution, ground: Geodetic) -> Imu:
     message = Imu(header=header)
     message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w = x, y, z, w
     covariance = fix.attitude_covariance.copy()
-    covariance[2, 2] += (
-        ground.covariance[2, 2] - fix.covariance[2, 2]
-    )  # the deflection's share of the azimuth
+    # The deflection's share of the azimuth.
+    covariance[2, 2] += ground.covariance[2, 2] - fix.covariance[2, 2]
     message.orientation_covariance = covariance.ravel()
     message.angular_velocity_covariance[0] = -1.0
     message.linear_acceleration_covariance[0] = -1.0
@@ -83,7 +84,7 @@ def imu(header: Header, answer: Solution, ground: Geodetic) -> Imu:
 
 
 def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.Solution:
-    """All there is to say about one frame."""
+    """Make the Solution message with everything known about one frame."""
     message = msg.Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
     message.ids = list(answer.names)
@@ -100,7 +101,7 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     if answer.tilt:
         message.tilt = tilt_to_message(answer.tilt, "")
         message.tilt_samples = answer.tilt.samples
-    if fix is None:
+    if fix is None or ground is None:
         for name in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading", "heading_stddev",
                      "refraction", "diurnal_aberration", "ut1_minus_utc", "xi", "eta"):  # fmt: skip
             setattr(message, name, NAN)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's parameters, and what they mean to starpos."""
+"""Parameters of the solver, and their conversion to objects of starpos."""
 
 import math
 from collections.abc import Mapping
@@ -18,7 +18,8 @@ from starpos_common.parameters import FRAME_NAME, Parameter
 from starpos_common.paths import path_of
 
 NAN = math.nan
-SAME_FOCAL = 0.05  # of the focal length, by which that of one camera may change
+# Share by which the focal length of one camera may change.
+SAME_FOCAL = 0.05
 
 PARAMETERS = (
     Parameter(
@@ -187,10 +188,10 @@ PARAMETERS = (
 def instrument_of(
     values: Mapping, camera: Camera, known: Instrument | None, found: Calibration | None = None
 ) -> Instrument:
-    """The Instrument of an instrument file (`known`, None without one) or of the parameters, with camera_info's camera.
+    """Make the Instrument from an instrument file (`known`, or None) or from the parameters, with camera_info's camera.
 
-    clock_stddev and tilt_stddev win over the file where they are set, and the calibration that frames have told (`found`)
-    over both; self_calibration makes the others unknown.
+    clock_stddev and tilt_stddev, if they are set, replace the values of the file. A calibration from frames (`found`)
+    replaces that of file and parameters; with self_calibration, and before there is a `found`, it counts as unknown.
     """
     if known is None:
         known = Instrument(
@@ -213,12 +214,12 @@ def instrument_of(
 
 
 def known_instrument(url: str) -> Instrument | None:
-    """The Instrument that calibration_url names, None for ''; InstrumentError with the reason where it is broken."""
+    """Read the Instrument that calibration_url names, None for ''; InstrumentError with the reason if it is broken."""
     return instrument_file.read(path_of(url)) if url else None
 
 
 def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
-    """InstrumentError where the instrument file (`known`, from `url`) is of a camera that is not this one."""
+    """Raise InstrumentError if the instrument file (`known`, from `url`) belongs to another camera."""
     if known is None or abs(known.focal_px / camera.fx - 1) <= SAME_FOCAL:
         return
     raise InstrumentError(
@@ -227,7 +228,7 @@ def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
 
 
 def atmosphere_of(values: Mapping) -> Atmosphere:
-    """The air as far as it is set."""
+    """Make the Atmosphere from the parameters; what is not set keeps its default."""
     pressure, temperature = (values[f"refraction.{name}"] for name in ("pressure", "temperature"))
     return Atmosphere.measured(
         None if math.isnan(pressure) else pressure,
@@ -237,12 +238,12 @@ def atmosphere_of(values: Mapping) -> Atmosphere:
 
 
 def geoid_file(name: str) -> Geoid | None:
-    """The Geoid that deflection.geoid names, None for ''; GeoidError with the reason where it is broken."""
+    """Read the Geoid that deflection.geoid names, None for ''; GeoidError with the reason if it is broken."""
     return geoid.read(name) if name else None
 
 
 def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
-    """The Geoid of a grid (`known`, None without one), or the deflection the parameters give for the place."""
+    """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place."""
     xi, eta = values["deflection.xi"], values["deflection.eta"]
     if known is None:
         return Deflection(xi, eta, values["deflection.stddev"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the solver says of its frames in /diagnostics."""
+"""Diagnostics of the solver about its frames."""
 
 from collections.abc import Mapping
 
@@ -20,9 +20,10 @@ OTHER_TILTS = (
 
 
 def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
-    """The newest frame's."""
-    values = counts | {"status": answer.status.value, "stars detected": answer.stars_detected}
+    """Report the solution of the newest frame."""
+    values: dict[str, object] = {**counts, "status": answer.status.value}
     values |= {
+        "stars detected": answer.stars_detected,
         "stars matched": len(answer.names),
         "identify (s)": answer.identify_s,
         "fit (s)": answer.fix_s,
@@ -41,9 +42,9 @@ def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
 
 
 def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt_s: float) -> Diagnosis:
-    """How well the time of the newest frame is known.
+    """Report how well the time of the newest frame is known.
 
-    ahead_s: by how much it was ahead of this node's clock; doubt_s: by how much the stars contradict it, or 0.
+    ahead_s: how far it was ahead of this node's clock.  doubt_s: how far the stars contradict it, or 0.
     """
     values = {"clock sigma (s)": clock_stddev_s, "stamp sigma (s)": stamp_stddev_s, "frame age (s)": -ahead_s}
     if ahead_s > AHEAD_S:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where solver/save_calibration may write."""
+"""Writing of the instrument file for solver/save_calibration."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ from starpos_common.paths import path_of
 
 
 def save(path: str, calibration_url: str, instrument: Instrument) -> Path:
-    """Write an instrument file, at `path` or else where calibration_url says; its Path.
+    """Write an instrument file to `path`, or without one to calibration_url; return its Path.
 
-    InstrumentError where it cannot be written, or there is something else already.
+    Raises InstrumentError if it cannot be written, or if the file there is no instrument file.
     """
     if not path and not calibration_url:
         raise InstrumentError("there is no file to write: give a path, or set calibration_url")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's parameters, and what is in the files that they name."""
+"""Parameters of the solver, and the contents of the files that they name."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,17 +21,18 @@ ANY_CAMERA = Camera.from_focal(100, 100, 1000.0)
 
 
 class SolverSettings:
-    """`values` by name, and what they make of files.
+    """The parameters as `values` by name, and the objects made from them and from their files.
 
-    A file is read once, when its parameter is set and the value validated: what is applied is what was found sound, and a
-    file that breaks or goes away later is no matter until the parameter is set again.
+    A file is read once, when its parameter is validated, so the checked contents are applied. A file that breaks or
+    disappears later does not matter until the parameter is set again.
 
-    camera: the one in use, None before there is one.  apply: called with the names that were set.
+    camera: returns the camera in use, None before there is one.
+    apply: called with the names that were set.
     """
 
     def __init__(
         self, node: Node, camera: Callable[[], Camera | None], apply: Callable[[frozenset[str]], None]
-    ):
+    ) -> None:
         self._camera, self._apply = camera, apply
         self._known: Instrument | None = None
         self._geoid: Geoid | None = None
@@ -40,7 +41,7 @@ class SolverSettings:
         self._known, self._geoid = self._read
 
     def _check(self, values: Mapping, names: frozenset[str]) -> str | None:
-        """Values that are each allowed but make no instrument together, such as a broken calibration file."""
+        """Say in a sentence why values make no instrument together, such as with a broken file; None if they do."""
         known, grid, camera = self._known, self._geoid, self._camera()
         try:
             if "calibration_url" in names:
@@ -57,12 +58,12 @@ class SolverSettings:
         self._read = known, grid
         return None
 
-    def _adopt(self, names: frozenset[str]):
+    def _adopt(self, names: frozenset[str]) -> None:
         self._known, self._geoid = self._read
         self._apply(names)
 
     def saved(self, instrument: Instrument) -> None:
-        """The file of calibration_url holds this now."""
+        """Note that the file of calibration_url holds this instrument now."""
         self._known = instrument
 
     @property
@@ -71,14 +72,17 @@ class SolverSettings:
 
     @property
     def tilt_stddev_rad(self) -> float:
-        """Of a sample that states none."""
+        """Standard deviation of a tilt sample that states none."""
         stated = math.radians(self.values["tilt_stddev"])
         if not math.isnan(stated):
             return stated
         return self._known.inclinometer.noise_rad if self._known else SCA100T_NOISE_RAD
 
     def solver(self, camera: Camera, found: Calibration | None, catalogue: Catalogue) -> Solver:
-        """For a camera, with the calibration that frames have told (`found`); InstrumentError where it is another one."""
+        """Make a Solver for a camera, with the calibration from frames (`found`, or None).
+
+        Raises InstrumentError if the instrument file belongs to another camera.
+        """
         parameters.check_camera(self._known, self.values["calibration_url"], camera)
         return Solver(
             parameters.instrument_of(self.values, camera, self._known, found),

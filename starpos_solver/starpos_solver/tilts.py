@@ -12,16 +12,19 @@ from starpos.recording.messages import OUT_OF_RANGE, SATURATED, UNUSABLE, messag
 from starpos_interfaces import msg
 
 CAPACITY = 6000  # ten minutes at 10 Hz
-TOGETHER = 20  # samples of an exposure have no more others between them
-NEAR_S = 1.0  # how far from an exposure a flagged sample still explains why there is no good one
-USUAL_PERIOD_S, JITTER = 0.1, 0.9  # between samples; how much of it the next one may come early
+# Between two samples of one exposure at most so many others arrive.
+TOGETHER = 20
+# A flagged sample so near to an exposure explains why it has no good one.
+NEAR_S = 1.0
+# Time between samples if there are too few to tell, and the share of it by which the next may come early.
+USUAL_PERIOD_S, JITTER = 0.1, 0.9
 
 
 class TiltBuffer:
-    """The latest samples in any order, bounded; unusable ones are remembered only to say so."""
+    """Keeps the latest samples, in any order; keeps unusable ones only to explain a missing tilt."""
 
-    def __init__(self):
-        self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with its number as it came
+    def __init__(self) -> None:
+        self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with the number of its arrival
         self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
 
@@ -33,7 +36,7 @@ class TiltBuffer:
         self._flagged.clear()
 
     def add(self, message: msg.Tilt, unknown_stddev_rad: float) -> None:
-        """Keep a sample; TiltError where the message is broken."""
+        """Keep a sample; TiltError if the message is broken."""
         if message.flags & UNUSABLE:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
             return
@@ -47,13 +50,13 @@ class TiltBuffer:
         self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
 
     def forget_after(self, unix_s: float) -> None:
-        """Samples of a clock that was ahead then: when their time comes the instrument may lean otherwise."""
+        """Drop later samples: their clock was ahead, and the instrument may lean otherwise when their time comes."""
         if self._latest_unix_s > unix_s:
             self._latest_unix_s = unix_s
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
-        """Whether no further sample of this exposure is to come: one is here that leaves no room for another."""
+        """Whether all samples of an exposure have arrived: the last one leaves no time for another."""
         times = [s.utc_unix_s for s in self._near(mid_unix_s, span_s)]
         if not times:
             return False
@@ -61,12 +64,13 @@ class TiltBuffer:
         return times[-1] >= mid_unix_s + span_s / 2 - JITTER * period
 
     def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
-        """The samples about an exposure in order of time, however they came; none counts twice.
+        """The samples near an exposure in order of time, however they came; none counts twice.
 
-        They came together.  Of a clock that was set back there are others of this time from long before, when the
-        instrument perhaps leaned otherwise.
+        Only samples that arrived together count. After a clock was set back there may be old samples of the same time,
+        from when the instrument perhaps leaned otherwise.
         """
-        reach, near, last = span_s / 2 + NEAR_S, {}, 0
+        near: dict[float, Tilt] = {}
+        reach, last = span_s / 2 + NEAR_S, 0
         for came, sample in self._good:
             if abs(sample.utc_unix_s - mid_unix_s) <= reach:
                 if came > last + TOGETHER:
@@ -75,11 +79,11 @@ class TiltBuffer:
         return [near[t] for t in sorted(near)]
 
     def average(self, mid_unix_s: float, span_s: float) -> Tilt:
-        """The mean over an exposure; TiltRangeError or TiltError with the reason where there is none."""
+        """Average over an exposure; TiltRangeError or TiltError with the reason if there is no sample."""
         near = self._near(mid_unix_s, span_s)
         if not near:
             self._explain(mid_unix_s, span_s)
-        # later ones must not matter: how many have come by now is chance
+        # Later samples must not count, because it is chance how many have arrived by now.
         near = [s for s in near if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + 1e-6] or near
         return TiltLog.of_readings(near).average(mid_unix_s, span_s)
 

@@ -68,7 +68,7 @@ def yaw_deg(imu) -> float:
 @pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
 def test_yaw_is_counterclockwise_from_east(azimuth, yaw):
     answer = answer_facing(azimuth)
-    message = outputs.imu(Header(), answer, outputs.on_ground(answer, EXACT))
+    message = outputs.imu(Header(), answer.fix, outputs.on_ground(answer, EXACT))
     assert (yaw_deg(message) - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-9)
 
 
@@ -92,7 +92,7 @@ def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
 
 def test_rates_and_accelerations_are_declared_unmeasured():
     answer = answer_facing(10.0)
-    message = outputs.imu(Header(), answer, outputs.on_ground(answer, EXACT))
+    message = outputs.imu(Header(), answer.fix, outputs.on_ground(answer, EXACT))
     assert message.angular_velocity_covariance[0] == -1.0
     assert message.linear_acceleration_covariance[0] == -1.0
     assert np.all(np.linalg.eigvalsh(np.array(message.orientation_covariance).reshape(3, 3)) > 0)
@@ -130,7 +130,9 @@ def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
     assert ground.covariance[0, 0] - plain.covariance[0, 0] == pytest.approx(
         (5 * arcsec * 6.387e6) ** 2, rel=1e-2
     )
-    turned = yaw_deg(outputs.imu(Header(), answer, ground)) - yaw_deg(outputs.imu(Header(), answer, plain))
+    turned = yaw_deg(outputs.imu(Header(), answer.fix, ground)) - yaw_deg(
+        outputs.imu(Header(), answer.fix, plain)
+    )
     # azimuth = A - eta tan(phi): a smaller azimuth is a larger yaw
     assert turned * 3600 == pytest.approx(-20.0 * math.tan(ground.latitude), rel=1e-3)
 

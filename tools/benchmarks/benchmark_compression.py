@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulated full frame takes in a bag (zstd), against Rice's coding and PNG, all lossless: size and CPU time."""
+"""Size and CPU time of a simulated full frame in a bag (zstd), against Rice's coding and PNG, all lossless."""
 
 import io
 import time

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time and memory of detection against the frame's size, the number of stars and the share of hot pixels.
 
-`benchmark_detection.py [--repeat N]`.  sep with windowed positions answers the same frames where it can be imported
-(`pip install sep`).  Memory is what the process grows by at its peak, over the frame's own bytes (Linux only).
+`benchmark_detection.py [--repeat N]`.  sep with windowed positions works on the same frames if it can be imported
+(`pip install sep`).  Memory is the growth of the process at its peak, over the frame's own bytes (Linux only).
 """
 
 import argparse
@@ -32,9 +32,9 @@ SKY, SIGMA, TRAIL = 600, 1.02, np.array([2.6, -2.2])  # DN; px; px: half a secon
 
 
 def exposure(size, count, rng, hot=0.0):
-    """A 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, faint ones commonest.
+    """Make a 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, most of them faint.
 
-    hot: the share of pixels that are hot, by 100 DN and more, 2000 on average.
+    hot: the share of hot pixels, which have 100 DN more or above, 2000 on average.
     """
     columns, rows = size
     pixels = rng.normal(SKY, 7.0, (rows, columns)).astype(np.float32)
@@ -70,7 +70,7 @@ def memory_kb(name):
 
 
 def measured(work, path, repeat):
-    """Stars found, CPU ms (the quickest of `repeat`), and the peak of memory over the frame's bytes."""
+    """Detect; return the number of stars, CPU ms (the quickest of `repeat`), and peak memory over the frame's bytes."""
     # what the first call loads is no frame's work; a small one leaves no memory to those that follow
     work(exposure((200, 200), 5, np.random.default_rng(1)))
     pixels = np.load(path)

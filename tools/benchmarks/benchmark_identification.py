@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same random fields through starpos and its peers, in one run: a table.
+"""Table of starpos and its peers on the same random fields, in one run.
 
 `benchmark_identification.py [--fields N] [--seed S] [--false K ...] [--index FOLDER]`.  Peers run where they can be
 imported (`pip install cedar-solve astrometry`): cedar-solve with a database made here from this program's catalogue for
 this field of view (five minutes), kept in the cache; astrometry.net's engine with FOLDER's index files
 (its figures are those of these files: `build-astrometry-index -P 7 .. 10 -n 30` of a V < 9.5 list finds 97 to 98 %).
-Every program is told the focal length to 3 % and gets the stars brightest first; each field is answered by all.
+Every program gets the focal length to 3 %, and the stars in order of brightness; all programs get each field.
 """
 
 import argparse
@@ -35,7 +35,7 @@ TIMEOUT_MS = 5000
 
 
 class Absent(Exception):
-    """Why a peer takes no part."""
+    """A peer cannot take part; the text says why."""
 
 
 def starpos(stars, args) -> montecarlo_fields.Answer:
@@ -84,7 +84,7 @@ def cedar_solve(stars, args) -> montecarlo_fields.Answer:
 
 
 def write_tyc_main(stars, limit_mag: float, path: Path) -> None:
-    """The columns that cedar-solve reads of the Tycho catalogue: identifier, V, place, with J2000 places in them."""
+    """Make the columns that cedar-solve reads of the Tycho catalogue: identifier, V, J2000 place."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as f:
         for k in np.flatnonzero(stars.vmag_centi < 100 * limit_mag):

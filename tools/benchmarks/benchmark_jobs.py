@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much faster `starpos solve --jobs N` is than --jobs 1, on simulated frames of the paper's size and on star lists.
+"""Comparison of `starpos solve --jobs N` with --jobs 1, on simulated frames of the paper's size and on star lists.
 
-`benchmark_jobs.py [--frames N] [--lists N] [--jobs N] [--rounds R]`.  Whole commands, start and end of the processes
-included, 1 and N by turns; the best of the rounds, for another's work only slows.  The CPU time of all processes tells
-what is to be had where that other's work never rests.  The answers are compared byte by byte.
+`benchmark_jobs.py [--frames N] [--lists N] [--jobs N] [--rounds R]`.  Whole commands are timed, with start and end of
+the processes, 1 and N by turns; the best round counts, because other work on the machine only slows.  The CPU time of all
+processes shows what is possible on a machine that always has other work.  The answers are compared byte by byte.
 """
 
 import argparse
@@ -21,11 +21,12 @@ from starpos.cli import main as starpos
 from starpos.parallel.processes import Processes, processors
 
 OPTICS = ("--focal-mm", "600", "--pixel-um", "6.4")
-AT_ONCE = 8  # frames simulated; a night of more repeats them
+# Frames simulated; a longer night repeats them.
+AT_ONCE = 8
 
 
 def timed(command: list[str]) -> tuple[np.ndarray, bytes]:
-    """Wall and CPU time in s, and what it printed."""
+    """Run a command; return wall and CPU time in s, and its output."""
     begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run([sys.executable, "-m", "starpos", *command], stdout=subprocess.PIPE, check=True)
     wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -33,11 +34,12 @@ def timed(command: list[str]) -> tuple[np.ndarray, bytes]:
 
 
 def compare(what: str, folder: Path, number: int, jobs: int, rounds: int) -> None:
-    """One line of the table."""
+    """Print a line of the table."""
     some = sorted(str(p) for p in folder.iterdir() if p.stem.startswith(("frame", "stars")))
     given = [some[k % len(some)] for k in range(number)]
     command = ["solve", *given, "--tilt", str(folder / "tilt.csv"), *OPTICS, "--json", "--jobs"]
-    timed([*command, "1"])  # files and triangles into memory
+    # This brings files and triangles into memory.
+    timed([*command, "1"])
     best = {1: np.full(2, np.inf), jobs: np.full(2, np.inf)}
     answers = set()
     for _ in range(rounds):
@@ -54,12 +56,12 @@ def compare(what: str, folder: Path, number: int, jobs: int, rounds: int) -> Non
 
 
 def nothing(of):
-    """The work whose cost is that of sending it."""
+    """Do nothing, so that only sending costs time."""
     return of
 
 
 def overhead_ms(jobs: int, calls: int = 2000) -> tuple[float, float]:
-    """Of starting the processes, and of a call."""
+    """Time for starting the processes, and for a call, in ms."""
     begin = time.perf_counter()
     with Processes(jobs) as workers:
         answers = workers.map((nothing, str(k)) for k in range(calls + 100))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time of the inclinometer's driver, from bytes to readings, a sample; and how many times real time that is.
+"""CPU time per sample of the inclinometer's driver, from bytes to readings, and how much faster than real time it is.
 
     python tools/benchmarks/driver_throughput.py [SAMPLES]          20000, at 50 Hz, a line at a time as they come
 
-Exit status 0; 1 where it is less than 100 times real time.
+Exit status 0; 1 if it is less than 100 times real time.
 """
 
 import sys
@@ -43,7 +43,7 @@ def report(what: str, each_us: float) -> float:
 
 
 def serial(samples: int, values) -> float:
-    """us of CPU a sample."""
+    """Measure the CPU time per sample, us."""
     mcu = Mcu(lambda now: (0.1, -0.2), rate_hz=RATE_HZ, seed=1)
     identity = mcu.reset(0.0)
     lines = [mcu.sample() for _ in range(samples)]
@@ -59,7 +59,7 @@ def serial(samples: int, values) -> float:
 
 
 def ascii_lines(samples: int, pattern: str) -> float:
-    """us of CPU a line, from bytes to a believed sample."""
+    """Measure the CPU time per line, from bytes to a believed sample, us."""
     decoder = LineDecoder(pattern, "deg")
     lines = [b"%.3f,%.3f\r\n" % (3 + k % 7 * 1e-3, -11 - k % 5 * 1e-3) for k in range(samples)]
     began_s = time.process_time()

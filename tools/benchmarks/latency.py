@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long the nodes as installed take, and what they cost: start to first fix, frame to fix, stars to fix, CPU, memory.
+"""Times and costs of the installed nodes: start to first fix, frame to fix, stars to fix, CPU, memory.
 
     python tools/benchmarks/latency.py [--frames 100] [--starts 5] [--only start,stars,frames] [--profile FILE]
 
-Prints a table in Markdown with the targets.  Exit status 1 where one is missed.  A frame waits for the tilts of its
+Prints a table in Markdown with the targets.  Exit status 1 if one is missed.  A frame waits for the tilts of its
 exposure, so they are sent before it.  The first run on a machine builds the sky's triangles before anything is timed.
 """
 
@@ -31,7 +31,7 @@ SETTLED = 3  # frames before the clocks run
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured; target: of the median, None where there is none."""
+    """A measurement; target: for the median, None if there is none."""
 
     what: str
     values: list[float]
@@ -51,7 +51,7 @@ class Row:
 
 
 class Ears:
-    """When what was heard, by stamp: fixes with a position, and the captures that announce a frame."""
+    """Notes when fixes with a position and captures were heard, by their stamps."""
 
     def __init__(self, graph):
         from sensor_msgs.msg import NavSatFix
@@ -75,7 +75,7 @@ def stamp_of(message) -> tuple[int, int]:
 
 
 class Run:
-    """A graph, and nodes that end with it."""
+    """Make a graph, and nodes that end with it."""
 
     def __init__(self, folder: Path):
         from starpos_testing.graph.graph import Graph
@@ -89,7 +89,7 @@ class Run:
         return self.graph.start(log, package, name, *parameters, arguments=arguments)
 
     def inclinometer(self, tilt_deg=(3.0, 2.0)):
-        """An emulated one on a pty; the port, and the node to start on it."""
+        """Emulate an inclinometer on a pty; gives the port, and the node to start on it."""
         port = self.folder / f"port{time.monotonic_ns()}"
         arguments = ("--link", str(port), "--tilt-x", f"{tilt_deg[0]:.9f}", "--tilt-y", f"{tilt_deg[1]:.9f}")
         self.start("starpos_inclinometer", "emulator", arguments=arguments)
@@ -104,9 +104,9 @@ class Run:
 
 
 def from_start(folder: Path, starts: int) -> Row:
-    """Solver, camera_detector and inclinometer, from exec to the first fix.
+    """Time solver, camera_detector and inclinometer from exec to the first fix.
 
-    Frames are small here: the simulated sky takes a second to draw a whole one, which no camera does.
+    Frames are small here, because the simulated sky takes a second to draw a whole one.
     """
     import numpy as np
 
@@ -130,7 +130,7 @@ def from_start(folder: Path, starts: int) -> Row:
 
 
 def from_start_of_solver(folder: Path, starts: int) -> Row:
-    """The solver alone, from exec to the first fix of stars and tilts that come all the time."""
+    """Time the solver alone from exec to the first fix, while stars and tilts come all the time."""
     from starpos_testing.graph.shots import SOLVER, shoot
 
     seconds, shot = [], shoot()
@@ -144,7 +144,7 @@ def from_start_of_solver(folder: Path, starts: int) -> Row:
 
 
 def from_stars(folder: Path, frames: int) -> Row:
-    """A star message published to its fix received."""
+    """Time from publishing a star message to receiving its fix."""
     from starpos_testing.graph.shots import SOLVER, shoot
 
     seconds = []
@@ -166,7 +166,7 @@ def from_stars(folder: Path, frames: int) -> Row:
 
 
 def write_frames(folder: Path):
-    """FILES frames of the paper's camera and the tilts of each, in order of time."""
+    """Draw FILES frames of the paper's camera and the tilts of each, in order of time."""
     import numpy as np
 
     from starpos.simulation.night_on_disk import write_fits
@@ -186,7 +186,7 @@ def write_frames(folder: Path):
 
 
 def from_frames(folder: Path, frames: int, together: bool) -> list[Row]:
-    """Frames of 21 megapixels off a disk at 1 Hz: from their capture message to their fix; CPU and memory."""
+    """Play frames of 21 megapixels from a disk at 1 Hz: time from capture message to fix, CPU and memory."""
     from starpos_testing.graph.shots import SOLVER
     from starpos_testing.processes import cpu_s
 
@@ -225,13 +225,13 @@ def from_frames(folder: Path, frames: int, together: bool) -> list[Row]:
 
 
 def peak_mb(pid: int) -> float:
-    """The most resident memory a process has had."""
+    """Peak resident memory of a process."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1.024e-3 for line in lines if line.startswith("VmHWM"))
 
 
 def choose(profile: str) -> None:
-    """The Fast DDS profiles of all nodes; '' is none, also where the shell has some."""
+    """Set the Fast DDS profiles of all nodes; '' is none, even if the shell has some."""
     if profile:
         os.environ[PROFILES] = profile
     else:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the network carries between the mount's computer and the robot's: two hosts of Linux namespaces, full frames.
+"""Network load between the mount's computer and the robot's: two hosts of Linux namespaces, full frames.
 
     python tools/benchmarks/link_bandwidth.py [FRAMES]          10; as root, with iproute2 and /dev/net/tun
 
-Counts Ethernet's bytes, both ways, with all that DDS adds. Detection is on the mount, so that stars and tilts cross.
+Counts the bytes of Ethernet in both directions, with those of DDS. Detection runs on the mount, so only stars and tilts
+cross.
 """
 
 import sys

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What a geoid grid says of the deflection of the vertical, and how far off it is against finer grids.
+"""Deflection of the vertical from a geoid grid, and its error against finer grids.
 
 python tools/data/geoid_sigma.py egm96_15.gtx [--against ch_swisstopo_chgeo2004_ETRS89_LHN95.tif ...]
 """
@@ -29,7 +29,7 @@ PLACES = {
 
 
 def compare(coarse: geoid.Geoid, fine: geoid.Geoid, places: int) -> tuple[np.ndarray, np.ndarray]:
-    """What xi and eta miss (places, 2) and their stated errors (places,), arcsec, at random places of the finer grid."""
+    """Errors of xi and eta (places, 2) and their stated errors (places,), arcsec, at random places of the finer grid."""
     grid, rng = fine.grid, np.random.default_rng(1)
     missed, stated = [], []
     for row, column in rng.uniform(0, grid.values.shape, (places, 2)):

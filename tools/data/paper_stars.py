@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the paper's star list differs from the plain cut V < 7 with a HIP number of the committed catalogue.
+"""Differences of the paper's star list from the plain cut V < 7 with a HIP number in the committed catalogue.
 
 `paper_stars.py ORIGINALS > src/starpos/starpos/identification/data/paper_stars.csv` (a folder with tyc2.dat.00 .. 19).
 The paper's list is rows of Tycho-2's main table: without supplement 1, both components of a pair, V not rounded to
@@ -19,7 +19,7 @@ from starpos.sky.tycho2 import johnson_v
 
 
 def paper_rows(folder: Path):
-    """TYC, RA and Dec (deg) of the rows of the main table with V < LIMIT_MAG and a HIP number."""
+    """Read TYC, RA and Dec (deg) of the rows of the main table with V < LIMIT_MAG and a HIP number."""
     for path in sorted(folder.glob("tyc2.dat.??")):
         for line in path.open("rb"):
             if not line[142:148].strip():

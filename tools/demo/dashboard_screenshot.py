@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of the dashboard as a browser shows it: of one that runs (--url), else of the demo's instrument, started now.
+"""Picture of the dashboard in a browser: of one that runs (--url), else of the demo's instrument, which it starts.
 
 Needs Chromium with its driver (apt: chromium, chromium-driver) and selenium (pip).
 
@@ -49,12 +49,12 @@ READY = """
 
 
 class ScreenshotError(Exception):
-    """One sentence: why there is no picture."""
+    """There is no picture; the text says why in a sentence."""
 
 
 @contextmanager
 def browser(size: tuple[int, int]):
-    """A Chromium with an empty profile."""
+    """Start a Chromium with an empty profile."""
     try:
         from selenium import webdriver
     except ImportError:
@@ -75,7 +75,7 @@ def browser(size: tuple[int, int]):
 
 
 def photograph(url: str, path: Path, fixes: int = FIXES, size: tuple[int, int] = SIZE) -> None:
-    """Write a PNG of the whole page once it shows so many fixes and a frame; ScreenshotError where it never does."""
+    """Write a PNG of the whole page once it shows so many fixes and a frame; ScreenshotError if it never does."""
     from selenium.common.exceptions import WebDriverException
 
     with browser(size) as driver:
@@ -96,7 +96,7 @@ def photograph(url: str, path: Path, fixes: int = FIXES, size: tuple[int, int] =
 
 
 def save(png: bytes, path: Path) -> None:
-    """With as many colours as make it small enough for a repository."""
+    """Reduce the colours until the file is small enough for a repository."""
     from PIL import Image
 
     picture = Image.open(io.BytesIO(png)).convert("RGB")
@@ -109,7 +109,7 @@ def save(png: bytes, path: Path) -> None:
 
 @contextmanager
 def own_instrument(seed: int):
-    """The demo's instrument and a dashboard in a ROS domain of their own; the page's address."""
+    """Run the demo's instrument and a dashboard in a ROS domain of their own; gives the page's address."""
     with own_domain(), tempfile.TemporaryDirectory() as scratch:
         os.chdir(scratch)
         with socket.socket() as free:

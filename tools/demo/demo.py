@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole instrument under a simulated sky, live: four nodes as they are installed, an emulated inclinometer on a pty.
+"""The whole instrument under a simulated sky, live: the four installed nodes, an emulated inclinometer on a pty.
 
 The place is drawn at random; nothing tells it to the solver.  Exit status 0 if the truth lies within 4 sigma and no
 node took more memory than it may.  All of it runs in a ROS domain of its own: no other graph hears it.  The dashboard
@@ -35,7 +35,8 @@ from starpos_testing.domain import own_domain
 
 FRAMES, CADENCE_S, EXPOSURE_S = 10, 3.0, 0.5
 MEMORY_LIMIT_MB = 500  # of each node
-FRAMES_KEPT = 3  # of 42 MB; a frame's solution comes before the third one after it
+# Frames of 42 MB; a frame's solution comes before the third frame after it.
+FRAMES_KEPT = 3
 
 
 class PictureWatcher(Watcher):
@@ -53,7 +54,8 @@ class PictureWatcher(Watcher):
 
     def _on_image(self, message):
         self.frames.append(message)
-        if self.pictured is not None and self.image is not None:  # one 42 MB frame is enough
+        # One frame of 42 MB is enough.
+        if self.pictured is not None and self.image is not None:
             self.node.destroy_subscription(self.image)
             self.image = None
             self.frames.clear()
@@ -65,7 +67,7 @@ class PictureWatcher(Watcher):
 
 
 def start(processes: Processes, place: Place, seed: int, port: Path):
-    """The emulated inclinometer, a link to it at `port`, and the nodes that make a fix."""
+    """Start the emulated inclinometer, with a link to it at `port`, and the nodes that make a fix."""
     theta_x, theta_y = np.degrees(place.scene().tilt)
     link = str(port)
     tilt = ["--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}", "--seed", str(seed)]
@@ -80,7 +82,7 @@ def start(processes: Processes, place: Place, seed: int, port: Path):
 
 
 def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray, path: Path) -> bool:
-    """Draw the fixes and the frame that was kept; False where none was, or its stars were not heard."""
+    """Draw the fixes and the frame that was kept; return False if there is none, or if its stars were not heard."""
     from picture import draw
 
     from starpos.frames.annotate import Identified, annotate
@@ -101,7 +103,7 @@ def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray,
 
 
 def show(processes: Processes) -> str:
-    """Start the dashboard; its address, '' where what serves it is not installed."""
+    """Start the dashboard; return its address, '' if tornado is not installed."""
     if not find_spec("tornado"):
         return ""
     with socket.socket() as free:
@@ -120,7 +122,7 @@ def main() -> int:
 
 
 def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
-    """The demo; its exit status."""
+    """Run the demo; return its exit status."""
     out.mkdir(parents=True, exist_ok=True)
     place = Place.drawn(np.random.default_rng(seed))
     introduce(seed, place, "four nodes and an emulated inclinometer")
@@ -148,7 +150,7 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
 
 
 def look(watcher: PictureWatcher, processes: Processes, page: str):
-    """Go on until Ctrl-C, or until a process ends."""
+    """Wait until Ctrl-C, or until a process ends."""
     print(f"\nit goes on: {page}, Ctrl-C ends it", flush=True)
     try:
         watcher.watch(math.inf, processes, patience_s=math.inf)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole instrument as it is built, with its devices emulated: firmware, INDI camera, detector, solver.
+"""The whole instrument with emulated devices: firmware, INDI camera, detector, solver.
 
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
-(starpos_inclinometer/firmware/sim); the camera is the CCD simulator of a real indiserver, before which indi_sky.py puts
-the sky of each exposure; the four nodes are those that are installed.  The place is drawn at random, and nothing tells
-it to them.  Exit status 0 if the truth lies within 4 sigma and all ended cleanly; 2 where something is not installed.
+(starpos_inclinometer/firmware/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
+each exposure. The four nodes are the installed ones. The place is drawn at random, and the nodes are not told it.  Exit
+status 0 if the truth lies within 4 sigma and all ended cleanly; 2 where something is not installed.
 """
 
 import json
@@ -46,7 +46,7 @@ NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
 
 def lacking() -> str | None:
-    """A sentence where this machine has not what the devices are made of."""
+    """Say how to install what the devices need and this machine lacks; None if it has all."""
     missing = subprocess.run(
         [ROOT / "tools" / "setup" / "missing", "tests"], capture_output=True, text=True, check=True
     )
@@ -56,7 +56,7 @@ def lacking() -> str | None:
 
 
 def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict]:
-    """Inclinometer, camera and sky; by node, the parameters by which it finds its device."""
+    """Start inclinometer, camera and sky; return for each node the parameters by which it finds its device."""
     folder = devices.folder
     make = ["make", "-C", str(ROOT / "starpos_inclinometer" / "firmware"), f"BUILD={folder}", "all", "sim"]
     subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
@@ -88,7 +88,7 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
 
 
 def wait_for(port: int):
-    """Until somebody listens there; OSError after some seconds."""
+    """Wait until somebody listens there; OSError after some seconds."""
     end = time.monotonic() + START_S
     while True:
         try:
@@ -110,7 +110,7 @@ def start_nodes(nodes: Processes, place: Place, found: dict):
 
 
 def latenesses_ms(watcher: Watcher, begun_s: list[float]) -> np.ndarray:
-    """How much later than its stamp says each frame's exposure began when the sky was drawn for it."""
+    """Delay of each frame's sky after the begin of the exposure that its stamp states."""
     starts = [s + 1e-9 * ns - watcher.captures[s, ns].exposure / 2 for s, ns in watcher.solutions]
     away = np.array(begun_s) - np.array(starts)[:, None]
     return 1e3 * away[np.arange(len(starts)), np.abs(away).argmin(1)]
@@ -126,7 +126,7 @@ def main() -> int:
 
 
 def run(seed: int, frames: int, out: Path) -> int:
-    """The exit status."""
+    """Run it; return the exit status."""
     out.mkdir(parents=True, exist_ok=True)
     place = Place.drawn(np.random.default_rng(seed))
     introduce(

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sky in front of the CCD simulator of a running indiserver: each exposure shows what a place sees in its middle.
+"""Sky for the CCD simulator of a running indiserver: each exposure shows the sky of a place at its middle.
 
     indi_sky.py PORT FOLDER EXPOSURE_S SEED PLACE       PLACE: instrument_run.Place as JSON
 
-The simulator can read its frames from a folder, and does so as an exposure begins.  There is one file in the folder,
-and this process holds a lease on it (fcntl(2), F_SETLEASE): the kernel tells it that the simulator opens the file, and
-has the simulator wait until the sky of that moment is drawn and the lease given back.  Only this process knows the place.
+The simulator reads its frames from a folder when an exposure begins.  The folder has one file, and this process holds a
+lease on it (fcntl(2), F_SETLEASE). When the simulator opens the file, the kernel tells this process, and the simulator
+waits until the sky of that moment is drawn and the lease given back.  Only this process knows the place.
 Prints `ready`, then the Unix time of each exposure's begin.
 """
 
@@ -29,7 +29,7 @@ ENDS = {signal.SIGINT, signal.SIGTERM}
 
 
 class Picture:
-    """A 16-bit FITS file that is opened once and drawn into; `lease` of it must be had before anybody may read it."""
+    """A 16-bit FITS file that is opened once and drawn into; call `lease` before anybody may read it."""
 
     def __init__(self, path: Path, width: int, height: int):
         from astropy.io import fits
@@ -46,7 +46,7 @@ class Picture:
         np.bitwise_xor(pixels, 0x8000, out=self._pixels, casting="unsafe")  # FITS has them signed, less 32768
 
     def lease(self):
-        """Wait until nobody reads the file; from now on a reader waits, and SIGIO tells of it."""
+        """Wait until nobody reads the file; from then on a reader has to wait, and SIGIO tells of it."""
         end = time.monotonic() + PATIENCE_S
         while True:
             try:
@@ -62,9 +62,9 @@ class Picture:
 
 
 def signals() -> int:
-    """A pipe's end from which each SIGIO and each of ENDS is read as a byte, its number.
+    """Make a pipe that gives the number of each SIGIO and each of ENDS as a byte; return its end for reading.
 
-    A signal may come to any thread, to those that numpy has started too, which heed no mask of the main thread's.
+    A mask of the main thread would not do: a signal may come to any thread, also to those that numpy has started.
     """
     told, tell = os.pipe()
     os.set_blocking(tell, False)
@@ -75,7 +75,7 @@ def signals() -> int:
 
 
 def set_up(port: str, folder: Path):
-    """Have the simulator take its frames from the folder."""
+    """Make the simulator take its frames from the folder."""
     for setting in (
         "CONNECTION.CONNECT=On",
         f"CCD_DIRECTORY_LOCATION.LOCATION={folder}",
@@ -94,7 +94,8 @@ def main() -> int:
     from starpos.sky.catalogue import load_catalogue
 
     catalogue = load_catalogue()
-    expose(scene, catalogue, time.time(), exposure_s, rng)  # what takes long the first time
+    # The first call takes long.
+    expose(scene, catalogue, time.time(), exposure_s, rng)
     picture = Picture(folder / "sky.fits", scene.camera.width, scene.camera.height)
     set_up(port, folder)
     told = signals()
@@ -103,7 +104,8 @@ def main() -> int:
     begun = 0.0
     while os.read(told, 1)[0] == signal.SIGIO:
         now = time.time()
-        if now > begun + exposure_s:  # else the same exposure looks once more
+        # Otherwise the same exposure reads the file once more.
+        if now > begun + exposure_s:
             begun = now
             stars = expose(scene, catalogue, begun, exposure_s, rng)
             picture.draw(render(scene, stars, begun, exposure_s, rng).pixels)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes as they are installed, run for some frames at a place that nobody tells them, and held against it.
+"""Run of the installed nodes for some frames at a place that they are not told, and comparison with it.
 
-What tools/demo/demo.py and tools/demo/emulated_instrument.py have in common.
+tools/demo/demo.py and tools/demo/emulated_instrument.py share this.
 """
 
 import argparse
@@ -21,7 +21,7 @@ ACCEPTED_SIGMA = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where the instrument stands, what it looks at, and how its parts are mounted; deg, Pa, deg C."""
+    """The place of the instrument, its pointing, and the mounting of its parts; deg, Pa, deg C."""
 
     latitude: float
     longitude: float
@@ -72,19 +72,19 @@ class Processes:
         self.folder, self.running = folder, {}
 
     def start(self, name: str, command: list[str], **options) -> subprocess.Popen:
-        """options: those of Popen."""
+        """Start a program; options: those of Popen."""
         with open(self.folder / f"{name}.log", "w") as log:
             options = {"stdout": log, "stderr": log, "start_new_session": True} | options
             self.running[name] = subprocess.Popen(command, **options)
         return self.running[name]
 
     def node(self, package: str, name: str, parameters: dict) -> None:
-        """A node with its parameters."""
+        """Start a node with its parameters."""
         options = [word for k, v in parameters.items() for word in ("-p", f"{k}:={v}")]
         self.start(name, [executable(package, name), "--ros-args", *options])
 
     def dead(self) -> str | None:
-        """A sentence about a process that has ended, if any has."""
+        """Say in a sentence which process has ended, if one has."""
         name = next((name for name, p in self.running.items() if p.poll() is not None), None)
         if name is None:
             return None
@@ -92,7 +92,7 @@ class Processes:
         return f"{name} has stopped with status {self.running[name].returncode}; it said last: {said[-1]}"
 
     def peak_mb(self) -> dict[str, int]:
-        """Peak resident memory of each, 10^6 bytes."""
+        """Peak resident memory of each process, 10^6 bytes."""
         peak = {}
         for name, p in self.running.items():
             lines = Path(f"/proc/{p.pid}/status").read_text().splitlines()
@@ -102,7 +102,7 @@ class Processes:
         return peak
 
     def stop(self) -> dict[str, int | str]:
-        """Stop all as launch does, with SIGINT; their exit codes."""
+        """Stop all processes with SIGINT, as launch does; return their exit codes."""
         for p in self.running.values():
             if p.poll() is None:
                 os.killpg(p.pid, signal.SIGINT)
@@ -117,7 +117,7 @@ class Processes:
 
 
 def known_of(place: Place) -> dict:
-    """The solver's parameters: what somebody who sets up the instrument there knows, which is not where it is."""
+    """Parameters of the solver that a user knows who sets up the instrument there, without the place."""
     known = {f"refraction.{k}": getattr(place, k) for k in ("pressure", "temperature", "humidity")}
     known["misalignment"] = "[" + ", ".join(f"{v:.9f}" for v in place.misalignment) + "]"
     return known
@@ -152,7 +152,7 @@ class Watcher:
         print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
 
     def watch(self, frames: float, *processes: Processes, patience_s: float = PATIENCE_S) -> str | None:
-        """Until so many frames are solved; a sentence if it will not come to that."""
+        """Wait until so many frames are solved; return a sentence if that will not happen."""
         end = time.monotonic() + patience_s
         while len(self.solutions) < frames:
             self.rclpy.spin_once(self.node, timeout_sec=0.2)
@@ -164,7 +164,7 @@ class Watcher:
         return None
 
     def good(self) -> list:
-        """The solutions that are fixes."""
+        """Solutions that are fixes."""
         return [s for s in self.solutions.values() if s.status == s.OK]
 
     def close(self):
@@ -177,7 +177,7 @@ def stamp_of(message) -> tuple[int, int]:
 
 
 def _error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
-    """East and north of the truth."""
+    """Errors of a solution to the east and north of the truth, m."""
     from starpos.earth.ellipsoid import curvature_radii_m
 
     phi = math.radians(place.latitude)
@@ -201,7 +201,7 @@ def _row(number: int, s, place: Place, seconds: float) -> str:
 
 
 def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarray]:
-    """The mean fix against the truth: a dict for people and scripts, the errors (N, 2) m, the covariance of one fix."""
+    """Compare the mean fix with the truth; return a summary, the errors (N, 2) m, and the covariance of one fix."""
     errors = np.array([_error_m(s.latitude, s.longitude, place) for s in solutions])
     one = np.array(solutions[-1].covariance).reshape(3, 3)
     variance = np.zeros(2)
@@ -229,7 +229,7 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
 
 
 def trouble_of(watcher: Watcher, codes: dict, trouble: str | None) -> str | None:
-    """A sentence where there is nothing to hold against the truth, or a program has ended badly."""
+    """Say in a sentence that there is no fix to compare, or that a program has failed; None if all is well."""
     unclean = {name: code for name, code in codes.items() if code != 0}
     if trouble or unclean:
         return trouble or f"unclean exits {unclean}"
@@ -237,7 +237,7 @@ def trouble_of(watcher: Watcher, codes: dict, trouble: str | None) -> str | None
 
 
 def say_errors(watcher: Watcher, summary: dict) -> bool:
-    """Print the mean fix beside the truth; whether the truth lies within ACCEPTED_SIGMA and every frame gave a fix."""
+    """Print the mean fix and the truth; return whether they agree within ACCEPTED_SIGMA and every frame gave a fix."""
     print(
         f"\n{summary['frames']} fixes together: {summary['north_m']:+.0f} m north, {summary['east_m']:+.0f} m east "
         f"of the truth, claimed {summary['sigma_north_m']:.0f} and {summary['sigma_east_m']:.0f} m; "
@@ -253,7 +253,7 @@ def say_errors(watcher: Watcher, summary: dict) -> bool:
 
 
 def parser_of(text: str, frames: int, out: str) -> argparse.ArgumentParser:
-    """Of a command's --seed, --frames and --out."""
+    """Make the parser of a command with --seed, --frames and --out."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--seed", type=int, help="another place and sky for another seed, 0 to 2147483647 (default: drawn)"
@@ -264,7 +264,7 @@ def parser_of(text: str, frames: int, out: str) -> argparse.ArgumentParser:
 
 
 def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Its arguments, with a seed drawn where none is given."""
+    """Parse the arguments; a seed is drawn if none is given."""
     args = parser.parse_args()
     if args.seed is None:
         args.seed = int.from_bytes(os.urandom(4), "big") >> 1
@@ -276,7 +276,7 @@ def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def introduce(seed: int, place: Place, who: str):
-    """Say where it is, and what runs."""
+    """Print the place, and what runs."""
     air = f"{place.pressure / 100:.0f} hPa, {place.temperature:g} deg C"
     print(
         f"seed {seed}: the instrument stands at {place.latitude:+.5f} {place.longitude:+.5f}, {air}; it is not told where"

@@ -27,7 +27,7 @@ def draw(
 
 
 def scatter(axes, fixes_m: np.ndarray, covariance_m2: np.ndarray) -> None:
-    """Fixes around the truth, their mean, and the claimed ellipses of one fix at 1 and 2 sigma around the truth."""
+    """Draw the fixes and their mean around the truth, and the claimed ellipses of one fix at 1 and 2 sigma."""
     from matplotlib.patches import Ellipse
 
     values, vectors = np.linalg.eigh(covariance_m2)

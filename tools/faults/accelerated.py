@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An instrument in accelerated time for `fault_soak.py`: what it sends, where it is, and a judge of its fixes."""
+"""Instrument in accelerated time for `fault_soak.py`: its messages, its place, and a judge of its fixes."""
 
 import math
 from collections import Counter
@@ -47,7 +47,7 @@ STATUS = {getattr(Solution, name): name for name in dir(Solution) if name.isuppe
 
 
 def parameters_of(folder: Path) -> dict:
-    """The solver's parameters, by which everything a fault has set is set back; writes the instrument file."""
+    """Make the solver's parameters, which also undo what a fault has set; write the instrument file."""
     file = folder / "instrument.yaml"
     instrument_file.write(file, KNOWN)
     nan = math.nan
@@ -73,14 +73,14 @@ def parameters_of(folder: Path) -> dict:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where it was, deg."""
+    """The place where it was, deg."""
 
     latitude: float
     longitude: float
     heading: float
 
     def sigmas_off(self, latitude: float, longitude: float, covariance_m2) -> tuple[float, str]:
-        """How far a place is from here in its own sigmas, and in words."""
+        """Distance of a place from here in its own sigmas, and in words."""
         prime, meridian = curvature_radii_m(math.radians(self.latitude))
         east = math.radians((longitude - self.longitude + 180) % 360 - 180)
         north = math.radians(latitude - self.latitude)
@@ -90,7 +90,7 @@ class Truth:
 
 
 class World:
-    """The instrument, the graph it is in, and a judge of all that the solver says."""
+    """The instrument, its graph, and a judge of all answers of the solver."""
 
     def __init__(self, graph: Graph, seed: int, parameters: dict):
         self.graph, self.rng = graph, np.random.default_rng(seed)
@@ -112,13 +112,13 @@ class World:
     # where it is -----------------------------------------------------------------------------------------------------
 
     def turn(self):
-        """Legitimate, as `drive` is: no fault."""
+        """Turn the instrument, which is legitimate, as `drive` is: no fault."""
         self.scene = replace(
             self.scene, azimuth_deg=self.rng.uniform(0, 360), altitude_deg=self.rng.uniform(76, 84)
         )
 
     def drive(self):
-        """To anywhere, at least some kilometres away."""
+        """Move to a random place, at least some kilometres away."""
         latitude = math.degrees(math.asin(self.rng.uniform(-0.9, 0.9)))
         site = Site(latitude, self.rng.uniform(-180, 180), self.scene.site.atmosphere)
         self.scene = replace(self.scene, site=site)
@@ -132,22 +132,22 @@ class World:
     # what it sends ---------------------------------------------------------------------------------------------------
 
     def shot(self) -> SimulatedShot:
-        """The next exposure."""
+        """Make the next exposure."""
         self.now_s += CADENCE_S
         return shot_of(self.scene, self.now_s, self.rng)
 
     def photograph(self):
-        """The next exposure with its stars still in the image: Shot, Image, Capture."""
+        """Make the next exposure as an image instead of stars: Shot, Image, Capture."""
         self.now_s += CADENCE_S
         return photograph_of(self.scene, self.now_s, self.rng)
 
     def tick(self, moment_s: float | None = None):
-        """Publish /clock: the end of the newest exposure, and a little."""
+        """Publish /clock: a little after the end of the newest exposure."""
         now = self.now_s + EXPOSURE_S + LATENCY_S if moment_s is None else moment_s
         self._clock.publish(Clock(clock=unix_to_stamp(now + self.clock_off_s)))
 
     def remember(self, message):
-        """Whatever is answered under the stamp of this message is of the instrument as it stands now."""
+        """Note that answers under the stamp of this message belong to the present place."""
         self._truths[stamp_of(message)] = self.truth
 
     def tilts(self, shot: SimulatedShot):
@@ -159,7 +159,7 @@ class World:
         self.graph.stars.publish(shot.stars)
 
     def send(self, shot: SimulatedShot):
-        """All of it in good order."""
+        """Send a frame and its tilts in good order."""
         self.tick()
         self.graph.info.publish(shot.info)
         self.tilts(shot)
@@ -171,22 +171,22 @@ class World:
         self.graph.send(shot, image, capture)
 
     def restore_parameters(self):
-        """The solver's, to what they were."""
+        """Set the solver's parameters back."""
         successful, reason = self.graph.set("solver", **self._parameters)
         assert successful, reason
 
     def spin(self, seconds: float):
-        """Let things happen that nobody waits for."""
+        """Spin for a while, for things that nobody waits for."""
         self.graph.comes(lambda: False, seconds)
 
     def good(self) -> bool:
-        """One good frame; whether it was answered by a fix."""
+        """Send a good frame; return whether a fix answered it."""
         shot = self.shot()
         self.send(shot)
         return self._is_fix(shot.stamp)
 
     def good_image(self) -> bool:
-        """The same through the detector."""
+        """Send a good frame through the detector; return whether a fix answered it."""
         shot, image, capture = self.photograph()
         self.send_image(shot, image, capture)
         return self._is_fix(shot.stamp)
@@ -198,7 +198,7 @@ class World:
     # what comes of it ------------------------------------------------------------------------------------------------
 
     def judge(self) -> Counter:
-        """Of all answers since the last call: how many of each status; `right` and `wrong` hold their fixes."""
+        """Count the answers since the last call by status; `right` and `wrong` hold their fixes."""
         graph, statuses = self.graph, Counter()
         for solution in _all(graph.solutions):
             statuses[STATUS[solution.status]] += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults from all inputs into the nodes as they are installed, thousands of them, and what became of each kind.
+"""Thousands of random faults from all inputs into the installed nodes, and the outcome of each kind.
 
     python tools/faults/fault_soak.py [--faults 10000] [--seed S]
 
@@ -34,7 +34,7 @@ GROWN_MB = 12.0  # of a node: the allocator's arenas wander by ten, up and down,
 
 @dataclass(kw_only=True)
 class Row:
-    """What became of one kind of fault."""
+    """Outcomes of one kind of fault."""
 
     about: str
     injected: int = 0
@@ -46,7 +46,7 @@ class Row:
 
 
 class Soak:
-    """The nodes, the world they are in, and the count of what happens."""
+    """The nodes, the instrument around them, and the counts of outcomes."""
 
     def __init__(self, folder: Path, seed: int):
         from accelerated import World, parameters_of
@@ -73,7 +73,7 @@ class Soak:
         self.nodes[name] = self.graph.start(self.folder / f"{self.starts}-{name}.log", package, name, *texts)
 
     def end(self, name: str, kill: bool):
-        """As a supervisor does it; the exit status and the log are looked at."""
+        """End a node as a supervisor does; look at its exit status and log."""
         node = self.nodes[name]
         node.signal(signal.SIGKILL if kill else signal.SIGTERM)
         status = node.wait()
@@ -88,7 +88,7 @@ class Soak:
             self.crashes.append(f"a defect in the log of {node.name}: {node.output[where:][:3000]}")
 
     def watch(self):
-        """Whether all nodes live; a dead one is a crash, and is started again."""
+        """Check that all nodes live; a dead one counts as a crash and is started again."""
         for name, node in self.nodes.items():
             if (status := node.process.poll()) is not None:
                 self.crashes.append(f"{name} has ended by itself with {status}: {node.output[-1500:]}")
@@ -96,7 +96,7 @@ class Soak:
                 self.start(name)
 
     def settle(self, image: bool = False) -> tuple[int, float]:
-        """Good frames until one is a fix: how many, and the seconds; 0 frames where none is."""
+        """Send good frames until one gives a fix; return their number, 0 if none does, and the seconds."""
         begin = time.monotonic()
         for n in range(1, PATIENCE + 1):
             if self.world.good_image() if image else self.world.good():
@@ -105,7 +105,7 @@ class Soak:
         return 0, time.monotonic() - begin
 
     def legitimate(self):
-        """A turn or a drive, and some frames there, as no fault."""
+        """Make a turn or a drive, and some frames there, which is no fault."""
         world = self.world
         if world.rng.random() < 0.5:
             world.turn()
@@ -126,7 +126,7 @@ class Soak:
         return row
 
     def inject(self, name: str, about: str, fault, image: bool = False):
-        """One fault, and the good frames after it."""
+        """Inject one fault, and send good frames after it."""
         row = self.rows.setdefault(name, Row(about=about))
         row.injected += 1
         fault()
@@ -161,7 +161,7 @@ class Soak:
         self.inject(f"{name} {'killed' if kill else 'ended'}", about, fault, name == "detector")
 
     def close(self):
-        """End the nodes; their logs tell of defects, how they end of crashes."""
+        """End the nodes; count defects from their logs, and crashes from their exit."""
         for name in self.nodes:
             self.end(name, kill=False)
         self.graph.close()
@@ -172,7 +172,7 @@ def _yaml(value) -> str:
 
 
 def run(faults: int, seed: int, folder: Path, restarts: int) -> tuple[Soak, dict[str, tuple[float, float]]]:
-    """The soak; and of each node its memory (MB) early and late."""
+    """Run the soak; return it, and the memory (MB) of each node early and late."""
     from starpos_testing.processes import memory_mb
 
     soak, sizes, begin = Soak(folder, seed), {}, time.monotonic()
@@ -197,12 +197,12 @@ def run(faults: int, seed: int, folder: Path, restarts: int) -> tuple[Soak, dict
 
 
 def _halves(mb: list[float]) -> tuple[float, float]:
-    """The most of the first and of the last half."""
+    """Largest values of the first and of the last half."""
     return max(mb[: len(mb) // 2]), max(mb[len(mb) // 2 :])
 
 
 def _spread(sigmas: dict[str, list[float]]) -> str:
-    """rms and most of the errors by topic: how near a wrong one was (of a place two coordinates: 1.41 were true)."""
+    """Rms and largest error by topic, in sigmas (for a place, which has two coordinates, an rms of 1.41 is right)."""
     return "; ".join(
         f"{topic} {math.sqrt(sum(s * s for s in of) / len(of)):.2f}, {max(of):.1f}"
         for topic, of in sigmas.items()
@@ -210,7 +210,7 @@ def _spread(sigmas: dict[str, list[float]]) -> str:
 
 
 def table(rows: dict[str, Row]) -> str:
-    """Markdown."""
+    """Write the table in Markdown."""
     lines = ["| fault | what | injected | answered | right | wrong | frames to a fix | s to a fix |"]
     lines.append("| --- | --- | ---: | --- | ---: | ---: | --- | --- |")
     for name, row in rows.items():
@@ -240,7 +240,7 @@ def main(arguments=None) -> int:
 
 
 def report(soak: Soak, memory: dict[str, tuple[float, float]], options: str, seconds: float) -> int:
-    """Print what happened; the exit status."""
+    """Print what happened; return the exit status."""
     from kinds import UNTOLD
 
     print(f"`tools/faults/fault_soak.py {options}`:\n")

@@ -2,8 +2,8 @@
 """Inject every fault that a test injects, and print what happened: one row a fault, as a table in Markdown.
 
 A test that injects one records it: record_property("fault", what) and record_property("result", what happened).
-`faults.py [PYTEST ARGUMENTS]`, in the workspace; the exit status is 0 only where every one of these tests passed: a
-skipped one has not.
+`faults.py [PYTEST ARGUMENTS]`, in the workspace; the exit status is 0 only if every one of these tests passed; a
+skipped one has not passed.
 """
 
 import subprocess
@@ -17,7 +17,7 @@ RECORDED = 'record_property("fault"'
 
 
 def tests_by_folder() -> dict[Path, list[Path]]:
-    """The test files that record faults, by their folder: each folder has fixtures of its own."""
+    """Find the test files that record faults, by their folder: each folder has fixtures of its own."""
     found: dict[Path, list[Path]] = {}
     for pattern in ("test/test_*.py", "*/test/test_*.py", "src/*/test/test_*.py"):
         for path in sorted(ROOT.glob(pattern)):
@@ -27,7 +27,7 @@ def tests_by_folder() -> dict[Path, list[Path]]:
 
 
 def rows_of(report: Path) -> tuple[list[tuple[str, str, str]], int]:
-    """(fault, result, test) of a JUnit file, and how many of these tests did not pass."""
+    """Read (fault, result, test) from a JUnit file, and how many of these tests did not pass."""
     rows, bad = [], 0
     for case in ElementTree.parse(report).getroot().iter("testcase"):
         told = {p.get("name"): p.get("value") for p in case.iter("property")}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print which of the named modules this interpreter cannot import, one a line.
 
-With --have, as pip's constraints, the versions of what apt has brought and pip must keep.
+With --have, print as pip's constraints the versions that apt has brought and pip must keep.
 """
 
 import sys

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A day of the solver as installed, as fast as it answers: its memory and its CPU time a frame, and whether they grow.
+"""A day of the installed solver, as fast as it answers: memory and CPU time per frame, and whether they grow.
 
     python tools/soaks/soak.py [FRAMES]          17280: a day of one frame every 5 s
 
-Exit status 0; 1 where the memory of the last half has grown by more than 2 MB against the half before.
+Exit status 0; 1 if the memory of the last half has grown by more than 2 MB against the half before.
 """
 
 import sys

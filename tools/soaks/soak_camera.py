@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Half an hour of one of the camera's sources, as fast as it gives frames: its memory, and whether it grows.
+"""Half an hour of one source of the camera, as fast as it gives frames: its memory, and whether it grows.
 
     python tools/soaks/soak_camera.py SOURCE [NAME:=VALUE ...] [FRAMES]       360: 30 minutes of a frame every 5 s
     python tools/soaks/soak_camera.py files files.path:=/nights/1 files.loop:=true
     python tools/soaks/soak_camera.py simulated simulated.width:=1404 simulated.height:=936 focal_mm:=150.0
 
 The parameters are those of the node `camera`; a camera, or the server of one, has to be there. Prints the resident
-memory at each tenth. Exit status 0; 1 where the last half's memory has grown by more than 2 MB against the half
+memory at each tenth. Exit status 0; 1 if the last half's memory has grown by more than 2 MB against the half
 before, or a frame did not come.
 """
 
@@ -75,7 +75,7 @@ def main() -> int:
 
 
 def values_of(words: list[str]) -> dict:
-    """The camera's parameters as the words NAME:=VALUE say; ParameterError in a sentence."""
+    """Make the camera's parameters from words NAME:=VALUE; ParameterError in a sentence."""
     table = {p.name: p for p in PARAMETERS}
     values = {p.name: p.default for p in PARAMETERS}
     for word in words:

@@ -3,7 +3,7 @@
 
     python tools/soaks/soak_inclinometer.py [SAMPLES] [SPEED]          90000 at 50 Hz, 60 times as fast
 
-A line in twenty is spoiled, the microcontroller is reset each 5 minutes, the cable pulled each 7. Exit status 0; 1 where
+One line in twenty is damaged, the microcontroller is reset every 5 minutes, the cable pulled every 7. Exit status 0; 1 if
 the resident memory of the last half has grown by more than 1 MB against the half before, or too few samples came.
 """
 
@@ -27,7 +27,7 @@ FAULTS = Faults(garbage=0.02, drop=0.01, truncate=0.01, double=0.01, flip=0.0000
 
 
 class Device(threading.Thread):
-    """The emulated microcontroller on a clock that goes fast; its cable is pulled now and then."""
+    """Emulated microcontroller on a fast clock; its cable is pulled now and then."""
 
     def __init__(self, path: str, now_s, stop: threading.Event):
         super().__init__(daemon=True)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole instrument at once: launching, default parameters, recording and playing."""
+"""Tools for the whole instrument: launching, default parameters, recording and playing."""

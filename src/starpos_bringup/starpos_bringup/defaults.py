@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter file of all nodes, from their own tables.
+"""Parameter file of all nodes, written from their tables.
 
 python -m starpos_bringup.defaults > config/starpos.yaml
 """
@@ -21,7 +21,7 @@ NODES = {
 
 
 def parameter_file() -> str:
-    """Every parameter of every node at its default, each under its meaning, unit and range."""
+    """Write every parameter of every node with its default, each below its meaning, unit and range."""
     parts = [to_yaml(node, table).split("\n", 1) for node, table in NODES.items()]
     licence = parts[0][0]
     about = (

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files have in common; imported where ROS's launch is."""
+"""Functions for the launch files; needs ROS's launch."""
 
 import atexit
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from launch.actions import DeclareLaunchArgument
@@ -14,7 +15,12 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-COMMON_ARGUMENTS = (  # name, default, what it is
+if TYPE_CHECKING:
+    from launch.launch_context import LaunchContext
+
+Arguments = Iterable[tuple[str, Any, str]]
+# Name, default and description of each argument.
+COMMON_ARGUMENTS = (
     ("namespace", "", "moves the whole instrument: /NAMESPACE/fix and so on"),
     (
         "params_file",
@@ -29,17 +35,18 @@ COMMON_ARGUMENTS = (  # name, default, what it is
     ),
 )
 RESPAWN_DELAY_S = 2.0
-PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # until Jazzy, and after
+# The variable until Jazzy, and the one after it.
+PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "quick_start.xml"])
 
 
 class LaunchError(Exception):
-    """An argument is not what it must be: one sentence."""
+    """An argument is wrong; the text is one sentence."""
 
 
 @dataclass(frozen=True)
 class Common:
-    """What all processes of a launch share; params_file: '' for none."""
+    """Settings that all processes of a launch share."""
 
     params_file: str
     log_level: str
@@ -48,8 +55,8 @@ class Common:
 
     @classmethod
     def of(cls, told: Mapping[str, str]) -> "Common":
-        """From the arguments; LaunchError where there is no such parameter file."""
-        # launch_ros only warns of one that is not there, and the instrument would run with defaults
+        """Make them from the arguments; LaunchError if there is no such parameter file."""
+        # launch_ros only warns of a missing file, and the instrument would run with defaults.
         path = Path(told["params_file"]).expanduser()
         if not path.is_file():
             raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
@@ -58,7 +65,7 @@ class Common:
 
 
 def is_true(told: Mapping[str, str], name: str) -> bool:
-    """What an argument says; LaunchError where it is neither true nor false."""
+    """Read an argument; LaunchError if it is neither true nor false."""
     words = {"true": True, "1": True, "false": False, "0": False}
     try:
         return words[told[name].lower()]
@@ -66,15 +73,15 @@ def is_true(told: Mapping[str, str], name: str) -> bool:
         raise LaunchError(f"{name}:={told[name]}: give true or false") from None
 
 
-def declared(arguments) -> list[DeclareLaunchArgument]:
-    """Launch's own form of them."""
+def declared(arguments: Arguments) -> list[DeclareLaunchArgument]:
+    """Convert arguments to those of launch."""
     return [
         DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments
     ]
 
 
-def given(context, arguments) -> dict[str, str]:
-    """What the arguments are, as text."""
+def given(context: "LaunchContext", arguments: Arguments) -> dict[str, str]:
+    """Read the values of the arguments, as text."""
     return {name: LaunchConfiguration(name).perform(context) for name, _, _ in arguments}
 
 
@@ -84,9 +91,9 @@ def process(
     common: Common,
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
-    **options,
+    **options: Any,
 ) -> Node:
-    """An executable with its nodes' parameters: a file's, and over it some of each node (by its name; '**' is all)."""
+    """Make a process; parameters of its nodes, by name ('**' is all), replace those of the parameter file."""
     files = [common.params_file]
     parameters = {name: dict(values) for name, values in parameters.items() if values}
     if parameters:
@@ -105,23 +112,26 @@ def process(
 
 
 def profile() -> dict[str, PathJoinSubstitution]:
-    """The variables that make nodes on Fast DDS find each other at once; none where the user has profiles of his own."""
+    """Variables that make nodes on Fast DDS find each other at once; none if the user has profiles of their own."""
     return {} if any(name in os.environ for name in PROFILES) else dict.fromkeys(PROFILES, QUICK_START)
 
 
 def ros_arguments(executable: str, common: Common) -> list[str]:
-    """The enclave is but a name while security is not enabled (ROS_SECURITY_ENABLE)."""
+    """Make the arguments for ROS; the enclave is only a name while security is not enabled (ROS_SECURITY_ENABLE)."""
     enclave = f"{common.enclaves}/{executable}"
     return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave]
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:
-    """A parameter file, gone with this process: a -p reaches all nodes of a process, or one of no namespace."""
+    """Write a parameter file that is deleted at the end of this process; return its path.
+
+    A `-p` cannot do this: it reaches all nodes of a process, or one without a namespace.
+    """
     content = {
         ("/**" if name == "**" else f"/**/{name}"): {"ros__parameters": values}
         for name, values in parameters.items()
     }
     with tempfile.NamedTemporaryFile("w", prefix="starpos_", suffix=".yaml", delete=False) as file:
         yaml.safe_dump(content, file)
-    atexit.register(lambda: os.path.exists(file.name) and os.unlink(file.name))
+    atexit.register(Path(file.name).unlink, missing_ok=True)
     return file.name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which requests are answered, and under which rules a browser shows the page."""
+"""Rules of access: which requests are answered, and how a browser may show the page."""
 
 import ipaddress
 import re
@@ -20,13 +20,13 @@ HEADERS = {
 
 
 def own_names() -> frozenset[str]:
-    """What this machine is called."""
+    """The names of this machine."""
     name = socket.gethostname().lower()
     return frozenset({"localhost", name, f"{name}.local"})
 
 
 def is_loopback(address: str) -> bool:
-    """Whether only this machine reaches it."""
+    """Whether only this machine reaches an address."""
     try:
         return ipaddress.ip_address(address).is_loopback
     except ValueError:
@@ -36,7 +36,7 @@ def is_loopback(address: str) -> bool:
 def host_is_known(header: str, names: frozenset[str]) -> bool:
     """Whether a request's Host is a plain address or one of the names.
 
-    A foreign page whose name was made to lead here (DNS rebinding) sends its own name.
+    A foreign page whose name was changed to lead here (DNS rebinding) sends its own name.
     """
     match = re.fullmatch(rf"({NAME.pattern})(:\d{{1,5}})?", header)
     if not match:
@@ -50,5 +50,5 @@ def host_is_known(header: str, names: frozenset[str]) -> bool:
 
 
 def comes_from_elsewhere(site: str | None, mode: str | None) -> bool:
-    """By a browser's Sec-Fetch-Site and Sec-Fetch-Mode: whether another site's page asks, other than by a link."""
+    """Whether another site's page asks, except by a link, judged by a browser's Sec-Fetch-Site and Sec-Fetch-Mode."""
     return site not in (None, "none", "same-origin") and mode != "navigate"

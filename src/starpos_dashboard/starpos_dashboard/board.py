@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The newest of everything that was heard, and when: what a page that is opened now has to know."""
+"""The newest message of each kind and when it came: the state that a page shows."""
 
 import json
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Imu, NavSatFix
@@ -12,15 +13,16 @@ from sensor_msgs.msg import Imu, NavSatFix
 from starpos_dashboard import readings
 from starpos_interfaces.msg import Solution, Tilt
 
-FAST_S = 5.0  # of what comes at 1 Hz and more: old after so long
+# Messages that come at 1 Hz or faster are old after so long.
+FAST_S = 5.0
 LIGHTS = 64  # diagnostics kept
-STATUSES = 256  # of one message that are looked at
+STATUSES = 256  # looked at in one message
 
 
 class Board:
-    """Messages in, one JSON text out; all of it bounded. `changed`: something came since the last `told`.
+    """Takes messages and gives one JSON text, of bounded size. `changed`: a message came since the last `told`.
 
-    nodes: whose diagnostics are lights, by their names in `namespace`, or whole ones; all where there are none.
+    nodes: the nodes whose diagnostics are shown as lights, by their names in `namespace`, or whole ones; empty: all.
     """
 
     def __init__(
@@ -29,18 +31,18 @@ class Board:
         nodes: frozenset[str],
         clock: Callable[[], float] = time.monotonic,
         namespace: str = "/",
-    ):
+    ) -> None:
         self.changed = False
         self._namespace = namespace
         self._nodes = self._seen(nodes)
         self._clock, self._since = clock, clock()
-        self._heard: dict[str, tuple[float, dict]] = {}  # (when, what)
-        self._lights: dict[str, tuple[float, dict]] = {}
+        self._heard: dict[str, tuple[float, dict[str, Any]]] = {}  # (when, what)
+        self._lights: dict[str, tuple[float, dict[str, Any]]] = {}
         self._track: deque[tuple[int, float, float]] = deque(maxlen=track)
         self._count = 0
 
     def keep_track_of(self, fixes: int) -> None:
-        """So many fixes from now on."""
+        """Keep so many fixes from now on."""
         self._track = deque(self._track, maxlen=fixes)
 
     @property
@@ -69,28 +71,29 @@ class Board:
         self._keep("solution", readings.solution(message))
 
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
-        """Those of the nodes that are to have lights."""
+        """Keep the diagnostics of the nodes that have lights."""
         for status in message.status[:STATUSES]:
             name = readings.seen_from(self._namespace, status.name)
             if self._nodes and _node_of(name) not in self._nodes:
                 continue
             told = readings.light(status, name)
-            self._lights.pop(told["name"], None)  # the newest is the last
+            # The newest has to be the last.
+            self._lights.pop(told["name"], None)
             self._lights[told["name"]] = self._clock(), told
             if len(self._lights) > LIGHTS:
                 del self._lights[next(iter(self._lights))]
             self.changed = True
 
     def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
-        """A picture is to be had under this number, or why there is none."""
+        """Note that a picture has this number, or why there is none."""
         self._keep("frame", {"number": number, "stamp": stamp_s, "trouble": readings.text(trouble)})
 
     def hide_frame(self) -> None:
-        """Nobody looks: what comes next is not a frame of now."""
+        """Forget the frame, because nobody looks and it would get old."""
         self._heard.pop("frame", None)
 
     def only_lights_of(self, nodes: frozenset[str]) -> None:
-        """Of these nodes, from now on; of all where there are none."""
+        """Show the lights of these nodes from now on; empty: of all."""
         self._nodes, self._since = self._seen(nodes), self._clock()
         if nodes:
             self._lights = {n: light for n, light in self._lights.items() if _node_of(n) in self._nodes}
@@ -98,7 +101,7 @@ class Board:
     def _seen(self, nodes: frozenset[str]) -> frozenset[str]:
         return frozenset(readings.seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
 
-    def _keep(self, name: str, told: dict | None):
+    def _keep(self, name: str, told: dict[str, Any] | None) -> None:
         self.changed = True
         if told is None:
             self._heard.pop(name, None)
@@ -106,13 +109,15 @@ class Board:
             self._heard[name] = self._clock(), told
 
     def told(self, now_s: float, slow_s: float) -> str:
-        """Everything as one line of JSON; `age` is since it came, on a clock that nobody sets [s].
+        """Write everything as one line of JSON; each `age` [s] counts since it came, on the monotonic clock.
 
-        now_s: what the node's clock says, Unix; slow_s: age at which what comes with each frame is old.
+        now_s: the node's time (Unix).  slow_s: age at which the values that come with each frame are old.
         """
         self.changed = False
         now = self._clock()
-        told = {name: {**what, "age": now - since} for name, (since, what) in self._heard.items()}
+        told: dict[str, Any] = {
+            name: {**what, "age": now - since} for name, (since, what) in self._heard.items()
+        }
         lights = [{**light, "age": now - since} for since, light in self._lights.values()]
         silent = self._nodes - {_node_of(name) for name in self._lights}
         lights += [{**readings.silence(node), "age": now - self._since} for node in silent]
@@ -123,5 +128,5 @@ class Board:
 
 
 def _node_of(name: str) -> str:
-    """`solver` of the diagnostic `solver: Solution`."""
+    """Node of a diagnostic: `solver` for `solver: Solution`."""
     return name.split(":", 1)[0].strip()

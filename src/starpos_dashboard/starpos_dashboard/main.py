@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable. The imports inside are heavy; they come after the signal handlers (see starpos_common)."""
+"""The executable. Its imports are heavy, so they come after the signal handlers (see starpos_common)."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 
 def dashboard() -> int:
-    """The node."""
+    """Run the node."""
     from starpos_common.node_main import leave, run
 
     return leave(run(make_nodes))
 
 
-def make_nodes():
-    """A DashboardNode; StarposError where this machine lacks what serves the page."""
+def make_nodes() -> "Iterator[Node]":
+    """Make the DashboardNode; StarposError if tornado, which serves the page, is not installed."""
     from importlib.util import find_spec
 
     from starpos.errors import StarposError

@@ -7,6 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos.errors import FrameError
@@ -20,13 +21,14 @@ from starpos_dashboard.parameters import PARAMETERS, names
 from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import Solution, Tilt
 
-HEARTBEAT_S = 1.0  # between states, where nothing comes: ages go on
+# An open page gets a state at least so often, because ages grow even if no message comes.
+HEARTBEAT_S = 1.0
 
 
 class DashboardNode(Node):
-    """See README.md."""
+    """Serves the page of the instrument; see README.md."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("dashboard")
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._board = Board(
@@ -39,7 +41,8 @@ class DashboardNode(Node):
             self._values["clients"],
         )
         self._image: Image | None = None  # the newest that is not shown yet
-        self._images = None  # the subscription, while a page shows the frame
+        # The subscription, while a page shows the frame.
+        self._images: Subscription | None = None
         self._shown = 0  # frames
         self._shown_at = self._told_at = 0.0  # monotonic, s
         self._pages = 0
@@ -47,7 +50,7 @@ class DashboardNode(Node):
         self._server.start()
         self._announce(address)
 
-    def _connect(self):
+    def _connect(self) -> None:
         board = self._board
         for kind, topic, hear in (
             (NavSatFix, "fix", board.hear_fix),
@@ -58,14 +61,13 @@ class DashboardNode(Node):
         ):
             subscription(self, kind, topic, hear, 10)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
-        self.destroy_subscription(
-            self._subscribe_frames()
-        )  # a bad qos_override is refused now, not by the first page
+        # Subscribe once now, so that a wrong qos_override is refused at the start.
+        self.destroy_subscription(self._subscribe_frames())
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1 / self._values["rate"], self._tell, clock=steady)
         self._diagnostics = Diagnostics(self, {"Page": self._report})
 
-    def _announce(self, address: str):
+    def _announce(self, address: str) -> None:
         host = f"[{address}]" if ":" in address else address
         self._url = f"http://{host}:{self._server.port}"
         self.get_logger().info(f"the instrument is shown at {self._url}")
@@ -74,7 +76,7 @@ class DashboardNode(Node):
                 f"every machine that reaches {address} can read there, without a password, where the instrument is"
             )
 
-    def _apply(self, changed: frozenset[str]):
+    def _apply(self, changed: frozenset[str]) -> None:
         if "rate" in changed:
             self._timer.timer_period_ns = round(1e9 / self._values["rate"])
         if "track" in changed:
@@ -83,21 +85,21 @@ class DashboardNode(Node):
             self._board.only_lights_of(names(self._values["lights"]))
         self._server.clients = self._values["clients"]
 
-    # what comes ------------------------------------------------------------------------------------------------------
+    # messages --------------------------------------------------------------------------------------------------------
 
-    def _on_diagnostics(self, message: DiagnosticArray):
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self._board.hear_diagnostics(message)
 
-    def _on_image(self, message: Image):
+    def _on_image(self, message: Image) -> None:
         self._image = message
 
-    # what goes -------------------------------------------------------------------------------------------------------
+    # the page --------------------------------------------------------------------------------------------------------
 
-    def _tell(self):
+    def _tell(self) -> None:
         now = time.monotonic()
         self._follow_viewers()
         if self._image is not None and now - self._shown_at >= 1 / self._values["image_rate"]:
-            self._show_frame(now)
+            self._show_frame(self._image, now)
         pages = self._server.pages
         more, self._pages = pages > self._pages, pages
         if pages and (more or self._board.changed or now - self._told_at >= HEARTBEAT_S):
@@ -105,8 +107,8 @@ class DashboardNode(Node):
             unix_s = self.get_clock().now().nanoseconds * 1e-9
             self._server.show(self._board.told(unix_s, self._values["stale_after"]), self._board.track)
 
-    def _follow_viewers(self):
-        """Subscribe the frames while somebody looks: until then the detector draws none."""
+    def _follow_viewers(self) -> None:
+        """Subscribe to the frames only while somebody looks, because the detector draws them for subscribers."""
         looking = self._server.looking
         if looking and self._images is None:
             self._images = self._subscribe_frames()
@@ -116,11 +118,11 @@ class DashboardNode(Node):
             self._server.show_frame(None)
             self._board.hide_frame()
 
-    def _subscribe_frames(self):
+    def _subscribe_frames(self) -> Subscription:
         return subscription(self, Image, "detector/image_annotated", self._on_image, 1)
 
-    def _show_frame(self, now_s: float):
-        image, self._image = self._image, None
+    def _show_frame(self, image: Image, now_s: float) -> None:
+        self._image = None
         self._shown_at = now_s
         self._shown += 1
         trouble = ""
@@ -131,7 +133,7 @@ class DashboardNode(Node):
             self._server.show_frame(None)
         self._board.show_frame(self._shown, stamp_to_unix(image.header.stamp), trouble)
 
-    # its own health --------------------------------------------------------------------------------------------------
+    # diagnostics -----------------------------------------------------------------------------------------------------
 
     def _report(self) -> Diagnosis:
         values = {
@@ -145,6 +147,6 @@ class DashboardNode(Node):
             return Diagnosis(Level.ERROR, f"{trouble}: start the dashboard again", values)
         return Diagnosis(Level.OK, f"shown at {self._url}", values)
 
-    def destroy_node(self):
+    def destroy_node(self) -> None:
         self._server.stop()
         super().destroy_node()

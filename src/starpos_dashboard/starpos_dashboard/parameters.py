@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dashboard's parameters."""
+"""Parameters of the node `dashboard`."""
 
 from starpos_common.parameters import Form, Parameter
 
-# An empty one would be every network of this machine, without a word of it.
+# An empty address would silently mean every network of this machine.
 ADDRESS = Form(
     "an address of this machine, such as 127.0.0.1, without blanks", lambda text: text.split() == [text]
 )
@@ -87,5 +87,5 @@ PARAMETERS = (
 
 
 def names(text: str) -> frozenset[str]:
-    """The words of a list separated by commas."""
+    """Split a list separated by commas into its words."""
     return frozenset(word.strip() for word in text.split(",") if word.strip())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The annotated frame as a JPEG."""
+"""Conversion of the annotated frame to a JPEG."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ QUALITY = 82
 
 
 def jpeg(message: Image, side: int) -> bytes:
-    """At most `side` px long; FrameError where the message is not a picture of 8 bits that holds together."""
+    """Convert a picture to a JPEG of at most `side` px; FrameError if it is not a consistent picture of 8 bits."""
     if message.encoding not in ENCODINGS:
         raise FrameError(
             f"the frame's encoding is {message.encoding[:32]!r}: only {', '.join(ENCODINGS)} are shown"

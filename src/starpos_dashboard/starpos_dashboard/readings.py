@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to what the page is told: JSON objects, in the units people read.
+"""Conversion of messages to JSON objects for the page, in the units that people read.
 
-A number that is not finite becomes null; a text is cut and loses what could rearrange the page's own; what does not hold
-together is told as trouble, never as a value.
+A number that is not finite becomes null. A text is shortened and loses characters that could rearrange the text of the
+page. An inconsistent message is shown as trouble, never as a value.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,10 +15,13 @@ from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from starpos.recording.messages import stamp_to_unix
 from starpos_interfaces.msg import Solution, Tilt
 
-NAME_LETTERS, SENTENCE_LETTERS = 80, 300  # of a text from outside, at most
-TERMS = 16  # of an error budget, at most
-STALE, ERROR = 3, 2  # of DiagnosticStatus
-UNIT = 1e-3  # by which a quaternion's length may be off 1
+# Most letters of a text from outside.
+NAME_LETTERS, SENTENCE_LETTERS = 80, 300
+# Most terms of an error budget.
+TERMS = 16
+STALE, ERROR = 3, 2  # levels of DiagnosticStatus
+# By so much the length of a quaternion may differ from 1.
+UNIT = 1e-3
 TILT_FLAGS = (
     (Tilt.OUT_OF_RANGE, "beyond ±30°"),
     (Tilt.STUCK, "the sensor repeats one value"),
@@ -27,21 +31,21 @@ TILT_FLAGS = (
 
 
 def number(value: float) -> float | None:
-    """None for what is not finite, which JSON cannot hold and a person must not read as a number."""
+    """Return a number, None if it is not finite: JSON cannot hold it, and nobody should read it as a number."""
     value = float(value)
     return value if math.isfinite(value) else None
 
 
 def text(value: str, letters: int = SENTENCE_LETTERS) -> str:
-    """One line of at most so many letters, without control characters and marks that turn the reading direction."""
+    """Shorten a text to one line, without control characters and marks that change the reading direction."""
     line = "".join(c if c.isprintable() else " " for c in value[: 2 * letters])
     line = " ".join(line.split())
     return line if len(line) <= letters else line[: letters - 1] + "…"
 
 
 def position(message: NavSatFix) -> dict:
-    """Place [deg], altitude [m], covariance of (east, north) [m2] as [ee, en, nn]; good: False where it is no fix."""
-    told = {"good": False, "trouble": "", "stamp": stamp_to_unix(message.header.stamp)}
+    """Place [deg], altitude [m], covariance of (east, north) [m2] as [ee, en, nn]; good: False if it is no fix."""
+    told: dict[str, Any] = {"good": False, "trouble": "", "stamp": stamp_to_unix(message.header.stamp)}
     latitude, longitude = number(message.latitude), number(message.longitude)
     if message.status.status == NavSatStatus.STATUS_NO_FIX:
         return told | {"trouble": "no fix"}
@@ -67,7 +71,7 @@ def _covariance(message: NavSatFix) -> list[float] | None:
 
 
 def heading(message: Imu) -> dict | None:
-    """Azimuth of the frame's x axis, clockwise from north, and its sigma [deg]; None where there is no attitude."""
+    """Azimuth of the frame's x axis, clockwise from north, and its sigma [deg]; None if there is no attitude."""
     q = message.orientation
     x, y, z, w = q.x, q.y, q.z, q.w
     length = math.sqrt(x * x + y * y + z * z + w * w)
@@ -84,7 +88,7 @@ def heading(message: Imu) -> dict | None:
 
 
 def tilt(message: Tilt) -> dict:
-    """Elevations of the inclinometer's axes and their sigmas [deg], temperature [deg C], what the flags say."""
+    """Elevations of the inclinometer's axes and their sigmas [deg], temperature [deg C], the flags in words."""
     xx, _, _, yy = (float(v) for v in message.covariance)
     sigma_x, sigma_y = (math.degrees(math.sqrt(v)) if 0 < v < math.inf else None for v in (xx, yy))
     return {
@@ -98,7 +102,7 @@ def tilt(message: Tilt) -> dict:
 
 
 def solution(message: Solution) -> dict:
-    """What the newest frame gave, in words and counts, and the error budget: east, north [m], heading [deg], 1 sigma."""
+    """Result of the newest frame in words and counts, and the error budget (1 sigma: position [m], heading [deg])."""
     terms = [
         {
             "name": text(term.name, NAME_LETTERS),
@@ -120,13 +124,13 @@ def solution(message: Solution) -> dict:
 
 
 def seen_from(namespace: str, name: str) -> str:
-    """A diagnostic's name as it is in a namespace: `solver: Solution` of its own, else whole: `/b/solver: Solution`."""
+    """Name of a diagnostic seen from a namespace: `solver: Solution` inside it, else whole: `/b/solver: Solution`."""
     whole = name if name.startswith("/") else f"/{name}"
     return whole.removeprefix(namespace.rstrip("/") + "/")
 
 
 def light(status: DiagnosticStatus, name: str) -> dict:
-    """One diagnostic, under a name; a level that is none of the four is an error."""
+    """Convert a diagnostic to a light; a level that is none of the four is an error."""
     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
     return {
         "name": text(name, NAME_LETTERS),
@@ -136,6 +140,6 @@ def light(status: DiagnosticStatus, name: str) -> dict:
 
 
 def silence(node: str) -> dict:
-    """The light of a node that has said nothing yet: without it a page where all is green might lack the solver."""
+    """Make the light of a node that has said nothing yet; otherwise an all-green page might lack the solver."""
     name = text(node, NAME_LETTERS)
     return {"name": name, "level": STALE, "sentence": "nothing heard yet"}

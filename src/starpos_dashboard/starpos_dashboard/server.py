@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page over HTTP, in a thread of its own: files of this package, the newest frame, and events as they come.
+"""HTTP server of the page, in a thread of its own: files of this package, the newest frame, and events.
 
-An open page is one request that does not end (server-sent events). It gets the newest state whenever it has taken the one
-before: a slow one misses some, a hung one is closed, and neither holds up anything or takes memory.
+An open page is one request that does not end (server-sent events). A page gets the newest state whenever it has taken the
+one before. So a slow page misses some states, and a hung page is closed; neither delays anything or takes memory.
 """
 
 import asyncio
@@ -10,24 +10,34 @@ import json
 import logging
 import threading
 import weakref
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
+from socket import socket
+from typing import Any
 
+from tornado.http1connection import HTTP1Connection
 from tornado.httpserver import HTTPServer
-from tornado.iostream import StreamClosedError
+from tornado.iostream import IOStream, StreamClosedError
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 
 from starpos.errors import StarposError, one_line
 from starpos_dashboard import access
 
-PATIENCE_S = 10.0  # for a page to take what is sent
-QUIET_S = 20.0  # of a connection that asks nothing
+# For a page to take what is sent.
+PATIENCE_S = 10.0
+# A connection without a request is closed after so long.
+QUIET_S = 20.0
 END_S = 2.0
-RETRY_MS = 3000  # after which a page that lost its connection comes again
+# A page that lost its connection tries again after so long.
+RETRY_MS = 3000
 HEADER_LIMIT, BODY_LIMIT, READ_LIMIT = 1 << 14, 1 << 10, 1 << 16
-SPARE_CONNECTIONS = 16  # besides six for each page, which is what a browser opens
+# Besides the six connections for each page that a browser opens.
+SPARE_CONNECTIONS = 16
+# (number, latitude, longitude) of fixes.
+Track = tuple[tuple[int, float, float], ...]
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -43,15 +53,15 @@ class DashboardError(StarposError):
 
 @dataclass(eq=False)
 class OpenPage:
-    """A page that listens. `looks`: it shows the frame; `sent`: number of the last fix it has."""
+    """A page that is open. `looks`: it shows the frame; `sent`: number of the last fix that was sent to it."""
 
     looks: bool
     news: asyncio.Event = field(default_factory=asyncio.Event)
     sent: int = 0
 
 
-def listen(address: str, port: int) -> list:
-    """Bound sockets; DashboardError with what to do where that cannot be."""
+def listen(address: str, port: int) -> list[socket]:
+    """Bind the sockets; DashboardError that says what to do if they cannot be bound."""
     try:
         return bind_sockets(port, address)
     except UnicodeError:
@@ -63,14 +73,14 @@ def listen(address: str, port: int) -> list:
             98: "another program has this port: stop it, or set the parameter port",
             13: "set port above 1023",
         }
-        cure = cures.get(e.errno, "set the parameter address to one of this machine's")
+        cure = cures.get(e.errno or 0, "set the parameter address to one of this machine's")
         raise DashboardError(
             f"{address}:{port} cannot be listened on ({one_line(e.strerror)}): {cure}"
         ) from None
 
 
 def files() -> dict[str, tuple[str, bytes]]:
-    """Content type and content by path: all there is to be had, so that no request ever names a file."""
+    """Read content type and content of all files, by path, so that no request can name any other file."""
     root = resources.files(__package__) / "assets"
     found = {}
     for folder, prefix in ((root, "/"), (root / "vendor", "/vendor/")):
@@ -82,18 +92,19 @@ def files() -> dict[str, tuple[str, bytes]]:
 
 
 class DashboardServer:
-    """`start`, then `show` what pages are to see, from any thread; `stop` ends it.
+    """Serves the page from `start` to `stop`; any thread may `show` a new state.
 
-    sockets: of `listen`; names: under which it may be asked for; clients: pages at once.
+    sockets: from `listen`.  names: host names under which it is served.  clients: most pages at once.
     """
 
-    def __init__(self, sockets: list, names: frozenset[str], clients: int):
+    def __init__(self, sockets: list[socket], names: frozenset[str], clients: int) -> None:
         self.clients = clients
         self.refused = 0  # pages for which there was no place
         self.files = files()
         self.names = names
         self.frame: bytes | None = None
-        self.state, self.track = "", ()
+        self.state = ""
+        self.track: Track = ()
         self.open: set[OpenPage] = set()
         self.trouble = ""
         self._sockets = sockets
@@ -107,12 +118,12 @@ class DashboardServer:
 
     @property
     def pages(self) -> int:
-        """How many are open."""
+        """Number of open pages."""
         return len(self.open)
 
     @property
     def looking(self) -> bool:
-        """Whether one of them shows the frame."""
+        """Whether an open page shows the frame."""
         return any(page.looks for page in tuple(self.open))
 
     @property
@@ -123,8 +134,8 @@ class DashboardServer:
         self._thread.start()
         self._ready.wait(END_S)
 
-    def show(self, state: str, track: tuple) -> None:
-        """The newest state as JSON, and the track of which each page gets what it has not."""
+    def show(self, state: str, track: Track) -> None:
+        """Send the newest state (JSON), and the part of the track that a page does not have yet."""
         self.state, self.track = state, track
         self._call(self._wake)
 
@@ -137,22 +148,26 @@ class DashboardServer:
             self._call(self._ended.set)
             self._thread.join(END_S)
 
-    def _call(self, function):
-        with suppress(RuntimeError):  # the loop has ended
+    def _call(self, function: Callable[[], object]) -> None:
+        if self._loop is None:
+            return
+        # The loop may have ended.
+        with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function)
 
-    def _wake(self):
+    def _wake(self) -> None:
         for page in self.open:
             page.news.set()
 
-    def _run(self):
+    def _run(self) -> None:
         try:
             asyncio.run(self._serve())
         except Exception as e:
             self.trouble = f"the server ended ({type(e).__name__}: {one_line(e)})"
 
-    async def _serve(self):
-        logging.getLogger("tornado").setLevel(logging.CRITICAL)  # what a client sends is no line in our log
+    async def _serve(self) -> None:
+        # A wrong request of a client is not worth a line in our log.
+        logging.getLogger("tornado").setLevel(logging.CRITICAL)
         self._ended = asyncio.Event()
         application = Application(
             [("/events", Events), ("/frame.jpg", FrameReply), ("/.*", File)],
@@ -180,13 +195,15 @@ class DashboardServer:
 
 
 class BoundedServer(HTTPServer):
-    """Closes at once what comes beyond `limit()` connections."""
+    """Closes at once every connection beyond `limit()`."""
 
-    def initialize(self, *args, **options):
+    limit: Callable[[], int]
+
+    def initialize(self, *args: Any, **options: Any) -> None:
         super().initialize(*args, **options)
-        self._streams = weakref.WeakSet()
+        self._streams: weakref.WeakSet[IOStream] = weakref.WeakSet()
 
-    def handle_stream(self, stream, address):
+    def handle_stream(self, stream: IOStream, address: tuple) -> None:
         if sum(not s.closed() for s in self._streams) >= self.limit():
             stream.close()
             return
@@ -195,19 +212,19 @@ class BoundedServer(HTTPServer):
 
 
 class Reply(RequestHandler):
-    """Reading only, from here only; errors are one sentence."""
+    """Answers requests to read only, and only from this page; an error is one sentence."""
 
     @property
     def server(self) -> DashboardServer:
         return self.settings["server"]
 
-    def set_default_headers(self):
+    def set_default_headers(self) -> None:
         self.clear_header("Server")
         for name, value in access.HEADERS.items():
             self.set_header(name, value)
         self.set_header("Cache-Control", "no-store")
 
-    def prepare(self):
+    def prepare(self) -> None:
         headers = self.request.headers
         if self.request.method not in ("GET", "HEAD"):
             self.set_header("Allow", "GET, HEAD")
@@ -219,38 +236,43 @@ class Reply(RequestHandler):
         if access.comes_from_elsewhere(headers.get("Sec-Fetch-Site"), headers.get("Sec-Fetch-Mode")):
             raise HTTPError(403, reason="not for pages of other sites")
 
-    def write_error(self, status_code, **about):
+    def write_error(self, status_code: int, **about: Any) -> None:
         if status_code == 405:
             self.set_header("Allow", "GET, HEAD")
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code}: {self._reason}\n")
 
     async def deliver(self) -> bool:
-        """Send what was written; False where the other side is gone, or takes too long and is closed."""
+        """Send what was written; False if the other side is gone, or takes too long and is closed."""
         try:
             await asyncio.wait_for(self.flush(), PATIENCE_S)
             return True
         except asyncio.TimeoutError:
-            self.request.connection.stream.close()
+            self._cut()
         except StreamClosedError:
             pass
         return False
 
-    async def send(self, kind: str, content: bytes):
-        """The whole reply; 304 where the browser has it already."""
+    def _cut(self) -> None:
+        """Close the connection without waiting for the other side."""
+        if isinstance(self.request.connection, HTTP1Connection):
+            self.request.connection.stream.close()
+
+    async def send(self, kind: str, content: bytes) -> None:
+        """Send the whole reply; 304 if the browser has it already."""
         self.set_header("Content-Type", kind)
         try:
             await asyncio.wait_for(self.finish(content), PATIENCE_S)
         except asyncio.TimeoutError:
-            self.request.connection.stream.close()
+            self._cut()
         except StreamClosedError:
             pass
 
 
 class File(Reply):
-    """One of the package's."""
+    """Answers with a file of this package."""
 
-    async def get(self):
+    async def get(self) -> None:
         kind, content = self.server.files.get(self.request.path, ("", b""))
         if not kind:
             raise HTTPError(404, reason="there is no such page")
@@ -261,9 +283,9 @@ class File(Reply):
 
 
 class FrameReply(Reply):
-    """The newest annotated frame."""
+    """Answers with the newest annotated frame."""
 
-    async def get(self):
+    async def get(self) -> None:
         if self.server.frame is None:
             raise HTTPError(404, reason="there is no frame now")
         await self.send("image/jpeg", self.server.frame)
@@ -272,14 +294,14 @@ class FrameReply(Reply):
 
 
 class Events(Reply):
-    """State and track, as they change."""
+    """Sends state and track as they change."""
 
     _page: OpenPage | None = None
 
-    def head(self):
+    def head(self) -> None:
         self.set_header("Content-Type", "text/event-stream")
 
-    async def get(self):
+    async def get(self) -> None:
         self.set_header("Content-Type", "text/event-stream")
         self.write(f"retry: {RETRY_MS}\n\n")
         if self.server.pages >= self.server.clients:
@@ -296,7 +318,7 @@ class Events(Reply):
         finally:
             self.server.open.discard(page)
 
-    def _write_news(self, page: OpenPage):
+    def _write_news(self, page: OpenPage) -> None:
         points = [p for p in self.server.track if p[0] > page.sent]
         if points:
             whole = {"begin": page.sent == 0, "points": points}
@@ -304,6 +326,7 @@ class Events(Reply):
             page.sent = points[-1][0]
         self.write(f"event: state\ndata: {self.server.state}\n\n")
 
-    def on_connection_close(self):
+    def on_connection_close(self) -> None:
         if self._page:
-            self._page.news.set()  # which it cannot deliver
+            # The page's loop wakes up, cannot deliver, and ends.
+            self._page.news.set()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where frames come from: a module a camera."""
+"""Sources of frames: a module for each kind of camera."""

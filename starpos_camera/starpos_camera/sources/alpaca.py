@@ -5,18 +5,25 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 
+if TYPE_CHECKING:
+    from alpaca.camera import Camera
+
+T = TypeVar("T")
 DEFAULT_EXPOSURE_S = 0.5
-READOUT_S = 20.0  # from the end of an exposure to its picture: slow CCDs take 15
+# From the end of an exposure to its picture; slow CCDs take 15 s.
+READOUT_S = 20.0
 POLL_S = 0.02
-WATCH_S = 0.5  # while an exposure runs: a dead server is noticed within it
+# Interval of looks at the server during an exposure, so that a dead server is noticed.
+WATCH_S = 0.5
 MONOCHROME, RGGB = 0, 2  # ASCOM's sensor types
 PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}  # by BayerOffsetX, BayerOffsetY
 IDLE, ERROR = 0, 5  # ASCOM's camera states
@@ -40,8 +47,8 @@ PARAMETERS = (
 )
 
 
-class Alpaca:
-    """Takes whole, unbinned frames; each exposure is commanded, waited for and fetched by `capture`."""
+class Alpaca(FrameSource):
+    """Takes whole, unbinned frames; `capture` commands an exposure, waits for it and fetches it."""
 
     parameters = PARAMETERS
     waits_for_listener = False
@@ -57,38 +64,40 @@ class Alpaca:
             return f"the `gain` of an Alpaca camera is a whole number, not {settings.gain:g}."
         return None
 
-    def __init__(self, values: Mapping, now: Callable[[], float]):
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         self._address = values["alpaca.address"]
         self._number = values["alpaca.device"]
         self.hardware_id = f"Alpaca camera {self._number} at {self._address}"
         self._values = values
         self._now = now
         self._closing = threading.Event()
-        self._camera = None
+        self._camera: Camera | None = None
         self._size = (0, 0)
         self._pattern = ""
-        self._gain: float | None = None  # as it was set last
+        self._gain: float | None = None  # the gain that was set last
 
     def lacking(self) -> None:
-        """Only a call to the server tells."""
+        """Return None, because only a call to the server would tell."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:
-            if self._camera is None or not self._camera.Connected:  # another program may have disconnected it
-                self._open()
-            return self._expose(settings)
-        except Exception as error:  # of alpyca, requests, urllib3, or what an absurd reply makes of them
+            # Another program may have disconnected the camera.
+            if self._camera is None or not self._camera.Connected:
+                self._camera = self._opened()
+            return self._expose(self._camera, settings)
+        except Exception as error:
+            # alpyca, requests and urllib3 have many exceptions, and an absurd reply causes others.
             self._camera = None
             raise CaptureError(f"{self.hardware_id}: {_sentence(error)}") from error
 
-    def update(self, values: Mapping):
+    def update(self, values: Mapping) -> None:
         self._values = values
 
-    def close(self):
+    def close(self) -> None:
         self._closing.set()
         self._camera = None
 
-    def _open(self):
+    def _opened(self) -> "Camera":
         from alpaca.camera import Camera
 
         from starpos_camera.sources.alpaca_http import Session
@@ -97,7 +106,8 @@ class Alpaca:
         camera.rqs = Session()
         if not camera.Connected:
             camera.Connected = True
-        if camera.CameraState != IDLE:  # of a session before, or after a fault
+        # A session before, or a fault, may have left an exposure.
+        if camera.CameraState != IDLE:
             camera.AbortExposure()
         width, height = int(camera.CameraXSize), int(camera.CameraYSize)
         if min(width, height) < 1 or width * height > MAX_PIXELS:
@@ -106,14 +116,14 @@ class Alpaca:
         camera.StartX = camera.StartY = 0
         camera.NumX, camera.NumY = width, height
         self._size, self._pattern, self._gain = (width, height), _pattern(camera), None
-        self._camera = camera
+        return camera
 
-    def _expose(self, settings) -> CapturedFrame:
-        camera, wanted_s = self._camera, settings.exposure_s or DEFAULT_EXPOSURE_S
-        remark = self._set_gain(settings.gain)
+    def _expose(self, camera: "Camera", settings: CaptureSettings) -> CapturedFrame:
+        wanted_s = settings.exposure_s or DEFAULT_EXPOSURE_S
+        remark = self._set_gain(camera, settings.gain)
         commanded_s = self._now()
         camera.StartExposure(wanted_s, True)
-        self._wait(wanted_s)
+        self._wait(camera, wanted_s)
         ready_s = self._now()
         exposure_s = _optional(camera, "LastExposureDuration", wanted_s)
         if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
@@ -136,25 +146,25 @@ class Alpaca:
         remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else remark
         return CapturedFrame(frame, stamp.source, remark=remark)
 
-    def _set_gain(self, gain):
-        """Set it where it is another than was asked last; a remark where the camera has another."""
+    def _set_gain(self, camera: "Camera", gain: float | None) -> str:
+        """Set the gain if it was not set last; return a remark if the camera has another one."""
         if gain is None:
             return ""
         if gain != self._gain:
-            self._camera.Gain = int(gain)
+            camera.Gain = int(gain)
             self._gain = gain
-        has = self._camera.Gain
+        has = camera.Gain
         return "" if has == gain else f"{self.hardware_id}: its gain is {has}, though {gain:g} was set."
 
-    def _wait(self, exposure_s):
-        """Until the picture is there."""
+    def _wait(self, camera: "Camera", exposure_s: float) -> None:
+        """Wait until the picture is there."""
         begin = time.monotonic()
-        while not self._camera.ImageReady:
+        while not camera.ImageReady:
             left_s = begin + exposure_s - time.monotonic()
-            state = self._camera.CameraState
+            state = camera.CameraState
             if state == ERROR:
                 raise CaptureError("it reports an error; see the server's log.")
-            if state == IDLE and not self._camera.ImageReady:
+            if state == IDLE and not camera.ImageReady:
                 raise CaptureError(
                     "its exposure was ended by another program, or the server has started anew."
                 )
@@ -164,17 +174,18 @@ class Alpaca:
                 raise CaptureError("the node ends.")
 
 
-def _optional(camera, member, otherwise):
-    """What a driver need not have."""
+def _optional(camera: "Camera", member: str, otherwise: T) -> T:
+    """Read a member that a driver need not have; `otherwise` if it has none."""
     from alpaca.exceptions import InvalidOperationException, NotImplementedException
 
     try:
-        return type(otherwise)(getattr(camera, member))
+        kind: Callable[[Any], T] = type(otherwise)
+        return kind(getattr(camera, member))
     except (NotImplementedException, InvalidOperationException):
         return otherwise
 
 
-def _pattern(camera):
+def _pattern(camera: "Camera") -> str:
     kind = int(_optional(camera, "SensorType", MONOCHROME))
     if kind == MONOCHROME:
         return ""
@@ -186,8 +197,8 @@ def _pattern(camera):
     return PATTERNS[offsets]
 
 
-def _unsigned(pixels):
-    """uint8 or uint16 of whole numbers of any width."""
+def _unsigned(pixels: np.ndarray) -> np.ndarray:
+    """Convert whole numbers of any width to uint8 or uint16."""
     if pixels.dtype == np.uint8:
         return np.ascontiguousarray(pixels)
     if pixels.dtype != np.dtype("<u2"):
@@ -197,8 +208,8 @@ def _unsigned(pixels):
     return np.ascontiguousarray(pixels, np.uint16)
 
 
-def _sentence(error):
-    """What a library's exception means."""
+def _sentence(error: Exception) -> str:
+    """Say in a sentence what an exception of a library means."""
     import requests
     import urllib3
 

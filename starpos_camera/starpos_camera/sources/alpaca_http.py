@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""HTTP to an Alpaca server that may be slow, dead or hostile: each exchange ends in its time, and within its size.
+"""HTTP to an Alpaca server that may be slow, dead or hostile: each exchange is limited in time and in size.
 
-requests' own timeout begins anew with every byte, and it takes replies of any length; alpyca fetches pictures without
-any. Source of the picture's format: ASCOM Alpaca API Reference, ImageBytes (metadata version 1).
+The timeout of requests starts again with every byte, and requests takes replies of any length; alpyca fetches pictures
+without a timeout. Source of the picture's format: ASCOM Alpaca API Reference, ImageBytes (metadata version 1).
 """
 
 import math
 import socket
 import struct
 import time
+from typing import Any
 
 import numpy as np
 import requests
@@ -18,32 +19,27 @@ from urllib3.connection import HTTPConnection
 
 from starpos_camera.sources.source import CaptureError
 
-CALL_S = 5.0  # alpyca's own, for all but pictures
+CALL_S = 5.0  # alpyca's own timeout, for everything but pictures
 STALL_S = 5.0  # between two pieces of a picture
-PICTURE_S = 60.0  # a whole one: 40 MB at 0.7 MB/s
-MAX_REPLY = 1_000_000  # bytes of all but pictures
+PICTURE_S = 60.0  # for a whole picture: 40 MB at 0.7 MB/s
+MAX_REPLY = 1_000_000  # bytes, of everything but pictures
 MAX_METADATA = 65536
 CHUNK = 1 << 20
 METADATA = struct.Struct("<4i7i")
-SENT_AS = {
-    1: "<i2",
-    2: "<i4",
-    6: "u1",
-    8: "<u2",
-    9: "<u4",
-}  # those of the standard's types that pixels may have
+# The types of the standard that pixels may have.
+SENT_AS = {1: "<i2", 2: "<i4", 6: "u1", 8: "<u2", 9: "<u4"}
 
 
 class _Socket(socket.socket):
-    """Its timeout is of the whole exchange, counted from when it is set."""
+    """A socket whose timeout limits the whole exchange, counted from when it is set."""
 
     _end_s = math.inf
 
-    def settimeout(self, seconds):
+    def settimeout(self, seconds: float | None) -> None:
         self._end_s = math.inf if seconds is None else time.monotonic() + seconds
         super().settimeout(seconds)
 
-    def recv_into(self, *args):
+    def recv_into(self, *args: Any) -> int:
         left_s = min(STALL_S, self._end_s - time.monotonic())
         if left_s <= 0:
             raise TimeoutError("timed out")
@@ -52,7 +48,9 @@ class _Socket(socket.socket):
 
 
 class _Connection(HTTPConnection):
-    def connect(self):
+    sock: socket.socket
+
+    def connect(self) -> None:
         super().connect()
         timeout = self.sock.gettimeout()
         self.sock = _Socket(fileno=self.sock.detach())
@@ -64,32 +62,34 @@ class _Pool(HTTPConnectionPool):
 
 
 class _Adapter(HTTPAdapter):
-    def init_poolmanager(self, *args, **kwargs):
+    def init_poolmanager(self, *args: Any, **kwargs: Any) -> None:
         super().init_poolmanager(*args, **kwargs)
         self.poolmanager.pool_classes_by_scheme = {"http": _Pool}
 
 
 class Session(requests.Session):
-    """A requests.Session for alpyca's devices to use: bounded, with no proxy, and sent on to no other server."""
+    """A requests.Session for alpyca's devices: bounded in time and size, without a proxy and without redirects."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.trust_env = False
         self.max_redirects = 0
         self.mount("http://", _Adapter())
 
-    def request(self, *args, stream=False, **kwargs):
-        response = super().request(*args, stream=True, **kwargs)
+    def request(self, *args: Any, **kwargs: Any) -> requests.Response:
+        stream, kwargs["stream"] = kwargs.get("stream", False), True
+        response = super().request(*args, **kwargs)
         if not stream:
             with response:
                 body = response.raw.read(MAX_REPLY + 1, decode_content=True)
             if len(body) > MAX_REPLY:
                 raise CaptureError("the server's reply is longer than any that has a meaning.")
-            response._content = body  # where requests keeps what it has read
+            # requests keeps the body that it has read there.
+            response._content = body
         return response
 
     def picture(self, url: str, width: int, height: int) -> np.ndarray:
-        """The newest picture of a camera, (height, width) with row 0 on top, as transmitted; CaptureError otherwise."""
+        """Fetch the newest picture, (height, width) with row 0 on top, as transmitted; CaptureError if there is none."""
         accept = {"Accept": "application/imagebytes", "Accept-Encoding": "identity"}
         with self.get(url, headers=accept, timeout=(CALL_S, PICTURE_S), stream=True) as response:
             if "application/imagebytes" not in response.headers.get("Content-Type", ""):
@@ -100,7 +100,7 @@ class Session(requests.Session):
             return _decode(response.raw, width, height)
 
 
-def _decode(stream, width, height):
+def _decode(stream: Any, width: int, height: int) -> np.ndarray:
     head = stream.read(METADATA.size)
     if len(head) < METADATA.size:
         raise CaptureError("a picture ended within its metadata.")
@@ -120,7 +120,7 @@ def _decode(stream, width, height):
         )
     stream.read(begin - METADATA.size)
     pixels = np.empty((width, height), SENT_AS[sent_as])
-    room, at = memoryview(pixels).cast("B"), 0
+    room, at = pixels.data.cast("B"), 0
     while at < len(room):
         piece = stream.read(min(CHUNK, len(room) - at))
         if not piece:
@@ -129,7 +129,8 @@ def _decode(stream, width, height):
         at += len(piece)
     if stream.read(1):
         raise CaptureError(f"a picture has more than its {len(room)} bytes.")
-    return pixels.T  # the standard's is [x][y]
+    # The standard's order is [x][y].
+    return pixels.T
 
 
 def _words(text: bytes) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames from files: of a folder, or all that a pattern matches, in the order of their names; or as they come into it."""
+"""Frames from files of a folder or a pattern, in the order of their names, or as they come into a folder."""
 
 import fnmatch
 import glob
@@ -16,6 +16,7 @@ from starpos_camera.sources.source import (
     CapturedFrame,
     CaptureError,
     CaptureSettings,
+    FrameSource,
     NothingYet,
     SourceEnded,
     missing,
@@ -86,11 +87,10 @@ PARAMETERS = (
 )
 
 
-class Files:
-    """Plays files.path once, round and round with files.loop (each round lists the files anew), or what comes into it.
+class Files(FrameSource):
+    """Plays files.path once, or again and again with files.loop (each round lists the files again), or new files.
 
-    A file that cannot be read raises FrameError, is passed over in later rounds, and the next call takes the
-    next one.
+    A file that cannot be read raises FrameError and is left out in later rounds; the next call takes the next file.
     """
 
     parameters = PARAMETERS
@@ -121,19 +121,20 @@ class Files:
             return "files.exif_utc_offset says how to take EXIF's times: set files.exif too."
         return None
 
-    def __init__(self, values: Mapping, now: Callable[[], float]):
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         self.hardware_id = self._path = values["files.path"]
         self._loop = values["files.loop"]
         self._restamp = values["files.restamp"]
         self._now = now
         self._clock = camera_clock(values)
-        self._queue: list[Path] | None = None  # what this round has left, last first
+        # The files that this round has left, last first; None before the first round.
+        self._queue: list[Path] | None = None
         self._bad: set[Path] = set()
-        self._watched = None
+        self._watched: WatchedFolder | None = None
         if values["files.watch"]:
             folder, pattern = split(self._path)
             self._watched = WatchedFolder(folder, lambda name: fits(name, pattern), values["files.rest"])
-        # else the first frames of a night are gone before the detector is up
+        # Without a listener the first frames of a night would be played before the detector is ready.
         self.waits_for_listener = self._watched is None
 
     def lacking(self) -> str | None:
@@ -145,7 +146,8 @@ class Files:
                 )
             if next(find_files(self._path), None) is None:
                 return f"{self._path}: there are no frames here; check files.path."
-        except (OSError, RuntimeError) as error:  # no permission, no such user's home
+        except (OSError, RuntimeError) as error:
+            # There is no permission, or no home of such a user.
             return f"{self._path}: it cannot be looked into ({error}); check files.path."
         return None
 
@@ -161,18 +163,18 @@ class Files:
             self._bad.add(path)
             raise
 
-    def update(self, values: Mapping):
-        """Nothing of it changes at run time."""
+    def update(self, values: Mapping) -> None:
+        """Do nothing, because no parameter of this source changes at run time."""
 
-    def close(self):
-        """Nothing is held open."""
+    def close(self) -> None:
+        """Do nothing, because no file is held open."""
 
     def _read(self, path: Path) -> CapturedFrame:
         frame = read_frame(path, self._clock)
         if not isinstance(frame, Frame):
             raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
         if self._restamp:
-            # as if the exposure had just ended: the tilts that belong to it are there
+            # The exposure is taken to have just ended, so that the tilts of its time are there.
             middle_s = self._now() - (frame.exposure_s or 0.0) / 2
             frame = replace(frame, mid_unix_s=middle_s, stamp_stddev_s=0.0)
             return CapturedFrame(frame, Capture.DRIVER)
@@ -206,7 +208,8 @@ class Files:
         except Exception:
             watched.done(path)
             raise
-        if not watched.at_rest(path):  # it was being written again
+        # Somebody may have begun to write it again.
+        if not watched.at_rest(path):
             raise NothingYet(f"waiting for the rest of {path}.")
         watched.done(path)
         return exposure
@@ -224,14 +227,14 @@ class Files:
 
 
 def camera_clock(values: Mapping) -> CameraClock | None:
-    """The clock of the camera that wrote the files' EXIF; None where nobody vouches for it."""
+    """Make the clock of the camera that wrote the files' EXIF; None unless files.exif is set."""
     if not values["files.exif"]:
         return None
     offset_h = values["files.exif_utc_offset"]
     return CameraClock(None if math.isnan(offset_h) else offset_h, values["files.exif_clock_stddev"])
 
 
-def _no_home(path):
+def _no_home(path: str) -> str | None:
     try:
         split(path)
     except RuntimeError as error:
@@ -240,20 +243,20 @@ def _no_home(path):
 
 
 def split(path: str) -> tuple[Path, str]:
-    """The folder that is watched and the pattern of its names, '' for every frame's."""
+    """Split a path into the folder to watch and the pattern of names, '' for all frames."""
     place = Path(path).expanduser()
     return (place.parent, place.name) if glob.has_magic(place.name) else (place, "")
 
 
 def fits(name: str, pattern: str) -> bool:
-    """Whether a name is a frame's; those of other encodings cannot be told, and hidden ones are not finished."""
+    """Whether a name is that of a frame; hidden files are not finished, and names of other encodings cannot be shown."""
     if not name.isprintable() or name.startswith("."):
         return False
     return fnmatch.fnmatchcase(name, pattern) if pattern else name.lower().endswith(SUFFIXES)
 
 
 def find_files(path: str) -> Iterator[Path]:
-    """The frames in a folder, or whatever files a pattern matches, in no order; none where there is no such place."""
+    """Find the frames in a folder, or all files that a pattern matches, in no order; none if there is no such place."""
     place = Path(path).expanduser()
     if place.is_dir():
         found = (file for file in place.iterdir() if fits(file.name, ""))

@@ -10,13 +10,15 @@ from pathlib import PurePosixPath
 from starpos.errors import FrameError
 from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources.gphoto2_camera import TOLERANCE, Gphoto2Camera, sentence
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource, missing
 from starpos_camera.sources.timing import middle_of_commanded
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
-TARGETS = {"memory": "ram", "card": "card"}  # and what is in libgphoto2's names of them
-FORMATS = ("imageformat", "imagequality")  # Canon's and Nikon's
+# Each target with a part of its name in libgphoto2.
+TARGETS = {"memory": "ram", "card": "card"}
+# Names of the setting with Canon and with Nikon.
+FORMATS = ("imageformat", "imagequality")
 RAW_ALONE = r"^(?!.*(jpe?g|\+|fine|large)).*\b(raw|nef)\b"
 PARAMETERS = (
     Parameter(
@@ -67,8 +69,8 @@ PARAMETERS = (
 )
 
 
-class Gphoto2:
-    """Commands each exposure, waits for its file, fetches and deletes it. The camera's dial stands at M."""
+class Gphoto2(FrameSource):
+    """Commands each exposure, waits for its file, fetches and deletes it. The camera's dial must stand at M."""
 
     parameters = PARAMETERS
     waits_for_listener = False
@@ -83,7 +85,7 @@ class Gphoto2:
             return f"`exposure` ({exposure_s:g} s) must not be longer than `cadence` ({cadence_s:g} s)."
         return None
 
-    def __init__(self, values: Mapping, now: Callable[[], float]):
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         self._values = values
         self._now = now
         which = filter(None, (values["gphoto2.model"], values["gphoto2.port"]))
@@ -93,7 +95,7 @@ class Gphoto2:
         self._camera: Gphoto2Camera | None = None
 
     def lacking(self) -> None:
-        """Only a look at the bus tells."""
+        """Return None, because only a look at the bus would tell."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         import gphoto2
@@ -110,24 +112,25 @@ class Gphoto2:
                 self._release()
                 raise CaptureError(f"{self.hardware_id}: {sentence(error.code)}") from error
 
-    def update(self, values: Mapping):
+    def update(self, values: Mapping) -> None:
         self._values = values
 
-    def close(self):
+    def close(self) -> None:
         self._closing.set()
         with self._in_use:
             self._release()
 
-    def _release(self):
+    def _release(self) -> None:
         if self._camera is not None:
             self._camera.release()
             self._camera = None
 
     def _opened(self) -> Gphoto2Camera:
-        """The camera, set to what holds as long as it is open."""
+        """Open the camera and make the settings that hold as long as it is open."""
         values = self._values
         camera = Gphoto2Camera(values["gphoto2.model"], values["gphoto2.port"], self._closing)
-        camera.prefer("autofocus", "off")  # stars are no target for it, and without one there is no exposure
+        # Autofocus finds no target in stars, and without a target the camera does not expose.
+        camera.prefer("autofocus", "off")
         camera.prefer("capturetarget", TARGETS[values["gphoto2.target"]])
         if values["gphoto2.raw"]:
             for name in FORMATS:
@@ -160,8 +163,8 @@ class Gphoto2:
         frame = replace(frame, exposure_s=exposure_s, mid_unix_s=mid_s, stamp_stddev_s=stddev_s)
         return CapturedFrame(frame, Capture.COMMAND, remark=remark)
 
-    def _delete(self, camera, files) -> str:
-        """Remove from the camera what this exposure put there; a sentence where that failed."""
+    def _delete(self, camera: Gphoto2Camera, files: list[str]) -> str:
+        """Delete the files of this exposure in the camera; return a sentence if that failed, otherwise ''."""
         import gphoto2
 
         try:
@@ -172,5 +175,5 @@ class Gphoto2:
 
 
 def named_off_s(exposure_s: float) -> float:
-    """How far an exposure may be from what it is called: shutters go by thirds of powers of 2, and 30 s may be 32 s."""
+    """Error of the nominal exposure (s): shutters go by thirds of powers of 2, so that 30 s may be 32 s."""
     return abs(2 ** (round(3 * math.log2(exposure_s)) / 3) - exposure_s)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera held through libgphoto2: its settings, an exposure, its files.
+"""One open camera of libgphoto2: its settings, its exposures, its files.
 
-GPhoto2Error where the camera fails, CaptureError where it does something else than was asked.
+GPhoto2Error is raised if the camera fails, CaptureError if it does something else than was asked.
 """
 
 import math
@@ -11,23 +11,29 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import PurePosixPath
+from typing import Any
 
 from starpos_camera.sources.source import CaptureError
 
-TOLERANCE = 0.05  # of an exposure or a gain from one the camera has
-AFTER_S = 20.0  # from the end of an exposure to its file; slow cards take some seconds
-COMPANIONS_S = 0.3  # from a file to others of the same exposure
-DRAIN_S = 1.0  # for the events that are left of what was before
+# Largest difference of an exposure or a gain from one that the camera has, as a share.
+TOLERANCE = 0.05
+# From the end of an exposure to its file; slow cards take some seconds.
+AFTER_S = 20.0
+# From a file to the others of the same exposure.
+COMPANIONS_S = 0.3
+# For the events that are left from before.
+DRAIN_S = 1.0
 POLL_S = 0.1
-STORE_FULL = "PTP Event 400a"  # of the standard, PIMA 15740; libgphoto2 has no word for it
+# An event of the standard PIMA 15740 for which libgphoto2 has no name.
+STORE_FULL = "PTP Event 400a"
 MAX_FILE_BYTES = 500_000_000
 
 
 class Gphoto2Camera:
-    """An open camera. `closing`, once set, ends what waits."""
+    """An open camera. Setting `closing` ends all waiting."""
 
-    def __init__(self, model: str, port: str, closing: threading.Event):
-        """The one camera that fits, initialised; CaptureError where it is none or one of several."""
+    def __init__(self, model: str, port: str, closing: threading.Event) -> None:
+        """Open the one camera that fits; CaptureError if none fits, or several."""
         import gphoto2
 
         self._gp = gphoto2
@@ -41,12 +47,13 @@ class Gphoto2Camera:
         self._camera.set_abilities(kinds[kinds.lookup_model(name)])
         self._camera.init()
 
-    def release(self):
-        with suppress(self._gp.GPhoto2Error):  # it has gone
+    def release(self) -> None:
+        # The camera may have gone.
+        with suppress(self._gp.GPhoto2Error):
             self._camera.exit()
 
-    def setting(self, name: str):
-        """A setting's widget; None where the camera has none of the name."""
+    def setting(self, name: str) -> Any:
+        """Return the widget of a setting; None if the camera has no such setting."""
         try:
             return self._camera.get_single_config(name)
         except self._gp.GPhoto2Error as error:
@@ -54,14 +61,15 @@ class Gphoto2Camera:
                 return None
             raise
 
-    def choices(self, widget) -> list[str]:
+    def choices(self, widget: Any) -> list[str]:
         try:
             return [widget.get_choice(k) for k in range(widget.count_choices())]
-        except self._gp.GPhoto2Error:  # a setting of another kind
+        except self._gp.GPhoto2Error:
+            # The setting is of another kind, without choices.
             return []
 
-    def choose(self, widget, choice: str | None):
-        """Have a setting at a choice (None: leave it), and see that it is."""
+    def choose(self, widget: Any, choice: str | None) -> None:
+        """Set a setting to a choice (None: leave it) and check it; CaptureError if it stays at another one."""
         if choice is None or widget.get_value() == choice:
             return
         name = widget.get_name()
@@ -72,13 +80,13 @@ class Gphoto2Camera:
         if has != choice:
             raise CaptureError(f"its {name} stays at {has!r}, not {choice!r}: turn its dial to M.")
 
-    def prefer(self, name: str, pattern: str):
-        """Have a setting at its first choice that fits a regular expression, where it has such."""
+    def prefer(self, name: str, pattern: str) -> None:
+        """Set a setting to its first choice that matches a regular expression, if it has one."""
         if (widget := self.setting(name)) is not None:
             self.choose(widget, next((c for c in self.choices(widget) if re.search(pattern, c, re.I)), None))
 
     def set_exposure(self, name: str, wanted_s: float | None) -> tuple[float, bool]:
-        """Have the shutter at an exposure (None: as it is); the exposure in s, and whether it has to be held open."""
+        """Set the shutter (None: leave it); return the exposure in s, and whether the shutter has to be held open."""
         widget = self.setting(name)
         if widget is None:
             raise CaptureError(f"it has no setting {name!r}: give its own in gphoto2.shutter_setting.")
@@ -96,19 +104,19 @@ class Gphoto2Camera:
         self.choose(widget, choice)
         return speeds[choice], False
 
-    def set_gain(self, name: str, wanted: float):
+    def set_gain(self, name: str, wanted: float) -> None:
         widget = self.setting(name)
         if widget is None:
             raise CaptureError(f"it has no setting {name!r} for `gain`: give its own in gphoto2.iso_setting.")
         gains = {c: float(c) for c in self.choices(widget) if re.fullmatch(r"\d+(\.\d+)?", c, re.ASCII)}
         self.choose(widget, nearest(gains, wanted, f"{name} of {wanted:g}"))
 
-    def trigger(self):
-        """Begin an exposure; some cameras return when it has ended."""
+    def trigger(self) -> None:
+        """Begin an exposure; with some cameras this returns only at its end."""
         self._camera.trigger_capture()
 
     def hold_open(self, exposure_s: float) -> float:
-        """Hold the shutter open; how long it was (s)."""
+        """Hold the shutter open; return for how long it was open (s)."""
         bulb = self._camera.get_single_config("bulb")
         begin = time.monotonic()
         bulb.set_value(1)
@@ -121,8 +129,8 @@ class Gphoto2Camera:
             self._camera.set_single_config("bulb", bulb)
         return held_s
 
-    def drain(self):
-        """Forget the events of before: some cameras stop when they pile up."""
+    def drain(self) -> None:
+        """Drop the events from before, because some cameras stop when they pile up."""
         end = time.monotonic() + DRAIN_S
         while time.monotonic() < end:
             kind, _ = self._camera.wait_for_event(1)
@@ -130,9 +138,10 @@ class Gphoto2Camera:
                 return
 
     def files(self, exposure_s: float) -> list[str]:
-        """The paths of the files that the exposure makes, at least one; waits for them."""
-        # with its noise reduction on, a camera takes a dark frame as long as the exposure before it gives the file
-        found, end = [], time.monotonic() + 2 * exposure_s + AFTER_S
+        """Wait for the files of the exposure and return their paths, at least one."""
+        # With noise reduction a camera takes a dark frame, as long as the exposure, before it gives the file.
+        found: list[str] = []
+        end = time.monotonic() + 2 * exposure_s + AFTER_S
         while (now := time.monotonic()) < end:
             if self._closing.is_set():
                 raise CaptureError("the node ends.")
@@ -142,7 +151,8 @@ class Gphoto2Camera:
                 end = min(end, now + COMPANIONS_S)
             elif kind == self._gp.GP_EVENT_UNKNOWN and str(what).startswith(STORE_FULL):
                 raise CaptureError(sentence(self._gp.GP_ERROR_NO_SPACE))
-            elif kind == self._gp.GP_EVENT_TIMEOUT:  # which some do not wait for
+            elif kind == self._gp.GP_EVENT_TIMEOUT:
+                # Some cameras return this event at once.
                 self._closing.wait(max(0.0, min(end, now + POLL_S) - time.monotonic()))
         if not found:
             raise CaptureError(
@@ -151,24 +161,25 @@ class Gphoto2Camera:
         return found
 
     def fetch(self, path: str) -> bytes:
-        """A file's bytes."""
+        """Fetch the bytes of a file."""
         place = str(PurePosixPath(path).parent), PurePosixPath(path).name
         size = self._camera.file_get_info(*place).file.size
         if not 0 < size <= MAX_FILE_BYTES:
             raise CaptureError(f"{path} is said to have {size} bytes; look at the camera's card.")
         file = self._camera.file_get(*place, self._gp.GP_FILE_TYPE_NORMAL)
-        data = bytes(file.get_data_and_size())  # a copy: the memory is the file's
+        # A copy, because the memory belongs to the file.
+        data = bytes(file.get_data_and_size())
         if len(data) != size:
             raise CaptureError(f"{path} came with {len(data)} of its {size} bytes.")
         return data
 
-    def delete(self, files: list[str]):
+    def delete(self, files: list[str]) -> None:
         for path in map(PurePosixPath, files):
             self._camera.file_delete(str(path.parent), path.name)
 
 
-def _found(model, port):
-    """Name and port of the one camera on the buses that fits."""
+def _found(model: str, port: str) -> tuple[str, str]:
+    """Find name and port of the one camera on the buses that fits."""
     import gphoto2
 
     found = gphoto2.Camera.autodetect()
@@ -183,7 +194,7 @@ def _found(model, port):
 
 
 def seconds(text: str) -> float | None:
-    """Of a shutter speed as cameras write them: 1/30, 0.5, 13/10, 0.0100s, 30"; None of bulb, Auto and the like."""
+    """Read a shutter speed as cameras write it: 1/30, 0.5, 13/10, 0.0100s, 30"; None for bulb, Auto and the like."""
     match = re.fullmatch(r'(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*(?:s|sec|")?', str(text).strip(), re.ASCII)
     if not match or not float(match[1]) or not float(match[2] or 1):
         return None
@@ -191,8 +202,8 @@ def seconds(text: str) -> float | None:
 
 
 def nearest(values: Mapping[str, float], wanted: float, what: str) -> str:
-    """The choice whose value is the wanted one to 5 %; CaptureError that names its neighbours where there is none."""
-    order = sorted(values, key=values.get)
+    """Find the choice whose value is within 5 % of the wanted one; CaptureError with the nearest ones if none is."""
+    order = sorted(values, key=lambda choice: values[choice])
     best = min(order, key=lambda choice: abs(values[choice] - wanted), default=None)
     if best is not None and abs(values[best] - wanted) <= TOLERANCE * wanted:
         return best
@@ -204,7 +215,7 @@ def nearest(values: Mapping[str, float], wanted: float, what: str) -> str:
 
 
 def sentence(code: int) -> str:
-    """What an error of libgphoto2 means."""
+    """Say in a sentence what an error of libgphoto2 means."""
     import gphoto2
 
     known = {

@@ -10,7 +10,7 @@ from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.indi_camera import Wish, connect, expose, find, set_up
 from starpos_camera.sources.indi_server import Blob, IndiServer
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
 from starpos_common.parameters import Parameter
 
@@ -51,8 +51,8 @@ PARAMETERS = (
 )
 
 
-class Indi:
-    """Takes whole light frames as FITS. Connects a device that is not connected; an exposure given up is aborted."""
+class Indi(FrameSource):
+    """Takes whole light frames as FITS. Connects the device if need be; aborts an exposure that is given up."""
 
     parameters = PARAMETERS
     waits_for_listener = False
@@ -69,7 +69,7 @@ class Indi:
                 return f"{name} must name {what}; it is empty."
         return None
 
-    def __init__(self, values: Mapping, now: Callable[[], float]):
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         self._host, self._port = values["indi.host"], values["indi.port"]
         self._device = values["indi.device"]
         self.hardware_id = f"{self._device} of indiserver at {self._host}:{self._port}"
@@ -79,13 +79,13 @@ class Indi:
         self._closing = False
 
     def lacking(self) -> None:
-        """Only the server knows."""
+        """Return None, because only the server knows."""
 
-    def update(self, values: Mapping):
+    def update(self, values: Mapping) -> None:
         self._values = values
 
-    def close(self):
-        """Also while `capture` runs, which then ends: the exposure is aborted."""
+    def close(self) -> None:
+        """Close the connection; a `capture` that runs ends, and its exposure is aborted."""
         self._closing = True
         if server := self._server:
             server.close()
@@ -100,17 +100,18 @@ class Indi:
             self._leave()
             raise
 
-    def _take(self, settings):
-        """The BLOB of one exposure, the length asked for (s), and when it was asked for and there (Unix time)."""
+    def _take(self, settings: CaptureSettings) -> tuple[Blob, float, float, float]:
+        """Expose; return the BLOB, the exposure asked for (s), and when it was commanded and ready (Unix time)."""
         if self._closing:
             raise CaptureError("the node ends.")
         if self._server is None:
             self._server = IndiServer(self._host, self._port)
-            if self._closing:  # meanwhile
+            # The node may have ended meanwhile.
+            if self._closing:
                 raise CaptureError("the node ends.")
         server = self._server
 
-        async def take():
+        async def take() -> tuple[Blob, float, float, float]:
             wish = Wish(
                 settings.exposure_s or DEFAULT_EXPOSURE_S,
                 settings.gain,
@@ -126,12 +127,12 @@ class Indi:
 
         return server.run(take())
 
-    def _leave(self):
+    def _leave(self) -> None:
         if self._server:
             self._server.close()
         self._server = None
 
-    def _exposure(self, blob, wanted_s, commanded_s, ready_s) -> CapturedFrame:
+    def _exposure(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:
         frame, header = decode_fits(_unpacked(blob), "its frame")
         exposure_s = frame.exposure_s or wanted_s
         if exposure_s > ready_s - commanded_s + CLOCK_TOLERANCE_S:
@@ -154,11 +155,12 @@ class Indi:
 
 
 def _unpacked(blob: Blob) -> bytes:
-    """The FITS file in a BLOB; CaptureError where it is another thing, or not all of it."""
+    """Unpack the FITS file of a BLOB; CaptureError if it is of another format or incomplete."""
     if not 0 < blob.size <= BLOB_MAX:
         raise CaptureError(f"its frame claims {blob.size} bytes; a frame has at most {BLOB_MAX}.")
     data = blob.data
-    if blob.format == ".fits.fz":  # astropy unpacks it; the size is that of the image before
+    # astropy unpacks this format; the stated size is that of the unpacked image.
+    if blob.format == ".fits.fz":
         return data
     if blob.format == ".fits.z":
         try:

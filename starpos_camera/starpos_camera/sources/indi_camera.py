@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera of an INDI server: found, connected, set up and exposed, by the standard properties of INDI."""
+"""Control of a camera of an INDI server through INDI's standard properties: find, connect, set up, expose."""
 
 from dataclasses import dataclass
 
@@ -7,20 +7,23 @@ from starpos_camera.sources.indi_server import Blob, IndiDevice, IndiServer
 from starpos_camera.sources.source import CaptureError
 
 LINK_S = 2.0
-ANSWER_S = 5.0  # of a driver that is asked or told something
-CONNECT_S = 15.0  # a driver opens its camera
-# Set before each exposure where the driver has them: another client may have had other wishes.
+# For a driver to answer.
+ANSWER_S = 5.0
+# For a driver to open its camera.
+CONNECT_S = 15.0
+# Set before each exposure if the driver has them, because another client may have changed them.
 SWITCHES = (
     ("UPLOAD_MODE", "UPLOAD_CLIENT"),
     ("CCD_TRANSFER_FORMAT", "FORMAT_FITS"),
     ("CCD_FRAME_TYPE", "FRAME_LIGHT"),
 )
-GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))  # drivers have the one or the other
+# Drivers have one or the other.
+GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))
 
 
 @dataclass(frozen=True)
 class Wish:
-    """How to expose: for so long (s), with a gain (None: as it is), binned (px each way), read out in time (s)."""
+    """Settings of an exposure: its time (s), gain (None: as it is), binning (px each way), time for the readout (s)."""
 
     exposure_s: float
     gain: float | None
@@ -29,7 +32,7 @@ class Wish:
 
 
 async def find(server: IndiServer, name: str) -> IndiDevice:
-    """The device of that name, once it is there; CaptureError if it is not."""
+    """Wait for the device of that name; CaptureError if it does not come."""
     if not await server.until(lambda: server.connected, LINK_S):
         raise CaptureError("no INDI server answers: start indiserver, or correct indi.host and indi.port.")
     device = server.device(name)
@@ -40,12 +43,12 @@ async def find(server: IndiServer, name: str) -> IndiDevice:
 
 
 async def connect(device: IndiDevice) -> None:
-    """Have the driver open its camera; it may have been told so already, by anyone."""
+    """Make the driver open its camera; another client may have done so already."""
 
-    def connected():
+    def connected() -> bool:
         return device.value("CONNECTION", "CONNECT") == "On"
 
-    def refused():
+    def refused() -> bool:
         return device.state("CONNECTION") == "Alert"
 
     device.forget()
@@ -65,8 +68,9 @@ async def connect(device: IndiDevice) -> None:
 
 
 async def set_up(device: IndiDevice, wish: Wish) -> None:
-    """All that an exposure needs; what the camera cannot do is refused."""
-    if device.state("CCD_EXPOSURE") == "Busy":  # of a client that was killed
+    """Make all settings of an exposure; CaptureError if the camera cannot do one of them."""
+    # A client that was killed may have left an exposure.
+    if device.state("CCD_EXPOSURE") == "Busy":
         await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
         await device.server.until(lambda: device.state("CCD_EXPOSURE") != "Busy", ANSWER_S)
     for vector, member in SWITCHES:
@@ -81,23 +85,22 @@ async def set_up(device: IndiDevice, wish: Wish) -> None:
         if width and height:
             await _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if wish.gain is not None:
-        vector, member = next(
-            ((v, m) for v, m in GAINS if device.value(v, m) is not None), ("CCD_GAIN", None)
-        )
-        if member is None:
+        gain = next(((v, m) for v, m in GAINS if device.value(v, m) is not None), None)
+        if gain is None:
             raise CaptureError("it has no gain to be set: leave `gain` unset.")
+        vector, member = gain
         _check_limits(device, vector, member, wish.gain, "`gain`")
         if device.number(vector, member) != wish.gain:
-            # a driver may round it to what there is
+            # The driver may round the gain to one that the camera has.
             await _set(device, vector, **{member: repr(float(wish.gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", wish.exposure_s, "`exposure` (s)")
 
 
 async def expose(device: IndiDevice, wish: Wish) -> Blob:
-    """The frame of an exposure begun now; it is aborted where it is given up."""
+    """Expose now and return the frame; an exposure that is given up is aborted."""
     server = device.server
 
-    def state():
+    def state() -> str | None:
         return device.state("CCD_EXPOSURE")
 
     device.forget()
@@ -114,16 +117,19 @@ async def expose(device: IndiDevice, wish: Wish) -> Blob:
             )
         if not server.blob:
             ends = {"Alert": "failed", "Idle": "was aborted by another client"}
-            raise CaptureError(f"the exposure {ends.get(state(), 'gave no frame in time')}{device.said()}.")
-    except BaseException:  # a cancellation too
+            end = ends.get(state() or "", "gave no frame in time")
+            raise CaptureError(f"the exposure {end}{device.said()}.")
+    except BaseException:
+        # This is for a cancellation too.
         await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
         raise
-    await server.until(lambda: state() != "Busy", ANSWER_S)  # the next exposure would abort this one
+    # The next exposure would abort one that is still busy.
+    await server.until(lambda: state() != "Busy", ANSWER_S)
     blob, server.blob = server.blob, None
     return blob
 
 
-async def _set(device, vector, **members):
+async def _set(device: IndiDevice, vector: str, **members: str) -> None:
     await device.send(vector, **members)
     if not await device.server.until(lambda: device.state(vector) != "Busy", ANSWER_S):
         raise CaptureError(f"the driver does not answer to {vector}: restart it.")
@@ -132,8 +138,8 @@ async def _set(device, vector, **members):
         raise CaptureError(f"the driver refuses {vector} {asked}{device.said()}.")
 
 
-async def _set_numbers(device, vector, **numbers):
-    """Set what is not so yet, and see that it has become so."""
+async def _set_numbers(device: IndiDevice, vector: str, **numbers: float) -> None:
+    """Set the numbers that differ, and check that they were taken."""
     wrong = {m: n for m, n in numbers.items() if device.number(vector, m) != n}
     if not wrong:
         return
@@ -144,7 +150,7 @@ async def _set_numbers(device, vector, **numbers):
             raise CaptureError(f"the driver has made its {vector} {member} {found}, not {number:g}.")
 
 
-def _check_limits(device, vector, member, value, name):
+def _check_limits(device: IndiDevice, vector: str, member: str, value: float, name: str) -> None:
     low, high = device.limits(vector, member)
     if low is not None and high is not None and low < high and not low <= value <= high:
         raise CaptureError(f"its {name} is {low:g} to {high:g}, not {value:g}.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sources by the name that the parameter `source` gives them."""
+"""The sources by their name in the parameter `source`. A new camera needs a module here and a line below."""
 
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.files import Files

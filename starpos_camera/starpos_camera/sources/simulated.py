@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated sky, live: what a camera standing at a place would have seen until now."""
+"""A simulated sky, live: the frames that a camera at a place would take now."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.instrument import focal_px_of
-from starpos_camera.sources.source import CapturedFrame, CaptureSettings
+from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource
 from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
+if TYPE_CHECKING:
+    from starpos.simulation.scene import Scene
+
 DEFAULT_EXPOSURE_S = 0.5
-MAX_EXPOSURE_S = 10.0  # the time and the memory of a render grow with the length of the trails
+# Time and memory of a render grow with the length of the trails.
+MAX_EXPOSURE_S = 10.0
 MAX_PIXELS = 100_000_000
 STAMP_ROUNDING_S = 1e-6
 PARAMETERS = (
@@ -99,7 +104,7 @@ PARAMETERS = (
 )
 
 
-class Simulated:
+class Simulated(FrameSource):
     """Renders the exposure that has just ended, through an ideal camera."""
 
     parameters = PARAMETERS
@@ -120,14 +125,14 @@ class Simulated:
             return "the simulated sky has no gain: leave `gain` unset."
         return None
 
-    def __init__(self, values: Mapping, now: Callable[[], float]):
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         self._now = now
         self._rng = np.random.default_rng(values["simulated.seed"])
         self._scene = scene_from(values)
         self.hardware_id = "simulated sky"
 
     def lacking(self) -> None:
-        """Nothing: the sky is always there."""
+        """Return None, because the sky is always there."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         from starpos.simulation.scene import expose, render
@@ -140,15 +145,15 @@ class Simulated:
         frame = render(scene, stars, start, exposure_s, self._rng)
         return CapturedFrame(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)
 
-    def update(self, values: Mapping):
+    def update(self, values: Mapping) -> None:
         self._scene = scene_from(values)
 
-    def close(self):
-        """Nothing is held open."""
+    def close(self) -> None:
+        """Do nothing, because nothing is held open."""
 
 
-def scene_from(values: Mapping):
-    """The starpos.simulation.scene.Scene of the node's parameters."""
+def scene_from(values: Mapping) -> "Scene":
+    """Make the scene of the node's parameters."""
     from starpos.simulation.scene import scene_of
 
     return scene_of(

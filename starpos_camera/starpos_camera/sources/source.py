@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a camera is to the node. Every camera is a Source; a new one is a module here and a line in `registry`."""
+"""Interface between the node and a camera. A new camera is a FrameSource in a module here, and a line in `registry`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
@@ -17,16 +17,16 @@ class CaptureError(StarposError):
 
 
 class NothingYet(StarposError):
-    """No frame has come since the last one, and that is as it should be."""
+    """No frame has come since the last one, which is no fault."""
 
 
 class SourceEnded(StarposError):
-    """There are no more frames, and there will be none: not a fault."""
+    """There are no more frames, and there will be none, which is no fault."""
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """How to take the next frame.
+    """Settings of the next frame.
 
     exposure_s  None: the source's own
     gain        in the camera's own unit; None: as the camera is set
@@ -42,10 +42,10 @@ class CaptureSettings:
 class CapturedFrame:
     """One frame and how it was taken.
 
-    frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s where another machine told it
+    frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s if another machine told the time
     stamp_source  one of starpos_interfaces/Capture's constants
-    camera        intrinsics that the source knows to be true; None: the node's
-    remark        what is wrong with the camera, though the frame is good: a sentence; '' for nothing
+    camera        intrinsics that the source knows; None: use the node's
+    remark        a sentence about a trouble of the camera although the frame is good; '' for none
     """
 
     frame: Frame
@@ -55,40 +55,43 @@ class CapturedFrame:
 
 
 class FrameSource(Protocol):
-    """A camera. Made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
+    """A camera, made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
 
-    Making one opens nothing and cannot fail for want of a device: `capture` opens what is not open, so that a
-    device may come, go and come back. All methods but `close` and `capture` return at once. The module imports what
-    only its own devices need (a vendor's library) where it is used: every node imports every source.
+    Making one opens no device and cannot fail for lack of one. `capture` opens the device if it is not open, so a
+    device may come, go and come back. All methods except `close` and `capture` return at once. A module imports the
+    library of its devices only inside the functions that use it, because every node imports every source.
     """
 
     parameters: Sequence[Parameter]  # each named `source.something`
     hardware_id: str
-    waits_for_listener: bool  # True: nothing is captured before someone subscribes to the images
+    # True: nothing is captured before somebody subscribes to the images.
+    waits_for_listener: bool
+
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None: ...
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
-        """A sentence where a source with these parameters cannot be made, or cannot take such frames."""
+        """Say in a sentence why a source cannot be made of these parameters, or cannot take such frames; else None."""
 
     def lacking(self) -> str | None:
-        """A sentence where `capture` would find nothing; asked before the first frame, each cadence."""
+        """Say in a sentence why `capture` would find nothing; asked each cadence before the first frame."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        """Take the next frame, in a thread of the node's; blocks until it is there.
+        """Take the next frame; blocks until it is there, in a thread of the node.
 
-        StarposError in one sentence where there is none: the node reports it and calls again one cadence
-        later. NothingYet where it waits for one, SourceEnded where there will be none.
+        Raises StarposError with a sentence if there is no frame: the node reports it and calls again one cadence
+        later. Raises NothingYet while it waits for a frame, SourceEnded if there will be none.
         """
 
-    def update(self, values: Mapping):
-        """The node's parameters have changed; may be called while `capture` runs."""
+    def update(self, values: Mapping) -> None:
+        """Apply changed parameters; may be called while `capture` runs."""
 
-    def close(self):
-        """Release the device. Called once, also while the last `capture` runs, which then ends soon."""
+    def close(self) -> None:
+        """Release the device; called once. A `capture` that still runs ends soon."""
 
 
 def missing(module: str, package: str) -> str | None:
-    """For `refusal`: the sentence where an optional library is not installed, with the line that installs it."""
+    """Say in a sentence, for `refusal`, that an optional library is not installed; None if it is."""
     return (
         None
         if find_spec(module)

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera of Video4Linux through OpenCV: the sensor's pixels where it gives them, the kernel's time of each frame.
+"""A Video4Linux camera through OpenCV: the sensor's own pixels if the camera sends them, the kernel's time of each frame.
 
-OpenCV's V4L2 backend (tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC, and with
-CAP_PROP_CONVERT_RGB at 0 the buffer itself, in its format's shape or as plain bytes. It waits for a frame no longer than
-10 s. Exposure is V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, where the menu of auto exposure is at 1. It does not tell when a
-buffer is short: the kernel's uvcvideo throws such frames away (its parameter nodrop is 0).
+OpenCV's V4L2 backend (tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC. With
+CAP_PROP_CONVERT_RGB at 0 it gives the buffer itself, in the shape of its format or as plain bytes. It waits at most 10 s
+for a frame. Exposure is V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not tell
+that a buffer is short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
 """
 
 import math
 import time
 from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,18 +20,27 @@ from starpos_camera.sources.opencv_video import quiet
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 
+if TYPE_CHECKING:
+    from cv2 import VideoCapture
+
 EXPOSURE_UNIT_S = 1e-4
 MANUAL = 1  # V4L2_EXPOSURE_MANUAL
 AUTOMATIC = (0, 3)  # V4L2_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY
 MAX_EXPOSURE_S = 60.0
-SETTLE_FRAMES = 4  # that a camera still takes with the settings before
-MAX_WAIT_S = 10.0  # besides what the frames themselves take
-DEFAULT_RATE = 5.0  # frames a second where the driver tells none: slow is careful
+# So many frames a camera may still take with the old settings.
+SETTLE_FRAMES = 4
+# Longest wait besides the time of the frames themselves.
+MAX_WAIT_S = 10.0
+# Frames per second if the driver tells none; a low value is the careful one.
+DEFAULT_RATE = 5.0
 MAX_AGE_S = 600.0
 MONO = {"GREY": "u1", "Y16 ": "<u2", "Y12 ": "<u2", "Y10 ": "<u2"}
-LUMA = {"YUYV": 0, "YVYU": 0, "UYVY": 1, "VYUY": 1}  # where in its pair of bytes
-PLANAR = ("NV12", "NV21", "YU12", "YV12")  # all Y comes first
-MOSAIC = {  # of 8, then 10, 12, 16 bits
+# Index of Y in its pair of bytes.
+LUMA = {"YUYV": 0, "YVYU": 0, "UYVY": 1, "VYUY": 1}
+# In these formats all Y come first.
+PLANAR = ("NV12", "NV21", "YU12", "YV12")
+# Formats of 8, 10, 12 and 16 bits.
+MOSAIC = {
     letters: (pattern, "<u2" if deep else "u1")
     for pattern, family in {
         "rggb": ("RGGB", "RG10", "RG12", "RG16"),
@@ -45,26 +56,29 @@ FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
 
 
 class V4l2Device:
-    """Keeps the camera streaming; `capture` gives the first frame that was exposed after it was asked for."""
+    """Keeps the camera streaming; `capture` returns the first frame that was exposed after the call."""
 
-    def __init__(self, path: str, values: Mapping, now: Callable[[], float]):
+    def __init__(self, path: str, values: Mapping, now: Callable[[], float]) -> None:
         self.closing = False
         self._path = path
         self._values = values
         self._now = now
-        self._capture = None
+        self._capture: VideoCapture | None = None
         self._format, self._size = "", (0, 0)
-        self._set: tuple | None = None  # exposure and gain as they were set last
-        self._not_before_s = 0.0  # steady time: frames before it have other settings
+        # Exposure and gain that were set last.
+        self._set: tuple[float | None, float | None] | None = None
+        # Frames before this steady time have other settings.
+        self._not_before_s = 0.0
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:
             with quiet() as cv2:
                 if self._capture is None:
-                    self._open(cv2)
-                exposure_s, remark = self._settings(cv2, settings)
-                mid_s, stddev_s, stamp = self._grab(cv2, exposure_s)
-                came, raw = self._capture.retrieve()
+                    self._capture = self._opened(cv2)
+                camera = self._capture
+                exposure_s, remark = self._settings(cv2, camera, settings)
+                mid_s, stddev_s, stamp = self._grab(cv2, camera, exposure_s)
+                came, raw = camera.retrieve()
                 if not came:
                     raise CaptureError("it gave no frame.")
                 pixels, pattern = self._pixels(cv2, raw)
@@ -82,19 +96,20 @@ class V4l2Device:
         )
         return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
 
-    def close(self):
+    def close(self) -> None:
         if self._capture is not None:
             self._capture.release()
         self._capture = None
 
-    def _open(self, cv2):
+    def _opened(self, cv2: ModuleType) -> "VideoCapture":
         capture = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
         if not capture.isOpened():
             raise CaptureError(
                 "it cannot be opened as a camera; it is unplugged, in use, or not yours (be in the group video)."
             )
-        self._capture, self._set = capture, None
-        capture.set(cv2.CAP_PROP_MODE, 0)  # controls in the driver's units, whatever the environment says
+        self._set = None
+        # Controls are in the driver's units, whatever the environment says.
+        capture.set(cv2.CAP_PROP_MODE, 0)
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         wanted = self._values["video.format"].ljust(4) if self._values["video.format"] else ""
         if wanted:
@@ -106,8 +121,8 @@ class V4l2Device:
         self._format = (
             (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
         )
-        self._size = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        width, height = self._size
+        width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        self._size = width, height
         if self._format not in FORMATS or (wanted and self._format != wanted):
             raise CaptureError(
                 f"it sends {self._format!r}, not {wanted or 'a known format'}; set video.format."
@@ -116,10 +131,13 @@ class V4l2Device:
             raise CaptureError(
                 f"it has frames of {width} x {height} px; correct video.width and video.height."
             )
+        return capture
 
-    def _settings(self, cv2, settings):
-        """Exposure time (s, None unknown) as the driver tells it, and what is to be remarked."""
-        capture, remark = self._capture, ""
+    def _settings(
+        self, cv2: ModuleType, capture: "VideoCapture", settings: CaptureSettings
+    ) -> tuple[float | None, str]:
+        """Make the settings; return the exposure as the driver tells it (s, None unknown), and a remark."""
+        remark = ""
         if self._set != (settings.exposure_s, settings.gain):
             if settings.exposure_s is not None:
                 capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
@@ -127,7 +145,7 @@ class V4l2Device:
             if settings.gain is not None:
                 capture.set(cv2.CAP_PROP_GAIN, settings.gain)
             self._set = settings.exposure_s, settings.gain
-            self._not_before_s = time.monotonic() + SETTLE_FRAMES * self._period_s(cv2)
+            self._not_before_s = time.monotonic() + SETTLE_FRAMES * _period_s(cv2, capture)
         units = capture.get(cv2.CAP_PROP_EXPOSURE)
         told = 0 < units <= MAX_EXPOSURE_S / EXPOSURE_UNIT_S
         told = told and capture.get(cv2.CAP_PROP_AUTO_EXPOSURE) not in AUTOMATIC
@@ -143,33 +161,35 @@ class V4l2Device:
             remark = f"its gain is {gain:g}, though {settings.gain:g} was set."
         return exposure_s, remark
 
-    def _period_s(self, cv2):
-        rate = self._capture.get(cv2.CAP_PROP_FPS)
-        return 1 / rate if 0.01 < rate < 10000 else 1 / DEFAULT_RATE
-
-    def _grab(self, cv2, exposure_s):
-        """Middle, its standard deviation (s) and where it comes from, of the frame that `retrieve` then gives."""
+    def _grab(
+        self, cv2: ModuleType, capture: "VideoCapture", exposure_s: float | None
+    ) -> tuple[float, float, int]:
+        """Grab a frame for `retrieve`; return its middle, its standard deviation (s) and the source of the stamp."""
         asked_s = max(time.monotonic(), self._not_before_s)
-        buffers = int(self._capture.get(cv2.CAP_PROP_BUFFERSIZE))
+        buffers = int(capture.get(cv2.CAP_PROP_BUFFERSIZE))
         stale = buffers if 1 <= buffers <= 32 else 4
-        period_s = max(self._period_s(cv2), exposure_s or 0.0)
+        period_s = max(_period_s(cv2, capture), exposure_s or 0.0)
         end_s = asked_s + MAX_WAIT_S + (stale + SETTLE_FRAMES) * period_s
-        before_s, apart_s, unstamped = None, [], 0
+        before_s: float | None = None
+        apart_s: list[float] = []
+        unstamped = 0
         while time.monotonic() < end_s and not self.closing:
-            if not self._capture.grab():
+            if not capture.grab():
                 raise CaptureError("it gives no frame; look after its plug.")
             steady_s, now_s = self._clocks()
-            stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            age_s = min(steady_s - stamp_s, time.time() - stamp_s, key=abs)  # drivers stamp with either clock
+            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            # Drivers stamp with one clock or the other.
+            age_s = min(steady_s - stamp_s, time.time() - stamp_s, key=abs)
             stamped = stamp_s > 0 and -0.1 < age_s < MAX_AGE_S
             if not stamped:
                 age_s, unstamped = 0.0, unstamped + 1
             at_s = steady_s - age_s
-            if before_s is not None:  # in the dark a camera may be slower than it says
-                apart_s.append(at_s - before_s)  # of reads: one that was late makes the next look early
+            if before_s is not None:
+                # In the dark a camera may be slower than it says. After a late read the next one looks early.
+                apart_s.append(at_s - before_s)
                 frame_s = min(apart_s) if stamped else max(apart_s)
                 lag_s, stddev_s, latest_s = self._lag(exposure_s, max(period_s, frame_s))
-                # Without stamps: after the buffers that had been filled before, and one that was being so.
+                # Without stamps: skip the buffers that were filled before, and the one that was being filled.
                 if at_s - latest_s >= asked_s and (stamped or unstamped > stale + 1):
                     return now_s - age_s - lag_s, stddev_s, Capture.HARDWARE if stamped else Capture.DRIVER
             before_s = at_s
@@ -179,25 +199,26 @@ class V4l2Device:
             "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
         )
 
-    def _clocks(self):
-        """Steady time and the node's (s) of one moment, to half a millisecond: other threads may come between."""
+    def _clocks(self) -> tuple[float, float]:
+        """Read steady time and the node's time (s) within half a millisecond; other threads may delay a reading."""
         for _ in range(5):
             before_s, now_s, after_s = time.monotonic(), self._now(), time.monotonic()
             if after_s - before_s < 1e-3:
                 break
         return (before_s + after_s) / 2, now_s
 
-    def _lag(self, exposure_s, period_s):
-        """From an exposure's middle to its stamp, the standard deviation of that, and the most from its start (s)."""
-        exposed_s = exposure_s or period_s  # an unknown one is no longer
+    def _lag(self, exposure_s: float | None, period_s: float) -> tuple[float, float, float]:
+        """Time from an exposure's middle to its stamp, its standard deviation, and the longest from its start (s)."""
+        # An unknown exposure is no longer than the period.
+        exposed_s = exposure_s or period_s
         lag_s = self._values["video.lag"]
         if not math.isnan(lag_s):
             return lag_s, self._values["command_lag_stddev"], lag_s + exposed_s / 2
         # Drivers stamp the start of the exposure, its end, or the end of the transfer, one period later at most.
         return period_s / 2, (period_s + exposed_s) / math.sqrt(12), period_s + exposed_s
 
-    def _pixels(self, cv2, raw):
-        """Pixels and the pattern of their mosaic; CaptureError of a frame that is not whole."""
+    def _pixels(self, cv2: ModuleType, raw: np.ndarray) -> tuple[np.ndarray, str]:
+        """Convert a buffer to pixels and the pattern of their mosaic; CaptureError if it is incomplete."""
         width, height = self._size
         raw = np.ascontiguousarray(raw).view(np.uint8).ravel()
         if self._format in JPEG:
@@ -215,11 +236,17 @@ class V4l2Device:
             pixels = raw.reshape(height, width, 3)[..., :: 1 if self._format == "BGR3" else -1]
         else:
             pixels = raw.view(kind).astype(kind.lstrip("<"), copy=False).reshape(height, width)
-        return np.array(pixels, order="C"), pattern  # OpenCV's memory may be the driver's
+        # A copy, because OpenCV's memory may be the driver's.
+        return np.array(pixels, order="C"), pattern
 
 
-def _from_jpeg(cv2, raw, width, height):
-    """Its brightness, (height, width) uint8."""
+def _period_s(cv2: ModuleType, capture: "VideoCapture") -> float:
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    return 1 / rate if 0.01 < rate < 10000 else 1 / DEFAULT_RATE
+
+
+def _from_jpeg(cv2: ModuleType, raw: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Decode the brightness of a JPEG, (height, width) uint8."""
     data = raw.tobytes().rstrip(b"\0")
     pixels = (
         cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from starpos_camera.sources.source import CapturedFrame, CaptureSettings
+from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource
 from starpos_camera.sources.timing import read_utc
 from starpos_camera.sources.v4l2 import FORMATS, V4l2Device
 from starpos_camera.sources.video_file import SUFFIXES, Film
@@ -65,8 +65,8 @@ PARAMETERS = (
 )
 
 
-class Video:
-    """A V4L2 camera, live, or the frames of a video file, one after the other."""
+class Video(FrameSource):
+    """A live V4L2 camera, or the frames of a video file, one after the other."""
 
     parameters = PARAMETERS
 
@@ -98,14 +98,13 @@ class Video:
             return "a video file has its own exposure and gain: leave `exposure` and `gain` unset."
         return None
 
-    def __init__(self, values: Mapping, now: Callable[[], float]):
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         device = values["video.device"]
-        self.waits_for_listener = not is_camera(
-            device
-        )  # else the first frames are gone before the detector is up
+        # Without a listener the first frames of a file would be played before the detector is ready.
+        self.waits_for_listener = not is_camera(device)
         self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
         self._in_use = threading.Lock()
-        self._from = (
+        self._from: V4l2Device | Film = (
             V4l2Device(self.hardware_id, values, now)
             if is_camera(device)
             else Film(self.hardware_id, values["video.start"])
@@ -120,15 +119,15 @@ class Video:
         with self._in_use:
             return self._from.capture(settings)
 
-    def update(self, values: Mapping):
-        """What may change is looked up at each frame."""
+    def update(self, values: Mapping) -> None:
+        """Do nothing, because parameters that may change are read at each frame."""
 
-    def close(self):
+    def close(self) -> None:
         self._from.closing = True
         with self._in_use:
             self._from.close()
 
 
 def is_camera(device: str) -> bool:
-    """Otherwise it is a file."""
+    """Whether a device is a camera; otherwise it is a file."""
     return device.isdecimal() or device.startswith("/dev/")

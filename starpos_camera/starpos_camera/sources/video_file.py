@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of a video file, each at the time of its place in the file."""
+"""Frames of a video file, each with the time of its place in the file."""
 
 import math
 import os
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +16,11 @@ from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSe
 from starpos_camera.sources.timing import read_utc
 from starpos_interfaces.msg import Capture
 
-BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")  # that a QuickTime or MP4 file may begin with
+if TYPE_CHECKING:
+    from cv2 import VideoCapture
+
+# A QuickTime or MP4 file begins with one of these.
+BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 BEGINNINGS = {
     ".avi": (0, (b"RIFF",)),
     ".mkv": (0, (b"\x1aE\xdf\xa3",)),
@@ -24,21 +30,25 @@ BEGINNINGS = {
 SUFFIXES = tuple(BEGINNINGS)
 MAX_RATE = 1000.0  # frames a second
 MAX_GAP_S = 3600.0  # between frames
-# A frame whose data are cut off or damaged is none; and a file must not lead to the network.
+# Cut-off or damaged frames are dropped, and a file must not lead to the network.
 OPTIONS = "fflags;discardcorrupt|err_detect;explode|protocol_whitelist;file"
 OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 GREY_8, GREY_16 = 0x30303859, 0x10003159  # FFmpeg's tags of pixel formats: Y800, and Y1 of 16 bits
 
 
 class Film:
-    """Plays a file once. A disk that has gone and come back is gone on with, at the next frame."""
+    """Plays a file once. If its disk goes away and comes back, it goes on at the next frame."""
 
-    closing = False  # a frame takes no time
+    # Set by the source; a frame of a file takes no time, so nothing waits for it.
+    closing = False
 
-    def __init__(self, path: str, start: str):
+    def __init__(self, path: str, start: str) -> None:
         self._path = path
-        self._start_s, self._start_resolution_s = read_utc(start)
-        self._capture = None
+        started = read_utc(start)
+        # Video.refusal has checked it.
+        assert started is not None
+        self._start_s, self._start_resolution_s = started
+        self._capture: VideoCapture | None = None
         self._grey = False
         self._period_s = 0.0
         self._taken = 0
@@ -53,7 +63,7 @@ class Film:
             raise CaptureError(f"{self._path}: it is not there; correct video.device, or mount its disk.")
         with quiet() as cv2:
             if self._capture is None:
-                self._open(cv2)
+                self._capture = self._opened(cv2)
             came, pixels = self._capture.read()
             at_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -72,20 +82,21 @@ class Film:
         self._first_s = at_s if not self._taken else self._first_s
         self._last_s = at_s
         self._taken += 1
-        if self._grey and pixels.ndim == 3:  # OpenCV 4.6 makes three of one
+        # OpenCV 4.6 makes three channels of one.
+        if self._grey and pixels.ndim == 3:
             pixels = np.ascontiguousarray(pixels[..., 0])
-        # exposed at some time within its period, for how long is not known
+        # The exposure is somewhere within the period of the frame; its length is not known.
         mid_s = self._start_s + at_s - self._first_s + self._period_s / 2
         stddev_s = math.hypot(self._period_s, self._start_resolution_s) / math.sqrt(12)
         frame = Frame(pixels, mid_unix_s=mid_s, source=self._path, stamp_stddev_s=stddev_s)
         return CapturedFrame(frame, Capture.FILE)
 
-    def close(self):
+    def close(self) -> None:
         if self._capture is not None:
             self._capture.release()
         self._capture = None
 
-    def _open(self, cv2):
+    def _opened(self, cv2: ModuleType) -> "VideoCapture":
         at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
         try:
             with open(self._path, "rb") as file:
@@ -94,7 +105,8 @@ class Film:
             raise CaptureError(
                 f"{self._path}: it cannot be read ({error.strerror}); look after its disk."
             ) from None
-        if head[at : at + 4] not in beginnings:  # FFmpeg takes a playlist of other files by any name
+        # FFmpeg would take a playlist of other files under any name.
+        if head[at : at + 4] not in beginnings:
             raise FrameError(
                 f"{self._path}: this is no {Path(self._path).suffix[1:].upper()} file; convert it to one."
             )
@@ -123,6 +135,7 @@ class Film:
             raise FrameError(
                 f"{self._path}: OpenCV {cv2.__version__} makes 8 bits of its 16; use 4.7 or newer."
             )
-        self._capture, self._period_s = capture, 1 / rate
+        self._period_s = 1 / rate
         for _ in range(self._taken):
             capture.grab()
+        return capture

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files that come into a folder, each once, when it has come to rest. By polling: a network's disks send no events.
+"""New files of a folder, each once, when it is complete. The folder is polled: network disks send no events.
 
-A look costs one stat of the folder and of the files that are being written; the folder is listed only where it has
-changed, and listing takes at most a tenth of the time. Of the files that are there 8 bytes each are remembered.
+A look costs one stat of the folder and of each file that is being written. The folder is listed only if it has changed,
+and listing takes at most a tenth of the time. For each file in the folder 8 bytes are kept.
 """
 
 import os
@@ -14,18 +14,21 @@ from pathlib import Path
 
 import numpy as np
 
-TICK_S = (
-    3.0  # the coarsest time stamps of folders (FAT: 2 s): what comes later in the same tick does not show
-)
-IDLE_S = 60.0  # a listing in spite of an unchanged folder: some network disks do not tell its time
-LISTING_SHARE = 0.1  # of the time, at most
-PATIENCE = 10.0  # a file that cannot be read is given up after so many times the time of rest
-MOST_LOOKED_AT = 200  # files that have come, in one look; the others wait
+# More than the coarsest time stamps of folders (FAT: 2 s): a second change within the same tick does not show.
+TICK_S = 3.0
+# The folder is listed so often even if it seems unchanged: some network disks do not update its time.
+IDLE_S = 60.0
+# Largest share of the time for listing.
+LISTING_SHARE = 0.1
+# A file that cannot be read is given up after so many times the time of rest.
+PATIENCE = 10.0
+# Most new files in one look; the others wait.
+MOST_LOOKED_AT = 200
 
 
 @dataclass(frozen=True)
 class NewFile:
-    """A file that has come: its size (-1: not looked at) and time, since when it has had them, whether it was tried."""
+    """A new file: its size (-1: not looked at yet) and time, since when both are unchanged, whether reading was tried."""
 
     size: int
     modified_ns: int
@@ -34,10 +37,10 @@ class NewFile:
 
 
 class WatchedFolder:
-    """New files of a folder. What is there at the first look is not new; a folder that comes later is new altogether.
+    """Finds the new files of a folder. Files that are there at the first look are not new.
 
-    A name counts once; where the folder itself has gone and another is in its place (a disk that is mounted again), what
-    is older than the newest file that was taken is not new.
+    If the folder itself comes later, all its files are new. A name counts once. If another folder takes its place (a
+    disk is mounted again), only files newer than the newest one taken so far are new.
     """
 
     def __init__(
@@ -46,23 +49,25 @@ class WatchedFolder:
         wanted: Callable[[str], bool],
         rest_s: float,
         clock: Callable[[], float] = time.monotonic,
-    ):
-        """wanted: whether a name is a frame's; rest_s: a file is whole once it has not changed for so long."""
+    ) -> None:
+        """Watch a folder; wanted: whether a name is that of a frame; rest_s: a file unchanged for so long is complete."""
         self._folder, self._wanted, self._rest_s, self._clock = folder, wanted, rest_s, clock
         self._arrivals: dict[str, NewFile] = {}
         self._known = np.zeros(0, np.int64)  # hashes of the names of the last listing
         self._is: tuple[int, int] | None = None  # the folder's device and inode
-        self._modified_ns = 0  # the folder's time, and when it was seen to change
+        # The folder's time, and when it was seen to change.
+        self._modified_ns = 0
         self._changed_s = -np.inf
+        # When the folder was listed last, and how long that took.
         self._listed_s = -np.inf
-        self._listing_s = 0.0  # how long it took
-        # time of the newest file that is new no more; None before the first look
+        self._listing_s = 0.0
+        # Time of the newest file that is not new any more; None before the first look.
         self._newest_ns: int | None = None
 
     def next(self) -> tuple[Path, bool] | None:
-        """The oldest file at rest, and whether it is its last chance; None: there is none.
+        """Return the oldest complete file, and whether this is its last chance; None if there is none.
 
-        It is to be followed by `try_again` or `done`. OSError where there is no such folder.
+        Call `try_again` or `done` afterwards. Raises OSError if there is no such folder.
         """
         self._look()
         now = self._clock()
@@ -78,28 +83,29 @@ class WatchedFolder:
         return self._folder / name, tried
 
     def at_rest(self, path: Path) -> bool:
-        """Whether it is as it was when `next` gave it."""
+        """Whether a file is unchanged since `next` returned it."""
         before = self._arrivals[path.name]
         self._follow(path.name, before)
         return self._arrivals.get(path.name) == before
 
-    def try_again(self, path: Path):
-        """It could not be read: it may be still on its way."""
+    def try_again(self, path: Path) -> None:
+        """Note that a file could not be read: it may be incomplete."""
         if path.name in self._arrivals:
             self._arrivals[path.name] = replace(self._arrivals[path.name], tried=True)
 
-    def done(self, path: Path):
-        """It has been taken, or given up."""
+    def done(self, path: Path) -> None:
+        """Note that a file has been taken, or given up."""
         arrival = self._arrivals.pop(path.name)
         self._newest_ns = max(self._newest_ns or 0, min(arrival.modified_ns, time.time_ns()))
 
-    def _look(self):
-        """Take note of what has come, and of what of it is at rest."""
+    def _look(self) -> None:
+        """Look for new files, and for changes of those that are known."""
         try:
             status = os.stat(self._folder)
         except OSError:
             if self._newest_ns is None:
-                self._newest_ns = 0  # all that comes is new
+                # All files that come are new.
+                self._newest_ns = 0
             self._modified_ns = 0
             raise
         now = self._clock()
@@ -112,30 +118,32 @@ class WatchedFolder:
         for name, arrival in list(self._arrivals.items())[:MOST_LOOKED_AT]:
             self._follow(name, arrival)
 
-    def _list(self, status):
+    def _list(self, status: os.stat_result) -> None:
         begin = self._clock()
         names = sorted(filter(self._wanted, os.listdir(self._folder)))
         hashes = np.fromiter(map(hash, names), np.int64, len(names))
         same = self._is == (status.st_dev, status.st_ino)
-        if self._newest_ns is None:
-            new, self._newest_ns = [], status.st_mtime_ns
+        newest_ns = self._newest_ns
+        new: list[str] = []
+        if newest_ns is None:
+            self._newest_ns = status.st_mtime_ns
         elif same:
             new = [names[k] for k in np.flatnonzero(~np.isin(hashes, self._known))]
         else:
-            new = [name for name in names if self._is_newer(name)]
+            new = [name for name in names if self._is_newer(name, newest_ns)]
         for name in new:
             self._arrivals.setdefault(name, NewFile(-1, 0, begin))
         self._known, self._is = hashes, (status.st_dev, status.st_ino)
         self._listed_s, self._listing_s = begin, self._clock() - begin
 
-    def _is_newer(self, name):
+    def _is_newer(self, name: str, than_ns: int) -> bool:
         try:
-            return os.stat(self._folder / name).st_mtime_ns > self._newest_ns
+            return os.stat(self._folder / name).st_mtime_ns > than_ns
         except OSError:
             return False
 
-    def _follow(self, name, arrival):
-        """Whether it has changed since the last look; what is no file any more is forgotten."""
+    def _follow(self, name: str, arrival: NewFile) -> None:
+        """Note changes of a file since the last look; forget it if it is no file any more."""
         try:
             status = os.stat(self._folder / name)
         except OSError:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The faults that tools/faults/fault_soak.py injects: each a function that sends something bad into the graph.
 
-Its docstring is what the table says.  A fault may only do what the numbers can tell to be wrong: a stamp, a tilt or a
-pointing that is off by itself, with no earlier frame to contradict it, makes a wrong fix anywhere; see UNTOLD.
+The table prints its docstring.  A fault may only do what the data can show to be wrong. A single wrong stamp, tilt or
+pointing that no earlier frame contradicts makes a wrong fix in any instrument; see UNTOLD.
 """
 
 import math
@@ -42,7 +42,7 @@ KINDS: list[Kind] = []
 
 
 def kind(weight: float):
-    """Registers a function as a Kind."""
+    """Register a function as a Kind."""
 
     def register(inject):
         KINDS.append(Kind(inject.__name__.replace("_", " "), weight, inject))
@@ -52,11 +52,11 @@ def kind(weight: float):
 
 
 def shift(messages, seconds: float):
-    """Move their stamps, not below 1 s."""
+    """Move the stamps of messages, not below 1 s."""
     for m in messages:
         m.header.stamp = unix_to_stamp(max(stamp_to_unix(m.header.stamp) + seconds, 1.0))
 
 
 def some_time(w: World, least=2.0, most=1e6) -> float:
-    """Seconds, evenly over the decades."""
+    """Draw seconds, evenly over the decades."""
     return float(np.exp(w.rng.uniform(math.log(least), math.log(most))))

@@ -8,7 +8,7 @@ from kinds.registry import kind, shift, some_time
 
 
 def send_as_exposed(w: World, shot):
-    """Its tilts come while it is exposed, the stars after: where times repeat that is what tells them apart."""
+    """Send the tilts during the exposure and the stars after it: that order distinguishes them if times repeat."""
     w.tick()
     w.tilts(shot)
     w.spin(0.02)

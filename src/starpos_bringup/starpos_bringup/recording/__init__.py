@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night into a rosbag2, and from one into the graph."""
+"""Recording of a night as a rosbag2, and playing it into the graph."""

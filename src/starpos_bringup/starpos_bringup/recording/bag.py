@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rosbag2 holds, read by `rosbags`: its topics with the message types of this workspace, and its messages."""
+"""Topics and messages of a rosbag2, read by `rosbags`, with the message types of this workspace."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
-LAST_NS = (2**31 - 1) * 10**9  # the latest time that a Clock message holds
+# The latest time that a Clock message can hold.
+LAST_NS = (2**31 - 1) * 10**9
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Topic:
 class Bag:
     """A bag to play; everything in it is checked before it is used."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path) -> None:
         self.path = path
         self._reader = BagReader(path)
 
@@ -42,7 +43,7 @@ class Bag:
         self._reader.__exit__(*exception)
 
     def inputs(self, needed: str, others: tuple[str, ...]) -> list[str]:
-        """The topics of these relative names, in whatever namespace; raises BagError if the needed one is missing."""
+        """Find the topics of these relative names in any namespace; raises BagError if the needed one is missing."""
         names = sorted({c.topic for c in self._reader.connections})
         if not any(name.endswith("/" + needed) for name in names):
             raise BagError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
@@ -51,7 +52,7 @@ class Bag:
         ]
 
     def topics(self, wanted: list[str] | None, left_out: Callable[[str], None]) -> dict[int, Topic]:
-        """The topics that can be played, by connection; `left_out` gets a sentence for each other one.
+        """Find the topics that can be played, by connection; `left_out` gets a sentence for each other topic.
 
         Raises BagError if one of the `wanted` (None: all) is not in the bag, or if nothing remains.
         """
@@ -74,7 +75,7 @@ class Bag:
         return topics
 
     def messages(self, topics: dict[int, Topic]) -> Iterator[tuple[Topic, int, bytes]]:
-        """(topic, log time in ns, bytes) in the bag's order; raises BagError if the file breaks off."""
+        """Read (topic, log time in ns, bytes) in the bag's order; raises BagError if the file breaks off."""
         connections = [c for c in self._reader.connections if c.id in topics]
         for connection, log_ns, data in self._reader.messages(connections):
             if not 0 <= log_ns <= LAST_NS:
@@ -85,7 +86,7 @@ class Bag:
 
 
 def _topic(connection: "Connection") -> Topic:
-    """The topic of a connection; raises BagError if this workspace has not its type, or another of the same name."""
+    """Make the topic of a connection; raises BagError if its type is not installed here, or differs."""
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -105,7 +106,7 @@ def _topic(connection: "Connection") -> Topic:
 
 
 def _message_class(name: str) -> type:
-    """The class of an installed message type; nothing is imported that is not one."""
+    """Find the class of an installed message type; imports nothing else."""
     from importlib import import_module
 
     from ament_index_python.resources import get_resource
@@ -123,7 +124,7 @@ def _message_class(name: str) -> type:
 
 
 def _type_hash(name: str) -> str:
-    """The hash of an installed type's description; '' if it was installed without."""
+    """Read the hash of an installed type's description; '' if it was installed without one."""
     import json
 
     from ament_index_python.packages import get_package_share_directory

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rosbag2 (mcap, zstd) of serialized messages, written by `rosbags` with the message types that are installed here."""
+"""Writing of a rosbag2 (mcap, zstd) through `rosbags`, with the message types that are installed here."""
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ament_index_python.packages import get_package_share_directory
 
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection, Qos
+
 
 class BagWriteError(Exception):
-    """One sentence: what, where, what to do."""
+    """A bag cannot be written; the text is one sentence."""
 
 
 class BagWriter:
-    """Messages as they are, compressed; the folder is a bag once it is closed.
+    """Writes serialized messages unchanged, compressed; the folder is a bag once it is closed.
 
-    Raises BagError where rosbags is not installed, the folder is there already, or cannot be made.
+    Raises BagWriteError if rosbags is not installed, or if the folder exists already or cannot be made.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path) -> None:
         try:
             from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
             from rosbags.typesys import Stores, get_typestore
@@ -26,7 +30,7 @@ class BagWriter:
         self.folder, self.count = folder, 0
         self.store = get_typestore(Stores.ROS2_JAZZY)
         self._known: set[str] = set()
-        self._connections = {}
+        self._connections: dict[str, Connection] = {}
         try:
             self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -36,7 +40,7 @@ class BagWriter:
         except OSError as error:
             raise BagWriteError(f"{folder}: no bag can be made there ({error.strerror})") from None
 
-    def add_topic(self, topic: str, type_name: str, latched: bool = False):
+    def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
         """Declare a topic before its first message; type_name as 'sensor_msgs/msg/Imu'."""
         if topic not in self._connections:
             self._learn(type_name)
@@ -44,8 +48,8 @@ class BagWriter:
                 topic, type_name, typestore=self.store, offered_qos_profiles=[offered_qos(latched)]
             )
 
-    def write(self, topic: str, log_ns: int, data: bytes):
-        """A serialized message; BagError where the disk does not take it."""
+    def write(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Write a serialized message; BagWriteError if the disk does not take it."""
         try:
             self._writer.write(self._connections[topic], log_ns, data)
         except OSError as error:
@@ -54,8 +58,8 @@ class BagWriter:
             ) from None
         self.count += 1
 
-    def close(self):
-        """Make it a bag. Where even that fails, BagError."""
+    def close(self) -> None:
+        """Finish the bag; BagWriteError if that fails."""
         try:
             self._writer.close()
         except OSError as error:
@@ -63,8 +67,8 @@ class BagWriter:
                 f"{self.folder}: its end cannot be written ({error.strerror}): `mcap recover` gets back what is in it"
             ) from None
 
-    def _learn(self, type_name: str):
-        """Have the definition of a type, and of those in it, as it is installed."""
+    def _learn(self, type_name: str) -> None:
+        """Register the installed definition of a type, and of the types in it."""
         from rosbags.typesys import get_types_from_msg
 
         if type_name in self.store.fielddefs or type_name in self._known:
@@ -78,8 +82,8 @@ class BagWriter:
         self.store.register(get_types_from_msg(text, type_name))
 
 
-def offered_qos(latched: bool = False):
-    """A reliable publisher's, as a bag describes it."""
+def offered_qos(latched: bool = False) -> "Qos":
+    """Make the QoS of a reliable publisher, as a bag describes it."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     endless = QosTime(9223372036, 854775807)

@@ -6,11 +6,17 @@ For machines without `ros2 bag record`; the bag is one that `ros2 bag play`, `re
 
 import argparse
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starpos_bringup.recording.bag_writer import BagWriteError, BagWriter
 
-TOPICS = {  # relative name: type
+if TYPE_CHECKING:
+    from starpos_bringup.recording.recorder import Recorder
+
+# Types by relative names.
+TOPICS = {
     "camera/camera_info": "sensor_msgs/msg/CameraInfo",
     "camera/capture": "starpos_interfaces/msg/Capture",
     "stars": "starpos_interfaces/msg/StarArray",
@@ -26,7 +32,7 @@ SAVED, BROKEN_OFF, REFUSED = 0, 1, 2  # exit statuses
 
 
 def record() -> int:
-    """The executable."""
+    """Run the executable."""
     from starpos_common.node_main import run
 
     k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
@@ -37,9 +43,9 @@ def record() -> int:
     except BagWriteError as error:
         say(str(error))
         return REFUSED
-    recorders = []
+    recorders: list[Recorder] = []
 
-    def make_nodes():
+    def make_nodes() -> "Iterator[Recorder]":
         from starpos_bringup.recording.recorder import Recorder
 
         recorders.append(Recorder(writer, topics, say))

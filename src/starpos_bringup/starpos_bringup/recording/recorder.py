@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `record`: what comes on topics into a bag."""
+"""The node `record`: writes the messages of topics to a bag."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -13,17 +13,19 @@ from starpos_bringup.recording.bag_writer import BagWriteError, BagWriter
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.topics import subscription
 
-LITTLE_BYTES = 1_000_000_000  # left on the disk
-DEPTH, IMAGE_DEPTH = 1000, 3  # an image may have 42 MB
+# With less left on the disk there is a warning.
+LITTLE_BYTES = 1_000_000_000
+# An image may have 42 MB.
+DEPTH, IMAGE_DEPTH = 1000, 3
 
 
 class Recorder(Node):
-    """Writes each message as it comes, with the node's time; ends the program where the bag takes no more.
+    """Writes each message as it comes, with the node's time; ends the program if the bag cannot be written any more.
 
-    topics: relative name to type.  say: takes a sentence for the person at the terminal.
+    topics: types by relative names.  say: takes a sentence for the person at the terminal.
     """
 
-    def __init__(self, writer: BagWriter, topics: Mapping[str, str], say: Callable[[str], None]):
+    def __init__(self, writer: BagWriter, topics: Mapping[str, str], say: Callable[[str], None]) -> None:
         super().__init__("record", start_parameter_services=False)
         self.trouble = ""  # why the recording broke off
         self._writer, self._say = writer, say
@@ -38,7 +40,7 @@ class Recorder(Node):
         self._diagnostics = Diagnostics(self, {"Bag": self._report}, str(writer.folder))
         say(f"{writer.folder}: recording {len(topics)} topics until Ctrl-C")
 
-    def destroy_node(self):
+    def destroy_node(self) -> None:
         super().destroy_node()
         try:
             self._writer.close()
@@ -47,7 +49,7 @@ class Recorder(Node):
             self.trouble = str(error)
             self._say(self.trouble)
 
-    def _keep(self, name: str, topic: str, data: bytes):
+    def _keep(self, name: str, topic: str, data: bytes) -> None:
         if self.trouble:
             return
         try:

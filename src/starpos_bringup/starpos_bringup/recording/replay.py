@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ros2 run starpos_bringup replay BAG`: a rosbag2 into the running graph, byte for byte, with its own time on /clock.
+"""`ros2 run starpos_bringup replay BAG`: play a rosbag2 into the running graph, byte for byte, with its time on /clock.
 
-For machines without `ros2 bag play`, and for what that cannot do: as fast as the solver answers, with the same result.
+For machines without `ros2 bag play`, and to play as fast as the solver answers, with the same result, which that cannot.
 """
 
 import argparse
@@ -9,32 +9,42 @@ import math
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from starpos.errors import BagError, StarposError
 from starpos_bringup.recording.bag import Bag, Topic
 
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.publisher import Publisher
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PLAYED, CUT_SHORT, REFUSED = 0, 1, 2  # exit statuses
 FRAMES = ("sensor_msgs/msg/Image", "starpos_interfaces/msg/StarArray")
-HELD = (*FRAMES, "sensor_msgs/msg/CameraInfo")  # what must not overtake the solution of the frame before
+# These must not overtake the solution of the frame before.
+HELD = (*FRAMES, "sensor_msgs/msg/CameraInfo")
 SOLUTION = "solver/solution"
-INPUTS = {  # the one there must be, and others
+# The topic that must be there, and others.
+INPUTS = {
     "stars": ("stars", ("camera/camera_info", "tilt")),
     "images": ("camera/image_raw", ("camera/camera_info", "camera/capture", "tilt")),
 }
 WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 CLOCK_PERIOD_S = 0.025
-ANSWER_S = 3.0  # the solver's own patience with a frame is far shorter
-UNANSWERED = 3  # frames of a topic in a row, until nothing is expected of it
+# The solver's own patience with a frame is far shorter.
+ANSWER_S = 3.0
+# After so many frames of a topic in a row without an answer none is expected any more.
+UNANSWERED = 3
 ACKNOWLEDGED_S = 3.0
-# at rate 0: no faster than subscribers' queues of some hundred messages are emptied
+# At rate 0: no faster than subscribers empty their queues of some hundred messages.
 BURST, BURST_REST_S = 100, 0.05
 
 
 def replay() -> int:
-    """The executable."""
-    stopped = []
+    """Run the executable."""
+    stopped: list[int] = []
     for number in SIGNALS:
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     try:
@@ -44,8 +54,8 @@ def replay() -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
-def main(arguments: list[str], stopped: list) -> int:
-    """Play until the end, or until `stopped`, filled by a signal handler, is not empty; the exit status."""
+def main(arguments: list[str], stopped: list[int]) -> int:
+    """Play to the end, or until a signal handler puts something into `stopped`; return the exit status."""
     ours, ros = _split(arguments)
     options = _parser().parse_args(ours)
     try:
@@ -59,7 +69,7 @@ def main(arguments: list[str], stopped: list) -> int:
 
 
 def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """What is ours, and what is rclpy's: from `--ros-args` on."""
+    """Split the arguments into ours and rclpy's, which begin with `--ros-args`."""
     k = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     return arguments[:k], arguments[k:]
 
@@ -108,17 +118,20 @@ def _say(sentence: str) -> None:
     print(f"replay: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
 
 
-def _play(bag: Bag, topics: dict[int, Topic], options, ros: list[str], stopped: list) -> int:
+def _play(
+    bag: Bag, topics: dict[int, Topic], options: argparse.Namespace, ros: list[str], stopped: list[int]
+) -> int:
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
-    # Frames have a participant of their own, as a camera has: they would fill the shared memory of the others, whose
-    # lost messages come again only a second later.
+    # Frames have a participant of their own, as a camera has. Otherwise they would fill the shared memory of the other
+    # messages, and a lost message is repeated only a second later.
     contexts = rclpy.Context(), rclpy.Context()
     try:
         for context in contexts:
             rclpy.init(args=ros, context=context, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # a bad --ros-args; rcl has an error class for each
+    except Exception as error:
+        # The --ros-args are wrong; rcl has an error class for each.
         raise StarposError(str(error)) from None
     try:
         player = Player(topics.values(), options.rate, stopped, contexts)
@@ -131,7 +144,9 @@ def _play(bag: Bag, topics: dict[int, Topic], options, ros: list[str], stopped: 
             context.try_shutdown()
 
 
-def _rounds(player: "Player", bag: Bag, topics: dict[int, Topic], options, stopped: list) -> int:
+def _rounds(
+    player: "Player", bag: Bag, topics: dict[int, Topic], options: argparse.Namespace, stopped: list[int]
+) -> int:
     patience_s = WAIT_FOR_INPUTS_S if options.inputs else WAIT_S
     player.wait_for_subscribers(patience_s if options.wait is None else options.wait)
     begin, status = time.monotonic(), PLAYED
@@ -155,9 +170,11 @@ def _rounds(player: "Player", bag: Bag, topics: dict[int, Topic], options, stopp
 
 
 class Player:
-    """Publishers for a bag's topics, and the patience to play at the pace that was asked for."""
+    """Publishes the topics of a bag at the wanted pace."""
 
-    def __init__(self, topics, rate: float, stopped: list, contexts):
+    def __init__(
+        self, topics: Iterable[Topic], rate: float, stopped: list[int], contexts: "tuple[Context, Context]"
+    ) -> None:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
         from rosgraph_msgs.msg import Clock
@@ -176,7 +193,8 @@ class Player:
         self._publishers = {t.name: self._publisher(t) for t in topics}
         self._frame_topics = [t.name for t in topics if t.type_name in FRAMES]
         self._answers = 0
-        self._awaited: tuple[str, tuple[int, int]] | None = None  # topic and stamp of the frame that is out
+        # Topic and stamp of the frame whose solution has not come yet.
+        self._awaited: tuple[str, tuple[int, int]] | None = None
         self._unanswered: dict[str, int] = {}
         self._solution_topic = self._node.resolve_topic_name(SOLUTION)
         if rate == 0 and self._solution_topic not in self._publishers:
@@ -184,18 +202,19 @@ class Player:
         self._show = sys.stderr.isatty()
         self._shown_s = 0.0
 
-    def _publisher(self, topic: Topic):
+    def _publisher(self, topic: Topic) -> "Publisher":
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
-        large = topic.type_name.endswith("Image")  # 42 MB each
+        # An image may have 42 MB.
+        large = topic.type_name.endswith("Image")
         durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
         profile = QoSProfile(depth=2 if large else 1000, durability=durability)
         return (self._frame_node if large else self._node).create_publisher(topic.kind, topic.name, profile)
 
-    def _listen(self):
+    def _listen(self) -> None:
         from starpos_interfaces.msg import Solution
 
-        def hear(message):
+        def hear(message: Any) -> None:
             stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
             if self._awaited and stamp == self._awaited[1]:
                 self._unanswered[self._awaited[0]] = 0
@@ -203,8 +222,8 @@ class Player:
 
         self._node.create_subscription(Solution, SOLUTION, hear, 10)
 
-    def wait_for_subscribers(self, at_most_s: float):
-        """Until every topic has one, or the time is up; and say who is deaf, or speaks as well."""
+    def wait_for_subscribers(self, at_most_s: float) -> None:
+        """Wait until every topic has a subscriber, or the time is over; then report missing ones and other publishers."""
         every = [*self._publishers.values(), self._clock]
         self._spin(at_most_s, lambda: all(p.get_subscription_count() for p in every))
         heard = [n for n in self._frame_topics if self._publishers[n].get_subscription_count()]
@@ -219,17 +238,19 @@ class Player:
                 f"{', '.join(doubled)} is published by another node too: both are heard; --topics leaves it out"
             )
 
-    def start_round(self):
-        self._now_ns = self._first_ns = None
+    def start_round(self) -> None:
+        self._now_ns: int | None = None
+        self._first_ns: int | None = None
         self._begin_s = time.monotonic()
 
-    def play(self, topic: Topic, log_ns: int, data: bytes):
+    def play(self, topic: Topic, log_ns: int, data: bytes) -> None:
         """Publish one message when its time has come; a broken one is counted and left out."""
         from rclpy.serialization import deserialize_message
 
         try:
             message = deserialize_message(data, topic.kind)
-        except Exception:  # RMWError, or whatever a conversion makes of hostile bytes
+        except Exception:
+            # Besides RMWError, hostile bytes may cause any error of a conversion.
             self.broken += 1
             if self.broken == 1:
                 _say(f"a message of {topic.name} is broken and left out, as are others like it")
@@ -246,13 +267,13 @@ class Player:
             self._spin(BURST_REST_S)
         self._progress()
 
-    def _pace(self, topic: Topic, log_ns: int):
+    def _pace(self, topic: Topic, log_ns: int) -> None:
         if self._first_ns is None:
             self._first_ns = log_ns
         if self._rate == 0 and topic.type_name in HELD:
             self._hold()
         while self._rate and not self._stopped:
-            # time never goes back within a round, even where a bag's messages do
+            # Time never goes back within a round, even if the times of a bag's messages do.
             elapsed_ns = max(log_ns - self._first_ns, 0)
             left_s = self._begin_s + elapsed_ns * 1e-9 / self._rate - time.monotonic()
             if left_s <= 0:
@@ -262,8 +283,8 @@ class Player:
             self._tick(min(self._first_ns + passed_ns, log_ns))
         self._tick(log_ns)
 
-    def _hold(self):
-        """Until the solution of the frame that is out has come; not for ever, and not where none ever comes."""
+    def _hold(self) -> None:
+        """Wait for the solution of the last frame, but not for ever, and not if the solver never answers."""
         if self._awaited is None:
             return
         topic = self._awaited[0]
@@ -274,7 +295,7 @@ class Player:
             self._unanswered[topic] = self._unanswered.get(topic, 0) + 1
         self._awaited = None
 
-    def _tick(self, now_ns: int):
+    def _tick(self, now_ns: int) -> None:
         if self._now_ns is not None and now_ns <= self._now_ns:
             return
         self._now_ns = now_ns
@@ -282,7 +303,7 @@ class Player:
         message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
         self._clock.publish(message)
 
-    def _spin(self, seconds: float, until=lambda: False) -> bool:
+    def _spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         end = time.monotonic() + seconds
         while not self._stopped and not until():
             left_s = end - time.monotonic()
@@ -291,12 +312,14 @@ class Player:
             self._executor.spin_once(timeout_sec=min(left_s, 0.05))
         return True
 
-    def _progress(self):
+    def _progress(self) -> None:
+        if self._now_ns is None or self._first_ns is None:
+            return
         if self._show and time.monotonic() - self._shown_s >= 1.0:
             self._shown_s = time.monotonic()
             _say(f"{(self._now_ns - self._first_ns) * 1e-9:.0f} s of the bag, {self.count} messages")
 
-    def finish(self):
+    def finish(self) -> None:
         """Let the last messages arrive, and the last frame be answered, before the publishers go."""
         from rclpy.duration import Duration
 
@@ -307,7 +330,7 @@ class Player:
         for publisher in (*self._publishers.values(), self._clock):
             publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
 
-    def close(self):
+    def close(self) -> None:
         self._executor.shutdown()
         self._node.destroy_node()
         self._frame_node.destroy_node()
