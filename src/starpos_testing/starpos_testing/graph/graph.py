@@ -110,7 +110,7 @@ class Graph:
             self.diagnostics.setdefault(status.name, []).append((time.monotonic(), status))
 
     def hear(self, kind, topic, qos=100) -> list:
-        heard = []
+        heard: list = []
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
