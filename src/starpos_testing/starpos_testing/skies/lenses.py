@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from starpos import rotation
-from starpos.calibration.intrinsics import Sighting
+from starpos.calibration.camera_adjustment import Sighting
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
 from starpos.simulation.scene import Optics, detected, expose, scene_of
