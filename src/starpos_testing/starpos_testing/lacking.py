@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a test does without the program or the package that it runs against."""
+"""Skips tests whose program or package is not on this machine."""
 
 import os
 from importlib.util import find_spec
@@ -10,7 +10,7 @@ PYPI = {"alpaca": "alpyca", "alpaca_simulators": "alpaca-simulators"}  # package
 
 
 def lacks(package: str, install: str = "sudo apt-get install") -> None:
-    """Skip the test: this machine lacks what the package has. Where STARPOS_COMPLETE is set, as in CI, it fails."""
+    """Skip the test, because this machine lacks a package; with STARPOS_COMPLETE set, as in CI, the test fails."""
     refuse = pytest.fail if os.environ.get("STARPOS_COMPLETE") else pytest.skip
     refuse(f"not on this machine: {install} {package}")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tests that ament's packages carry: a package's test_linters.py imports them, they judge the package it is in."""
+"""Tests that run ament's linters on a package: its test_linters.py imports them."""
 
 import shutil
 import subprocess
@@ -11,19 +11,20 @@ import pytest
 from starpos_testing.lacking import lacks
 
 FLAKE8 = Path(__file__).with_name("flake8.ini")
-PEP257 = ["D213", "D401", "D403", "D415"]  # beyond ament's own: see flake8.ini; D415 is D400 once more
+# rules to leave out besides ament's own, see flake8.ini; D415 repeats D400
+PEP257 = ["D213", "D401", "D403", "D415"]
 
 
 @pytest.fixture
 def package(request, monkeypatch) -> Path:
-    """The package's folder, where ament's linters look for what they are to leave out."""
+    """The package's folder, as the working directory: ament's linters look there for files to leave out."""
     folder = request.path.parents[1]
     monkeypatch.chdir(folder)
     return folder
 
 
 def test_copyright(package):
-    """ament_copyright wants a holder's name and the licence's words in each file; here one line names it (SPDX)."""
+    """Each file names the licence in one line (SPDX), instead of the header that ament_copyright wants."""
     line = f"SPDX-License-Identifier: {ElementTree.parse(package / 'package.xml').findtext('license')}"
     sources = [f for ending in ("py", "c", "h") for f in package.rglob(f"*.{ending}")]
     assert sources
@@ -49,7 +50,7 @@ def test_pep257(package, capsys):
 
 
 def test_xmllint(package):
-    """As ament_xmllint does, but for the schema, which it fetches from the network."""
+    """Checks XML like ament_xmllint, but without the schema, which that fetches from the network."""
     if shutil.which("xmllint") is None:
         lacks("libxml2-utils")
     files = [str(f) for f in package.rglob("*.xml")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""For the nodes' own tests: a node as a process, and someone who listens to it; it waits for events, never sleeps."""
+"""Helpers for the tests of a node: the node as a process, and a listener that waits for events and never sleeps."""
 
 import atexit
 import os
@@ -34,7 +34,7 @@ def take_domain() -> None:
 
 
 class Listener:
-    """A node that keeps what it hears and waits for what it wants; `states` are the newest diagnostics by name."""
+    """A node that keeps the messages it hears and waits for conditions; states: the newest diagnostics by name."""
 
     def __init__(self):
         self._context = rclpy.Context()
@@ -54,8 +54,8 @@ class Listener:
         self.states |= {status.name: status for status in message.status}
 
     def hear(self, kind, topic: str, depth: int = 10) -> list:
-        """A list that the topic's messages are appended to."""
-        heard = []
+        """Subscribe to a topic; returns the list that its messages are appended to."""
+        heard: list = []
         self.node.create_subscription(kind, topic, heard.append, depth)
         return heard
 
@@ -66,7 +66,7 @@ class Listener:
             self._executor.spin_once(timeout_sec=0.1)
 
     def wait_for_state(self, name: str, level: int, text: str = "") -> dict[str, str]:
-        """The values of the next diagnostic of that name that has the level and the text in its sentence."""
+        """Wait for the next diagnostic of a name with this level and this text in its sentence; returns its values."""
         self.states.pop(name, None)
 
         def come():
@@ -77,7 +77,7 @@ class Listener:
         return {v.key: v.value for v in self.states[name].values}
 
     def call(self, kind, name: str, request):
-        """The answer of a service."""
+        """Call a service; returns its answer."""
         client = self.node.create_client(kind, name)
         self.wait(client.service_is_ready)
         future = client.call_async(request)
@@ -85,14 +85,14 @@ class Listener:
         return future.result()
 
     def set(self, node: str, **values):
-        """Set a node's parameters, all or none; a SetParametersResult."""
+        """Set a node's parameters, all or none; returns the SetParametersResult."""
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         request = SetParametersAtomically.Request(parameters=parameters)
         return self.call(SetParametersAtomically, f"/{node}/set_parameters_atomically", request).result
 
 
 class Process:
-    """The function `executable` of a module as a program of its own."""
+    """The function `executable` of a module, run as a program."""
 
     def __init__(self, module: str, executable: str, parameters, namespace: str = "/"):
         program = f"import sys; from {module} import {executable}; sys.exit({executable}())"
@@ -105,14 +105,14 @@ class Process:
         )
 
     def end(self, *signals) -> tuple[int, str]:
-        """Send the signals; the exit status and all output."""
+        """Send the signals; returns the exit status and all output."""
         for number in signals:
             self._process.send_signal(number)
         out, _ = self._process.communicate(timeout=WAIT_S)
         return self._process.returncode, out
 
     def kill(self):
-        """Whatever a test has left of it."""
+        """Kill the program if a test has left it running."""
         if self._process.poll() is None:
             self._process.kill()
         self._process.communicate()  # which closes the pipe

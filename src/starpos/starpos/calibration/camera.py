@@ -10,15 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.calibration.camera_adjustment import PARAMETERS, Sighting, unbent
 from starpos.calibration.intrinsics import (
-    PARAMETERS,
     Intrinsics,
-    Sighting,
     check_invertible,
     check_sound,
     fewest_stars,
     fit_camera,
-    unbent,
 )
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError

@@ -205,7 +205,7 @@ def hang(
 
 @dataclass(frozen=True)
 class _Known:
-    """What is known before the fit: the zenith (3,) or None, its sigma, and the sigma of A3's turn, in rad."""
+    """Prior knowledge of the fit: the zenith (3,) or None, its sigma, and the sigma of A3's turn, in rad."""
 
     zenith: np.ndarray | None = None
     zenith_sigma: float = np.inf

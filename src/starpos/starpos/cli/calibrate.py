@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from starpos.calibration.camera import FromSky, calibrate_camera
-from starpos.calibration.intrinsics import PARAMETERS, UNLEVELLED, UNTIMED, Intrinsics, rms
+from starpos.calibration.camera_adjustment import PARAMETERS, UNLEVELLED, UNTIMED
+from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError

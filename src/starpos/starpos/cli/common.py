@@ -297,14 +297,26 @@ def complain(command: str, error: StarposError | str) -> None:
     print(f"starpos {command}: {error}", file=sys.stderr)
 
 
-def tell_extrapolation(command: str, fixes: Sequence[tuple[Fix, float]]) -> None:
-    """Complain about the fix of the most days beyond the IERS table, if there is one.  fixes: with their days."""
-    fix, days = max(fixes, key=lambda f: f[1], default=(None, 0.0))
-    if fix is not None and days > 0:
-        (ut1,) = (t for t in fix.terms if t.name == "ut1")
+class HasFix(Protocol):
+    """The fix of a frame, and how many days beyond the IERS table its date lies."""
+
+    @property
+    def fix(self) -> Fix | None:
+        """The fix; None without one."""
+
+    @property
+    def extrapolated_days(self) -> float:
+        """Days beyond the table; 0 within it."""
+
+
+def tell_extrapolation(command: str, solved: Sequence[HasFix]) -> None:
+    """Complain once about all fixes beyond the IERS table: the days and the error of the worst."""
+    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
+    if worst is not None and worst.fix is not None and worst.extrapolated_days > 0:
+        (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
         complain(
             command,
-            f"the Earth's rotation is extrapolated {days:.0f} days beyond the IERS table, "
+            f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
             f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data",
         )
 

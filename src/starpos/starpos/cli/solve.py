@@ -146,7 +146,7 @@ def _tell(args: argparse.Namespace, night: NightFolder, rows: Iterable, vertical
             common.print_json({"file": path} | _json_of(answer.fix, vertical) | _json_about(answer))
         else:
             print(_line(path, answer), flush=True)
-    common.tell_extrapolation("solve", [(s.fix, s.extrapolated_days) for s in solved])
+    common.tell_extrapolation("solve", solved)
     together = _combine(night, solved)
     if solved:
         last = solved[-1].fix

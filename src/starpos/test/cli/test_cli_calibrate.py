@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from starpos.calibration.intrinsics import PARAMETERS
+from starpos.calibration.camera_adjustment import PARAMETERS
 from starpos.cli import main
 from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file

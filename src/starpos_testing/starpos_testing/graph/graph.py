@@ -24,7 +24,7 @@ def executable(package: str, name: str) -> str:
 
 
 class Executable:
-    """An executable of this workspace; its output goes to a file, which a pipe nobody reads would block."""
+    """An executable of this workspace as a process; its output goes to a file, as a pipe that nobody reads blocks."""
 
     def __init__(self, log: Path, package: str, name: str, arguments=(), parameters=()):
         options = [word for p in parameters for word in ("-p", p)]
@@ -45,7 +45,7 @@ class Executable:
         return self.process.wait(WAIT_S)
 
     def end(self):
-        """End it in whatever state it is; by a signal it handles, so that it takes its leave of the others."""
+        """End the process in any state, by a signal that it handles, so that the other nodes notice."""
         if self.process.poll() is None:
             self.signal(signal.SIGINT)
         try:
@@ -60,7 +60,7 @@ def stamp_of(message) -> tuple[int, int]:
 
 
 class Graph:
-    """A node with publishers for every input and an ear on every output, kept by stamp."""
+    """A node that publishes all inputs of the graph and keeps all its outputs by stamp."""
 
     def __init__(self):
         self._context = rclpy.Context()
@@ -71,7 +71,7 @@ class Graph:
         self.processes: list[Executable] = []
         self.info = self._publisher(CameraInfo, "camera/camera_info")
         self.capture = self._publisher(Capture, "camera/capture")
-        # a participant of its own, as a camera has: images fill the shared memory, and what is lost comes a second later
+        # a participant of its own, as a camera has: images fill its shared memory, and lost messages come a second later
         self._camera_context = rclpy.Context()
         rclpy.init(context=self._camera_context)
         self._camera = rclpy.create_node("test_camera", context=self._camera_context)
@@ -79,7 +79,8 @@ class Graph:
         self.stars = self._publisher(StarArray, "stars")
         self.tilt = self._publisher(Tilt, "tilt", 1000)
         self.solutions, self.fixes, self.imus = {}, {}, {}
-        self.diagnostics: dict[str, list] = {}  # (seconds, status) by name
+        # by name: (seconds, status)
+        self.diagnostics: dict[str, list] = {}
         self._ears = [
             self._keep(Solution, "solver/solution", self.solutions),
             self._keep(NavSatFix, "fix", self.fixes),
@@ -110,7 +111,7 @@ class Graph:
             self.diagnostics.setdefault(status.name, []).append((time.monotonic(), status))
 
     def hear(self, kind, topic, qos=100) -> list:
-        heard = []
+        heard: list = []
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
@@ -119,7 +120,7 @@ class Graph:
         return self.processes[-1]
 
     def comes(self, condition, seconds: float) -> bool:
-        """Whether it comes true within so many seconds."""
+        """Whether a condition becomes true within so many seconds."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
@@ -133,7 +134,7 @@ class Graph:
             raise AssertionError(f"waited {WAIT_S:g} s in vain {why}\n{tails}")
 
     def wait_for_solver(self):
-        """Until it hears our publishers and we hear its; before a detector is there."""
+        """Wait until the solver hears our publishers and we hear its; call it before a detector is there."""
 
         def counts():
             ears = [e.get_publisher_count() for e in self._ears]
@@ -143,7 +144,7 @@ class Graph:
             raise AssertionError(f"the solver is not there, or there are two: {counts()}")
 
     def wait_for_detector(self, photograph):
-        """Until an image that is sent comes back as a solution: nobody else knows that detector and solver met."""
+        """Wait until an image comes back as a solution, which is the only proof that detector and solver have met."""
         self.wait(lambda: self.image.get_subscription_count() and self.capture.get_subscription_count())
         for _ in range(20):
             shot, image, capture = photograph()
@@ -153,7 +154,7 @@ class Graph:
         raise AssertionError("detector and solver do not find each other")
 
     def send(self, shot, image=None, capture=None):
-        """A shot's intrinsics, its tilts, then its stars or the image they are in."""
+        """Publish a shot's intrinsics, its tilts, then its stars or the image that they are in."""
         self.info.publish(shot.info)
         for tilt in shot.tilts:
             self.tilt.publish(tilt)
@@ -164,7 +165,7 @@ class Graph:
             self.image.publish(image)
 
     def answer(self, shot):
-        """Send a shot; the Solution and the NavSatFix of its stamp, and the Imu where the solution is one."""
+        """Send a shot; returns the Solution and the NavSatFix of its stamp, and the Imu if the solution is a fix."""
         self.send(shot)
         return self.result(shot.stamp)
 
@@ -177,7 +178,7 @@ class Graph:
         return solution, self.fixes[stamp][-1], self.imus[stamp][-1]
 
     def state(self, name: str, text: str) -> object:
-        """The next diagnostic of that name whose sentence holds the text."""
+        """Wait for the next diagnostic of a name with this text in its sentence."""
         self.diagnostics.pop(name, None)
 
         def found():
@@ -195,7 +196,7 @@ class Graph:
         return future.result()
 
     def set(self, node: str, **values):
-        """Set parameters, dots written as __; (successful, reason)."""
+        """Set parameters, with dots written as __; returns (successful, reason)."""
         parameters = [
             Parameter(name.replace("__", "."), value=value).to_parameter_msg()
             for name, value in values.items()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints the messages of the named topics, a JSON line each, until its standard input ends; hosts.Ear starts it there."""
+"""Prints each message of the named topics as a line of JSON until standard input ends; hosts.Ear starts it on a host."""
 
 import base64
 import contextlib
@@ -22,10 +22,15 @@ def tell(topic: str):
     return heard
 
 
+def end_with_input():
+    sys.stdin.read()
+    rclpy.try_shutdown()
+
+
 rclpy.init()
 node = rclpy.create_node("ear")
 for name in sys.argv[1:]:
     node.create_subscription(KINDS[name], name, tell(name), 100, raw=True)
-threading.Thread(target=lambda: (sys.stdin.read(), rclpy.try_shutdown()), daemon=True).start()
+threading.Thread(target=end_with_input, daemon=True).start()
 with contextlib.suppress(ExternalShutdownException):
     rclpy.spin(node)

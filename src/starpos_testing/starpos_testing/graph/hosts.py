@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two computers and the cable between them, on one machine: Linux namespaces, and a cable that can be had bad.
+"""Two hosts on one machine (Linux namespaces), and a cable between them that may lose and delay frames.
 
-Each host has network, shared memory and name of its own, so that nothing but the cable joins them. All of it
-is gone with the process that made it, however that ends.
+Each host has its own network, shared memory and name, so that only the cable joins them.  All of this ends with the
+process that made it.
 """
 
 import base64
@@ -35,12 +35,14 @@ from starpos_testing.patience import WAIT_S
 DEVICE = "link0"
 KINDS = {"solver/solution": Solution, "fix": NavSatFix}
 TUN, TUNSETIFF, IFF_TAP, IFF_NO_PI = "/dev/net/tun", 0x400454CA, 0x0002, 0x1000
-LOOK_S = 0.2  # a condition may also be of the cable
-ETHERNET_BYTES = 1514  # the largest frame of a device of the usual 1500
+# time between two looks at a condition, which need not depend on a message
+LOOK_S = 0.2
+# the largest frame of a device with the usual MTU of 1500
+ETHERNET_BYTES = 1514
 
 
 def need() -> None:
-    """Skip where a machine cannot be two; the package is what it may lack, the rights are whose machine it is."""
+    """Skip the test if this machine lacks the package, or the rights, to act as two hosts."""
     if not shutil.which("ip"):
         lacks("iproute2")
     unshared = subprocess.run(["unshare", "--net", "--mount", "true"], check=False, capture_output=True)
@@ -53,34 +55,36 @@ def need() -> None:
 
 
 class Host:
-    """A computer; `environment` is what is set on it for ROS."""
+    """A host; environment: variables that are set on it for ROS."""
 
     def __init__(self, name: str, **environment: str):
         made = (
             f"mount -t tmpfs tmpfs /dev/shm && hostname {name} && ip link set lo up && echo made && exec cat"
         )
         command = ["unshare", "--net", "--mount", "--uts", "--ipc", "--", "sh", "-c", made]
-        # it reads from us until we are gone
+        # `cat` reads from this process and so ends with it
         self._holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert self._holder.stdout is not None
         assert self._holder.stdout.readline() == b"made\n"
-        self.pid, self.name, self.running = self._holder.pid, name, []
+        self.pid, self.name = self._holder.pid, name
+        self.running: list[Program] = []
         ours = {k: v for k, v in os.environ.items() if k != "ROS_STATIC_PEERS"}
         self.environment = ours | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"} | environment
 
     def command(self, *words: str) -> list[str]:
-        """A command that runs these words there; signals reach them."""
+        """A command line that runs these words on the host; signals reach them."""
         return ["nsenter", f"--target={self.pid}", "--net", "--mount", "--uts", "--ipc", "--", *words]
 
     def ip(self, *words: str) -> None:
         subprocess.run(self.command("ip", *words), check=True)
 
     def start(self, log: Path, package: str, name: str, *parameters: str, arguments=()) -> "Program":
-        """An executable of this workspace, as graph.Process has it."""
+        """Start an executable of this workspace; its output goes to `log`."""
         self.running.append(Program(self, log, package, name, arguments, parameters))
         return self.running[-1]
 
     def stop(self) -> None:
-        """End what runs there."""
+        """End all programs on the host."""
         while self.running:
             self.running.pop().end()
 
@@ -105,19 +109,20 @@ class Program(Executable):
 
 
 class Cable:
-    """Ethernet between two hosts, 10.11.12.1 and .2, with what it may be asked to do to frames.
+    """Ethernet between two hosts, 10.11.12.1 and .2, with faults.
 
-    `loss` is the share that is lost, `delay_s` what each takes, `multicast` whether such frames pass. `passed` counts
-    the bytes that went either way, Ethernet's headers among them.
+    loss: share of the frames that are lost.  delay_s: of each frame.  multicast: whether multicast frames pass.
+    passed: bytes that each host has sent, with Ethernet's headers.  refused: multicast frames that did not pass.
     """
 
     ADDRESSES = ("10.11.12.1", "10.11.12.2")
 
     def __init__(self, *hosts: Host):
         self.loss, self.delay_s, self.multicast = 0.0, 0.0, True
-        self.passed, self.refused = [0, 0], [0, 0]  # by sender
+        self.passed, self.refused = [0, 0], [0, 0]
         self._random, self._order = random.Random(11), count()
-        self._late: list[tuple] = []  # (when, order, receiver, frame)
+        # frames on their way: (when, order, receiver, frame)
+        self._late: list[tuple[float, int, int, bytes]] = []
         self._ends = [
             self._plug_in(k, *pair) for k, pair in enumerate(zip(hosts, self.ADDRESSES, strict=True))
         ]
@@ -142,11 +147,6 @@ class Cable:
         for end in (*self._ends, self._end_us):
             os.close(end)
 
-    @property
-    def bytes(self) -> int:
-        """What has gone over it so far, both ways."""
-        return sum(self.passed)
-
     def _carry(self) -> None:
         while True:
             wait_s = max(self._late[0][0] - time.monotonic(), 0.0) if self._late else None
@@ -161,7 +161,7 @@ class Cable:
                 _write(self._ends[receiver], frame)
 
     def _take(self, sender: int, frame: bytes) -> None:
-        # the lowest bit of an Ethernet address: to a group; ff:... is everybody, who is asked for addresses
+        # the lowest bit of the first byte marks a group; ff:... is the broadcast that asks for addresses
         group = frame[:1] != b"\xff" and frame[:1] and frame[0] & 1
         if group and not self.multicast:
             self.refused[sender] += 1
@@ -169,6 +169,12 @@ class Cable:
             self.passed[sender] += len(frame)
             when = time.monotonic() + self.delay_s
             heapq.heappush(self._late, (when, next(self._order), 1 - sender, frame))
+
+    # last, because its name hides the type's from there on
+    @property
+    def bytes(self) -> int:
+        """Bytes that have gone over the cable so far, both ways."""
+        return sum(self.passed)
 
 
 def _read(end: int) -> bytes:
@@ -184,24 +190,33 @@ def _write(end: int, frame: bytes) -> None:
 
 
 class Ear:
-    """Who listens on a host to what the solver says there."""
+    """A listener on a host to the topics of the solver there."""
 
     def __init__(self, host: Host):
         command = host.command(sys.executable, str(Path(__file__).with_name("host_ear.py")), *KINDS)
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=host.environment
         )
-        self._lines: queue.Queue = queue.Queue()
-        self._thread = threading.Thread(target=lambda: [self._lines.put(x) for x in self._process.stdout])
+        self._lines: queue.Queue[bytes] = queue.Queue()
+        self._thread = threading.Thread(target=self._read)
         self._thread.start()
-        self.heard: dict[str, dict] = {topic: {} for topic in KINDS}  # by stamp; the newest
-        self.at_s: dict[tuple, float] = {}  # monotonic, of a solution
+        # by topic and stamp, the newest message
+        self.heard: dict[str, dict] = {topic: {} for topic in KINDS}
+        # by stamp, the monotonic time of a solution
+        self.at_s: dict[tuple, float] = {}
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
 
     def __enter__(self) -> "Ear":
         return self
 
     def __exit__(self, *error) -> None:
-        self._process.stdin.close()  # which is what it ends at
+        assert self._process.stdin is not None and self._process.stdout is not None
+        # the program ends with its input
+        self._process.stdin.close()
         try:
             self._process.wait(WAIT_S)
         except subprocess.TimeoutExpired:
@@ -219,7 +234,7 @@ class Ear:
         return sorted(stamp for stamp, s in self.solutions.items() if s.status == Solution.OK)
 
     def comes(self, condition, seconds: float) -> bool:
-        """Whether it comes true within so many seconds."""
+        """Whether a condition becomes true within so many seconds."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
@@ -236,7 +251,7 @@ class Ear:
         return True
 
     def wait(self, condition, *hosts: Host, seconds=WAIT_S) -> None:
-        """Until it comes true; else what the hosts' programs said."""
+        """Wait until a condition is true; raises AssertionError with the output of the hosts' programs."""
         if not self.comes(condition, seconds):
             said = [f"{h.name} {p.name}: {p.output[-2000:]}" for h in hosts for p in h.running]
             raise AssertionError("\n".join([f"waited {seconds:g} s in vain", *said]))

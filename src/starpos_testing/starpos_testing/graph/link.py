@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrument on two hosts under a simulated sky, and what the cable between them carries."""
+"""The instrument on two hosts under a simulated sky, and the traffic on the cable between them."""
 
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ class LinkedInstrument:
     ear: Ear
 
     def wait(self, condition, **patience) -> None:
-        """Until it comes true of what the ear hears; else what the programs said."""
+        """Wait until a condition of what the ear hears is true; raises AssertionError with the output of the programs."""
         self.ear.wait(condition, self.mount, self.robot, **patience)
 
 
 @contextmanager
 def two_hosts(**environment):
-    """An instrument of which nothing runs yet; `environment` is set on both hosts."""
+    """Make an instrument whose programs do not run yet; `environment` is set on both hosts."""
     with (
         Host("mount", **environment) as mount,
         Host("robot", **environment) as robot,
@@ -46,7 +46,7 @@ def two_hosts(**environment):
 def start(
     instrument: LinkedInstrument, folder: Path, size: tuple[int, int], cadence_s: float, *patience: str
 ):
-    """Camera and detector in one process and the inclinometer on the mount, the solver on the robot; the camera.
+    """Start camera and detector (one process) and inclinometer on the mount, the solver on the robot; returns the camera.
 
     patience: more parameters of the solver.
     """
@@ -79,7 +79,7 @@ def start(
 
 @dataclass(frozen=True)
 class Traffic:
-    """What went over the cable, both ways, all headers and DDS's own part included; `stars` of a frame, on average."""
+    """Bytes that went over the cable both ways, with all headers and the traffic of DDS; stars: mean of a frame."""
 
     frames: int
     stars: float
@@ -88,7 +88,7 @@ class Traffic:
 
 
 def traffic(folder: Path, frames: int, cadence_s: float, quiet_s: float = 10.0) -> Traffic:
-    """Of so many frames of the whole camera; the first ones, while nodes and middleware find each other, do not count.
+    """Measure the traffic of so many full frames; the first, during which nodes find each other, do not count.
 
     quiet_s: how long without a camera, to see what the tilts take.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far an answer is from the true place, in its own sigmas; and instruments that are not what the solver is told."""
+"""Distances of answers from the true place, in their sigmas; and instruments that differ from what the solver is told."""
 
 from dataclasses import replace
 
@@ -25,25 +25,25 @@ def site_at(latitude_deg, longitude_deg) -> Site:
 
 
 def headings(graph, azimuths, frames=2, **changes):
-    """Shots at each of these azimuths; (shot, solution) of each."""
+    """Send shots at each of these azimuths; returns (shot, solution) of each."""
     shots = (shoot(azimuth, **changes) for azimuth in azimuths for _ in range(frames))
     return [(shot, graph.answer(shot)[0]) for shot in shots]
 
 
 def answer_in(graph, heard: list, shot):
-    """The message among those heard that has the stamp of a shot."""
+    """Wait for the message in `heard` that has the stamp of a shot."""
     graph.wait(lambda: any(stamp_of(m) == shot.stamp for m in heard), f"for the message of {shot.stamp}")
     return next(m for m in heard if stamp_of(m) == shot.stamp)
 
 
 def moved_m(site: Site, latitude_deg: float, longitude_deg: float) -> np.ndarray:
-    """East, north from the true place."""
+    """East, north (2,) in m of a place (deg) from the true one."""
     east = np.radians(longitude_deg - site.longitude_deg) * np.cos(np.radians(site.latitude_deg))
     return np.array([east, np.radians(latitude_deg - site.latitude_deg)]) * METRES
 
 
 def sigmas(site: Site, latitude_deg: float, longitude_deg: float, covariance) -> float:
-    """Distance from the true place in units of its claim; covariance: row-major, east and north first, m2."""
+    """Distance from the true place in sigma; covariance: row by row, east and north first, m2."""
     size = int(np.sqrt(len(covariance)))
     covariance = np.reshape(covariance, (size, size))[:2, :2]
     moved = moved_m(site, latitude_deg, longitude_deg)
@@ -51,6 +51,6 @@ def sigmas(site: Site, latitude_deg: float, longitude_deg: float, covariance) ->
 
 
 def sigma_m(covariance) -> float:
-    """The larger of east and north."""
+    """The larger sigma in m of east and north."""
     size = int(np.sqrt(len(covariance)))
     return float(np.sqrt(np.diag(np.reshape(covariance, (size, size)))[:2].max()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an instrument at a known place would send: intrinsics, stars and tilts of one exposure, or an image."""
+"""Messages of an instrument at a known place: intrinsics, stars and tilts of one exposure, or an image."""
 
 from dataclasses import dataclass, replace
 
@@ -34,13 +34,13 @@ SOLVER = (
 
 
 def focal_of(size) -> float:
-    """The focal length in px that gives this frame the full one's field: one catalogue of triangles does for all."""
+    """Focal length in px that gives a frame the field of the full one, so that all share a catalogue of triangles."""
     return FULL_FOCAL_PX * float(np.hypot(*size) / np.hypot(*FULL))
 
 
 @dataclass
 class SimulatedShot:
-    """One exposure as messages, for tests to spoil, and the truth about it."""
+    """One exposure as messages that tests may change, and the truth about it."""
 
     info: CameraInfo
     stars: msg.StarArray
@@ -52,7 +52,7 @@ class SimulatedShot:
         return self.stars.header.stamp.sec, self.stars.header.stamp.nanosec
 
     def error_m(self, solution) -> np.ndarray:
-        """East, north in m of a solution's place against the truth (a sphere will do)."""
+        """East, north (2,) in m of a solution's place from the true one, on a sphere."""
         east = np.radians(solution.longitude - LONGITUDE_DEG) * np.cos(np.radians(LATITUDE_DEG))
         return np.array([east, np.radians(solution.latitude - LATITUDE_DEG)]) * 6.371e6
 
@@ -67,7 +67,7 @@ def scene_at(azimuth_deg=40.0, size=FULL) -> Scene:
 
 
 def azimuth_for_heading(heading_deg: float) -> float:
-    """The optical axis' azimuth that turns the base link's x axis there."""
+    """Azimuth in deg of the optical axis for which the base link has this heading."""
     return heading_deg - float(np.degrees(scene_at(0.0).heading))
 
 
@@ -75,14 +75,14 @@ _count = iter(range(1, 100000))
 
 
 def shoot(azimuth_deg=40.0, **changes) -> SimulatedShot:
-    """A shot 10 s after the one before, so that every one has a stamp of its own."""
+    """A shot 10 s after the last one, so that each has its own stamp."""
     k = next(_count)
     scene = replace(scene_at(azimuth_deg), **changes)
     return shot_of(scene, START_S + k * CADENCE_S, np.random.default_rng(k))
 
 
 def shot_of(scene: Scene, start: float, rng) -> SimulatedShot:
-    """What the scene's instrument sends of an exposure that begins then (Unix s)."""
+    """The messages for an exposure of a scene that begins at `start` (Unix s)."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     stars = detected(scene, light, start + EXPOSURE_S / 2, EXPOSURE_S, rng)
     return SimulatedShot(
@@ -111,13 +111,13 @@ def tilts_of(scene: Scene, start: float, rng) -> list[msg.Tilt]:
 
 
 def photograph(azimuth_deg=40.0) -> tuple[SimulatedShot, Image, msg.Capture]:
-    """A shot of the small camera whose stars are still in the image."""
+    """A shot of the small camera as an image, with its stars not yet detected."""
     k = next(_count)
     return photograph_of(scene_at(azimuth_deg, SMALL), START_S + k * CADENCE_S, np.random.default_rng(k))
 
 
 def photograph_of(scene: Scene, start: float, rng) -> tuple[SimulatedShot, Image, msg.Capture]:
-    """The same of any scene and time; its frame is drawn, so a small one is quick."""
+    """An image of any scene and time; the frame is rendered, so a small one is quick."""
     light = expose(scene, load_catalogue(), start, EXPOSURE_S, rng)
     image = frame_to_message(render(scene, light, start, EXPOSURE_S, rng), FRAME)
     info = camera_to_message(scene.camera, FRAME, start + EXPOSURE_S / 2)

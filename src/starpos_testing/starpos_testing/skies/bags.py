@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes rosbag2 files of a simulated night as the nodes would have filled them, for the tests of reading them."""
+"""Writes rosbag2 files of a simulated night as the nodes would, for the tests of reading them."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ EMPTY = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 
 
 def typestore():
-    """ROS's types and ours; the test skips where ours are not beside this package."""
+    """Message types of ROS and our own; skips the test if our own are not beside this package."""
     if not MESSAGES.is_dir():
         pytest.skip("starpos_interfaces is not beside this package")
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -24,7 +24,7 @@ def typestore():
 
 
 class NightBag:
-    """A bag in the making, MCAP unless told otherwise; topics lie in `namespace`."""
+    """Writes a bag, by default MCAP, with its topics in `namespace`."""
 
     def __init__(self, path, namespace="", plugin=StoragePlugin.MCAP):
         self.store, self.namespace, self._connections = typestore(), namespace, {}
@@ -38,7 +38,7 @@ class NightBag:
         self._writer.close()
 
     def message(self, name, unix_s=0.0, /, **fields):
-        """One of starpos_interfaces, or of another package by its full name; all that is not given is 0."""
+        """A message of starpos_interfaces, or of another package by its full name; fields not given are 0."""
         kind = name if "/" in name else f"starpos_interfaces/msg/{name}"
         seconds, micro = divmod(round(unix_s * 1e6), 1_000_000)
         made = self._blank(kind)
@@ -78,12 +78,12 @@ class NightBag:
         )
 
     def tilts(self, log):
-        """A TiltLog."""
+        """Write the readings of a TiltLog."""
         for at, x, y, warm in zip(log.utc_unix_s, log.theta_x, log.theta_y, log.temperature_c, strict=True):
             self.write("tilt", self.message("Tilt", at, x=x, y=y, temperature=warm), at)
 
     def solution(self, unix_s, solved):
-        """From what `starpos solve --json` says of a frame."""
+        """Write a Solution from an object of `starpos solve --json`."""
         terms = [
             self.message("ErrorTerm", name=name, east=e, north=n, heading=h, common=name != "tilt")
             for name, (e, n, h) in solved["budget"].items()
@@ -99,7 +99,7 @@ class NightBag:
         self.write("solver/solution", made, unix_s)
 
     def failure(self, unix_s, status, text):
-        """A Solution without a fix."""
+        """Write a Solution without a fix."""
         nothing = np.full(9, np.nan)
         about = {"status": status, "status_text": text, "covariance": nothing, "covariance_geodetic": nothing}
         nan = dict.fromkeys(("latitude", "longitude", "heading", "right_ascension", "residual"), float("nan"))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of identified stars as an instrument at a known place would see them, for the tests of fix and average."""
+"""Fields of identified stars, as an instrument at a known place sees them, for the tests of fix and average."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -54,22 +55,23 @@ class SkyField:
 
     def tilt(self, covariance=NO_ERROR) -> Tilt:
         up = self.a3 @ self.attitude[2]
-        return Tilt(*np.arcsin(up[:2]), covariance, utc_unix_s=self.utc)
+        theta_x, theta_y = np.arcsin(up[:2])
+        return Tilt(theta_x, theta_y, covariance, utc_unix_s=self.utc)
 
     def places(self, state: EarthState, rng) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, 2) of N stars without error and the ICRS directions (N, 3) that a catalogue would have of them."""
+        """Pixels (N, 2) of N stars without error, and the ICRS directions (N, 3) that a catalogue would have."""
         xy = rng.uniform(0, [self.camera.width - 1, self.camera.height - 1], (self.stars, 2))
         site = Site(self.latitude, self.longitude, self.air)
         wanted = self.camera.directions(*xy.T) @ self.attitude.T
         itrs = self.air.refraction().unbend(wanted) @ site.enu
-        # any catalogue will do: the directions near these that the forward chain takes to the frame
+        # directions near these will do, because the forward chain takes them to the frame
         icrs = (itrs @ state.cirs_to_itrs) @ np.asarray(state.astrom["bpn"]).reshape(3, 3)
         v = state.to_itrs(icrs) + station_velocity(site.enu[2])
         seen = self.air.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ site.enu.T)
         return self.camera.project(seen @ self.attitude), icrs
 
     def mounting(self, calibration=0.0) -> Mounting:
-        """Calibration errors in arcsec, 1 sigma a axis."""
+        """The mounting, with a calibration error in arcsec per axis, 1 sigma."""
         return Mounting(
             a3=self.a3,
             link_to_camera=np.array(TOP_OF_FRAME),
@@ -77,11 +79,11 @@ class SkyField:
         )
 
     def solve(self, xy, places, state=None, **given) -> Fix:
-        """solve_fix with what this field knows, each part replaceable."""
+        """Call solve_fix with the truth of this field; `given` replaces parts of it."""
         n = len(xy)
         covariance = given.pop("covariance_px2", np.eye(2)[None].repeat(n, 0) * 0.05**2)
         stars = MatchedStars(xy, covariance, places, given.pop("place_sigma", np.full(n, 1e-9)))
-        parts = {
+        parts: dict[str, Any] = {
             "camera": self.camera,
             "tilt": self.tilt(),
             "mounting": self.mounting(),
@@ -93,8 +95,8 @@ class SkyField:
 
 
 def random_field(rng, **fixed) -> SkyField:
-    """Any place on Earth, any heading, leaning up to 25 deg from the zenith, bent by up to 3 deg."""
-    drawn = {
+    """A field at any place and heading, up to 25 deg from the zenith, with an A3 of up to 3 deg."""
+    drawn: dict[str, Any] = {
         "latitude": float(np.degrees(np.arcsin(rng.uniform(-1, 1)))),
         "longitude": float(rng.uniform(-180, 180)),
         "azimuth": float(rng.uniform(0, 360)),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras with lenses, the sky through them, and how far off a fitted one is: for the tests of calibration."""
+"""Cameras with lenses, the sky as they see it, and the error of a fitted one, for the tests of calibration."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from starpos import rotation
-from starpos.calibration.intrinsics import Sighting
+from starpos.calibration.camera_adjustment import Sighting
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
 from starpos.simulation.scene import Optics, detected, expose, scene_of
@@ -35,7 +35,7 @@ def k1_of(camera: Camera, corner: float) -> float:
 
 
 def random_camera(field, rng) -> Camera:
-    """1.5 % off in focal length, off centre by 2 % of the frame, with a lens."""
+    """A camera with a lens, 1.5 % off in focal length and 2 % of the frame off centre."""
     c = ideal(field)
     r = np.hypot(c.width, c.height) / 2 / c.fx
     distortion = rng.normal(0, CORNER) / [r**2, r**4, 3 * r, 3 * r, r**6]
@@ -53,7 +53,7 @@ def random_camera(field, rng) -> Camera:
 
 
 def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighting]:
-    """Identified stars all over the frames of a camera in a vacuum; the attitudes are 20 arcsec off."""
+    """Identified stars all over the frames of a camera in a vacuum, with attitudes 20 arcsec off."""
     made = []
     for _ in range(frames):
         attitude = rotation.from_vector(rng.normal(0, 1, 3))
@@ -77,7 +77,7 @@ def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighti
 
 
 def night(camera, frames, catalogue, rng, limit_mag, air=AIR, altitude=(60, 89), roll=(-180, 180)):
-    """Star lists of a simulated sky, and C into L of each."""
+    """Star lists of a simulated sky, and the rotation (3, 3) of C into L for each."""
     lists, levels = [], []
     base = scene_of(size=(camera.width, camera.height), focal_px=camera.fx, atmosphere=air)
     for k in range(frames):
@@ -97,7 +97,7 @@ def values(camera: Camera) -> np.ndarray:
 
 
 def prediction_errors(true: Camera, fitted: Camera, side=21) -> np.ndarray:
-    """Pixels (N, 2) by which a fitted camera errs over the frame, once attitude and scale are fitted."""
+    """Errors (N, 2) in px of a fitted camera over the frame, after a fit of attitude and scale."""
     x, y = np.meshgrid(np.linspace(0, true.width - 1, side), np.linspace(0, true.height - 1, side))
     xy = np.stack([x.ravel(), y.ravel()], -1)
     v = true.directions(*xy.T)

@@ -62,13 +62,13 @@ def dng(mosaic, pattern="rggb", order="<", **exif):
 
 
 def with_exif(jpeg, orientation=1, **exif):
-    """A JPEG's bytes with an APP1 segment of EXIF after its SOI."""
+    """The bytes of a JPEG with an APP1 segment of EXIF after its SOI."""
     segment = b"Exif\0\0" + tiff({0x112: (SHORT, [orientation])}, exif_tags(**exif))
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
 
 
 def mosaic(height=96, width=128, seed=1):
-    """(h, w) uint16 of noise, brighter towards the bottom right."""
+    """Noise (h, w) as uint16, brighter towards the bottom right."""
     rng = np.random.default_rng(seed)
     ramp = np.add.outer(np.arange(height) * 20, np.arange(width) * 3)
     return (ramp + rng.integers(500, 600, (height, width))).astype(np.uint16)
@@ -80,7 +80,7 @@ def _length(tags):
 
 
 def _ifd(tags, at, order):
-    """An IFD that begins at a place of the file, its long values behind it."""
+    """The bytes of an IFD at a place of the file, followed by its long values."""
     entries, values = b"", b""
     behind = at + 2 + 12 * len(tags) + 4
     for tag, (kind, items) in sorted(tags.items()):

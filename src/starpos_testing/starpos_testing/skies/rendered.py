@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small star fields for the tests of detection, and the Cramer-Rao bound of what is in them.
+"""Small star fields for the tests of detection, and the Cramer-Rao bound of their stars.
 
 A star is a Gaussian drawn along a straight trail and integrated over each pixel; 1 DN is one electron.
 """
@@ -54,7 +54,7 @@ def coloured(count, rng):
 
 
 def noisy(image, rng, top=65535, dtype=np.uint16):
-    """What a camera writes of these electrons."""
+    """The pixels that a camera writes for these electrons."""
     counts = rng.poisson(image) + rng.normal(0, READ_NOISE, image.shape) + BIAS
     return np.clip(np.rint(counts), 0, top).astype(dtype)
 
@@ -75,7 +75,7 @@ def bound(electrons, fwhm=2.4, trail=(0.0, 0.0), sky=SKY, gain=None):
 
 
 def grid(size, spacing, electrons, rng):
-    """Stars (N, 3) about `spacing` px apart, each somewhere in its pixel, away from the edges."""
+    """Stars (N, 3) on a grid of `spacing` px with random offsets, away from the edges."""
     y, x = np.meshgrid(*(np.arange(spacing, n - spacing + 1, spacing) for n in size), indexing="ij")
     x, y = (v.ravel() + rng.uniform(-2, 2, v.size) for v in (x, y))
     return np.stack(
@@ -84,7 +84,7 @@ def grid(size, spacing, electrons, rng):
 
 
 def match(found, stars, within=2.0):
-    """For every true star the index of the nearest found one, -1 where none lies within so many px."""
+    """Index (N,) of the found star nearest to each true one; -1 if none lies within so many px."""
     if len(found) == 0:
         return np.full(len(stars), -1)
     apart = np.hypot(stars[:, None, 0] - found.x, stars[:, None, 1] - found.y)
@@ -92,7 +92,7 @@ def match(found, stars, within=2.0):
 
 
 def errors(found, stars):
-    """Errors (N, 2) px of stars that must all be found, and these over their sigmas."""
+    """Errors (N, 2) in px and in sigma of stars, which must all be found."""
     index = match(found, stars)
     assert np.all(index >= 0)
     error = np.stack([found.x[index], found.y[index]], 1) - stars[:, :2]

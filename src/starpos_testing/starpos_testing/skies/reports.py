@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nights to report on and pages to look into, for the tests of the report."""
+"""Nights to report on, and readers of pages and pictures, for the tests of the report."""
 
 import base64
 import json
@@ -15,7 +15,7 @@ PLACE = {"latitude": 47.3, "longitude": -122.8}
 
 
 def simulate(folder, *more, frames=6, place=PLACE):
-    """A folder of lists of stars, tilt.csv and truth.json."""
+    """Simulate a folder with lists of stars, tilt.csv and truth.json."""
     at = [f"--{k}={v}" for k, v in place.items()]
     wide = ("--stars-only", "--size", "1000", "700", *OPTICS, *AIR)
     assert main(["simulate", str(folder), "-n", str(frames), *wide, *at, *map(str, more)]) == 0
@@ -23,7 +23,7 @@ def simulate(folder, *more, frames=6, place=PLACE):
 
 
 def run(capsys, *args):
-    """Exit status, standard output, lines of standard error."""
+    """Run a command; returns exit status, standard output, and the lines of standard error."""
     capsys.readouterr()
     try:
         status = main([str(a) for a in args])
@@ -34,14 +34,14 @@ def run(capsys, *args):
 
 
 def solved(capsys, night, *more):
-    """What `starpos solve` says of all frames together."""
+    """The last object of `starpos solve --json`, on all frames together."""
     frames = sorted(night.glob("stars_*.csv"))
     _, out, _ = run(capsys, "solve", *frames, "--tilt", night / "tilt.csv", "--json", *more)
     return json.loads(out.splitlines()[-1])
 
 
 class Page(HTMLParser):
-    """The text of a page, what it refers to, and its pictures (bytes of PNG by title)."""
+    """Parser of a page: its text, its references, and its pictures (bytes of PNG by title)."""
 
     def __init__(self, path):
         super().__init__()
@@ -64,7 +64,7 @@ class Page(HTMLParser):
 
 
 def assert_drawn(png):
-    """A PNG that decodes and is not blank."""
+    """Assert that a PNG can be decoded and is not blank."""
     import cv2
 
     pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated exposures of wide fields, whose triangles build fast: for the tests of solver and command line."""
+"""Simulated exposures of wide fields, whose triangles are quickly built, for the tests of solver and command line."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def stars_of(scene, catalogue, rng, start=START) -> Stars:
 
 
 def tilt_of(scene, rng, start=START) -> Tilt:
-    """One reading, with the error it says."""
+    """One reading with its stated error."""
     sigma = max(scene.tilt_errors.noise, np.radians(1e-6))
     return Tilt(*read_tilt(scene, 0.0, rng), np.eye(2) * sigma**2, utc_unix_s=start + EXPOSURE / 2)
 
@@ -39,7 +39,7 @@ def solver_of(scene, catalogue, **more) -> Solver:
 
 
 def with_false_stars(stars, xy, flux_factor=10.0) -> Stars:
-    """The list with stars at xy (N, 2) put before all others in brightness."""
+    """The list with additional stars at xy (N, 2) px, brighter than all others."""
     n = len(xy)
     return replace(
         stars, x=np.r_[xy[:, 0], stars.x], y=np.r_[xy[:, 1], stars.y],
@@ -51,7 +51,7 @@ def with_false_stars(stars, xy, flux_factor=10.0) -> Stars:
 
 
 def random_stars(n, rng, width=SIZE[0], height=SIZE[1], mid_unix_s=START) -> Stars:
-    """Points that are nothing of the sky."""
+    """Random points, which are no part of the sky."""
     x, y = rng.uniform(0, width - 1, n), rng.uniform(0, height - 1, n)
     flux = np.sort(rng.exponential(1e4, n))[::-1]
     covariance = np.eye(2)[None].repeat(n, 0) * 0.05**2

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of one instrument at a known place that leans otherwise from frame to frame, for the tests of calibration."""
+"""Frames of an instrument at a known place, with a lean of its own for each frame, for the tests of calibration."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos import rotation
 from starpos.fix.solver import Solver
+from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.simulation.scene import Scene
@@ -20,15 +21,15 @@ TRUE_A3_DEG = (1.5, -2.0, 130.0)
 class Shots:
     """Frames and the tilt of each; scene: of the last; tilts: by the middle of the exposure."""
 
-    scene: Scene | None = None
-    frames: list = field(default_factory=list)
-    tilts: dict = field(default_factory=dict)
+    scene: Scene
+    frames: list[Stars]
+    tilts: dict[float | None, Tilt]
 
     def tilt(self, mid_unix_s: float, _exposure_s: float) -> Tilt:
         return self.tilts[mid_unix_s]
 
     def spoil(self, k: int, x_deg: float) -> None:
-        """Misread the tilt of frame k."""
+        """Put an error on the tilt of frame k."""
         mid = self.frames[k].mid_unix_s
         self.tilts[mid] = replace(self.tilts[mid], theta_x=self.tilts[mid].theta_x + np.radians(x_deg))
 
@@ -37,26 +38,25 @@ class Shots:
         return self.scene.instrument.calibration.a3
 
     def solver(self, catalogue, given=(0.0, 0.0, 0.0)) -> Solver:
-        """That of an instrument whose A3 is said to be as given, without its error."""
+        """The solver of an instrument whose A3 is said to be as given, without an error."""
         instrument = Instrument(FOCAL_PX, calibration=Calibration(misalignment_deg=given))
         return Solver(instrument, catalogue, self.scene.site.atmosphere)
 
 
 def shots(catalogue, rng, leans=(0.0,), a3_deg=TRUE_A3_DEG, start=START, noise_deg=0.0035, **scene) -> Shots:
-    """One frame for each lean (deg, from 78 deg of altitude), 20 s apart."""
-    made = Shots()
+    """One frame for each lean (deg, from 78 deg of altitude), at least one, 20 s apart."""
+    frames, tilts = [], {}
     for n, lean in enumerate(leans):
         here = wide_scene(pointing_deg=(40.0, 78.0 + lean, 15.0), tilt_noise_deg=noise_deg, **scene)
-        made.scene = replace(
-            here, instrument=replace(here.instrument, calibration=Calibration(misalignment_deg=a3_deg))
-        )
-        stars = stars_of(made.scene, catalogue, rng, start + 20.0 * n)
-        made.frames.append(stars)
-        made.tilts[stars.mid_unix_s] = tilt_of(made.scene, rng, start + 20.0 * n)
-    return made
+        calibration = Calibration(misalignment_deg=a3_deg)
+        shot = replace(here, instrument=replace(here.instrument, calibration=calibration))
+        stars = stars_of(shot, catalogue, rng, start + 20.0 * n)
+        frames.append(stars)
+        tilts[stars.mid_unix_s] = tilt_of(shot, rng, start + 20.0 * n)
+    return Shots(shot, frames, tilts)
 
 
 def a3_error(shot: Shots, calibration: Calibration) -> tuple[np.ndarray, float]:
-    """Found to true as a small rotation about S's axes (3,) in arcsec, and its chi-square against what is claimed."""
+    """Error of A3 as a small rotation (3,) in arcsec about S's axes, and its chi-square by the stated covariance."""
     off = rotation.to_small_vector(shot.true_a3 @ calibration.a3.T) / ARCSEC
     return off, float(off @ np.linalg.solve(np.asarray(calibration.covariance_arcsec2), off))
