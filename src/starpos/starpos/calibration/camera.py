@@ -23,7 +23,8 @@ from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.fix import sound_matches
 from starpos.fix.solver import ENOUGH_SOUND
 from starpos.frames.stars import Stars
-from starpos.identification import Identification, PointingPrior, Sky, identify_directions, triangles
+from starpos.identification import Identification, PointingPrior, Sky, identify_directions, triangle_cache
+from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -67,7 +68,7 @@ def calibrate_camera(
                 f"{stars.source}: the frame is {stars.width} x {stars.height} px but the first or the instrument has "
                 f"{given.width} x {given.height}: give frames of one size"
             )
-    table = triangles.cached(catalogue, given.half_diagonal_rad, progress)
+    table = triangle_cache.cached(catalogue, given.half_diagonal_rad, progress)
     skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
     camera, before = given, 0
     attitudes: dict[int, np.ndarray] = {}
@@ -113,7 +114,7 @@ class _Frame:
         stars: Stars,
         level: np.ndarray | None,
         catalogue: Catalogue,
-        table: triangles.TriangleCatalogue,
+        table: TriangleCatalogue,
     ) -> "_Frame":
         return cls(stars.take(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s))
 

@@ -109,12 +109,12 @@ def show_paper() -> int:
 def show_field(camera: Camera) -> int:
     """Print the catalogue of triangles for a camera."""
     from starpos.fix.solver import Solver
-    from starpos.identification import triangles
+    from starpos.identification import triangle_cache
     from starpos.instrument.instrument import Instrument
 
     c = catalogue.load_catalogue()
     Solver(Instrument(camera.fx), c, progress=common.ProgressBar()).prepare(camera.width, camera.height)
-    table = triangles.cached(c, camera.half_diagonal_rad)
+    table = triangle_cache.cached(c, camera.half_diagonal_rad)
     used = np.unique(table.corners)
     size = sum(getattr(table, column).nbytes for column in table.__dataclass_fields__) / 1e6
     width, height = np.degrees(2 * np.arctan([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy]))

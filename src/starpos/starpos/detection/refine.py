@@ -67,7 +67,8 @@ class Terms:
 def even_terms(psf: Psf, highest: int) -> Terms:
     """Terms of even order, up to `highest` across the trail and, for a long star, up to twice that along it."""
     grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
-    orders = np.array(grid[1:])  # without (0, 0)
+    # without (0, 0)
+    orders = np.array(grid[1:])
     orders = orders[_rank(psf, *orders.T) <= highest]
     steps = np.arange(2, highest + 1, 2)
     return Terms(

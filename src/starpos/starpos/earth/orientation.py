@@ -89,7 +89,8 @@ def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) 
     # computed in seconds, because ERFA's UTC stretches a day that ends in a leap second, and Unix time does not
     tt = UNIX_EPOCH_JD, (utc_unix_s + _tai_minus_utc(utc_unix_s) + TT_MINUS_TAI_S) / DAY_S
     ut1 = UNIX_EPOCH_JD, (utc_unix_s + orientation.ut1_minus_utc_s) / DAY_S
-    astrom, _ = erfa.apci13(*tt)  # TT serves as TDB: they differ by 2 ms
+    # TT serves as TDB: they differ by 2 ms
+    astrom, _ = erfa.apci13(*tt)
     pole = erfa.pom00(orientation.pole_x, orientation.pole_y, erfa.sp00(*tt))
     spin = erfa.rz(erfa.era00(*ut1), np.eye(3))
     year = 2000.0 + (tt[0] - erfa.DJ00 + tt[1]) / erfa.DJY

@@ -15,8 +15,9 @@ from starpos.errors import FixError, InstrumentError, StarposError, TiltError, T
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import SATURATED, Stars
-from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangles
+from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangle_cache
 from starpos.identification.hint import Hint
+from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, a2_matrix
 from starpos.instrument.instrument import Instrument
@@ -228,8 +229,8 @@ class Solver:
             )
         return camera
 
-    def _triangles(self, camera: Camera) -> triangles.TriangleCatalogue:
-        return triangles.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
+    def _triangles(self, camera: Camera) -> TriangleCatalogue:
+        return triangle_cache.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
 
     def _unidentified(self, stars: Stars) -> Solution:
         place, n = stars.source or "the frame", len(stars)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is asked of a file before it is read as a frame."""
+"""Checks of a file before it is read as a frame."""
 
 import stat
 from pathlib import Path
@@ -27,10 +27,12 @@ def check_file(path: Path) -> None:
 
 
 def bytes_of(path: Path) -> bytes:
+    """The content of a file; FrameError if it is larger than MAX_BYTES."""
     check_size(path, MAX_BYTES)
     return path.read_bytes()
 
 
 def check_size(path: Path, most: int) -> None:
+    """Raise FrameError if a file has more than `most` bytes."""
     if path.stat().st_size > most:
         raise FrameError(f"{path}: it is larger than {most // 10**6} MB, too large for a frame.")

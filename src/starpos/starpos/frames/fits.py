@@ -5,7 +5,7 @@ import io
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -18,7 +18,9 @@ FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, Ari
 
 def read_fits(path: Path | str) -> Frame:
     """Read a FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame."""
-    return _read(path, str(path))[0]
+    # opened here, because astropy leaves a damaged file open
+    with open(path, "rb") as file:
+        return _read(file, str(path))[0]
 
 
 def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
@@ -29,7 +31,7 @@ def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
     return _read(io.BytesIO(data), source)
 
 
-def _read(file: Path | str | io.BytesIO, place: str) -> tuple[Frame, dict[str, Any]]:
+def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
     from astropy.io import fits
 
     try:

@@ -13,10 +13,12 @@ from starpos.frames.header import focal_px, times
 from starpos.frames.stars import Stars
 
 MAX_CSV_BYTES = 20_000_000
-DEFAULT_SIGMA_PX = 0.1  # of a centroid whose file has no sigma
+# Error of a centroid if its file gives no sigma.
+DEFAULT_SIGMA_PX = 0.1
 
 
 def read_star_list(path: Path) -> Stars:
+    """Read Stars from a CSV by the rules of `reading.read_frame`; FrameError if it is not one."""
     check_size(path, MAX_CSV_BYTES)
     try:
         text = path.read_text(encoding="utf-8")

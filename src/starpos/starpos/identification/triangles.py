@@ -5,34 +5,20 @@ Triangles are found by their angles, as in the paper, because these hardly depen
 field's size gives its own brightest stars, so that every field of the instrument has enough triangles.
 """
 
-import hashlib
-import os
-import shutil
-import tempfile
-import threading
-import time
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.sky.zones import CELLS, ZONES, cell_starts, ranges
-from starpos.units import DAY_S
+from starpos.sky.zones import cell_starts, ranges
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-# Names of folders in the cache; the number is that of the format.
-PREFIX = "triangles-9-"
-SCRATCH = "unfinished-"
 # Shortest side over the longest allowed one: the errors of centroids blur the angles of smaller triangles.
 SHORTEST_SIDE = 0.03
 # Shapes (largest angle 60..180 deg, smallest 0..60 deg, longest side 0..the longest allowed) are kept to 1/65536 of
@@ -49,7 +35,6 @@ BEACONS = 0.25
 # Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
 # first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
-MOST_IN_USE = 4
 BLOCK = 100_000
 # Limit, counted before duplicates of overlapping circles are removed.
 MAX_TRIANGLES = 6_000_000
@@ -156,11 +141,13 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
 
     A circle takes its own brightest stars, however bright its neighbours are, so that every part of the sky has enough.
     """
-    from scipy.spatial import cKDTree  # slow to import, and mostly the cache has all
+    # slow to import, and mostly the cache has all
+    from scipy.spatial import cKDTree
 
     by_light = np.argsort(catalogue.vmag_centi, kind="stable")
     smallest_circle = min(radius for radius, _, _ in CIRCLES) * half_diagonal
-    circles = 4 / smallest_circle**2  # that make up a sphere
+    # so many circles have the area of the sphere
+    circles = 4 / smallest_circle**2
     pool = np.sort(by_light[: int(POOL_PER_CIRCLE * circles) + 1000])
     rank = np.argsort(np.argsort(catalogue.vmag_centi[pool], kind="stable"))
     v = catalogue.directions(pool)
@@ -275,147 +262,3 @@ def _measured(
         code.astype(np.uint16),
         bins.astype(np.int32),
     )
-
-
-def cache_folder() -> Path:
-    """The folder where triangle catalogues are kept: $XDG_CACHE_HOME/starpos, by default ~/.cache/starpos."""
-    given = os.environ.get("XDG_CACHE_HOME")
-    try:
-        return Path(given or Path.home() / ".cache") / "starpos"
-    # a user without a home, as in some containers
-    except RuntimeError:
-        return Path(tempfile.gettempdir()) / f"starpos-{os.getuid()}"
-
-
-def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> TriangleCatalogue:
-    """The TriangleCatalogue for a field of this half diagonal (rad), memory-mapped from the cache; built if missing.
-
-    The field is rounded up to steps of 5 %, so that a refined focal length does not need a new one.
-    """
-    half_diagonal = float(1.05 ** np.ceil(np.log(half_diagonal_rad) / np.log(1.05)))
-    with _lock:
-        key = (catalogue.fingerprint, half_diagonal)
-        if key not in _in_use:
-            while len(_in_use) >= MOST_IN_USE:
-                _in_use.pop(next(iter(_in_use)))
-            _in_use[key] = _load_or_build(catalogue, half_diagonal, progress)
-        return _in_use[key]
-
-
-_lock = threading.Lock()
-_in_use: dict[tuple, TriangleCatalogue] = {}
-
-
-def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
-    settings = (
-        catalogue.fingerprint,
-        half_diagonal,
-        CIRCLES,
-        POOL_PER_CIRCLE,
-        BEACONS,
-        SHORTEST_SIDE,
-        MAX_TRIANGLES,
-    )
-    digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
-    folder = cache_folder() / f"{PREFIX}{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
-    if (stored := _map(folder, len(catalogue))) is not None:
-        return stored
-    with _one_builder(folder.parent):
-        if (stored := _map(folder, len(catalogue))) is not None:  # another process was first
-            return stored
-        built = build(catalogue, half_diagonal, progress)
-        try:
-            _store(built, folder)
-        except OSError as e:
-            warnings.warn(
-                f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}), so that each start builds "
-                "it again: make the folder writable or set XDG_CACHE_HOME",
-                stacklevel=2,
-            )
-            return built
-    return _map(folder, len(catalogue)) or built
-
-
-@contextmanager
-def _one_builder(cache: Path) -> Iterator[None]:
-    """Let one process build in the cache while others wait, if folders can be locked; a killed process holds no lock."""
-    folder = None
-    with suppress(OSError, ImportError):
-        import fcntl
-
-        cache.mkdir(parents=True, exist_ok=True)
-        folder = os.open(cache, os.O_RDONLY)
-        fcntl.flock(folder, fcntl.LOCK_EX)
-    try:
-        yield
-    finally:
-        if folder is not None:
-            os.close(folder)
-
-
-def _store(triangles: TriangleCatalogue, folder: Path) -> None:
-    """Write all columns into a new folder, then rename it, so that all of it is there or nothing."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    _clear(folder.parent)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=SCRATCH) as scratch:
-        whole = Path(scratch) / "whole"
-        whole.mkdir()
-        for f in fields(triangles):
-            with open(whole / f"{f.name}.npy", "wb") as file:
-                np.save(file, getattr(triangles, f.name))
-                file.flush()
-                os.fsync(file.fileno())
-        if folder.exists():  # it was broken, or it would have been used
-            folder.rename(Path(scratch) / "broken")
-        try:
-            whole.rename(folder)
-        except OSError:
-            if not folder.is_dir():  # otherwise another process was first
-                raise
-
-
-def _clear(cache: Path) -> None:
-    """Remove the folders of earlier formats, and unfinished ones that are older than a day."""
-    for old in cache.glob("triangles-*"):
-        if not old.name.startswith(PREFIX):
-            shutil.rmtree(old, ignore_errors=True)
-    for left in cache.glob(f"{SCRATCH}*"):
-        with suppress(OSError):
-            if time.time() - left.stat().st_mtime > DAY_S:
-                shutil.rmtree(left, ignore_errors=True)
-
-
-def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
-    """The stored catalogue; None if it is missing or its columns do not fit together."""
-    try:
-        columns = {
-            f.name: np.asarray(np.load(folder / f"{f.name}.npy", mmap_mode="r", allow_pickle=False))
-            for f in fields(TriangleCatalogue)
-        }
-    except (OSError, ValueError, EOFError):
-        return None
-    t = TriangleCatalogue(**columns)
-    stars, count = len(t.star), len(t.corners)
-    kinds = "iiiifibufi"  # of the columns' numbers, in their order
-    fit = (
-        [column.dtype.kind for column in columns.values()] == list(kinds)
-        and t.bin_start.shape == (np.prod(BINS) + 1,)
-        and t.cell_start.shape == (ZONES * CELLS + 1,)
-        and t.corners.shape == t.shape.shape == (count, 3)
-        and t.counter_clockwise.shape == (count,)
-        and t.rank.shape == t.star.shape == (stars,)
-        and t.beacons.shape == (len(t.beacon), 3)
-        and t.longest_allowed.shape == (1,)
-        and t.longest_allowed[0] > 0
-        and _rising(t.bin_start, count)
-        and _rising(t.cell_start, stars)
-        and bool(np.all(np.diff(t.star) > 0))  # so that the first and the last are the limits
-        and (stars == 0 or 0 <= t.star[0] <= t.star[-1] < catalogue_stars)
-        and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
-        and bool(np.all(t.corners[:, 0] != t.corners[:, 1]))
-    )
-    return t if fit else None
-
-
-def _rising(start: np.ndarray, end: int) -> bool:
-    return bool(start[0] == 0 and start[-1] == end and np.all(np.diff(start) >= 0))

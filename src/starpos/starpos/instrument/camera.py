@@ -138,7 +138,8 @@ def _distortion_jacobian(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d x = slope * x
+    # d radial / dx = slope * x
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
     off = x * y * slope + 2 * p1 * x + 2 * p2 * y
     xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
     yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x

@@ -27,21 +27,21 @@ class Workers(Protocol):
         """
 
 
-def worked(work: Callable, of: Files) -> bytes:
+def worked(work: Callable, files: Files) -> bytes:
     """Do the work and return its answer, or its StarposError, pickled.
 
     Work in this process uses it too: the sum of an array that is a view of another may differ in the last digit from that
     of its pickled copy, and the answers must be the same everywhere.
     """
     try:
-        answer = work(of)
+        answer = work(files)
     except StarposError as error:
         answer = error
     # a failure on one frame must not lose the others
     except Exception as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
         answer = FrameError(
-            f"{of}: this program failed on it ({type(error).__name__}: {one_line(error)}; {at.filename}:{at.lineno}): "
+            f"{files}: this program failed on it ({type(error).__name__}: {one_line(error)}; {at.filename}:{at.lineno}): "
             "please report it with the frame"
         )
     return pickle.dumps(answer)
@@ -56,9 +56,9 @@ def answer_of(outcome: bytes) -> Any:
     return answer
 
 
-def given_up(of: Files, why: str) -> FrameError:
+def given_up(files: Files, why: str) -> FrameError:
     """The answer for a frame whose work ends the process that does it."""
-    return FrameError(f"{of}: given up: {why}")
+    return FrameError(f"{files}: given up: {why}")
 
 
 class Here:

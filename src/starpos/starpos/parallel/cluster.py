@@ -142,19 +142,19 @@ class Cluster:
 
     def _begun(self, call: Call, here: Same) -> Any:
         """Start a call and return its future, or its pickled answer if its files cannot be seen by a worker."""
-        work, of = call
-        files = {}
-        for path in (*getattr(work, "files", ()), *([of] if isinstance(of, str) else ())):
+        work, files = call
+        sizes = {}
+        for path in (*getattr(work, "files", ()), *([files] if isinstance(files, str) else ())):
             try:
                 status = os.stat(path)
             except (OSError, ValueError):
-                return worked(work, of)
+                return worked(work, files)
             if not stat.S_ISREG(status.st_mode):
-                return worked(work, of)
-            files[os.path.abspath(path)] = status.st_size
-        of = os.path.abspath(of) if isinstance(of, str) else tuple(map(os.path.abspath, of))
+                return worked(work, files)
+            sizes[os.path.abspath(path)] = status.st_size
+        files = os.path.abspath(files) if isinstance(files, str) else tuple(map(os.path.abspath, files))
         # sent as bytes that the worker unpickles itself: so a failure to load them is an error that we are told
-        return self._client.submit(pickle.loads, pickle.dumps(_Task(work, of, files, here)), pure=False)
+        return self._client.submit(pickle.loads, pickle.dumps(_Task(work, files, sizes, here)), pure=False)
 
 
 @dataclass(frozen=True)
@@ -162,12 +162,12 @@ class _Task:
     """A call as it is sent to a worker; to unpickle it is to do it, and gives its pickled answer."""
 
     work: Callable
-    of: object
-    files: dict[str, int]  # size of each
+    files: Files
+    sizes: dict[str, int]  # bytes of each file
     here: Same
 
     def __reduce__(self) -> tuple[Callable[..., bytes], tuple]:
-        return _on_worker, (self.work, self.of, self.files, self.here)
+        return _on_worker, (self.work, self.files, self.sizes, self.here)
 
 
 def _is_address(text: str) -> bool:
@@ -179,7 +179,7 @@ def _is_address(text: str) -> bool:
         return False
 
 
-def _on_worker(work: Callable, of: Files, files: dict[str, int], here: Same) -> bytes:
+def _on_worker(work: Callable, files: Files, sizes: dict[str, int], here: Same) -> bytes:
     """Do a call on this worker, if its starpos and its files are the same as those of the sender."""
     from distributed import get_worker
 
@@ -187,7 +187,7 @@ def _on_worker(work: Callable, of: Files, files: dict[str, int], here: Same) -> 
     there = same_here()
     if there != here:
         return pickle.dumps(ClusterError(f"{name}: {differing(there, here)}"))
-    for path, size in files.items():
+    for path, size in sizes.items():
         try:
             seen = os.stat(path).st_size
         except OSError:
@@ -202,4 +202,4 @@ def _on_worker(work: Callable, of: Files, files: dict[str, int], here: Same) -> 
     # the worker's own threads already share its processors
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
-    return worked(work, of)
+    return worked(work, files)

@@ -129,13 +129,13 @@ class _Board:
         self._done[task[0]] = outcome
 
     def died(self, task: Task, why: str) -> None:
-        number, (_, of) = task
+        number, (_, files) = task
         self._under_way.discard(number)
         if number not in self._tried:
             self._tried.add(number)
             self._again.append(task)
             return
-        error = given_up(of, f"the process that worked it ended twice, the second time alone ({why})")
+        error = given_up(files, f"the process that worked it ended twice, the second time alone ({why})")
         self._done[number] = pickle.dumps(error)
 
     def answers(self) -> Iterator:
@@ -217,7 +217,7 @@ def _serve(pipe: Connection) -> None:
     with suppress(EOFError, OSError):
         pipe.send_bytes(pickle.dumps(((), None)))
         while True:
-            work, of = pickle.loads(pipe.recv_bytes())
+            work, files = pickle.loads(pipe.recv_bytes())
             with warnings.catch_warnings(record=True) as said:
-                outcome = worked(work, of)
+                outcome = worked(work, files)
             pipe.send_bytes(pickle.dumps(([str(w.message) for w in said], outcome)))

@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
-ZONES = 180  # of declination
-CELLS = 360  # of right ascension in each
+ZONES = 180  # zones of declination
+CELLS = 360  # cells of right ascension in each zone
 
 
 def cell_starts(zone_start: np.ndarray, ra_deg: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.identification import Sky, identify, identify_directions, search, triangles
+from starpos.identification import Sky, identify, identify_directions, search, triangle_cache
 from starpos.identification.lookup import LOOSE_PX
 from starpos.instrument.camera import Camera
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
@@ -16,7 +16,7 @@ FIELDS = {
 
 
 def sky_for(catalogue, camera, **more):
-    return Sky(catalogue, triangles.cached(catalogue, camera.half_diagonal_rad), **more)
+    return Sky(catalogue, triangle_cache.cached(catalogue, camera.half_diagonal_rad), **more)
 
 
 def random_attitude(rng):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starpos.identification import triangles
+from starpos.identification import triangle_cache, triangles
 from starpos.instrument.camera import Camera
 from starpos_testing.patience import WAIT_S
 
@@ -19,7 +19,7 @@ WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
 
 @pytest.fixture(scope="module")
 def table(catalogue):
-    return triangles.cached(catalogue, WIDE)
+    return triangle_cache.cached(catalogue, WIDE)
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +32,9 @@ def places(table, catalogue):
 def own_cache(tmp_path, monkeypatch):
     """An empty cache and nothing remembered from it, before and after."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    triangles._in_use.clear()
+    triangle_cache._in_use.clear()
     yield tmp_path / "cache" / "starpos"
-    triangles._in_use.clear()
+    triangle_cache._in_use.clear()
 
 
 def angles(v):
@@ -149,35 +149,35 @@ def test_every_part_of_the_sky_has_enough(table, places, catalogue, rng):
 
 def test_it_is_built_once_then_mapped(own_cache, catalogue, monkeypatch):
     built = []
-    table = triangles.cached(catalogue, WIDE, lambda what, done: built.append(done))
+    table = triangle_cache.cached(catalogue, WIDE, lambda what, done: built.append(done))
     assert built[-1] == pytest.approx(1)
     (folder,) = own_cache.iterdir()
-    triangles._in_use.clear()
+    triangle_cache._in_use.clear()
     monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built again"))
-    again = triangles.cached(catalogue, WIDE)
+    again = triangle_cache.cached(catalogue, WIDE)
     np.testing.assert_array_equal(again.corners, table.corners)
     # a refined focal length does not build another
-    assert triangles.cached(catalogue, WIDE * 1.0001) is not None
+    assert triangle_cache.cached(catalogue, WIDE * 1.0001) is not None
     assert [p.name for p in own_cache.iterdir()] == [folder.name]
 
 
 def test_who_waited_for_another_process_that_built_does_not_build_again(own_cache, catalogue, monkeypatch):
-    triangles.cached(catalogue, WIDE)
+    triangle_cache.cached(catalogue, WIDE)
     (folder,) = own_cache.iterdir()
     away = folder.rename(own_cache.parent / "away")
-    triangles._in_use.clear()
-    absent, built, load = threading.Event(), [], triangles._map
+    triangle_cache._in_use.clear()
+    absent, built, load = threading.Event(), [], triangle_cache._map
 
     def looked(*of):
         found = load(*of)
         absent.set()
         return found
 
-    monkeypatch.setattr(triangles, "_map", looked)
+    monkeypatch.setattr(triangle_cache, "_map", looked)
     other = os.open(own_cache, os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
     waiting = threading.Thread(
-        target=triangles.cached, args=(catalogue, WIDE, lambda what, done: built.append(done))
+        target=triangle_cache.cached, args=(catalogue, WIDE, lambda what, done: built.append(done))
     )
     waiting.start()
     assert absent.wait(30)
@@ -212,16 +212,16 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_broken_cache_is_built_anew(damage, own_cache, catalogue):
-    good = triangles.cached(catalogue, WIDE)
+    good = triangle_cache.cached(catalogue, WIDE)
     (folder,) = own_cache.iterdir()
     column, harm = DAMAGE[damage]
     kept = {path.name: path.read_bytes() for path in folder.iterdir()}
-    triangles._in_use.clear()
+    triangle_cache._in_use.clear()
     path = folder / f"{column}.npy"
     path.unlink()  # or the harm would reach what is still mapped
     path.write_bytes(kept[path.name])
     harm(path)
-    again = triangles.cached(catalogue, WIDE)
+    again = triangle_cache.cached(catalogue, WIDE)
     np.testing.assert_array_equal(again.corners, good.corners)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == kept
 
@@ -237,8 +237,8 @@ def test_what_older_versions_left_in_the_cache_goes(own_cache, catalogue):
     os.utime(own_cache / "unfinished-old", (0, 0))
     (own_cache / "unfinished-now").mkdir()
     (own_cache / "somebody's").mkdir()
-    triangles.cached(catalogue, WIDE)
-    left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangles.PREFIX))
+    triangle_cache.cached(catalogue, WIDE)
+    left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangle_cache.PREFIX))
     assert left == ["somebody's", "unfinished-now"]
 
 
@@ -247,13 +247,13 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch, catalogue):
     (tmp_path / "cache").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.warns(UserWarning, match="XDG_CACHE_HOME"):
-        assert len(triangles.cached(catalogue, WIDE).corners) > 1000
+        assert len(triangle_cache.cached(catalogue, WIDE).corners) > 1000
 
 
 def test_two_processes_at_once(own_cache):
     program = (
-        "import numpy as np; from starpos.sky import catalogue; from starpos.identification import triangles\n"
-        f"t = triangles.cached(catalogue.load_catalogue(), {WIDE}); print(len(t.corners), int(t.corners.sum()))"
+        "import numpy as np; from starpos.sky import catalogue; from starpos.identification import triangle_cache\n"
+        f"t = triangle_cache.cached(catalogue.load_catalogue(), {WIDE}); print(len(t.corners), int(t.corners.sum()))"
     )
     environment = os.environ | {"XDG_CACHE_HOME": str(own_cache.parent)}
     running = [
