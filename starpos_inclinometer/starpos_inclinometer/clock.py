@@ -72,12 +72,14 @@ class ArrivalFilter:
         """
         elapsed = (milliseconds - self._last_ms) & 0xFFFFFFFF
         if not self._points or elapsed >= 1 << 31:
-            return self._start(milliseconds, arrival_s)
+            self._start(milliseconds, arrival_s)
+            return None
         time, apart_s = self._time + elapsed * 1e-3, arrival_s - self._last_arrival_s
         offset = arrival_s - time
         late = offset - (self._level + self._slope * time)
         if late < -EARLY_S and self._live:
-            return self._start(milliseconds, arrival_s)
+            self._start(milliseconds, arrival_s)
+            return None
         catching_up = apart_s < SLOWEST_PACE * elapsed * 1e-3
         self._last_ms, self._last_arrival_s, self._time = milliseconds, arrival_s, time
         if not self._live:

@@ -4,7 +4,9 @@
 import math
 import traceback
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -42,6 +44,7 @@ from starpos_solver.tilts import TiltBuffer
 # Most frames that wait for their tilts or for the triangles; older ones are dropped.
 WAITING = 4
 POLL_S = 0.02
+TILT_QUEUE = 1000
 # Times that differ by more are not of the same evening.
 ANOTHER_TIME_S = 3600.0
 J2000_UNIX_S = 946_728_000.0
@@ -97,7 +100,7 @@ class SolverNode(Node):
     def _connect(self) -> None:
         self._outputs = SolutionPublishers(self, self._settings)
         subscription(self, CameraInfo, "camera/camera_info", self._on_camera, 10)
-        subscription(self, msg.Tilt, "tilt", self._on_tilt, 1000)
+        self._tilt_subscription = subscription(self, msg.Tilt, "tilt", self._on_tilt, TILT_QUEUE)
         subscription(self, msg.StarArray, "stars", self._on_stars, 10)
         self.create_service(Solve, "solver/solve", self._on_solve)
         self.create_service(Trigger, "solver/reset", self._on_reset)
@@ -178,9 +181,26 @@ class SolverNode(Node):
             self._remake_solver()
         self._work()
 
-    def _on_tilt(self, message: msg.Tilt) -> None:
+    def _on_tilt(self, message: msg.Tilt, info: Mapping[str, Any]) -> None:
+        self._take_tilt(message, info)
+        if self._waiting:
+            self._work()
+
+    def _take_arrived_tilts(self) -> None:
+        """Read the tilts that have arrived but wait for the executor: after a stall they are those of the frame."""
+        handle = self._tilt_subscription.handle
+        with handle:
+            for _ in range(TILT_QUEUE):
+                taken = handle.take_message(msg.Tilt, False)
+                if taken is None:
+                    return
+                self._take_tilt(*taken)
+
+    def _take_tilt(self, message: msg.Tilt, info: Mapping[str, Any]) -> None:
         self._watch_clock()
         try:
+            now_s = self._steady.now().nanoseconds * 1e-9
+            self._tilts.heard(message, info.get("publication_sequence_number"), now_s)
             ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
             # The instrument may lean otherwise when the time of its stamp comes.
             if ahead_s > reports.AHEAD_S:
@@ -189,8 +209,6 @@ class SolverNode(Node):
             self._inputs.came("tilt")
         except StarposError as e:
             self._inputs.refuse("tilt", str(e))
-        if self._waiting:
-            self._work()
 
     def _on_stars(self, message: msg.StarArray) -> None:
         self._inputs.came("stars")
@@ -243,6 +261,7 @@ class SolverNode(Node):
     def _work(self) -> None:
         """Solve the frames that have everything they need; poll only while a frame waits."""
         while self._waiting and self._ready(self._waiting[0]):
+            self._take_arrived_tilts()
             self._solve(self._waiting.popleft())
         if self._waiting and self._poll.is_canceled():
             self._poll.reset()

@@ -7,15 +7,23 @@ import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import TiltLog
-from starpos.recording.messages import OUT_OF_RANGE, SATURATED, UNUSABLE, message_to_tilt, stamp_to_unix
+from starpos.instrument.tilt_log import BRACKET_S, TOUCH_S, TiltLog
+from starpos.recording.messages import (
+    OUT_OF_RANGE,
+    SATURATED,
+    STUCK,
+    UNUSABLE,
+    message_to_tilt,
+    stamp_to_unix,
+)
 from starpos_interfaces import msg
+from starpos_solver.tilt_publishers import TiltPublishers
 
 CAPACITY = 6000  # ten minutes at 10 Hz
 # Between two samples of one exposure at most so many others arrive.
 TOGETHER = 20
-# A flagged sample so near to an exposure explains why it has no good one.
-NEAR_S = 1.0
+# Samples so near to an exposure may bracket it; a flagged one explains why it has no good one.
+NEAR_S = BRACKET_S
 # Time between samples if there are too few to tell, and the share of it by which the next may come early.
 USUAL_PERIOD_S, JITTER = 0.1, 0.9
 
@@ -27,6 +35,7 @@ class TiltBuffer:
         self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with the number of its arrival
         self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
+        self._publishers = TiltPublishers()
 
     def __len__(self) -> int:
         return len(self._good)
@@ -34,6 +43,16 @@ class TiltBuffer:
     def clear(self) -> None:
         self._good.clear()
         self._flagged.clear()
+
+    def heard(self, message: msg.Tilt, number: int | None, now_s: float) -> None:
+        """Note who publishes, before `add`; number: that of its publisher's messages, None if there is none.
+
+        TiltError while two publish: whose samples are the instrument's own nobody knows, so none is kept.
+        """
+        self._publishers.heard(message.header.frame_id, number, now_s)
+        if several := self._publishers.several:
+            self._good.clear()
+            raise TiltError(several)
 
     def add(self, message: msg.Tilt, unknown_stddev_rad: float) -> None:
         """Keep a sample; TiltError if the message is broken."""
@@ -58,10 +77,12 @@ class TiltBuffer:
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether all samples of an exposure have arrived: the last one leaves no time for another."""
         times = [s.utc_unix_s for s in self._near(mid_unix_s, span_s)]
-        if not times:
-            return False
+        end = mid_unix_s + span_s / 2
+        if not times or times[-1] >= end:
+            return bool(times)
         period = float(np.median(np.diff(times))) if len(times) > 2 else USUAL_PERIOD_S
-        return times[-1] >= mid_unix_s + span_s / 2 - JITTER * period
+        # a sample that comes after an exposure without any of its own is needed to bracket it
+        return times[-1] >= max(end - JITTER * period, end - span_s)
 
     def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
         """The samples near an exposure in order of time, however they came; none counts twice.
@@ -79,15 +100,20 @@ class TiltBuffer:
         return [near[t] for t in sorted(near)]
 
     def average(self, mid_unix_s: float, span_s: float) -> Tilt:
-        """Average over an exposure; TiltRangeError or TiltError with the reason if there is no sample."""
+        """Average over an exposure; TiltRangeError or TiltError with the reason if there is none."""
+        if several := self._publishers.several:
+            raise TiltError(several)
         near = self._near(mid_unix_s, span_s)
-        if not near:
-            self._explain(mid_unix_s, span_s)
-        # Later samples must not count, because it is chance how many have arrived by now.
-        near = [s for s in near if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + 1e-6] or near
+        inside = [k for k, s in enumerate(near) if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + TOUCH_S]
+        if not inside:
+            self._explain(mid_unix_s, span_s, bool(near))
+        else:
+            # Later samples must not count, because it is chance how many have arrived by now.
+            near = near[max(inside[0] - 1, 0) : inside[-1] + 1]
         return TiltLog.of_readings(near).average(mid_unix_s, span_s)
 
-    def _explain(self, mid_unix_s: float, span_s: float) -> None:
+    def _explain(self, mid_unix_s: float, span_s: float, others_near: bool) -> None:
+        """Raise the reason why no sample lies in an exposure; return if others that are near it may bracket it."""
         flags = 0
         for moment, flag in self._flagged:
             if abs(moment - mid_unix_s) <= span_s / 2 + NEAR_S:
@@ -96,8 +122,14 @@ class TiltBuffer:
             raise TiltRangeError(
                 "tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright"
             )
-        if flags:
+        if flags & STUCK:
             raise TiltError("tilt: the inclinometer repeats the same value: check its converter's wiring")
+        if flags and not others_near:
+            raise TiltError(
+                "tilt: when the inclinometer's readings were taken is not known: its process or its link stood still"
+            )
+        if others_near:
+            return
         nearest = min((abs(s.utc_unix_s - mid_unix_s) for _, s in self._good), default=None)
         known = "none has arrived at all" if nearest is None else f"the nearest is {nearest:.1f} s off"
         raise TiltError(f"tilt: no sample near the exposure ({known}): check the inclinometer and the clocks")

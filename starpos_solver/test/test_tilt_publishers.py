@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two inclinometers on one topic are seen, however they send; one is trusted again once it alone has sent for a second."""
+
+import pytest
+
+from starpos_solver.tilt_publishers import TiltPublishers
+
+
+def heard(messages) -> TiltPublishers:
+    """After messages (frame, number, seconds)."""
+    publishers = TiltPublishers()
+    for message in messages:
+        publishers.heard(*message)
+    return publishers
+
+
+def test_one_publisher_is_alone_also_where_messages_are_lost():
+    numbers = [1, 2, 3, 7, 8, 1000]
+    assert not heard(("s", n, 0.1 * k) for k, n in enumerate(numbers)).several
+    assert not heard(("s", n, 60.0 * k) for k, n in enumerate(numbers)).several
+
+
+@pytest.mark.parametrize("frames", [("s", "other"), ("s", "s")])
+@pytest.mark.parametrize("begin", [(1, 1), (1, 500), (500, 1), (7, 8)])
+@pytest.mark.parametrize("often", [1, 10])
+def test_two_publishers_are_seen_within_two_messages_of_each(frames, begin, often):
+    publishers, told = TiltPublishers(), []
+    numbers = list(begin)
+    for k in range(3):
+        for which, count in ((0, 1), (1, often)):
+            for _ in range(count):
+                publishers.heard(frames[which], numbers[which], 0.1 * k)
+                numbers[which] += 1
+                told.append(bool(publishers.several))
+    assert all(told[2 * (1 + often) :])
+    assert "stop all but one" in publishers.several
+
+
+def test_a_frame_that_changes_is_another_inclinometer():
+    assert "'a' and 'b'" in heard([("a", 1, 0.0), ("b", 2, 0.1)]).several
+
+
+def test_the_one_that_goes_on_is_trusted_after_a_second_alone():
+    both = [(f, n, 0.1 * n) for n in range(10) for f in ("a", "b")]
+    after = [("a", n, 0.1 * n) for n in range(10, 19)]
+    assert heard([*both, *after]).several
+    assert not heard([*both, *after, ("a", 19, 1.95)]).several
+
+
+def test_a_publisher_that_was_restarted_is_trusted_after_a_second():
+    before = [("a", n, 0.1 * n) for n in range(100)]
+    assert heard([*before, ("a", 1, 10.0)]).several
+    assert not heard([*before, *(("a", 1 + n, 10.0 + 0.1 * n) for n in range(12))]).several
+    assert not heard([*before, ("a", 1, 12.0)]).several
+
+
+def test_a_middleware_that_numbers_nothing_tells_frames_apart():
+    assert not heard([("a", None, 0.0), ("a", None, 0.1)]).several
+    assert heard([("a", None, 0.0), ("b", None, 0.1)]).several
