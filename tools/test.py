@@ -27,6 +27,7 @@ LINTERS = [
     *(f"ruff {check} --output-format concise" for check in ("check", "format --check")),
     "codespell",
     "mypy",
+    f"{sys.executable} tools/walls.py",
 ]
 NO_TESTS = 5  # pytest's exit status where a -k left none
 SHOWN = 20  # of the slowest tests
