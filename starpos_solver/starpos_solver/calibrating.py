@@ -6,7 +6,6 @@ Both are here because they must forget at the same events: an average holds for 
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -14,10 +13,8 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
-from starpos.averaging.average import Average, Averager, average
 from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.calibration.plumb_line import UNKNOWN_ARCSEC
-from starpos.calibration.turning import turn
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
@@ -28,6 +25,7 @@ from starpos_common.job import JobRunner, Outcome
 from starpos_interfaces.srv import Calibrate, SelfCalibrate
 from starpos_solver.averaging import Averaging, News
 from starpos_solver.memory import PoseMemory, RecentFrames, Seen, tilts_of
+from starpos_solver.turned import Turned, turn_on_the_spot
 
 # Fewer headings cannot show that they are of one place. The caller of the service asserts it, so it needs one less.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
@@ -45,14 +43,6 @@ OF_AVERAGE = OF_CALIBRATION | {
     "clock_stddev",
     "tilt_stddev",
 }
-
-
-@dataclass(frozen=True)
-class Turned:
-    """Result of headings on the spot: A3 and the place."""
-
-    calibrated: Calibrated
-    place: Average
 
 
 class Calibrating:
@@ -254,7 +244,7 @@ class Calibrating:
             )
         solver = self._solver()
         turn_deg = self._values["calibration_turn_stddev"]
-        return lambda: _turn(solver, poses, turn_deg)
+        return lambda: turn_on_the_spot(solver, poses, turn_deg)
 
     def _turn_by_itself(self) -> None:
         """Calibrate from the present poses; if a job runs, do it afterwards, from the poses of that time."""
@@ -354,34 +344,6 @@ class Calibrating:
             sentence = "camera against inclinometer is not known: " + (self._said or "turn it on the spot")
             return Diagnosis(Level.WARN, sentence, values)
         return Diagnosis(Level.OK, self._about or "that of the parameters", values)
-
-
-def _turn(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
-    """Calibrate from poses on the spot; FixError if they give no place, or more than one."""
-    calibrated = turn(solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg)
-    if not calibrated.fixes:
-        raise FixError(f"no heading has a fix: {calibrated.solutions[0].message}")
-    place = average(calibrated.fixes)
-    if place.moved:
-        raise FixError(
-            "the headings are of more than one place: call solver/reset, and turn the instrument on the spot"
-        )
-    if _newest_is_off(calibrated.fixes):
-        raise FixError(
-            "the newest heading does not fit the others: the instrument has moved, then call solver/reset, or its tilt "
-            "was wrong"
-        )
-    return Turned(calibrated, place)
-
-
-def _newest_is_off(fixes: list[Fix]) -> bool:
-    averager = Averager()
-    before = after = averager.average
-    for fix in sorted(fixes, key=lambda f: f.utc_unix_s):
-        before = after
-        averager.add(fix)
-        after = averager.average
-    return before is not None and after is not None and after.left_out > before.left_out
 
 
 def _about(found: Calibrated) -> str:

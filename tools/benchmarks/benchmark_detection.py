@@ -13,7 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # CPU time is compared, not cleverness at sharing
+# CPU time is compared, so each program gets one thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
@@ -71,10 +72,11 @@ def memory_kb(name):
 
 def measured(work, path, repeat):
     """Detect; return the number of stars, CPU ms (the quickest of `repeat`), and peak memory over the frame's bytes."""
-    # what the first call loads is no frame's work; a small one leaves no memory to those that follow
+    # The first call loads modules, which should not count. A small frame leaves little memory for the ones that follow.
     work(exposure((200, 200), 5, np.random.default_rng(1)))
     pixels = np.load(path)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    # This resets the peak of memory.
+    Path("/proc/self/clear_refs").write_text("5")
     before, times = memory_kb("VmRSS"), []
     for _ in range(repeat):
         begin = time.process_time()

@@ -29,7 +29,8 @@ from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue
 
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
-LIMIT_MAG, DEEPER_MAG = 9.0, 0.5  # a peer's catalogue reaches deeper, for the scatter of brightness
+# A peer's catalogue is deeper by this much, because of the scatter of brightness.
+LIMIT_MAG, DEEPER_MAG = 9.0, 0.5
 SCALE_ERROR = 0.03
 TIMEOUT_MS = 5000
 
@@ -106,7 +107,7 @@ def astrometry_net(stars, args) -> montecarlo_fields.Answer:
     solver = astrometry.Solver(index)
     scale = CAMERA.scale_arcsec
     size = astrometry.SizeHint(scale * (1 - SCALE_ERROR), scale * (1 + SCALE_ERROR))
-    # rows run downwards: to this engine a frame as it is has the flipped parity
+    # Rows run downwards, so for this engine a frame has flipped parity.
     settings = astrometry.SolutionParameters(
         sip_order=0, tune_up_logodds_threshold=None, parity=astrometry.Parity.FLIP,
         logodds_callback=lambda odds: astrometry.Action.STOP,
@@ -143,7 +144,8 @@ def main() -> int:
     )
     parser.add_argument("--index", type=Path, metavar="FOLDER", help="astrometry.net's index files")
     args = parser.parse_args()
-    logging.basicConfig(level=logging.WARNING)  # one peer's log would be timed as its work
+    # Otherwise the log of one peer would be timed as its work.
+    logging.basicConfig(level=logging.WARNING)
     stars, answers = catalogue.load_catalogue(), {}
     for name, peer in (
         ("starpos", starpos),

@@ -24,9 +24,11 @@ ROOT = Path(__file__).resolve().parents[2]
 QUICK_START = ROOT / "src" / "starpos_bringup" / "config" / "quick_start.xml"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 FIRST_FIX_S, SOLVER_S, FRAME_S, STARS_S = 3.0, 1.0, 0.6, 0.02  # targets, median
-FILES = 8  # frames of 42 MB on disk, played round and round
+# Frames of 42 MB on disk, played again and again.
+FILES = 8
 CADENCE_S = 1.0
-SETTLED = 3  # frames before the clocks run
+# Frames before the timing begins.
+SETTLED = 3
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,8 @@ def from_stars(folder: Path, frames: int) -> Row:
             run.graph.info.publish(shot.info)
             for tilt in shot.tilts:
                 run.graph.tilt.publish(tilt)
-            run.graph.comes(lambda: False, 0.1)  # a second of tilts has come in the meantime
+            # Meanwhile the tilts of a second have come.
+            run.graph.comes(lambda: False, 0.1)
             begin = time.monotonic()
             run.graph.stars.publish(shot.stars)
             run.graph.wait(lambda shot=shot: shot.stamp in run.ears.fixes, "for a fix")
@@ -255,7 +258,8 @@ def main() -> int:
     with own_domain(), tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         if "start" in only:
-            from_start(folder, 1)  # the cache is warm from here
+            # This fills the cache.
+            from_start(folder, 1)
             rows.append(from_start(folder, options.starts))
             rows.append(from_start_of_solver(folder, options.starts))
         if "stars" in only:

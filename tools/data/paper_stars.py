@@ -27,7 +27,8 @@ def paper_rows(folder: Path):
             bt, vt = (np.float64(text.strip() or b"nan") for text in (line[110:116], line[123:129]))
             if johnson_v(bt, vt) < LIMIT_MAG:
                 place = line[15:27], line[28:40]
-                if not place[0].strip():  # no mean position: the observed one
+                # Without a mean position take the observed one.
+                if not place[0].strip():
                     place = line[152:164], line[165:177]
                 yield tuple(int(t) for t in line[:12].split()), *map(float, place)
 

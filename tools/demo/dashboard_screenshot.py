@@ -25,7 +25,8 @@ from instrument_run import Place, Processes
 from starpos_testing.domain import own_domain
 
 PICTURE = Path(__file__).resolve().parents[2] / "src" / "starpos_dashboard" / "dashboard.png"
-PORT = Path("ttyUSB0")  # in the picture, where a robot's port has its name
+# The picture shows this name, as it would show a robot's port.
+PORT = Path("ttyUSB0")
 SIZE = (1440, 1000)
 FIXES = 6  # on the map
 PATIENCE_S = 120.0
@@ -91,7 +92,8 @@ def photograph(url: str, path: Path, fixes: int = FIXES, size: tuple[int, int] =
             time.sleep(0.2)
         height = driver.execute_script("return document.documentElement.scrollHeight")
         driver.set_window_size(size[0], height + size[1] - driver.execute_script("return innerHeight"))
-        time.sleep(1.0)  # the map draws itself anew
+        # The map is drawn again meanwhile.
+        time.sleep(1.0)
         save(driver.get_screenshot_as_png(), path)
 
 

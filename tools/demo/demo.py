@@ -126,7 +126,8 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
     out.mkdir(parents=True, exist_ok=True)
     place = Place.drawn(np.random.default_rng(seed))
     introduce(seed, place, "four nodes and an emulated inclinometer")
-    with tempfile.TemporaryDirectory() as scratch:  # a pty's link wants a short path
+    # The link to a pty needs a short path.
+    with tempfile.TemporaryDirectory() as scratch:
         processes = Processes(out)
         watcher = PictureWatcher(place)
         start(processes, place, seed, Path(scratch) / "inclinometer-port")

@@ -40,7 +40,8 @@ from starpos_testing.domain import own_domain
 FRAMES, CADENCE_S, EXPOSURE_S = 10, 3.0, 0.5
 START_S = 5.0
 EXACT_ARCSEC, EXACT_S = 0.1, 0.001
-LATE_MS = 5.0  # the sky may lag behind the frames' stamps, of which the source claims as much
+# The sky may lag behind the frames' stamps by the error that the source states.
+LATE_MS = 5.0
 ROOT = Path(__file__).resolve().parents[2]
 NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
@@ -63,14 +64,14 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
     board, link = [str(folder / "inclinometer-sim"), str(folder / "inclinometer.elf")], str(folder / "port")
     theta_x, theta_y = np.degrees(place.scene().tilt)
     tilt = ["--tilt", f"{theta_x:.9f}", f"{theta_y:.9f}"]
-    devices.start("board", [*board, "--link", link, *tilt], stdin=subprocess.PIPE)  # it ends with its input
+    # It ends when its input ends.
+    devices.start("board", [*board, "--link", link, *tilt], stdin=subprocess.PIPE)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
     server = ["indiserver", "-p", port, "-u", str(folder / "indi"), "indi_simulator_ccd"]
-    devices.start(
-        "indiserver", server, env=os.environ | {"HOME": str(folder)}
-    )  # where its drivers keep settings
+    # The drivers keep their settings in HOME.
+    devices.start("indiserver", server, env=os.environ | {"HOME": str(folder)})
     wait_for(int(port))
     sky = [
         sys.executable,
@@ -102,7 +103,7 @@ def wait_for(port: int):
 
 def start_nodes(nodes: Processes, place: Place, found: dict):
     nodes.node("starpos_inclinometer", "inclinometer", found["inclinometer"])
-    # A3 is exact here, and so is the clock, being the sky's too: what is usually not known would only widen the claim
+    # A3 is exact here, and the clock is also that of the sky, so their usual errors would only widen the covariance.
     exact = {"misalignment_stddev": EXACT_ARCSEC, "clock_stddev": EXACT_S}
     nodes.node("starpos_solver", "solver", known_of(place) | exact)
     nodes.node("starpos_camera", "detector", {})
@@ -134,7 +135,8 @@ def run(seed: int, frames: int, out: Path) -> int:
         place,
         "four nodes, the firmware on an emulated MCU, the CCD simulator of indiserver under a sky",
     )
-    with tempfile.TemporaryDirectory() as scratch:  # a pty's link wants a short path
+    # The link to a pty needs a short path.
+    with tempfile.TemporaryDirectory() as scratch:
         devices, nodes = Processes(Path(scratch)), Processes(Path(scratch))
         watcher = Watcher(place)
         begun, memory = "", {}
@@ -148,7 +150,8 @@ def run(seed: int, frames: int, out: Path) -> int:
         except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
             trouble = str(error)
         codes = nodes.stop() | devices.stop()
-        if codes.get("indiserver") == -signal.SIGINT:  # it has no other way to end
+        # A signal is its only way to end.
+        if codes.get("indiserver") == -signal.SIGINT:
             codes["indiserver"] = 0
         if "sky" in devices.running:
             begun = devices.running["sky"].stdout.read()

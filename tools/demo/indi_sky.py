@@ -43,7 +43,8 @@ class Picture:
         self._pixels = np.frombuffer(content, ">u2", width * height, begin).reshape(height, width)
 
     def draw(self, pixels: np.ndarray):
-        np.bitwise_xor(pixels, 0x8000, out=self._pixels, casting="unsafe")  # FITS has them signed, less 32768
+        # FITS stores them signed, minus 32768.
+        np.bitwise_xor(pixels, 0x8000, out=self._pixels, casting="unsafe")
 
     def lease(self):
         """Wait until nobody reads the file; from then on a reader has to wait, and SIGIO tells of it."""

@@ -143,7 +143,8 @@ class Watcher:
 
     def _on_solution(self, message):
         stamp = stamp_of(message)
-        if stamp in self.solutions:  # a frame that is solved again is no other frame
+        # A frame that is solved again does not count twice.
+        if stamp in self.solutions:
             return
         if not self.solutions:
             print(f"\n{HEADER}")
@@ -205,8 +206,10 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
     errors = np.array([_error_m(s.latitude, s.longitude, place) for s in solutions])
     one = np.array(solutions[-1].covariance).reshape(3, 3)
     variance = np.zeros(2)
-    for term in solutions[-1].budget:  # what is new in every frame averages, the rest stays
-        if term.name == "deflection":  # of the geodetic position, which has no part in this
+    # Errors that are new in every frame average out, the others stay.
+    for term in solutions[-1].budget:
+        # It concerns the geodetic position, which is not compared here.
+        if term.name == "deflection":
             continue
         share = 1 if term.common else len(solutions)
         variance += np.array([term.east, term.north]) ** 2 / share

@@ -34,9 +34,11 @@ from starpos_testing.graph.shots import (
 )
 
 CADENCE_S, LATENCY_S = 0.8, 0.5
-TILT_TIMEOUT_S = 0.2  # of the solver here: a missing tilt costs less of the run
+# Shorter than the solver's default, so that a missing tilt costs less time.
+TILT_TIMEOUT_S = 0.2
 WRONG_SIGMA = 5.0
-ANSWER_S = 1.0  # a good frame has its answer by then, or a fault still works
+# If a good frame has no answer by then, a fault still has an effect.
+ANSWER_S = 1.0
 # An instrument far better than usual, so that small errors count: 15 m, where the paper's claims 190.
 KNOWN = Instrument(
     focal_of(SMALL),
@@ -85,7 +87,8 @@ class Truth:
         east = math.radians((longitude - self.longitude + 180) % 360 - 180)
         north = math.radians(latitude - self.latitude)
         apart = np.array([east * prime * math.cos(math.radians(self.latitude)), north * meridian])
-        sigmas = float(np.sqrt(apart @ np.linalg.solve(covariance_m2, apart)))  # NaN of what is none: wrong
+        # NaN if the covariance is none, which counts as wrong.
+        sigmas = float(np.sqrt(apart @ np.linalg.solve(covariance_m2, apart)))
         return sigmas, f"{np.hypot(*apart):.0f} m, {math.sqrt(np.trace(covariance_m2) / 2):.0f} claimed"
 
 
@@ -104,12 +107,13 @@ class World:
         )
         self._truths: dict[tuple[int, int], Truth] = {}
         self.right = Counter()  # by topic
-        self.sigmas: dict[str, list[float]] = {}  # by topic: how far off every fix was, in its own
+        # By topic: the error of every fix, in its own sigmas.
+        self.sigmas: dict[str, list[float]] = {}
         self.wrong: list[str] = []
         self.scene = scene_at(40.0, SMALL)
         self.drive()
 
-    # where it is -----------------------------------------------------------------------------------------------------
+    # place -----------------------------------------------------------------------------------------------------------
 
     def turn(self):
         """Turn the instrument, which is legitimate, as `drive` is: no fault."""
@@ -129,7 +133,7 @@ class World:
         site, heading = self.scene.site, math.degrees(self.scene.heading)
         return Truth(site.latitude_deg, site.longitude_deg, heading)
 
-    # what it sends ---------------------------------------------------------------------------------------------------
+    # messages --------------------------------------------------------------------------------------------------------
 
     def shot(self) -> SimulatedShot:
         """Make the next exposure."""
@@ -195,7 +199,7 @@ class World:
         self.graph.comes(lambda: stamp in self.graph.fixes and stamp in self.graph.solutions, ANSWER_S)
         return any(s.status == Solution.OK for s in self.graph.solutions.get(stamp, ()))
 
-    # what comes of it ------------------------------------------------------------------------------------------------
+    # answers ---------------------------------------------------------------------------------------------------------
 
     def judge(self) -> Counter:
         """Count the answers since the last call by status; `right` and `wrong` hold their fixes."""
@@ -217,7 +221,7 @@ class World:
                 [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y)]
             )
             off = math.degrees(math.atan2(x[0], x[1])) - self._truth_of(imu).heading
-            # by how much a small turn about east, north or up turns the azimuth of an x axis that leans
+            # The turn of a leaning x axis's azimuth for a small turn about east, north or up.
             slope = np.cross(x, [-x[1], x[0], 0.0]) / (x[0] ** 2 + x[1] ** 2)
             covariance = np.reshape(imu.orientation_covariance, (3, 3))
             sigma = math.degrees(math.sqrt(slope @ covariance @ slope))

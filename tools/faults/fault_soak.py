@@ -24,12 +24,17 @@ from starpos_testing.domain import own_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 
-WARM = 0.1  # of the faults, before memory is compared
+# Share of the faults before memory is compared.
+WARM = 0.1
 FAULTS_A_RESTART = 400
-LEGITIMATE = 0.04  # chance of a turn or a drive before a fault
-PATIENCE = 30  # good frames after a fault, of at most a second each
-FEWEST_FOR_MEMORY = 2000  # faults; the first of each kind takes memory for good
-GROWN_MB = 12.0  # of a node: the allocator's arenas wander by ten, up and down, however long it runs
+# Chance of a turn or a drive before a fault.
+LEGITIMATE = 0.04
+# Most good frames after a fault, of at most a second each.
+PATIENCE = 30
+# With fewer faults memory is not compared, because the first of each kind takes memory for good.
+FEWEST_FOR_MEMORY = 2000
+# Largest growth of a node: its allocator's memory varies by 10 MB however long it runs.
+GROWN_MB = 12.0
 
 
 @dataclass(kw_only=True)
@@ -41,7 +46,8 @@ class Row:
     statuses: Counter = field(default_factory=Counter)
     right: int = 0
     wrong: int = 0
-    frames: list[int] = field(default_factory=list)  # good ones until a fix, the one with the fix included
+    # Good frames until a fix, including the one with the fix.
+    frames: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
 

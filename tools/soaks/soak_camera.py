@@ -57,7 +57,8 @@ def main() -> int:
             except StarposError as error:
                 failed += 1
                 size = str(error)
-            if k > frames // 10:  # what is made once has been made
+            # By then everything that is made only once has been made.
+            if k > frames // 10:
                 sizes.append(memory_mb())
             if k % max(1, frames // 10) == 0:
                 gc.collect()

@@ -4,8 +4,8 @@
     ros2 launch starpos_bringup demo.launch.py latitude:=48.1 longitude:=11.6
     ros2 topic echo /fix
 
-Compare `fix` with the place given. Its time is the computer's own;
-tools/demo/demo.py does it with a place drawn at random.
+Compare `fix` with the given place. The time is that of this computer.
+tools/demo/demo.py does the same with a place drawn at random.
 """
 
 import atexit
@@ -37,7 +37,7 @@ AIR = {"pressure": 95000.0, "temperature": 8.0, "humidity": 0.4}
 
 
 def tilt_deg(place: dict[str, float], roll_deg: float):
-    """What the inclinometer of an instrument reads that stands so."""
+    """Compute the readings of the inclinometer at a place and pointing, deg."""
     from starpos.earth.refraction import Atmosphere
     from starpos.simulation.scene import scene_of
 
@@ -72,7 +72,8 @@ def nodes(context):
     emulator = ExecutableInPackage("emulator", "starpos_inclinometer")
     device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]
     processes = [
-        ExecuteProcess(cmd=device, name="emulator", output="screen"),  # a device, no node
+        # The emulator is a device, not a node.
+        ExecuteProcess(cmd=device, name="emulator", output="screen"),
         process("starpos_inclinometer", "inclinometer", common, {"inclinometer": {"port": link}}),
         process("starpos_camera", "camera_detector", common, {"camera": camera}),
         process("starpos_solver", "solver", common, {"solver": solver}),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded night through the solver: its topics with their own time on /clock, everything ended with it.
+"""Replay of a recorded night through the solver, with its own time on /clock; everything ends with the bag.
 
     ros2 launch starpos_bringup replay.launch.py bag:=night rate:=0 params_file:=mine.yaml
 
-Of a bag that holds images and no stars, detector:=true finds the stars again.
+If a bag holds images and no stars, detector:=true finds the stars again.
 """
 
 from launch import LaunchDescription

@@ -3,7 +3,7 @@
 
     ros2 launch starpos_bringup starpos.launch.py port:=/dev/serial/by-id/... params_file:=mine.yaml
 
-An argument that is not given leaves what the parameter file says.
+Without an argument the value of the parameter file holds.
 """
 
 from launch import LaunchDescription

@@ -83,7 +83,8 @@ def services_called(w: World):
     elif call == 3:
         request = Calibrate.Request(frames=4294967295)
         graph.call(Calibrate, "solver/calibrate", request)
-    elif call == 4:  # somewhere else than it is: the frames refuse, or reset follows
+    # A wrong place: the frames refuse it, or a reset follows.
+    elif call == 4:
         graph.call(SelfCalibrate, "solver/self_calibrate", SelfCalibrate.Request())
     else:
         path = str(rng.choice(["/dev/null", "relative.yaml", "/proc/1/x", "/" + "x" * 300]))

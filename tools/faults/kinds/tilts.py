@@ -45,12 +45,14 @@ def tilts_from_the_future(w: World):
     shot = w.shot()
     shift(shot.tilts, some_time(w))
     w.send(shot)
-    for ahead in range(3, 8):  # just where the next frames will be
+    # These are the times of the next frames.
+    for ahead in range(3, 8):
         early = w.shot()
         w.now_s -= 0.8
         shift(early.tilts, 0.8 * ahead)
         w.tilts(early)
-    w.spin(0.3)  # they come before that time does, also here, where a second passes in 50 ms
+    # The tilts arrive before their time comes, also here, where a second takes 50 ms.
+    w.spin(0.3)
     w.turn()
 
 
