@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two inclinometers on one topic are seen, however they send; one is trusted again once it alone has sent for a second."""
+"""Two inclinometers on one topic are seen, however they send; one that alone has sent for a second is trusted again."""
 
 import pytest
 
