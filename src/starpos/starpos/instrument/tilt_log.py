@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A log of tilt readings: the tilt of an exposure from it, and the table on disk that holds it."""
 
+import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -221,6 +222,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
             f"{path}: a tilt table needs the columns {', '.join(need)} and at least one row: {cure}"
         )
     column = dict(zip(names, rows.T, strict=True))
+    _check_one_sensor(path, column["utc_unix_s"], rows)
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]
     temperature = column.get("temperature_c", np.full(len(rows), np.nan))
@@ -231,6 +233,23 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         temperature[order],
         noise_rad,
     )
+
+
+def _check_one_sensor(path: Path, utc_unix_s: np.ndarray, rows: np.ndarray) -> None:
+    """TiltError if the times go back into those that the table already holds: readings of two sensors, it seems.
+
+    A table may hold nights in any order, and a part of itself once more.
+    """
+    finite = np.isfinite(utc_unix_s)
+    _, first = np.unique(rows[finite], axis=0, return_index=True)
+    t = utc_unix_s[finite][np.sort(first)]
+    runs = np.split(t, np.flatnonzero(np.diff(t) < 0) + 1)
+    ranges = sorted((run[0], run[-1]) for run in runs if len(run))
+    if any(later < end for (_, end), (later, _) in itertools.pairwise(ranges)):
+        raise TiltError(
+            f"{path}: its times go back into those that it already holds, as if it had the readings of two "
+            "inclinometers: give the table of one"
+        )
 
 
 def _first_line(error: Exception) -> str:

@@ -220,3 +220,28 @@ def test_missing_csv_and_folder(tmp_path):
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(TiltError, match=r"no such file|not a readable table"):
             read_tilt_csv(path)
+
+
+def table(path, *logs):
+    """A table of the rows (time, x, y in deg) of the logs, one after another."""
+    rows = np.concatenate(logs)
+    np.savetxt(path, rows, delimiter=",", header="utc_unix_s,theta_x_deg,theta_y_deg", fmt="%.6f")
+    return path
+
+
+def test_two_inclinometers_in_one_table_are_refused(tmp_path):
+    t = 1000 + 0.1 * np.arange(100)
+    mine = np.stack([t, np.full(100, 1.0), np.full(100, 2.0)], 1)
+    other = np.stack([t, np.full(100, 1.1), np.full(100, 2.0)], 1)
+    for offset in (0.0, 0.05, 5.0):
+        with pytest.raises(TiltError, match="two inclinometers"):
+            read_tilt_csv(table(tmp_path / "tilt.csv", mine, other + [offset, 0, 0]))
+
+
+def test_nights_in_any_order_and_a_part_twice_are_one_table(tmp_path):
+    t = 1000 + 0.1 * np.arange(100)
+    night = np.stack([t, np.full(100, 1.0), np.full(100, 2.0)], 1)
+    later = night + [86400, 0, 0]
+    for logs in ((later, night), (night, later), (night, night[50:]), (night, later, night)):
+        tilt = read_tilt_csv(table(tmp_path / "tilt.csv", *logs)).average(1005.0, 0.5)
+        assert tilt.samples == 5
