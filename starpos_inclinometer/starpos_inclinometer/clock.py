@@ -18,15 +18,15 @@ REFIT_S = 1.0
 MAX_RATE_ERROR = 0.05
 # With a sample so far ahead of the envelope the MCU's clock has jumped.
 EARLY_S = 0.2
-# So far behind a sample is of a backlog, or of a clock that stood still.
+# A sample so far behind comes from a backlog, or the MCU's clock stood still.
 LATE_S = 2.0
-# Samples that are read so late, and fast, are of a backlog.
+# Samples that are read so late, and fast, come from a backlog.
 BACKLOG_S = 0.25
-# Samples that follow each other faster than this share of their pace are read from a backlog
+# Shares of the usual spacing of samples: closer ones are read from a backlog, wider ones come late.
 SLOWEST_PACE, FASTEST_PACE = 0.5, 1.5
-# By which a line may be late on a busy machine, and still be taken to come at its pace
+# On a busy machine a line may be late by so much and still count as coming at its pace.
 JITTER_S = 0.05
-# A clock that stood still shows after so long
+# It takes so long to see that the device's clock stood still.
 STANDING_S = 1.0
 MAX_POINTS = 4096
 # The usual time between lines is the median of so many.
@@ -34,41 +34,43 @@ USUAL_OF = 21
 
 
 class ArrivalFilter:
-    """By how much each sample arrived later than the shortest delay of late, from the device's own milliseconds.
+    """Finds how late each sample arrived beyond the shortest recent delay, from the device's own milliseconds.
 
-    A backlog, which this process reads after it stood still, keeps the times that its samples were taken at. Where those
-    cannot be known there is no answer: at the first sample, and after a reset, until samples come at the pace at which
-    they are taken; and at a leap, until it shows whether a backlog follows or the device's clock stood still.
+    After this process stood still it reads a backlog, whose samples keep the times at which they were taken. The time of
+    a sample is unknown in two cases: after the start or a reset, until samples come at their usual pace; and at a leap,
+    until it is clear whether a backlog follows or the device's clock stood still.
     """
 
     def __init__(self) -> None:
-        self.restarts = -1  # of the filter; the first sample starts it
+        # How often the filter started again; its first sample makes it 0.
+        self.restarts = -1
         self._points: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
         self._last_ms = 0
         self._last_arrival_s = 0.0
         self._time = 0.0
         self._level = self._slope = 0.0
         self._next_fit = 0.0
-        # a sample has come at its pace since the start
+        # Whether a sample has come at its pace since the start.
         self._live = False
-        # what comes now is read from a backlog
+        # Whether the present samples are read from a backlog.
         self._backlog = False
-        # time and arrival of the first sample of those that are too late
+        # Time and arrival of the first sample that was too late.
         self._leap: tuple[float, float] | None = None
 
     @property
     def rate_ppm(self) -> float:
-        """How much the device's clock is slow against the host's, 1e-6; 0 until it is known."""
+        """How slow the device's clock is against the host's, 1e-6; 0 until it is known."""
         return self._slope * 1e6
 
     def restart(self) -> None:
-        """Forget the device's clock: it was reset, or may have been while nobody listened."""
+        """Forget the device's clock: it was reset, or may have been reset while nobody listened."""
         self._points.clear()
 
     def delay(self, milliseconds: int, arrival_s: float) -> float | None:
-        """Seconds (>= 0) by which this sample arrived later than the line is quick; None where nobody can know.
+        """Delay of this sample in s (>= 0) beyond the shortest delay of the line; None if it cannot be known.
 
-        milliseconds: the sample's, 32 bits.  arrival_s: of a clock that does not step (time.monotonic).
+        milliseconds: the device's time of the sample, 32 bits.
+        arrival_s: when it arrived, on a clock that does not step (time.monotonic).
         """
         elapsed = (milliseconds - self._last_ms) & 0xFFFFFFFF
         if not self._points or elapsed >= 1 << 31:
@@ -90,7 +92,7 @@ class ArrivalFilter:
         if late > LATE_S:
             return self._too_late(late, arrival_s, catching_up)
         self._leap = None
-        # a backlog tells nothing of the line's delay, and would drive out what does
+        # The samples of a backlog do not show the delay of the line, and would replace those that do.
         self._backlog = catching_up and (self._backlog or late > BACKLOG_S)
         if self._backlog:
             return max(late, 0.0)
@@ -104,7 +106,7 @@ class ArrivalFilter:
         return max(late, 0.0)
 
     def _too_late(self, late: float, arrival_s: float, catching_up: bool) -> float | None:
-        """The answer for a sample that is later than a line can be: of a backlog, or of a clock that stood still."""
+        """Delay of a sample that is later than a line can be: a backlog is read, or the device's clock stood still."""
         self._backlog = True
         if self._leap is None:
             self._leap = self._time, arrival_s
@@ -142,7 +144,7 @@ class ArrivalFilter:
 
 
 class PaceWatch:
-    """Whether lines without a clock of their own come when they are sent: not after a silence, as from a backlog."""
+    """Judges whether lines without a clock of their own were just sent: lines after a silence may be a backlog."""
 
     def __init__(self) -> None:
         self._spacings: deque[float] = deque(maxlen=USUAL_OF)
@@ -150,7 +152,7 @@ class PaceWatch:
         self._doubtful = False
 
     def on_time(self, arrival_s: float) -> bool:
-        """Whether this line was sent about when it arrived, as far as the pace of the lines tells."""
+        """Whether this line was sent about when it arrived, judged by the pace of the lines."""
         if self._last_s is None:
             self._last_s = arrival_s
             return True
@@ -159,7 +161,7 @@ class PaceWatch:
         silence = apart_s > 2 * usual_s + JITTER_S
         if not silence and not self._doubtful:
             self._spacings.append(apart_s)
-        # the line that ends a silence may be the first of a backlog; those that follow too fast are of one
+        # The line after a silence may be the first of a backlog; lines that follow too fast belong to it.
         self._doubtful = silence or (self._doubtful and apart_s < SLOWEST_PACE * usual_s)
         return not self._doubtful
 
