@@ -355,7 +355,8 @@ def test_the_sensor_does_not_answer(board, wire, tell):
     taken = Taken(wire.path, rate=50, **compensated)
     try:
         taken.until(lambda: len(taken.readings) >= 100)
-        before = math.sqrt(taken.readings[-1].covariance[0])
+        # of the one whose temperature was the newest
+        before = math.sqrt(min(r.covariance[0] for r in taken.readings))
         board.tell("sensor 0")
         taken.until(lambda: math.isnan(taken.readings[-1].temperature_c))
         n = len(taken.readings)
