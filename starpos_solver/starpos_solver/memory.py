@@ -5,8 +5,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from starpos.averaging.slip import slip_s
 from starpos.errors import TiltError
 from starpos.fix.fix import Fix
@@ -112,15 +110,7 @@ class PoseMemory:
 
 def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
     """Average the tilts of an instrument at rest without outliers; TiltError if the tilts contradict each other."""
-    times = np.array([t.utc_unix_s for t in tilts])
-    log = TiltLog(
-        times,
-        np.array([t.theta_x for t in tilts]),
-        np.array([t.theta_y for t in tilts]),
-        np.array([t.temperature_c for t in tilts]),
-        np.array([t.covariance for t in tilts]),
-    )
-    mean = log.average((times.min() + times.max()) / 2, float(np.ptp(times)))
+    mean = TiltLog.of_readings(tilts).mean()
     return replace(mean, samples=sum(t.samples for t in tilts))
 
 

@@ -106,7 +106,14 @@ class TiltLog:
         stated (wind, footsteps), the covariance is larger. TiltError if the readings do not cover the exposure, or the
         instrument moved.
         """
-        use = self._of_exposure(mid_unix_s, exposure_s)
+        return self._mean(self._of_exposure(mid_unix_s, exposure_s))
+
+    def mean(self) -> Tilt:
+        """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
+        return self._mean(np.arange(len(self.utc_unix_s)))
+
+    def _mean(self, use: np.ndarray) -> Tilt:
+        """The mean tilt of the readings `use` (indices)."""
         theta = np.stack([self.theta_x[use], self.theta_y[use]], -1)
         noise = self.excess * np.sqrt(np.trace(self.covariance[use], axis1=1, axis2=2).mean() / 2)
         from_middle = np.abs(theta - np.median(theta, axis=0))
