@@ -17,7 +17,8 @@ from starpos.parallel.cluster import Cluster, ClusterError
 from starpos.parallel.same import same_here
 from starpos_testing.lacking import needs
 
-pytestmark = needs("distributed")
+# a scheduler and its workers start as processes of their own, each with the whole of Python's science
+pytestmark = [needs("distributed"), pytest.mark.timeout(1500)]
 
 
 @pytest.fixture(scope="module")
