@@ -316,12 +316,11 @@ class SolverNode(Node):
         stars = frame.stars
         try:
             solver = self._solver_now()
-            answer = solver.solve(stars, lambda mid, _: self._tilts.average(mid, self._span(stars)), hint)
-            if answer.ok and frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
+            if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
                 raise TimeError(
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
-            return answer
+            return solver.solve(stars, lambda mid, *_: self._tilts.average(mid, self._span(stars)), hint)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:

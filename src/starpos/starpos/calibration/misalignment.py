@@ -33,8 +33,8 @@ TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all
 OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25
 
-# the tilt at (mid_unix_s, exposure_s)
-Tilts = Callable[[float, float], Tilt]
+# the tilt at (mid_unix_s, exposure_s, spread_s)
+Tilts = Callable[[float, float, float], Tilt]
 # A3 and the zenith from readings, A3 as it is, and the fixes
 FindPlumbLine = Callable[[Readings, np.ndarray, list[Fix]], PlumbLine]
 
@@ -68,7 +68,7 @@ def calibrate_at(
 ) -> Calibrated:
     """A3 from one or more frames at a known astronomic place; the solver's A3 need not be near.
 
-    tilt: a function of (mid_unix_s, exposure_s).
+    tilt: a function of (mid_unix_s, exposure_s, spread_s).
     site_stddev_arcsec: sigma of the place.
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not tell
     that turn, and only a fix at another lean needs it; the covariance shows it.

@@ -17,13 +17,13 @@ from starpos.progress import Progress, quiet
 def turn(
     solver: Solver,
     frames: Sequence[Stars],
-    tilt: Callable[[float, float], Tilt],
+    tilt: Callable[[float, float, float], Tilt],
     turn_stddev_deg: float = 180.0,
     progress: Progress = quiet,
 ) -> Calibrated:
     """A3, and fixes, from frames of one place at several headings; the solver's A3 need not be near.
 
-    tilt: a function of (mid_unix_s, exposure_s).
+    tilt: a function of (mid_unix_s, exposure_s, spread_s).
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line; it matters if the axis of the turn leans.
     The `average` of the fixes is the place; its covariance says how well the headings separate it from A3.  With fewer
     than two fixes A3 stays as it was.

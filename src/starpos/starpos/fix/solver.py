@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The chain from stars and tilt to a solution, which the command line and the node share."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -133,11 +134,11 @@ class Solver:
         )
 
     def solve(
-        self, stars: Stars, tilt: Tilt | Callable[[float, float], Tilt], hint: Hint | None = None
+        self, stars: Stars, tilt: Tilt | Callable[[float, float, float], Tilt], hint: Hint | None = None
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
-        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s) that gives it.
+        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s, spread_s) that gives it.
         hint: of an earlier solution; one that no longer holds costs half a millisecond and does no harm.
         """
         if (inside := _inside(stars)) is not None:
@@ -148,7 +149,9 @@ class Solver:
                 raise TimeError(f"{place}: no time of exposure: {why_no_time(stars.source)}")
             state = earth_state(stars.mid_unix_s)
             if callable(tilt):
-                tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0)
+                # the width of an even distribution of that standard deviation, as rounding makes it
+                spread_s = math.sqrt(12) * stars.stamp_stddev_s
+                tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0, spread_s)
             self.instrument.calibration.check_age(stars.mid_unix_s)
             camera = self._camera(stars.width, stars.height)
             g = a2_matrix(tilt.theta_x, tilt.theta_y) @ self.instrument.mounting.a3

@@ -99,14 +99,17 @@ class TiltLog:
         found = float(white_noise(steps).max() / stated)
         return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
 
-    def average(self, mid_unix_s: float, exposure_s: float) -> Tilt:
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
 
         Two readings of the same time count once. A reading far from the others is left out. If they scatter more than
         stated (wind, footsteps), the covariance is larger. TiltError if the readings do not cover the exposure, or the
         instrument moved.
+
+        spread_s: the whole width in which the middle may lie, where a clock counts in whole seconds; then readings within
+        it stand for the exposure, if all of them agree.
         """
-        return self._mean(self._of_exposure(mid_unix_s, exposure_s))
+        return self._mean(self._of_exposure(mid_unix_s, exposure_s, spread_s))
 
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
@@ -143,7 +146,7 @@ class TiltLog:
             times=tuple(self.utc_unix_s[use].tolist()),
         )
 
-    def _of_exposure(self, mid_unix_s: float, exposure_s: float) -> np.ndarray:
+    def _of_exposure(self, mid_unix_s: float, exposure_s: float, spread_s: float) -> np.ndarray:
         """Indices of the readings that `average` takes, in order of time, one for each time.
 
         They are those inside the exposure, which must cover it. If none is inside, two do that bracket it closely and
@@ -164,6 +167,14 @@ class TiltLog:
             raise TiltError(
                 "the tilt differs before and after the exposure, and no reading lies in it: the instrument was not at "
                 "rest, or readings were lost"
+            )
+        first, end = np.searchsorted(t, [mid_unix_s - half - spread_s / 2, mid_unix_s + half + spread_s / 2])
+        if spread_s > exposure_s and first < end:
+            middle = index[first:end][np.argsort(self.theta_x[index[first:end]])[(end - first) // 2]]
+            if all(self._agree(k, middle) for k in index[first:end]):
+                return index[first:end]
+            raise TiltError(
+                f"the tilt changes within the {spread_s:g} s in which the exposure may lie: the instrument was not at rest"
             )
         nearest = np.abs(t - mid_unix_s).min() if len(t) and np.isfinite(mid_unix_s) else np.inf
         raise TiltError(

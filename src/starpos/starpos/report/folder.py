@@ -32,14 +32,14 @@ class StarList:
 class StarLists:
     """Exposures to solve: each call of `read` goes through all `count` of them, one at a time.
 
-    tilt: a function of (mid_unix_s, exposure_s) that may raise TiltError.
+    tilt: a function of (mid_unix_s, exposure_s, spread_s) that may raise TiltError.
     """
 
     name: str
     origin: str
     count: int
     read: Callable[[], Iterator[StarList]]
-    tilt: Callable[[float, float], Tilt]
+    tilt: Callable[[float, float, float], Tilt]
     truth: Truth | None = None
 
 
@@ -50,7 +50,7 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
     frames = frames_in(folder)
-    tilt: Callable[[float, float], Tilt]
+    tilt: Callable[[float, float, float], Tilt]
     try:
         tilt = read_tilt_csv(folder / TILTS, tilt_noise_rad).average
     except TiltError as error:
@@ -117,8 +117,8 @@ def truth_in(folder: Path) -> Truth | None:
     return Truth(latitude, longitude, headings)
 
 
-def _no_tilt(reason: str) -> Callable[[float, float], Tilt]:
-    def tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
+def _no_tilt(reason: str) -> Callable[[float, float, float], Tilt]:
+    def tilt(mid_unix_s: float, exposure_s: float, spread_s: float) -> Tilt:
         raise TiltError(reason)
 
     return tilt

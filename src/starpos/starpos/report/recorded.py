@@ -35,10 +35,10 @@ def _exposures(r: Recorded) -> StarLists:
     def read_stars() -> Iterator[StarList]:
         return map(star_list_of, star_lists(r))
 
-    def no_tilt(mid_unix_s: float, exposure_s: float) -> Tilt:
+    def no_tilt(mid_unix_s: float, exposure_s: float, spread_s: float) -> Tilt:
         raise TiltError(f"{r.path}: no usable tilt in it: record the topic tilt too")
 
-    tilt: Callable[[float, float], Tilt] = r.tilts.average if r.tilts else no_tilt
+    tilt: Callable[[float, float, float], Tilt] = r.tilts.average if r.tilts else no_tilt
     origin = f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}"
     return StarLists(
         name=r.name, origin=origin, count=r.star_count, read=read_stars, tilt=tilt, truth=r.truth

@@ -36,7 +36,7 @@ def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(
             tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, utc_unix_s=stars.mid_unix_s
         )
     solver = Solver(Instrument(FOCAL_PX), catalogue, scene.site.atmosphere)
-    return turn(solver, frames, lambda mid, _: tilts[mid]), scene
+    return turn(solver, frames, lambda mid, *_: tilts[mid]), scene
 
 
 def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
@@ -64,7 +64,7 @@ def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
         off = np.radians(rng.normal(0, turn_stddev_deg))
         given = given.turned_to(rotation.about_axis(2, off) @ misalignment.a3)
     solver = Solver(Instrument(FOCAL_PX, calibration=given), catalogue, scene.site.atmosphere)
-    return turn(solver, frames, lambda mid, _: tilts[mid], turn_stddev_deg), scene
+    return turn(solver, frames, lambda mid, *_: tilts[mid], turn_stddev_deg), scene
 
 
 @pytest.mark.montecarlo

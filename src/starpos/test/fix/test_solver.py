@@ -170,7 +170,7 @@ def test_the_tilt_may_be_a_function_of_the_exposure(night):
     _, stars, tilt, solver = night
     asked = []
 
-    def average(mid, exposure):
+    def average(mid, exposure, spread):
         asked.append((mid, exposure))
         return tilt
 
@@ -257,7 +257,7 @@ def test_no_tilt(night):
     nan = TiltLog.of(np.array([START]), np.full(1, np.nan), np.zeros(1), np.zeros(1))
     assert "no tilt reading" in refused(solver.solve(stars, nan.average), Status.NO_TILT)
 
-    def broken(mid, exposure):
+    def broken(mid, exposure, spread):
         return Tilt(np.nan, 0.0, np.eye(2), utc_unix_s=mid)
 
     assert "not a finite number" in refused(solver.solve(stars, broken), Status.NO_TILT)
@@ -266,7 +266,7 @@ def test_no_tilt(night):
 def test_tilt_out_of_range(night):
     _, stars, _, solver = night
 
-    def leaning(mid, exposure):
+    def leaning(mid, exposure, spread):
         return Tilt(0.6, 0.0, np.eye(2), utc_unix_s=mid)
 
     assert "30 deg" in refused(solver.solve(stars, leaning), Status.TILT_OUT_OF_RANGE)
@@ -415,7 +415,7 @@ def test_prepare_builds_what_solve_needs(night, monkeypatch):
 def test_an_error_of_the_tilts_source_is_the_frames(night):
     _, stars, _, solver = night
 
-    def gone(mid, exposure):
+    def gone(mid, exposure, spread):
         raise TiltError("the port is gone: plug it in")
 
     assert refused(solver.solve(stars, gone), Status.NO_TILT) == "the port is gone: plug it in"

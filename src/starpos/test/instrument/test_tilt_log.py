@@ -235,13 +235,25 @@ def test_two_inclinometers_in_one_table_are_refused(tmp_path):
     other = np.stack([t, np.full(100, 1.1), np.full(100, 2.0)], 1)
     for offset in (0.0, 0.05, 5.0):
         with pytest.raises(TiltError, match="two inclinometers"):
-            read_tilt_csv(table(tmp_path / "tilt.csv", mine, [*other, offset, 0, 0]))
+            read_tilt_csv(table(tmp_path / "tilt.csv", mine, other + np.array([offset, 0, 0])))
 
 
 def test_nights_in_any_order_and_a_part_twice_are_one_table(tmp_path):
     t = 1000 + 0.1 * np.arange(100)
     night = np.stack([t, np.full(100, 1.0), np.full(100, 2.0)], 1)
-    later = [*night, 86400, 0, 0]
+    later = night + np.array([86400, 0, 0])
     for logs in ((later, night), (night, later), (night, night[50:]), (night, later, night)):
         tilt = read_tilt_csv(table(tmp_path / "tilt.csv", *logs)).average(1005.0, 0.5)
         assert tilt.samples == 5
+
+
+def test_a_clock_that_counts_whole_seconds_takes_what_agrees_around_it():
+    """A camera's EXIF: the readings of the exposure lie up to half a second from where its stamp says."""
+    reading = log(np.zeros(5))
+    with pytest.raises(TiltError, match="no tilt reading in the exposure"):
+        reading.average(1000.75, 0.5)
+    assert reading.average(1000.75, 0.5, spread_s=1.0).samples == 5
+    with pytest.raises(TiltError, match="not at rest"):
+        log(np.repeat([0.0, 5.0], 5)).average(999.6, 0.5, spread_s=1.5)
+    with pytest.raises(TiltError, match="no tilt reading in the exposure"):
+        reading.average(1002.0, 0.5, spread_s=1.0)
