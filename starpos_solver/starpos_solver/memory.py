@@ -114,7 +114,7 @@ def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
     return replace(mean, samples=sum(t.samples for t in tilts))
 
 
-def tilts_of(seen: Sequence[Seen]) -> Callable[[float, float], Tilt]:
+def tilts_of(seen: Sequence[Seen]) -> Callable[[float, float, float], Tilt]:
     """Make the function that `starpos.calibration.misalignment` calls for the tilt of an exposure."""
     by_time = {s.mid_unix_s: s.tilt for s in seen}
     return lambda mid_unix_s, *_: by_time[mid_unix_s]

@@ -174,7 +174,8 @@ class TiltLog:
             if all(self._agree(k, middle) for k in index[first:end]):
                 return index[first:end]
             raise TiltError(
-                f"the tilt changes within the {spread_s:g} s in which the exposure may lie: the instrument was not at rest"
+                f"the tilt changes within the {spread_s:g} s in which the exposure may lie: the instrument was not at "
+                "rest"
             )
         nearest = np.abs(t - mid_unix_s).min() if len(t) and np.isfinite(mid_unix_s) else np.inf
         raise TiltError(
