@@ -18,6 +18,7 @@ from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
+from starpos_testing.patience import WAIT_S
 
 SHORT = CaptureSettings(0.1, None, 5.0)
 LONG = CaptureSettings(60.0, None, 60.0)
@@ -138,7 +139,9 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     other.tell("Switch", "CCD_TRANSFER_FORMAT", FORMAT_NATIVE="On")
     other.tell("Number", "CCD_BINNING", HOR_BIN=2, VER_BIN=2)
     other.tell("Number", "CCD_FRAME", X=10, Y=20, WIDTH=300, HEIGHT=200)
-    other.hear("CCD_FRAME", "Ok")
+    server = source._server
+    heard = server.until(lambda: server.device(DEVICE).number("CCD_FRAME", "X") == 10, WAIT_S)
+    assert server.run(heard)  # and all that was set before
     assert source.capture(SHORT).frame.pixels.shape == SIZE
     source.update({p.name: p.default for p in PARAMETERS} | {"indi.binning": 2})
     assert source.capture(SHORT).frame.pixels.shape == (SIZE[0] // 2, SIZE[1] // 2)
