@@ -19,7 +19,7 @@ RECORDED = 'record_property("fault"'
 def tests_by_folder() -> dict[Path, list[Path]]:
     """Find the test files that record faults, by their folder: each folder has fixtures of its own."""
     found: dict[Path, list[Path]] = {}
-    for pattern in ("test/test_*.py", "*/test/test_*.py", "src/*/test/test_*.py"):
+    for pattern in ("test/test_*.py", "*/test/test_*.py", "src/*/test/**/test_*.py"):
         for path in sorted(ROOT.glob(pattern)):
             if RECORDED in path.read_text():
                 found.setdefault(path.parent, []).append(path)
