@@ -28,6 +28,7 @@ demo: build
 	@. tools/env.sh && python tools/demo/demo.py $(ARGS)
 
 emulated: build
+	@tools/setup/counterparts
 	@. tools/env.sh && python tools/demo/emulated_instrument.py $(ARGS)
 
 test: build
