@@ -25,7 +25,7 @@ class Shots:
     frames: list[Stars]
     tilts: dict[float | None, Tilt]
 
-    def tilt(self, mid_unix_s: float, _exposure_s: float) -> Tilt:
+    def tilt(self, mid_unix_s: float, _exposure_s: float, _spread_s: float) -> Tilt:
         return self.tilts[mid_unix_s]
 
     def spoil(self, k: int, x_deg: float) -> None:
