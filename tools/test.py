@@ -31,7 +31,7 @@ LINTERS = [
 ]
 NO_TESTS = 5  # pytest's exit status where a -k left none
 SHOWN = 20  # of the slowest tests
-LANES = 3  # at once: some compute, others wait for nodes
+LANES = 2  # at once, as there are cores
 LONGEST_FIRST = ("graph", "starpos", "starpos_camera", "starpos, Ubuntu's", "starpos_inclinometer")
 VERSIONS = "tools/setup/ubuntu-24.04.txt"
 UNDERLAY = ROOT / ".underlay"

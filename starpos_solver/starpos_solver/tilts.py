@@ -43,6 +43,7 @@ class TiltBuffer:
     def clear(self) -> None:
         self._good.clear()
         self._flagged.clear()
+        self._publishers = TiltPublishers()
 
     def heard(self, message: msg.Tilt, number: int | None, now_s: float) -> None:
         """Note who publishes, before `add`; number: that of its publisher's messages, None if there is none.
