@@ -10,12 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.averaging.claim import Claim, Seen
 from starpos.averaging.filter import PlaceFilter
 from starpos.averaging.slip import slip_s
 from starpos.errors import FixError
 from starpos.fix.budget import ErrorTerm, total_covariance
 from starpos.fix.fix import Fix
 
+# the term of what fixes scatter beyond their budgets
+SCATTER = "scatter"
 # a fix further off than this is wrong, or of another place
 GATE_SIGMA = 6.0
 # so many fixes of a turned camera, so far off, are of another place
@@ -59,10 +62,16 @@ def average(fixes: Sequence[Fix]) -> Average:
 
     Raises FixError if there is no fix, or if as many were left out as were used: then nobody can say which are right.
     """
-    averager = Averager()
     different = {(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values()
-    for f in sorted(different, key=lambda f: f.utc_unix_s):
+    in_order = sorted(different, key=lambda f: f.utc_unix_s)
+    averager = Averager()
+    for f in in_order:
         averager.add(f)
+    if averager.frame_sigma:
+        # the first fixes were judged before anything showed how much all scatter
+        averager = Averager(averager.frame_sigma)
+        for f in in_order:
+            averager.add(f)
     whole = averager.average
     if whole is None:
         raise FixError("there is no fix to average: none of the frames has one")
@@ -80,10 +89,12 @@ class _Track:
     """An average that grows with each fix.
 
     pose: the first fix since the camera was last touched; in_pose: number of accepted fixes since then.
+    claim: what the fixes tell of their scatter.
     """
 
     place_filter: PlaceFilter
     pose: Fix
+    claim: Claim
     frames: int = 0
     poses: int = 0
     in_pose: int = 0
@@ -91,13 +102,21 @@ class _Track:
     began_unix_s: float = float("nan")
 
     @classmethod
-    def before(cls, f: Fix) -> "_Track":
-        """A track without a fix, ready for fixes like `f`."""
-        return cls(place_filter=PlaceFilter.before(f), pose=f, began_unix_s=f.utc_unix_s)
+    def before(cls, f: Fix, frame_sigma: float) -> "_Track":
+        """A track without a fix, ready for fixes like `f` that scatter by so many rad beyond their budgets."""
+        place_filter = PlaceFilter.before(_with_scatter(f, frame_sigma))
+        return cls(
+            place_filter=place_filter, pose=f, claim=Claim(frame_sigma=frame_sigma), began_unix_s=f.utc_unix_s
+        )
 
     def rival(self, f: Fix) -> "_Track":
         """A track without a fix that knows the errors of this one, but not its place."""
-        return _Track(place_filter=self.place_filter.elsewhere(f), pose=self.pose, began_unix_s=f.utc_unix_s)
+        return _Track(
+            place_filter=self.place_filter.elsewhere(self._scattered(f)),
+            pose=self.pose,
+            claim=Claim(frame_sigma=self.claim.frame_sigma),
+            began_unix_s=f.utc_unix_s,
+        )
 
     def touched(self, f: Fix) -> "_Track":
         """The track after somebody touched the camera; `f` is the first fix since."""
@@ -105,31 +124,53 @@ class _Track:
 
     def begin(self, f: Fix) -> "_Track":
         """The track with its first fix, which nothing can contradict."""
-        return self._extended(f, self.place_filter.add(f, self.pose)[0])
+        return self._extended(f, self.place_filter.add(self._scattered(f), self.pose)[0])
 
     def add(self, f: Fix) -> "_Track | None":
         """The track with one more fix; None if the fix lies too far off."""
-        extended, sigmas = self.place_filter.add(f, self.pose)
+        extended, sigmas = self.place_filter.add(self._scattered(f), self.pose)
         if sigmas > GATE_SIGMA or not extended.straight_from(self.place_filter):
             return None
         return self._extended(f, extended)
 
+    def terms(self, last: Fix) -> tuple[ErrorTerm, ...]:
+        """The budget of the average, whose last fix is `last`.
+
+        The filter takes the scatter as noise; in truth fixes next to each other are alike, as the claim knows.
+        """
+        stated = self.place_filter.terms(self._scattered(last).terms)[:-1]
+        return (*stated, self.claim.term(SCATTER, last))
+
+    def _scattered(self, f: Fix) -> Fix:
+        """The fix with the scatter of those before as one more error of its own."""
+        return _with_scatter(f, self.claim.frame_sigma)
+
     def _extended(self, f: Fix, extended: PlaceFilter) -> "_Track":
-        frames = self.frames + 1
+        frames, poses = self.frames + 1, self.poses + (self.in_pose == 0)
+        seen = Seen.of(f, self.pose, poses, extended.plane)
         return replace(
             self,
             place_filter=extended,
+            claim=self.claim.with_fix(seen, extended.east_north_m),
             frames=frames,
-            poses=self.poses + (self.in_pose == 0),
+            poses=poses,
             in_pose=self.in_pose + 1,
             mean_unix_s=self.mean_unix_s + (f.utc_unix_s - self.mean_unix_s) / frames,
         )
 
 
-class Averager:
-    """Averages fixes as they come in: `add` them in order of time and read `average`.  Its memory does not grow."""
+def _with_scatter(f: Fix, sigma: float) -> Fix:
+    return replace(f, terms=(*f.terms, ErrorTerm(SCATTER, f.levelling * sigma)))
 
-    def __init__(self) -> None:
+
+class Averager:
+    """Averages fixes as they come in: `add` them in order of time and read `average`.  Its memory does not grow.
+
+    frame_sigma (rad): scatter of the fixes beyond their budgets, as far as it is known before the first.
+    """
+
+    def __init__(self, frame_sigma: float = 0.0) -> None:
+        self._begin_sigma = frame_sigma
         self._track: _Track | None = None
         # the average of the fixes since the camera was touched, or since one did not agree
         self._rival: _Track | None = None
@@ -152,7 +193,7 @@ class Averager:
             latitude=latitude,
             longitude=longitude,
             heading=heading,
-            terms=t.place_filter.terms(self._last.terms),
+            terms=t.terms(self._last),
             frames=t.frames,
             poses=t.poses,
             left_out=self._left_out,
@@ -160,11 +201,16 @@ class Averager:
             moved=self._moved,
         )
 
+    @property
+    def frame_sigma(self) -> float:
+        """Scatter in rad of the fixes beyond their budgets; 0 before the first fix."""
+        return self._track.claim.frame_sigma if self._track else 0.0
+
     def add(self, f: Fix) -> None:
         """Take in one more fix, later than all before."""
         track = self._track
         if track is None:
-            self._track, self._last = _Track.before(f).begin(f), f
+            self._track, self._last = _Track.before(f, self._begin_sigma).begin(f), f
             return
         slip = slip_s(f, track.pose)
         if slip is None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, zenith_of
-from starpos.fix.budget import ErrorTerm, correlation, symmetric_root
+from starpos.fix.budget import EACH_POSE, ErrorTerm, correlation, symmetric_root
 from starpos.fix.fix import Fix
 from starpos.rotation import full_turn, half_turn
 
@@ -144,7 +144,7 @@ class PlaceFilter:
 
         pose: the first fix since the camera was touched.  Raises ValueError if the fix has other error terms.
         """
-        now, own = self._at(f)
+        now, own = self._at(f, pose)
         shared, noise = np.zeros((3, len(now.state))), np.zeros((len(own), 3, 3))
         for k, t in enumerate(f.terms):
             like = pose if t.posed else f
@@ -195,7 +195,7 @@ class PlaceFilter:
         least = np.linalg.eigvalsh(self.sources.sum(0)[:2, :2])[0]
         return bool(bent <= MOST_BENT * np.sqrt(max(least, 0.0)))
 
-    def _at(self, f: Fix) -> tuple["PlaceFilter", np.ndarray]:
+    def _at(self, f: Fix, pose: Fix) -> tuple["PlaceFilter", np.ndarray]:
         """The filter at the time of a fix, before it is added; and a mask (T,) of the terms whose error is new in it.
 
         Raises ValueError if the fix has other terms.
@@ -207,13 +207,14 @@ class PlaceFilter:
         for k, t in enumerate(f.terms):
             if t.shared is None:
                 continue
-            at, alike = self.columns[k], correlation(keys[k], t.shared)
+            shared = (pose.utc_unix_s,) if t.shared == EACH_POSE else t.shared
+            at, alike = self.columns[k], correlation(keys[k], shared)
             state[at] *= alike
             sources[:, at, :] *= alike
             sources[:, :, at] *= alike
             walked = t.walk_s * abs(f.utc_unix_s - self.utc_unix_s) if alike else 0.0
             sources[k, at, at] += np.eye(at.stop - at.start) * (t.variance * (1 - alike**2) + walked)
-            keys[k] = t.shared
+            keys[k] = shared
         later = max(self.utc_unix_s, f.utc_unix_s)
         return replace(self, state=state, sources=sources, keys=tuple(keys), utc_unix_s=later), own
 
@@ -225,6 +226,11 @@ class PlaceFilter:
             return latitude, longitude, float("nan")
         heading = self.state[2] * UNIT[2] + self.plane.heading - self.plane.convergence(latitude, longitude)
         return latitude, longitude, full_turn(heading)
+
+    @property
+    def east_north_m(self) -> np.ndarray:
+        """East, north (2,) in m of the place in the plane."""
+        return self.state[:2] * UNIT[:2]
 
     def terms(self, like: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
         """The budget of `place`, with factors (3, 3); names and keys are those of the terms `like`."""

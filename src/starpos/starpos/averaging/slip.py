@@ -5,6 +5,8 @@ For a camera at rest the sky turns about the Earth's axis as its time stamps say
 turned about exactly that axis, which no hand does, one of the stamps is wrong.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from starpos import rotation
@@ -45,3 +47,13 @@ def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
     if abs(angle) <= SIGMAS * np.sqrt(variance + (stated_s * ROTATION_RAD_S) ** 2):
         return 0.0
     return None if abs(fix.latitude) > HIGHEST_LATITUDE else float(abs(angle) / ROTATION_RAD_S)
+
+
+def poses_of(fixes: Sequence[Fix]) -> np.ndarray:
+    """Number (K,) of the pose of each fix, from 0: a pose lasts until somebody touches the camera."""
+    poses, pose, first = np.zeros(len(fixes), int), -1, None
+    for k in np.argsort([f.utc_unix_s for f in fixes], kind="stable"):
+        if first is None or slip_s(fixes[k], first) is None:
+            pose, first = pose + 1, fixes[k]
+        poses[k] = pose
+    return poses

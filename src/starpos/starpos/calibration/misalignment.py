@@ -7,16 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, FixedFrame, PlumbLine, Readings, hang
+from starpos.averaging.scatter import Scatter
+from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, PlumbLine, hang, settled, typical
+from starpos.calibration.readings import FixedFrame, Readings
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Solver
+from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
-from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt, up_of
 from starpos.instrument.instrument import MOST_C, Calibration, Instrument
+from starpos.instrument.response import angles_at, stated_variances
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -26,12 +29,14 @@ SETTLED_RAD = 0.02 * ARCSEC
 # terms that move the zenith, of all frames about alike
 OF_PLACE = ("refraction", "clock", "time stamp", "ut1", "pole")
 VALID_DAYS = 365.0
-# chi-square per degree of freedom that frames of one zenith may have
-MOST_SCATTER = 4.0
 # the fixes use so many times the sigma of A3's turn that the leans gave, because both come from the same tilts
 TURN_SIGMA = 3.0
-# frames further off are left out, up to this share of all
-OUTLIER_SIGMA, MOST_OUTLIERS = 6.0, 0.25
+# frames further off are left out, up to this share of all, and so often are those left judged again
+OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
+# poses that scatter more than any inclinometer were moved, or are of several places
+MOST_POSE_RAD = np.radians(0.25)
+# share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
+WORTH = 0.05
 
 # the tilt at (mid_unix_s, exposure_s, spread_s)
 Tilts = Callable[[float, float, float], Tilt]
@@ -106,11 +111,11 @@ def calibrate(
     Raises FixError if the frames do not agree.
     """
     unknown = Calibration.of(solver.instrument.calibration.misalignment_deg, UNKNOWN_ARCSEC)
-    solver = _with(solver, unknown)
+    errors = solver.instrument.inclinometer
+    solver = _with(solver, unknown, errors)
     solutions: list[Solution] = []
     hints: list[Hint | None] = [None] * len(frames)
-    plumb: PlumbLine | None = None
-    sound: list[FixedFrame] = []
+    agreement: _Agreement | None = None
     for k in range(ROUNDS):
         solutions = []
         for n, (stars, hint) in enumerate(zip(frames, hints, strict=True)):
@@ -121,83 +126,126 @@ def calibrate(
         if len(solved) < fewest:
             break
         a3 = solver.instrument.mounting.a3
-        plumb, sound = _found(find, solved, solver.instrument)
-        solver = _with(solver, _unknown(plumb, sound))
+        agreement = _agreed(find, solved, a3, errors)
+        solver = _with(solver, _unknown(agreement, errors), agreement.errors(errors))
         # a turn about the plumb line changes no fix
-        if k and np.linalg.norm(plumb.a3[2] - a3[2]) < SETTLED_RAD:
+        if k and np.linalg.norm(agreement.plumb.a3[2] - a3[2]) < SETTLED_RAD:
             break
     progress("calibrating", 1.0)
-    if plumb is None:
+    if agreement is None:
         return Calibrated(solver.instrument, float(UNKNOWN_ARCSEC[0]), tuple(solutions))
     # the check waits for the end, because with a wrong A3 the errors are not known either
-    if plumb.scatter > _most_scatter(len(sound)):
-        raise FixError(
-            f"{len(sound)} frames do not agree on one zenith (chi-square {plumb.scatter:.0f} a degree of freedom): the "
-            "instrument was moved between them, its inclinometer or clock was disturbed, or the place given is wrong"
-        )
-    if plumb.scatter > _usual_scatter(len(sound)):
-        plumb = replace(plumb, covariance=plumb.covariance * plumb.scatter)
-        solutions = [_scattered(s, plumb.scatter) for s in solutions]
+    agreement.check()
+    plumb = agreement.plumb
+    solutions = [agreement.judged(s) for s in solutions]
     if plumb.astray:
         solutions = [
             replace(s, fix=_with_zenith_error(s.fix, plumb.astray)) if s.fix else s for s in solutions
         ]
-    mean_plumb = Readings.of(sound, solver.instrument.inclinometer).mean_plumb
-    error = float(plumb.stddev_across(mean_plumb) / ARCSEC)
-    instrument = replace(solver.instrument, calibration=_dated(plumb, sound))
+    error = float(plumb.stddev_across(agreement.readings.mean_plumb) / ARCSEC)
+    instrument = replace(
+        solver.instrument, calibration=_dated(agreement, errors), inclinometer=agreement.errors(errors)
+    )
     return Calibrated(instrument, error, tuple(solutions))
 
 
-def _found(
-    find: FindPlumbLine, solved: list[FixedFrame], instrument: Instrument
-) -> tuple[PlumbLine, list[FixedFrame]]:
-    """The plumb line that `find` gives for the frames that agree with each other, and these frames."""
-    a3, errors = instrument.mounting.a3, instrument.inclinometer
-    plumb = find(Readings.of(solved, errors), a3, [s.fix for s in solved])
-    sound = [s for s, off in zip(solved, plumb.off, strict=True) if off < OUTLIER_SIGMA]
-    if not 0 < len(solved) - len(sound) <= MOST_OUTLIERS * len(solved):
-        return plumb, solved
-    return find(Readings.of(sound, errors), a3, [s.fix for s in sound]), sound
+@dataclass(frozen=True)
+class _Agreement:
+    """The plumb line of the frames that agree, and how well they do.
+
+    readings: of the frames `sound`.  scatter: of these.
+    left_out: utc_unix_s of each frame that disagrees, and by how much, in rad.
+    """
+
+    plumb: PlumbLine
+    readings: Readings
+    sound: list[FixedFrame]
+    scatter: Scatter
+    left_out: dict[float, float]
+
+    def errors(self, stated: InclinometerErrors) -> InclinometerErrors:
+        """The inclinometer's errors, with those of its poses as these show them."""
+        return replace(stated, pose_rad=self.scatter.pose_sigma)
+
+    def check(self) -> None:
+        """Raise FixError if the frames are not of one zenith."""
+        of = len(self.sound) + len(self.left_out)
+        why = "the instrument was moved between them, its inclinometer or clock was disturbed, or the place given is wrong"
+        if len(self.left_out) > MOST_OUTLIERS * of:
+            raise FixError(
+                f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
+            )
+        if max(self.scatter.pose_sigma, self.scatter_left) > MOST_POSE_RAD:
+            raise FixError(
+                f"{of} frames do not agree on one zenith (they scatter by "
+                f"{np.degrees(max(self.scatter.pose_sigma, self.scatter_left)):.2f} deg): {why}"
+            )
+
+    @property
+    def scatter_left(self) -> float:
+        """Root mean square in rad of what the fit leaves of the frames, per axis."""
+        return float(np.sqrt(np.mean(self.plumb.left**2)))
+
+    def judged(self, solution: Solution) -> Solution:
+        """The solution, without a fix if its frame disagrees."""
+        if solution.fix is None:
+            return solution
+        off = self.left_out.get(solution.fix.utc_unix_s)
+        if off is not None:
+            place = solution.source or "a frame"
+            why = f"{place}: its tilt is off by {off / ARCSEC:.0f} arcsec against those of the other frames"
+            return replace(solution, status=Status.POOR_FIT, message=f"{why}: it is left out", fix=None)
+        return solution
 
 
-def _unknown(plumb: PlumbLine, sound: list[FixedFrame]) -> Calibration:
+def _agreed(
+    find: FindPlumbLine, solved: list[FixedFrame], a3: np.ndarray, errors: InclinometerErrors
+) -> _Agreement:
+    """The plumb line that `find` gives for the frames that agree with each other."""
+    whole = Readings.of(solved, errors)
+    rows = np.arange(len(solved))
+    for _ in range(JUDGED):
+        plumb = find(whole.take(rows), a3, [solved[k].fix for k in rows])
+        size = np.linalg.norm(plumb.left, axis=1)
+        usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
+        agree = size < OUTLIER_SIGMA * usual
+        if agree.all() or agree.sum() < (1 - MOST_OUTLIERS) * len(solved):
+            break
+        rows = rows[agree]
+    sound = [solved[k] for k in rows]
+    fixes = [s.fix for s in sound]
+    readings = whole.take(rows)
+    _, scatter = settled(plumb, readings)
+    # once more about the answer, with what the poses tell of their errors
+    again = find(replace(readings, pose_sigma=scatter.pose_sigma), a3, fixes)
+    plumb, scatter = settled(again, readings)
+    # errors that poses share in part leave the zenith less certain than as many errors of their own do
+    alike = max(plumb.zenith_sigma / again.zenith_sigma, 1.0)
+    scatter = replace(scatter, pose_sigma=scatter.pose_sigma * alike)
+    left_out = {}
+    if len(rows) < len(solved):
+        # how far the others are off shows against the answer of these
+        turned = whole.plumb - np.einsum("ij,kjl,l->ki", plumb.a3, whole.to_camera, plumb.zenith)
+        for k in np.setdiff1d(np.arange(len(solved)), rows):
+            left_out[solved[k].fix.utc_unix_s] = float(np.linalg.norm(turned[k]))
+    return _Agreement(plumb, readings, sound, scatter, left_out)
+
+
+def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     """A3 as the budgets of the fixes take it: unknown, except for its turn about the plumb line if the leans told that.
 
     With an unknown turn every lean would become an error.
     """
-    tilt_deg = _mean_tilt_deg(sound)
-    up = a2_matrix(*np.radians(tilt_deg))[2]
+    plumb, found = agreement.plumb, _found(agreement, errors)
+    up = up_of(np.radians(found.tilt_deg))
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
-    # `_with_zenith_error` accounts for the turn then; here the noise of single tilts would seem to tell it
-    if plumb.astray:
+    # the errors of single tilts would seem to tell the turn, unless the instrument really leans from pose to pose; if it does
+    # and nothing tells the turn, `_with_zenith_error` accounts for it
+    if plumb.astray or not agreement.readings.lean(agreement.scatter.pose_sigma):
         about = 0.0
     covariance = np.eye(3) * across**2 + np.outer(up, up) * (about**2 - across**2)
-    held = Calibration(
-        covariance_arcsec2=tuple(map(tuple, covariance.tolist())),
-        temperature_c=_mean_temperature_c(sound),
-        tilt_deg=tilt_deg,
-    )
-    return held.turned_to(plumb.a3)
-
-
-def _most_scatter(frames: int) -> float:
-    """Chi-square per degree of freedom that sound frames may have; few frames may have more."""
-    # slow to import
-    from scipy.special import gammainccinv
-
-    freedom = max(2 * frames - 5, 1)
-    return max(MOST_SCATTER, 2 * float(gammainccinv(freedom / 2, 1e-9)) / freedom)
-
-
-def _scattered(solution: Solution, scatter: float) -> Solution:
-    """The solution with the tilt's error enlarged to the scatter of the frames."""
-    if solution.fix is None:
-        return solution
-    terms = tuple(
-        replace(t, variance=t.variance * scatter) if t.name == "tilt" else t for t in solution.fix.terms
-    )
-    return replace(solution, fix=replace(solution.fix, terms=terms))
+    return replace(found, covariance_arcsec2=tuple(map(tuple, covariance.tolist())))
 
 
 def _with_zenith_error(fix: Fix, astray: float) -> Fix:
@@ -218,34 +266,43 @@ def _with_zenith_error(fix: Fix, astray: float) -> Fix:
     return replace(fix, terms=(*fix.terms, term))
 
 
-def _usual_scatter(frames: int) -> float:
-    """Chi-square per degree of freedom that frames with rightly stated errors usually stay below."""
-    return 1 + 2 * np.sqrt(2 / max(2 * frames - 5, 1))
+def _with(solver: Solver, calibration: Calibration, errors: InclinometerErrors) -> Solver:
+    return replace(
+        solver, instrument=replace(solver.instrument, calibration=calibration, inclinometer=errors)
+    )
 
 
-def _with(solver: Solver, calibration: Calibration) -> Solver:
-    return replace(solver, instrument=replace(solver.instrument, calibration=calibration))
-
-
-def _dated(plumb: PlumbLine, solved: list[FixedFrame]) -> Calibration:
+def _dated(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     """The calibration at the mean time, temperature and tilt of the frames."""
-    found = Calibration(
-        covariance_arcsec2=tuple(map(tuple, (plumb.covariance / ARCSEC**2).tolist())),
-        utc_unix_s=float(np.mean([s.fix.utc_unix_s for s in solved])),
-        temperature_c=_mean_temperature_c(solved),
-        tilt_deg=_mean_tilt_deg(solved),
-        frames=len(solved),
+    sound = agreement.sound
+    return replace(
+        _found(agreement, errors),
+        covariance_arcsec2=tuple(map(tuple, (agreement.plumb.covariance / ARCSEC**2).tolist())),
+        utc_unix_s=float(np.mean([s.fix.utc_unix_s for s in sound])),
+        frames=len(sound),
         valid_days=VALID_DAYS,
     )
-    return found.turned_to(plumb.a3)
+
+
+def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
+    """The A3 that was found, at the mean temperature and tilt of the frames, with the response if the poses tell it."""
+    plumb, axes = agreement.plumb, agreement.sound[0].tilt.axes
+    found = Calibration(
+        temperature_c=_mean_temperature_c(agreement.sound),
+        tilt_deg=tuple(np.degrees(angles_at(agreement.readings.mean_plumb, axes)).tolist()),
+    ).turned_to(plumb.a3)
+    stated = np.diag(stated_variances(errors, axes))
+    known, most = np.sqrt(np.diag(plumb.response_covariance)), np.sqrt(np.diag(stated))
+    if (np.abs(known - most) <= WORTH * np.maximum(known, most)).all():
+        return found
+    return replace(
+        found,
+        response=tuple(plumb.response.tolist()),
+        response_covariance=tuple(map(tuple, plumb.response_covariance.tolist())),
+    )
 
 
 def _mean_temperature_c(solved: list[FixedFrame]) -> float:
     # an unknown temperature is NaN, which is not below MOST_C
     known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MOST_C]
     return float(np.mean(known)) if known else float("nan")
-
-
-def _mean_tilt_deg(solved: list[FixedFrame]) -> tuple[float, float]:
-    x, y = np.degrees(np.mean([[s.tilt.theta_x, s.tilt.theta_y] for s in solved], axis=0))
-    return float(x), float(y)

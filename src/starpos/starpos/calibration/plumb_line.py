@@ -6,17 +6,14 @@ of the Earth, z = R^T A3^T s, where s is the plumb line as the inclinometer read
 headings lie on a circle; with the right one they agree.  Only the sum of A3's tilts and the inclinometer's zero matters.
 """
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.averaging.scatter import Frames, Scatter, scatter_of
+from starpos.calibration.readings import KNOWN, Readings
 from starpos.errors import FixError
-from starpos.fix.fix import Fix
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt, a2_matrix
 from starpos.units import ARCSEC
 
 # sigma of A3 about S's axes before anything is known of it
@@ -26,6 +23,8 @@ ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10
 TURNS_TRIED = 8
 # chi-square per degree of freedom above which the search ended in a wrong minimum
 FOUND_SCATTER = 16.0
+# chi-square per degree of freedom above which the poses scatter
+USUAL_SCATTER = 4.0
 # the instrument leans if chi-square falls by this when the tilts may follow the heading
 LEAN_CHI2 = 25.0
 # zeniths of equally good solutions that are further apart are two answers
@@ -39,85 +38,23 @@ NARROW_TURN = np.radians(20)
 AS_GOOD = 8.0
 # share of the axis' weight below which the headings do not tell the axis
 SAME_AXIS = 1e-9
+MEDIAN_OF_CHI2 = 2 * np.log(2)  # for two degrees of freedom
 MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
 
 
 @dataclass(frozen=True)
-class FixedFrame:
-    """A frame's fix, and the tilt that it was made with."""
+class Linear:
+    """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the columns.
 
-    fix: Fix
-    tilt: Tilt
-
-
-@dataclass(frozen=True)
-class Readings:
-    """Attitudes and tilts of K frames.
-
-    to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.  heading (K,) in rad.
-    sigma (K,) in rad: of the zenith from each frame alone.
-    wandering (K, 3, M): change of `plumb` by 1 sigma of each of M errors of the inclinometer that frames share, besides
-    its zero.
+    residual (K, 2) in rad with p = 0 for the columns, design (K, 2, n): its derivatives.  prior_sigma (n,).
+    turns (3, 3): axes in S, two across the plumb line and it.  across (2, 3): axes in ITRS, across the zenith.
     """
 
-    to_camera: np.ndarray
-    plumb: np.ndarray
-    heading: np.ndarray
-    sigma: np.ndarray
-    wandering: np.ndarray
-
-    @classmethod
-    def of(cls, solved: Sequence[FixedFrame], errors: InclinometerErrors) -> "Readings":
-        """Readings of frames with a fix."""
-        plumb = np.array([a2_matrix(s.tilt.theta_x, s.tilt.theta_y)[2] for s in solved])
-        return cls(
-            np.array([s.fix.camera_to_itrs.T for s in solved]),
-            plumb,
-            np.array([s.fix.heading for s in solved]),
-            _own_sigma([s.fix for s in solved]),
-            _wandering(solved, plumb, errors),
-        )
-
-    @property
-    def mean_plumb(self) -> np.ndarray:
-        """Mean direction (3,) of `plumb`."""
-        return rotation.normalised(self.plumb.sum(0))
-
-
-def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
-    """Sigma per axis (K,) in rad of each frame's zenith, without the errors that all frames share.
-
-    An error that some frames share (a reading, the same stars) counts as an own error of each of them, enlarged so much
-    that together they know the zenith no better than one.
-    """
-    terms = [[(k, t) for k, t in enumerate(f.terms) if not t.common] for f in fixes]
-    frames = Counter((k, key) for own in terms for k, t in own for key in t.shared or ())
-    variance = [
-        sum(
-            np.trace(t.covariance[:2, :2]) / 2 * max((frames[k, key] for key in t.shared or ()), default=1)
-            for k, t in own
-        )
-        for own in terms
-    ]
-    return np.sqrt(variance) / EARTH_RADIUS_M
-
-
-def _wandering(solved: Sequence[FixedFrame], plumb: np.ndarray, errors: InclinometerErrors) -> np.ndarray:
-    """Change (K, 3, 6) of `plumb` by drift, temperature and scale of each axis, counted from the means of the frames."""
-    hours = np.array([s.fix.utc_unix_s for s in solved]) / 3600
-    warm = np.array([s.tilt.temperature_c for s in solved])
-    theta = np.array([[s.tilt.theta_x, s.tilt.theta_y] for s in solved])
-    late = (hours - hours.mean()) / max(np.sqrt(np.ptp(hours)), 1e-9)
-    warm = warm - np.mean(warm) if np.isfinite(warm).all() else np.zeros(len(warm))
-    known = np.stack([late * errors.drift_rad_per_sqrt_hour, warm * errors.temperature_rad_per_c], -1)
-    columns = []
-    for axis in range(2):
-        for off in (*known.T, (theta[:, axis] - theta[:, axis].mean()) * errors.scale):
-            moved = np.zeros_like(plumb)
-            moved[:, axis] = np.cos(theta[:, axis])
-            moved[:, 2] = -plumb[:, axis] * moved[:, axis] / plumb[:, 2]
-            columns.append(moved * off[:, None])
-    return np.stack(columns, -1)
+    residual: np.ndarray
+    design: np.ndarray
+    prior_sigma: np.ndarray
+    turns: np.ndarray
+    across: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +62,9 @@ class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) in rad2 about S's axes, and the zenith (3,) in ITRS with its sigma in rad.
 
     cost: half the robust chi-square.  scatter: chi-square per degree of freedom, 1 for frames of one zenith.
-    off (K,): distance of each frame from the zenith, in its own sigma.
+    left (K, 2): what the fit leaves of each frame's reading, in rad across the plumb line.
+    response (m,), response_covariance (m, m): of the inclinometer's response.
+    linear: the fit about its answer.
     astray (rad): sigma by which the zenith may be off together with A3's turn about a leaning axis; no heading tells it.
     """
 
@@ -135,7 +74,10 @@ class PlumbLine:
     zenith_sigma: float
     cost: float
     scatter: float
-    off: np.ndarray
+    left: np.ndarray
+    response: np.ndarray
+    response_covariance: np.ndarray
+    linear: "Linear"
     astray: float = 0.0
 
     def stddev_across(self, plumb: np.ndarray) -> float:
@@ -163,9 +105,14 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
     starts = _turns(mean, start) if turn_sigma > NARROW_TURN else [(0.0, start)]
     found = [_fitted(readings, start, known) for _, start in starts]
     best = min(found, key=_cost)
+    if best.scatter > USUAL_SCATTER:
+        # whichever way the inclinometer faces, its poses scatter
+        readings = replace(readings, pose_sigma=_pose_scatter(best, readings))
+        found = [_fitted(readings, start, known) for _, start in starts]
+        best, nearest, leans = min(found, key=_cost), found[0], _leans(readings)
     # a search that began half a turn away may have ended in a wrong minimum
     if not leans:
-        return best if best.scatter < FOUND_SCATTER else nearest
+        return best if best.cost < nearest.cost - AS_GOOD else nearest
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
     lean = np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max()
@@ -212,6 +159,59 @@ class _Known:
     turn_sigma: float = np.pi
 
 
+def typical(left: np.ndarray, parameters: int) -> float:
+    """Sigma per axis in rad of what a fit of so many parameters leaves (K, 2), by the median: outliers do not count."""
+    free = len(left) / max(len(left) - parameters / 2, 0.5)
+    return float(np.sqrt(np.median(np.sum(left**2, 1)) / MEDIAN_OF_CHI2 * free))
+
+
+def _pose_scatter(plumb: PlumbLine, readings: Readings) -> float:
+    """Sigma in rad of the error of a pose, by the median of the poses."""
+    poses = [readings.pose == k for k in range(readings.pose.max() + 1)]
+    left = np.array([np.median(plumb.left[rows], axis=0) for rows in poses])
+    own2 = np.median([1 / np.sum(1 / readings.sigma[rows] ** 2) for rows in poses])
+    return float(np.sqrt(max(typical(left, 5) ** 2 - own2, readings.pose_sigma**2)))
+
+
+def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
+    """The plumb line as the mean over all sizes of the poses' errors and of the response, and what these are.
+
+    readings: of the frames of the fit.
+    """
+    linear, prior_sigma = plumb.linear, plumb.linear.prior_sigma.copy()
+    # the errors of the tilts would seem to tell A3's turn, unless the instrument really leans from pose to pose
+    leans = readings.lean(_pose_scatter(plumb, readings))
+    if not leans:
+        prior_sigma[2] = KNOWN
+    scatter = scatter_of(
+        Frames(
+            utc_unix_s=readings.utc_unix_s,
+            pose=readings.pose,
+            residual=linear.residual,
+            design=linear.design,
+            sigma=readings.sigma,
+            pose_sigma=readings.pose_sigma,
+            prior_sigma=prior_sigma,
+            response=np.arange(len(prior_sigma)) >= 5 + readings.response.start,
+        )
+    )
+    moved, covariance, at = scatter.moved, scatter.covariance, 5 + readings.response.start
+    if not leans:
+        covariance[2, 2] = linear.prior_sigma[2] ** 2
+    a3 = rotation.from_vector(linear.turns @ moved[:3]) @ plumb.a3
+    up = rotation.normalised(plumb.zenith + moved[3:5] @ linear.across)
+    answer = replace(
+        plumb,
+        a3=a3,
+        covariance=_symmetric(linear.turns @ covariance[:3, :3] @ linear.turns.T),
+        zenith=up,
+        zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[-1])),
+        response=moved[at:],
+        response_covariance=_symmetric(covariance[at:, at:]),
+    )
+    return answer, scatter
+
+
 def _cost(plumb: PlumbLine) -> float:
     return plumb.cost
 
@@ -236,9 +236,10 @@ def _chi2_without(readings: Readings, columns: np.ndarray) -> float:
 
     Robust, because one reading that is far off is no lean.
     """
-    weight, more = 1 / readings.sigma, readings.wandering.shape[2]
+    weight, more = 1 / readings.spread, readings.columns.shape[2]
+    wandering = (readings.columns * readings.column_sigma).reshape(-1, more)
     off = np.append(((readings.plumb - readings.mean_plumb) * weight[:, None]).ravel(), np.zeros(more))
-    design = np.hstack([np.kron(columns, np.eye(3)), readings.wandering.reshape(-1, more)])
+    design = np.hstack([np.kron(columns, np.eye(3)), wandering])
     design = np.vstack(
         [design * np.repeat(weight, 3)[:, None], np.eye(more, design.shape[1], design.shape[1] - more)]
     )
@@ -277,51 +278,69 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
     # two axes across the zenith; and in S two across the plumb line and one along it
     across = np.linalg.svd(zenith[None])[2][1:]
     turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
-    wandering = -np.einsum("kim,ij->kjm", readings.wandering, turns[:, :2])
-    more = wandering.shape[2]
+    columns = -np.einsum("kim,ij->kjm", readings.columns, turns[:, :2])
+    more, spread = columns.shape[2], readings.spread
     loose = UNKNOWN_ARCSEC[0] * ARCSEC
-    prior = 1 / np.array([loose, loose, known.turn_sigma, *[known.zenith_sigma] * 2, *[1.0] * more])
+    prior_sigma = np.array(
+        [loose, loose, known.turn_sigma, *[min(known.zenith_sigma, np.pi)] * 2, *readings.column_sigma]
+    )
     a3, p = start, np.zeros(5 + more)
     p[2] = turned
     up, best = zenith, np.inf
     for _ in range(MOST_STEPS):
         length = np.linalg.norm(up)
         read = to_camera @ (up / length) @ a3.T
-        off = (readings.plumb - read) @ turns[:, :2] + wandering @ p[5:]
+        residual = (readings.plumb - read) @ turns[:, :2]
         slope = np.concatenate(
             [
                 -np.einsum("kij,il->klj", np.cross(turns.T, read[:, None]).swapaxes(1, 2), turns[:, :2]),
                 -np.einsum("kij,il->klj", np.einsum("ab,kbc,dc->kad", a3, to_camera, across) / length, turns[:, :2]),
-                wandering,
+                columns,
             ],
             2,
-        ) / readings.sigma[:, None, None]  # fmt: skip
-        off = off / readings.sigma[:, None]
+        )  # fmt: skip
+        off = (residual + columns @ p[5:]) / spread[:, None]
         weight = _huber(off)
-        design = np.vstack([(slope * weight[..., None]).reshape(-1, 5 + more), np.diag(prior)])
-        cost = float(_robust(off).sum() + np.sum((p * prior) ** 2)) / 2
+        design = np.vstack(
+            [
+                (slope / spread[:, None, None] * weight[..., None]).reshape(-1, 5 + more),
+                np.diag(1 / prior_sigma),
+            ]
+        )
+        cost = float(_robust(off).sum() + np.sum((p / prior_sigma) ** 2)) / 2
         # if the headings hardly differ, later steps may lead away again
         if cost < best:
-            best, answer = cost, (a3, up, off, design)
-        step = -np.linalg.lstsq(design, np.concatenate([(off * weight).ravel(), p * prior]), rcond=None)[0]
+            best, answer = cost, (a3, up, residual, slope, design, p)
+        # the prior's own units keep the loose and the tight of one size
+        scaled = np.concatenate([(off * weight).ravel(), p / prior_sigma])
+        step = -prior_sigma * np.linalg.lstsq(design * prior_sigma, scaled, rcond=None)[0]
         step *= min(1.0, LONGEST_STEP / np.linalg.norm(step[:5]))
         a3, p = rotation.from_vector(turns @ step[:3]) @ a3, p + step
         up = zenith + p[3:5] @ across
         if np.abs(step[:5]).max() < SETTLED_RAD:
             break
-    a3, up, off, design = answer
-    whole = turns @ np.linalg.inv(design.T @ design)[:3, :3] @ turns.T
+    a3, up, residual, slope, design, p = answer
+    scaled = design * prior_sigma
+    whole = np.outer(prior_sigma, prior_sigma) * np.linalg.inv(scaled.T @ scaled)
     # without the turn about the plumb line, which may be as good as unknown
     told = np.delete(design, 2, 1)
+    response = slice(5 + readings.response.start, 5 + readings.response.stop)
     return PlumbLine(
         a3=a3,
-        covariance=(whole + whole.T) / 2,
+        covariance=_symmetric(turns @ whole[:3, :3] @ turns.T),
         zenith=rotation.normalised(up),
         zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(told.T @ told)[2:4, 2:4])[-1])),
         cost=best,
-        scatter=2 * best / max(2 * len(readings.sigma) - 5, 1),
-        off=np.hypot(*off.T),
+        scatter=2 * best / max(2 * len(spread) - 5, 1),
+        left=residual + slope[:, :, 5:] @ p[5:],
+        response=p[response],
+        response_covariance=_symmetric(whole[response, response]),
+        linear=Linear(residual, slope, prior_sigma, turns, across),
     )
+
+
+def _symmetric(covariance: np.ndarray) -> np.ndarray:
+    return (covariance + covariance.T) / 2
 
 
 def _axis_of_turn(readings: Readings, given: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import a2_matrix
+from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog, read_tilt_csv
 from starpos.sky import catalogue
@@ -132,7 +132,7 @@ def _levelled(
             if stars.mid_unix_s is None:
                 raise FrameError(f"no time of exposure: {why_no_time(stars.source)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
-            levels.append(a2_matrix(tilt.theta_x, tilt.theta_y) @ instrument.mounting.a3)
+            levels.append(level_of(tilt.up) @ instrument.mounting.a3)
             kept.append(stars)
         except StarposError as e:
             common.complain("calibrate", f"{stars.source} is left out: {e}")

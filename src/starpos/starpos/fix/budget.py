@@ -9,12 +9,15 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
-from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.inclinometer import Tilt, level_of, levelling_of
 from starpos.instrument.mounting import Mounting
 from starpos.units import HOUR_S
 
-STEP_RAD = 1e-6
 ALWAYS = ("always",)
+# the key of a pose, which only the average of several fixes knows, takes its place
+EACH_POSE = ("pose",)
+# 1 sigma of the difference of two temperatures that nobody measured: a warm room and a clear night
+UNKNOWN_TEMPERATURE_C = 14.0
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,7 @@ class ErrorTerm:
     factor (6, m): rows are east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.
     shared: None if the error is new in every frame.  Otherwise the error is the mean of several readings, and these are
     their keys: the m errors of two frames have the `correlation` of their keys.  ALWAYS: for a calibration or a clock.
+    EACH_POSE: the same as long as nobody touches the instrument.
     walk_s: growth of the variance per second, for an error that wanders.
     posed: the true factor is constant while nobody touches the camera; differences between frames are noise.
     """
@@ -191,16 +195,24 @@ def error_terms(
     east, north = np.eye(6)[:, :1], np.eye(6)[:, 1:2]
     second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
     pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
-    a2 = a2_matrix(tilt.theta_x, tilt.theta_y)
-    levelling = _levelling(tilt, a2)
+    up = mounting.up(tilt)
+    columns, response = mounting.response_at(tilt)
     calibration = np.hstack(
-        [a2 @ symmetric_root(mounting.calibration_covariance), levelling @ _turn_error(tilt, mounting)]
+        [level_of(up) @ symmetric_root(mounting.calibration_covariance), _turn_error(up, mounting)]
     )
     return (
         ErrorTerm("centroids", factor_from_stars(stars.centroids)),
         ErrorTerm("catalogue", factor_from_stars(stars.catalogue), shared=stars.same_stars),
         ErrorTerm("calibration", sensitivity.level @ calibration, shared=ALWAYS, posed=True),
-        *_inclinometer_terms(sensitivity.level @ levelling, tilt, mounting, earth.utc_unix_s),
+        *_inclinometer_terms(
+            sensitivity.level @ levelling_of(up, tilt.slope), tilt, mounting, earth.utc_unix_s
+        ),
+        ErrorTerm(
+            "tilt response",
+            sensitivity.level @ levelling_of(up, columns) @ symmetric_root(response),
+            shared=ALWAYS,
+            posed=True,
+        ),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
         ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
         # a constant lag does not average away, and nobody can exclude one
@@ -210,40 +222,32 @@ def error_terms(
     )
 
 
-def _turn_error(tilt: Tilt, mounting: Mounting) -> np.ndarray:
-    """Error (2, 1) in rad of theta_x, theta_y that an A3 with a large turn about the plumb line causes.
+def _turn_error(up: np.ndarray, mounting: Mounting) -> np.ndarray:
+    """Error (3, 1) of L, as a small rotation about its axes, that an A3 with a large turn about the plumb line causes.
 
     To first order a turn moves the lean since the calibration sideways only, which the calibration's own term holds.
     A large turn also makes that lean shorter, by its cosine.
     """
-    up = a2_matrix(*mounting.calibrated_tilt)[2]
-    variance = up @ mounting.calibration_covariance @ up
+    then = mounting.calibrated_up
+    variance = then @ mounting.calibration_covariance @ then
     # the mean of (1 - cos)^2 over a Gaussian turn
     shorter2 = 1.5 - 2 * np.exp(-variance / 2) + np.exp(-2 * variance) / 2
-    lean = np.array([tilt.theta_x, tilt.theta_y]) - mounting.calibrated_tilt
-    return lean[:, None] * np.sqrt(max(shorter2, 0.0))
-
-
-def _levelling(tilt: Tilt, a2: np.ndarray) -> np.ndarray:
-    """Derivatives (3, 2) of L's small rotation with respect to theta_x, theta_y."""
-    steps = (np.array([STEP_RAD, 0.0]), np.array([0.0, STEP_RAD]))
-    turned = [a2_matrix(tilt.theta_x + dx, tilt.theta_y + dy) @ a2.T for dx, dy in steps]
-    return np.stack([rotation.to_small_vector(r) / STEP_RAD for r in turned], -1)
+    return levelling_of(up, (up - then)[:, None] * np.sqrt(max(shorter2, 0.0)))
 
 
 def _inclinometer_terms(
     level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The inclinometer's terms; level (6, 2): rows of an ErrorTerm for an error of theta_x, theta_y.
+    """The inclinometer's terms; level (6, axes): rows of an ErrorTerm for an error of each angle.
 
     Its zero is not among them: the calibration's covariance includes it.
     """
-    errors, theta = mounting.inclinometer, np.array([tilt.theta_x, tilt.theta_y])
-    warmer = tilt.temperature_c - mounting.calibrated_temperature_c
+    errors = mounting.inclinometer
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
     return (
-        ErrorTerm("tilt", level @ symmetric_root(tilt.covariance), shared=tilt.times),
+        ErrorTerm("tilt", level @ symmetric_root(tilt.noise), shared=tilt.times),
         ErrorTerm("tilt quantisation", level * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
+        ErrorTerm("tilt pose", level * errors.pose_rad, shared=EACH_POSE),
         ErrorTerm(
             "tilt drift",
             level * errors.drift_rad_per_sqrt_hour / np.sqrt(HOUR_S),
@@ -254,10 +258,19 @@ def _inclinometer_terms(
         ),
         ErrorTerm(
             "tilt temperature",
-            level * errors.temperature_rad_per_c * (warmer if np.isfinite(warmer) else 0.0),
+            level * errors.temperature_rad_per_c * _warmer_c(tilt, mounting),
             shared=ALWAYS,
         ),
-        ErrorTerm(
-            "tilt scale", level * (theta - mounting.calibrated_tilt) * errors.scale, shared=ALWAYS, posed=True
-        ),
     )
+
+
+def _warmer_c(tilt: Tilt, mounting: Mounting) -> float:
+    """The inclinometer's temperature less that of its calibration; if it is not known, what may be expected of it.
+
+    The stated error of a calibration with neither a date nor a temperature is for all temperatures.
+    """
+    warmer = tilt.temperature_c - mounting.calibrated_temperature_c
+    if np.isfinite(warmer):
+        return float(warmer)
+    dated = np.isfinite([mounting.calibrated_unix_s, mounting.calibrated_temperature_c]).any()
+    return UNKNOWN_TEMPERATURE_C if dated else 0.0

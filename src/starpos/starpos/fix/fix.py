@@ -27,7 +27,7 @@ from starpos.fix.outliers import expected_extra, judged
 from starpos.frames.stars import Stars
 from starpos.identification import Identification
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.inclinometer import Tilt, level_of, levelling_of
 from starpos.instrument.mounting import Mounting
 
 MAX_ROUNDS = 6
@@ -72,6 +72,7 @@ class Fix:
     used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
     jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
     focal_scale: factor on the given focal length.
+    levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the inclinometer.
     camera_to_itrs (3, 3): attitude of the camera against the Earth by the stars alone; camera_covariance (3, 3) in rad2:
     of its small rotation about the Earth's axes.
     """
@@ -82,6 +83,7 @@ class Fix:
     heading: float
     link_to_enu: np.ndarray
     terms: tuple[ErrorTerm, ...]
+    levelling: np.ndarray
     used: np.ndarray
     residual_px: np.ndarray
     residual_arcsec: float
@@ -125,7 +127,7 @@ def solve_fix(
     problem = _Adjustment(
         stars.xy,
         camera,
-        a2_matrix(tilt.theta_x, tilt.theta_y) @ mounting.a3,
+        level_of(mounting.up(tilt)) @ mounting.a3,
         earth.to_itrs(stars.places),
         atmosphere.refraction(),
     )
@@ -154,11 +156,23 @@ def solve_fix(
     centroids = stars.covariance_px2[keep] + np.eye(2) * claimed2
     same_stars = ALWAYS if stars.index is None else tuple(stars.index[keep][:MARKS].tolist())
     errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep], same_stars)
-    terms = _terms(
-        problem, state, keep, errors, tilt, mounting, atmosphere, earth, (clock_stddev_s, stamp_stddev_s)
-    )
     place = place_of(state.a4)
     link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
+    sensitivity, up = Sensitivity.of(state.a4, link_to_enu), mounting.up(tilt)
+    # the two axes go with the inclinometer, however it leans
+    axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), up)[:, :2]
+    terms = _terms(
+        problem,
+        state,
+        keep,
+        errors,
+        tilt,
+        mounting,
+        atmosphere,
+        earth,
+        (clock_stddev_s, stamp_stddev_s),
+        sensitivity,
+    )
     axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
     bent = np.linalg.norm(np.cross(axis, problem.refraction.unbend(axis)))
     return Fix(
@@ -168,6 +182,7 @@ def solve_fix(
         heading=heading_of(link_to_enu),
         link_to_enu=link_to_enu,
         terms=terms,
+        levelling=sensitivity.level @ levelling_of(up, axes),
         used=np.flatnonzero(keep),
         residual_px=residual,
         residual_arcsec=float(np.sqrt(np.mean(residual**2)) * camera.scale_arcsec),
@@ -272,20 +287,20 @@ def _terms(
     atmosphere: Atmosphere,
     earth: EarthState,
     clock_and_stamp_stddev_s: tuple[float, float],
+    sensitivity: Sensitivity,
 ) -> tuple[ErrorTerm, ...]:
     """The budget of the fix: the errors of its stars, of the refraction as it acts on them, and all others."""
-    place = place_of(state.a4)
     stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
     bending = (
         -np.einsum("ank,nk->a", errors.gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
     )
     return error_terms(
-        Sensitivity.of(state.a4, place.local_to_enu @ problem.g @ mounting.link_to_camera),
+        sensitivity,
         errors,
         tilt,
         mounting,
         bending,
-        place.latitude,
+        place_of(state.a4).latitude,
         earth,
         *clock_and_stamp_stddev_s,
     )

@@ -20,7 +20,7 @@ from starpos.identification import FEWEST_STARS, Identification, Sky, identify_d
 from starpos.identification.hint import Hint
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
@@ -154,7 +154,9 @@ class Solver:
                 tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0, spread_s)
             self.instrument.calibration.check_age(stars.mid_unix_s)
             camera = self._camera(stars.width, stars.height)
-            g = a2_matrix(tilt.theta_x, tilt.theta_y) @ self.instrument.mounting.a3
+            self.instrument.inclinometer.check_range(tilt)
+            mounting = self.instrument.mounting
+            g = level_of(mounting.up(tilt)) @ mounting.a3
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(camera.directions(stars.x, stars.y) @ g.T) @ g
             priors = hint.priors(state, g[2]) if hint else ()

@@ -6,27 +6,36 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starpos import rotation
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
 from starpos.units import ARCSEC
 
-LIMIT_RAD = np.radians(30.0)  # the SCA100T-D01's range, and this product's
+LIMIT_RAD = np.radians(30.0)  # range of the SCA100T-D01
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
 SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
+# sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors change it by less than this
+SQUARE = 0.1
+# one vertical axis: L's X, which lies below S's X', is taken below Y' instead
+STEEP = 0.999
+
+
 @dataclass(frozen=True)
 class Tilt:
-    """Elevation of S's X' and Y' axes above the horizon, averaged over readings.
+    """Elevation of S's X', Y' and, of a three-axis sensor, Z' above the horizon, averaged over readings.
 
     theta_x, theta_y  rad
-    covariance        (2, 2) rad2 of the average
+    covariance        (2, 2) rad2 of the average of these two
     utc_unix_s        middle of the readings
     samples           number of readings
     temperature_c     NaN: unknown
     times             Unix times of the readings, if they are known
+    theta_z           rad; NaN of a two-axis sensor, whose Z' points upwards
+    variance_z        rad2 of theta_z; NaN: that of the other two
 
-    TiltError if a value is not finite, TiltRangeError beyond LIMIT_RAD.
+    The sensor may lean in any way. TiltError if a value is not finite, or no direction of gravity gives these angles.
     """
 
     theta_x: float
@@ -37,6 +46,8 @@ class Tilt:
     samples: int = 1
     temperature_c: float = float("nan")
     times: tuple[float, ...] = ()
+    theta_z: float = float("nan")
+    variance_z: float = float("nan")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", np.asarray(self.covariance, float))
@@ -44,22 +55,58 @@ class Tilt:
             raise TiltError("a tilt reading is not a finite number: check the inclinometer")
         if self.covariance.shape != (2, 2) or not np.isfinite(self.covariance).all():
             raise TiltError("a tilt's covariance must be 2 x 2 finite numbers, rad2")
-        if max(abs(self.theta_x), abs(self.theta_y)) > LIMIT_RAD:
-            raise TiltRangeError(
-                f"tilt ({np.degrees(self.theta_x):.3f}, {np.degrees(self.theta_y):.3f}) deg is beyond +-30 deg, "
-                "the inclinometer's range: set the instrument more upright"
+        sines = np.sin(self.theta)
+        square = float(sines @ sines)
+        possible = abs(square - 1) < SQUARE if self.axes == 3 else square < 1
+        if not possible or np.abs(self.theta).max() > np.pi / 2:
+            angles = ", ".join(f"{angle:.3f}" for angle in np.degrees(self.theta))
+            raise TiltError(
+                f"tilts of {angles} deg cannot hold together: check the inclinometer and its units"
             )
 
+    @property
+    def axes(self) -> int:
+        """Number of axes that were measured, 2 or 3."""
+        return 2 if np.isnan(self.theta_z) else 3
 
-@dataclass(frozen=True)
+    @property
+    def theta(self) -> np.ndarray:
+        """The elevations (axes,) in rad."""
+        return np.array([self.theta_x, self.theta_y, self.theta_z])[: self.axes]
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Covariance (axes, axes) of `theta` in rad2."""
+        if self.axes == 2:
+            return self.covariance
+        whole = np.zeros((3, 3))
+        whole[:2, :2] = self.covariance
+        whole[2, 2] = np.trace(self.covariance) / 2 if np.isnan(self.variance_z) else self.variance_z
+        return whole
+
+    @property
+    def up(self) -> np.ndarray:
+        """Up (3,), a unit vector in S."""
+        return up_of(self.theta)
+
+    @property
+    def slope(self) -> np.ndarray:
+        """Derivatives (3, axes) of `up` by `theta`."""
+        return up_slope(self.theta)
+
+
+@dataclass(frozen=True, kw_only=True)
 class InclinometerErrors:
-    """Errors of an inclinometer, 1 sigma; the default is an SCA100T-D01 with a good converter.
+    """Errors of an inclinometer, 1 sigma; the default has the noise of an SCA100T-D01 with a good converter.
 
     noise_rad                white noise of one reading
     quantum_rad              step of its readings
     drift_rad_per_sqrt_hour  random walk of its zero
     temperature_rad_per_c    change of its zero with temperature, after compensation
     scale                    relative error of the angle
+    cross                    share of one axis' angle that the other shows: the axes are not square
+    pose_rad                 new at each pose, and the same in all its readings: hysteresis, nonlinearity, flexure
+    range_rad                largest angle that it measures
     """
 
     noise_rad: float = SCA100T_NOISE_RAD
@@ -67,13 +114,27 @@ class InclinometerErrors:
     drift_rad_per_sqrt_hour: float = 2 * ARCSEC
     temperature_rad_per_c: float = 3 * ARCSEC
     scale: float = 1e-4
+    cross: float = 0.0
+    pose_rad: float = 0.0
+    range_rad: float = np.pi / 2
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 <= value <= 1:
+            most = np.pi / 2 if name == "range_rad" else 1
+            if not 0 <= value <= most:
                 raise InstrumentError(
-                    f"the inclinometer's {name} is {value:g}: it must be a finite number from 0 to 1"
+                    f"the inclinometer's {name} is {value:g}: it must be a finite number from 0 to {most:.4g}"
                 )
+
+    def check_range(self, tilt: Tilt) -> None:
+        """Raise TiltRangeError if a tilt is beyond the range of the sensor."""
+        most = float(np.abs(tilt.theta[:2]).max())
+        if most > self.range_rad:
+            x, y = np.degrees(tilt.theta[:2])
+            raise TiltRangeError(
+                f"tilt ({x:.3f}, {y:.3f}) deg is beyond +-{np.degrees(self.range_rad):.3g} deg, the inclinometer's range: "
+                "set the instrument more upright"
+            )
 
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.
@@ -87,29 +148,53 @@ class InclinometerErrors:
         return float(self.quantum_rad / np.sqrt(12) * np.exp(-2 * np.pi**2 * noise2))
 
     def steps(self, tilt: Tilt) -> tuple:
-        """The quantiser's steps on which the two readings stand; the error of rounding is the same while they stay."""
+        """The quantiser's steps on which the readings stand; the error of rounding is the same while they stay."""
         if self.quantum_rad == 0:
             return ()
-        return ((round(tilt.theta_x / self.quantum_rad), round(tilt.theta_y / self.quantum_rad)),)
+        return (tuple(np.round(tilt.theta / self.quantum_rad).astype(int).tolist()),)
 
 
-EXACT = InclinometerErrors(0.0, 0.0, 0.0, 0.0, 0.0)
+EXACT = InclinometerErrors(
+    noise_rad=0.0, quantum_rad=0.0, drift_rad_per_sqrt_hour=0.0, temperature_rad_per_c=0.0, scale=0.0
+)
 
 
-def a2_matrix(theta_x: float, theta_y: float) -> np.ndarray:
-    """A2 = R2(b) R1(a) of the paper's section 4.2 (3, 3): S into L, from the two elevations in rad.
+def up_of(theta: np.ndarray) -> np.ndarray:
+    """Up (..., 3) in S, from elevations (..., 2) in rad of X', Y', with Z' upwards, or (..., 3) of all three axes."""
+    sines = np.sin(np.asarray(theta, float))
+    if sines.shape[-1] == 3:
+        return rotation.normalised(sines)
+    third = np.sqrt(np.maximum(1 - np.sum(sines**2, -1, keepdims=True), 0.0))
+    return np.concatenate([sines, third], -1)
 
-    b = -theta_x and a = asin(sin theta_y / cos b), so that the third row is up as S sees it.
+
+def up_slope(theta: np.ndarray) -> np.ndarray:
+    """Derivatives (3, axes) of `up_of` by the elevations (axes,)."""
+    up, slope = up_of(theta), np.cos(theta)
+    if len(theta) == 3:
+        across = np.eye(3) - np.outer(up, up)
+        return across * slope / np.linalg.norm(np.sin(theta))
+    return np.vstack([np.diag(slope), -up[:2] * slope / max(up[2], 1e-9)])
+
+
+def level_of(up: np.ndarray) -> np.ndarray:
+    """A2 (3, 3), S into L, from up (3,) in S: A2 = R2(b) R1(a) of the paper's section 4.2.
+
+    b = -theta_x, and a = atan2 of up's y and z, so that the third row is up. L's X is below S's X'; where that is
+    vertical, L's X is below Y' instead. Any X will do, because the heading comes from the stars.
     """
-    b = -theta_x
-    s = np.sin(theta_y) / np.cos(b)
-    if not abs(s) < 1:
-        raise TiltError(
-            f"tilts {np.degrees(theta_x):.3f}, {np.degrees(theta_y):.3f} deg cannot hold together"
-        )
-    a = np.arcsin(s)
-    ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    if abs(up[0]) > STEEP:
+        across = rotation.normalised(np.cross(up, np.cross([0.0, 1.0, 0.0], up)))
+        return np.stack([across, np.cross(up, across), up])
+    cb, sb = np.sqrt(up[1] ** 2 + up[2] ** 2), -up[0]
+    sa, ca = up[1] / cb, up[2] / cb
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
+
+
+def levelling_of(up: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Small rotation (3, n) of L about its axes for n errors that move up (3,) in S by slope (3, n); none about Z."""
+    moved = level_of(up) @ slope
+    return np.stack([moved[1], -moved[0], np.zeros(slope.shape[1])])
 
 
 def sca100t_angle(

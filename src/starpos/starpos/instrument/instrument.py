@@ -9,8 +9,9 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import LIMIT_RAD, InclinometerErrors
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.mounting import Mounting
+from starpos.instrument.response import COEFFICIENTS
 from starpos.units import ARCSEC, DAY_S
 from starpos.utc import utc_text
 
@@ -21,6 +22,7 @@ UNSTATED_CALIBRATION_ARCSEC = 5.0
 # An error of several turns means that nothing is known; no inclinometer is so hot.
 MOST_ARCSEC, MOST_C = 1e7, 200.0
 MOST_CLOCK_S = 86400.0
+MOST_RESPONSE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +33,11 @@ class Calibration:
     covariance_arcsec2  (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
     utc_unix_s          when it was found; NaN: unknown
     temperature_c       temperature of the inclinometer then; NaN: unknown
-    tilt_deg            (x, y) tilt then; an error of the scale grows with the distance from it
+    tilt_deg            its two or three angles then; an error of the scale grows with the distance from them
     frames              number of frames it was found from
     valid_days          how long it may be used
+    response            coefficients of the inclinometer's response that were found with A3 (response.py), or none
+    response_covariance square, of these
     """
 
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -43,24 +47,30 @@ class Calibration:
     tilt_deg: tuple[float, ...] = (0.0, 0.0)
     frames: int = 0
     valid_days: float = float("inf")
+    response: tuple[float, ...] = ()
+    response_covariance: tuple = ()
 
     def __post_init__(self) -> None:
         for name, numbers in (
             ("misalignment_deg", self.misalignment_deg),
             ("calibration's covariance", np.ravel(self.covariance_arcsec2)),
             ("calibration's tilt_deg", self.tilt_deg),
+            ("calibration's response", [*self.response, *np.ravel(self.response_covariance)]),
         ):
             if not np.isfinite(np.asarray(numbers, float)).all():
                 raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
-        if len(self.misalignment_deg) != 3 or len(self.tilt_deg) != 2:
-            raise InstrumentError("misalignment_deg is three numbers, tilt_deg of a calibration two")
+        if len(self.misalignment_deg) != 3 or len(self.tilt_deg) not in (2, 3):
+            raise InstrumentError("misalignment_deg is three numbers, tilt_deg of a calibration two or three")
         if max(abs(angle) for angle in self.misalignment_deg) > 360:
             raise InstrumentError(
                 "an angle of misalignment_deg is beyond 360 deg: give A3's three angles in deg"
             )
-        if max(abs(angle) for angle in self.tilt_deg) > np.degrees(LIMIT_RAD):
+        if (
+            max(abs(angle) for angle in self.tilt_deg) > 90
+            or np.sum(np.sin(np.radians(self.tilt_deg[:2])) ** 2) > 1
+        ):
             raise InstrumentError(
-                "tilt_deg of the calibration is beyond 30 deg, which no inclinometer here measures"
+                "tilt_deg of the calibration cannot be: give the elevations of the inclinometer's axes, in deg"
             )
         if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MOST_C):
             raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")
@@ -73,8 +83,28 @@ class Calibration:
             raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
         if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
             raise InstrumentError("the calibration's covariance is none: a variance in it is negative")
+        self._check_response()
         if not self.valid_days > 0:
             raise InstrumentError(f"valid_days is {self.valid_days}: must be positive")
+
+    def _check_response(self) -> None:
+        """Raise InstrumentError for coefficients of a response that no sensor has."""
+        if not self.response:
+            return
+        n, covariance = len(self.response), np.asarray(self.response_covariance, float)
+        if n not in COEFFICIENTS.values() or covariance.shape != (n, n):
+            raise InstrumentError(
+                f"the calibration's response has {n} coefficients: give the 5 of two axes or the 9 of three, and a "
+                "covariance of as many rows and columns"
+            )
+        sound = np.allclose(covariance, covariance.T) and np.linalg.eigvalsh(covariance)[
+            0
+        ] > -1e-9 * np.trace(covariance)
+        if max(abs(c) for c in self.response) > MOST_RESPONSE or not sound:
+            raise InstrumentError(
+                f"the calibration's response is none: its coefficients are at most {MOST_RESPONSE:g}, their covariance is "
+                "symmetric and without negative variances"
+            )
 
     @classmethod
     def of(
@@ -205,6 +235,8 @@ class Instrument:
             calibrated_unix_s=c.utc_unix_s,
             calibrated_temperature_c=c.temperature_c,
             calibrated_tilt=tuple(np.radians(c.tilt_deg)),
+            response=c.response,
+            response_covariance=c.response_covariance,
         )
 
 

@@ -27,7 +27,19 @@ INCLINOMETER = {
     "tilt_drift_arcsec_per_sqrt_hour": ("drift_rad_per_sqrt_hour", ARCSEC),
     "tilt_temperature_arcsec_per_c": ("temperature_rad_per_c", ARCSEC),
     "tilt_scale": ("scale", 1.0),
+    "tilt_cross": ("cross", 1.0),
+    "tilt_pose_arcsec": ("pose_rad", ARCSEC),
+    "tilt_range_deg": ("range_rad", math.radians(1)),
 }
+CALIBRATED = (
+    "utc",
+    "temperature_c",
+    "tilt_deg",
+    "frames",
+    "valid_days",
+    "response",
+    "response_covariance",
+)
 KEYS = (
     "camera",
     "misalignment_deg",
@@ -49,13 +61,17 @@ def read(path: Path | str) -> Instrument:
     misalignment_deg: [rx, ry, rz]
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
-    calibrated: {utc, temperature_c, tilt_deg, frames, valid_days}   which `starpos calibrate` writes
+    calibrated: {utc, temperature_c, tilt_deg, frames, valid_days, response, response_covariance}
+                                                         which `starpos calibrate` writes
     link_to_camera: [[..], [..], [..]]
     tilt_noise_deg: 0.0035                               for one reading; the others are errors of zero and scale
     tilt_quantum_deg: 0.0005
     tilt_drift_arcsec_per_sqrt_hour: 2
     tilt_temperature_arcsec_per_c: 3
     tilt_scale: 1e-4
+    tilt_cross: 0                                        share of one axis' angle that the other shows
+    tilt_pose_arcsec: 0                                  new at each pose: hysteresis, nonlinearity, flexure
+    tilt_range_deg: 90
     clock_stddev_s: 0.01
     """
     path = Path(path)
@@ -93,6 +109,9 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
             content["calibrated"]["temperature_c"] = float(c.temperature_c)
         if math.isfinite(c.valid_days):
             content["calibrated"]["valid_days"] = float(c.valid_days)
+        if c.response:
+            content["calibrated"]["response"] = [float(r) for r in c.response]
+            content["calibrated"]["response_covariance"] = np.asarray(c.response_covariance, float).tolist()
     content["link_to_camera"] = np.asarray(instrument.link_to_camera, float).tolist()
     for key, (name, unit) in INCLINOMETER.items():
         content[key] = float(getattr(instrument.inclinometer, name) / unit)
@@ -170,10 +189,8 @@ def _calibration(content: dict) -> Calibration:
     if about is None:
         return calibration
     if not isinstance(about, dict):
-        raise InstrumentError(
-            f"calibrated is {_short(about)}: give {{utc, temperature_c, tilt_deg, frames, valid_days}}"
-        )
-    _refuse_others(about, ("utc", "temperature_c", "tilt_deg", "frames", "valid_days"))
+        raise InstrumentError(f"calibrated is {_short(about)}: give {{{', '.join(CALIBRATED)}}}")
+    _refuse_others(about, CALIBRATED)
     try:
         utc = unix_of(str(about.get("utc")))
     except TimeError as e:
@@ -181,6 +198,16 @@ def _calibration(content: dict) -> Calibration:
     more: dict[str, Any] = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
     if "tilt_deg" in about:
         more["tilt_deg"] = _row(about["tilt_deg"], "tilt_deg")
+    if "response" in about:
+        more["response"] = _row(about["response"], "response")
+        rows = about.get("response_covariance")
+        if not isinstance(rows, list):
+            raise InstrumentError(f"response_covariance is {_short(rows)}: give rows of numbers")
+        more["response_covariance"] = tuple(_row(row, "response_covariance") for row in rows)
+        if {len(row) for row in more["response_covariance"]} != {len(more["response"])}:
+            raise InstrumentError(
+                "response_covariance has not as many rows and columns as response has numbers"
+            )
     frames = about.get("frames", 0)
     if isinstance(frames, bool) or not isinstance(frames, int) or not 0 <= frames < MOST_FRAMES:
         raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")
@@ -214,8 +241,9 @@ def _number(mapping: dict, key: str) -> float:
 def _error(mapping: dict, key: str, unit: float) -> float:
     """An error of the inclinometer, given in `unit`, in rad or as a share."""
     given = _number(mapping, key)
-    if not 0 <= given * unit <= 1:
-        raise InstrumentError(f"{key} is {given:g}: give a finite number from 0 to {1 / unit:.4g}")
+    most = math.pi / 2 if key == "tilt_range_deg" else 1
+    if not 0 <= given * unit <= most:
+        raise InstrumentError(f"{key} is {given:g}: give a finite number from 0 to {most / unit:.4g}")
     return given * unit
 
 

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.instrument.inclinometer import EXACT, InclinometerErrors
+from starpos import rotation
+from starpos.errors import InstrumentError
+from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, up_of
+from starpos.instrument.response import response_columns, stated_variances
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +22,9 @@ class Mounting:
     inclinometer              its errors
     calibrated_unix_s         time of the calibration; NaN: unknown, then the covariance includes the drift until now
     calibrated_temperature_c  temperature of the inclinometer then; NaN: unknown
-    calibrated_tilt           its tilt then, rad; an error of its scale grows with the distance from it
+    calibrated_tilt           its two or three angles then, rad; an error of its response grows with the distance from them
+    response                  (m,) coefficients of its response that were found, or none
+    response_covariance       (m, m) of these
     """
 
     a3: np.ndarray
@@ -28,4 +33,30 @@ class Mounting:
     inclinometer: InclinometerErrors = EXACT
     calibrated_unix_s: float = float("nan")
     calibrated_temperature_c: float = float("nan")
-    calibrated_tilt: tuple[float, float] = (0.0, 0.0)
+    calibrated_tilt: tuple[float, ...] = (0.0, 0.0)
+    response: tuple[float, ...] = ()
+    response_covariance: tuple = ()
+
+    @property
+    def calibrated_up(self) -> np.ndarray:
+        """Up (3,) in S at the calibration."""
+        return up_of(np.asarray(self.calibrated_tilt))
+
+    def response_at(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
+        """Change (3, m) of up for each coefficient of the response at a tilt, and their covariance (m, m)."""
+        columns = response_columns(tilt.theta, self.calibrated_up)
+        if not self.response:
+            return columns, np.diag(stated_variances(self.inclinometer, tilt.axes))
+        if columns.shape[1] != len(self.response):
+            raise InstrumentError(
+                f"the calibration's response has {len(self.response)} coefficients, and a tilt of {tilt.axes} axes needs "
+                f"{columns.shape[1]}: calibrate with the inclinometer that is used"
+            )
+        return columns, np.asarray(self.response_covariance)
+
+    def up(self, tilt: Tilt) -> np.ndarray:
+        """Up (3,) in S, corrected by the response."""
+        if not self.response:
+            return tilt.up
+        columns, _ = self.response_at(tilt)
+        return rotation.normalised(tilt.up - columns @ self.response)

@@ -92,10 +92,11 @@ class TiltLog:
         if near.sum() < ENOUGH_NEIGHBOURS:
             return 1.0
         steps = np.diff(np.stack([self.theta_x, self.theta_y], -1)[order], axis=0)[near]
-        steps = steps[np.isfinite(steps).all(1)]
+        stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
+        # of an instrument at rest: while it moves, readings differ by more than any noise that is let pass
+        steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * REST * stated).all(1)]
         if len(steps) < ENOUGH_NEIGHBOURS:
             return 1.0
-        stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
         found = float(white_noise(steps).max() / stated)
         return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
 

@@ -18,7 +18,7 @@ from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
-from starpos.instrument.inclinometer import a2_matrix
+from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.report.folder import StarList, StarLists
@@ -224,7 +224,7 @@ def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
     turned = np.abs(wrapped(headings - headings[0])).max()
     if len(tilts) < 3 or moved > STILL_SIGMA * noise + 1.0 or turned > np.radians(1.0):
         return None
-    g = a2_matrix(*tilts.mean(0)) @ instrument.mounting.a3
+    g = level_of(up_of(tilts.mean(0))) @ instrument.mounting.a3
     steady = []
     for camera_to_itrs in attitudes:
         place = place_of(g @ camera_to_itrs.T)
