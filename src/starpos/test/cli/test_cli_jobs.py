@@ -96,8 +96,7 @@ def test_a_damaged_gz_and_a_pipe_cost_their_own_frames(more, archive, capfd, tmp
     given = [whole, *map(str, tmp_path.iterdir()), other]
     status, out, err = run(capfd, ["detect", *given, "--json", *more])
     assert status == 2 and len(err.splitlines()) == 2
-    told = [json.loads(line) for line in out.splitlines()]
-    assert [bool(frame["stars"]) for frame in told] == [True, False, False, True]
+    assert ['"stars": []' in line for line in out.splitlines()] == [False, True, True, False]
     command = ["solve", *given, "--tilt", str(archive / "still" / "tilt.csv"), "--json", *more]
     status, out, err = run(capfd, command)
     told = [json.loads(line) for line in out.splitlines()]
