@@ -12,10 +12,11 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from starpos.errors import StarposError
+from starpos_common.paths import LONGEST_PATH
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
-# Characters of a text; no path is longer. Nothing else limits what a caller may send.
-LONGEST = 4096
+# Characters of a text, as of a path. Nothing else limits what a caller may send.
+LONGEST = LONGEST_PATH
 SHOWN = reprlib.Repr()
 SHOWN.maxstring = SHOWN.maxother = SHOWN.maxlist = SHOWN.maxtuple = 200
 
