@@ -59,7 +59,7 @@ class DetectionSettings:
             )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Detection:
     """The stars of a frame, its background and noise (DN, medians over the frame) and FWHM (px).
 
@@ -114,12 +114,21 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         **about,
     )
     fwhm_px = lesson.psf.fwhm_px if len(stars) else float("nan")
-    return Detection(stars, level, noise, fwhm_px, columns["chi2"], peaks.left_out + len(x) - most)
+    return Detection(
+        stars=stars,
+        background=level,
+        noise=noise,
+        fwhm_px=fwhm_px,
+        chi2=columns["chi2"],
+        left_out=peaks.left_out + len(x) - most,
+    )
 
 
 def _starless(about: dict[str, Any], level: float, noise: float) -> Detection:
     """The Detection of a frame without stars."""
-    return Detection(no_stars(**about), level, noise, float("nan"), np.zeros(0))
+    return Detection(
+        stars=no_stars(**about), background=level, noise=noise, fwhm_px=float("nan"), chi2=np.zeros(0)
+    )
 
 
 def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: DetectionSettings) -> float:
