@@ -226,6 +226,9 @@ class DetectorNode(Node):
         last = self._last
         if last and last.message.stars:
             sentence = f"{len(last.message.stars)} stars in {last.seconds:.2f} s."
+        if last and last.detection.left_out:
+            level = Level.WARN
+            sentence += f" {last.detection.left_out} fainter peaks are left out: too many for stars, check the exposure."
         silence_s = time.monotonic() - self._last_frame_s if self._last_frame_s is not None else math.inf
         if self._last_frame_s is None:
             level, sentence = Level.WARN, f"no frame has come yet{self._where}."
@@ -242,6 +245,7 @@ class DetectorNode(Node):
         if last:
             values |= {
                 "stars": len(last.message.stars),
+                "left out": last.detection.left_out,
                 "background (DN)": last.detection.background,
                 "noise (DN)": last.detection.noise,
                 "fwhm (px)": last.detection.fwhm_px,

@@ -94,6 +94,7 @@ def test_diagnostics_tell_what_the_frame_was_like(feed, scene, frame):
         ("noise (DN)", want.noise),
         ("fwhm (px)", want.fwhm_px),
         ("chi2", want.typical_chi2),
+        ("left out", 0),
     ):
         assert float(state[name]) == pytest.approx(value, rel=1e-8), name
     sky = np.median(frame.pixels)

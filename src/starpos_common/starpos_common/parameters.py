@@ -2,6 +2,7 @@
 """Parameters from one table: declared with descriptors, refused with a sentence, applied once they are set."""
 
 import math
+import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
@@ -11,8 +12,13 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from starpos.errors import StarposError
+from starpos_common.paths import LONGEST_PATH
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+# Characters of a text, as of a path. Nothing else limits what a caller may send.
+LONGEST = LONGEST_PATH
+SHOWN = reprlib.Repr()
+SHOWN.maxstring = SHOWN.maxother = SHOWN.maxlist = SHOWN.maxtuple = 200
 
 
 class ParameterError(StarposError):
@@ -44,7 +50,7 @@ class Parameter:
     unit         '' for a bare number or a text
     minimum, maximum   inclusive bounds of a number (of each number of a tuple); None: unbounded
     choices      the allowed values; () for any
-    form         the rule for a text; None for any
+    form         the rule for a text; None for any of up to LONGEST characters
     read_only    cannot be changed while the node runs
     """
 
@@ -95,7 +101,7 @@ class Parameter:
 
         Raises ParameterError with the constraint if the value is not allowed.
         """
-        if isinstance(self.default, tuple):
+        if isinstance(self.default, tuple) and not _is_large(value):
             sequence = not isinstance(value, (str, bytes)) and isinstance(value, (Sequence, memoryview))
             values = tuple(value) if sequence or hasattr(value, "tolist") else None
             if values is None or len(values) != len(self.default):
@@ -107,7 +113,7 @@ class Parameter:
         kind = type(self.items[0])
         if kind is float and type(item) is int:
             item = float(item)
-        if type(item) is not kind or (self.choices and item not in self.choices):
+        if type(item) is not kind or _is_large(item) or (self.choices and item not in self.choices):
             raise self._error(whole)
         if self.form and not self.form.fits(item):
             raise self._error(whole)
@@ -122,8 +128,12 @@ class Parameter:
         return item
 
     def _error(self, value: Any) -> ParameterError:
-        shown = value.tolist() if hasattr(value, "tolist") else value
-        return ParameterError(f"parameter {self.name} must be {self.constraint}; {shown!r:.200} was given.")
+        if _is_large(value):
+            what = "characters" if isinstance(value, (str, bytes)) else "values"
+            shown = f"a value of {len(value)} {what}, over {LONGEST},"
+        else:
+            shown = SHOWN.repr(value.tolist() if hasattr(value, "tolist") else value)[:200]
+        return ParameterError(f"parameter {self.name} must be {self.constraint}; {shown} was given.")
 
     def descriptor(self) -> ParameterDescriptor:
         """Make its descriptor, without the range of ROS where the default is NaN, because that range would refuse NaN."""
@@ -150,6 +160,11 @@ class Parameter:
     def ros_value(self, value: Any) -> Any:
         """Convert a value to the type that rclpy wants: a tuple to a list."""
         return list(value) if isinstance(value, tuple) else value
+
+
+def _is_large(value: Any) -> bool:
+    """Whether a text or an array is longer than any parameter's."""
+    return hasattr(value, "__len__") and len(value) > LONGEST
 
 
 class Values(Mapping[str, Any]):

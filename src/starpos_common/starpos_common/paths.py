@@ -6,9 +6,16 @@ from urllib.parse import unquote, urlsplit
 
 from starpos.errors import InstrumentError
 
+# Linux opens no longer path.
+LONGEST_PATH = 4096
+
 
 def path_of(url: str) -> Path:
     """Convert file:///a/b.yaml, or a path that may begin with ~, to a Path; InstrumentError for anything else."""
+    if len(url) > LONGEST_PATH:
+        raise InstrumentError(
+            f"a text of {len(url)} characters names no file: give file:///path/to/file.yaml, or a path"
+        )
     try:
         parts = urlsplit(url)
         if not parts.scheme:

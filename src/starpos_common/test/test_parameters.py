@@ -204,6 +204,29 @@ def test_such_names_frames_have(name):
     assert next(p for p in TABLE if p.name == "frame_id").convert(name) == name
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("frame_id", "x" * 10_000_000, "leading /; a value of 10000000 characters, over 4096, was given."),
+        ("frame_id", ["x" * 10_000_000], "leading /; ['xxx"),
+        ("frame_id", [0.5] * 1_250_000, "leading /; a value of 1250000 values, over 4096, was given."),
+        ("offsets", [0.5] * 1_250_000, "a value of 1250000 values, over 4096, was given."),
+        ("offsets", ["x" * 5_000_000] * 2, "must be 2 values, each a number from 0 to 5 V; ['xxx"),
+    ],
+    ids=["text", "text in a list", "numbers", "numbers for two", "texts for two"],
+)
+def test_ten_megabytes_are_refused_in_a_short_sentence(make, name, value, words):
+    parameter = next(p for p in TABLE if p.name == name)
+    with pytest.raises(ParameterError) as raised:
+        parameter.convert(value)
+    node, _ = make()
+    before = node.get_parameter(name).value
+    result = change(node, **{name: value})
+    assert not result.successful and result.reason == str(raised.value)
+    assert words in result.reason and len(result.reason) < 400
+    assert node.get_parameter(name).value == before
+
+
 def test_a_parameter_cannot_be_taken_away(make):
     node, values = make()
     result = node.set_parameters_atomically(

@@ -38,14 +38,17 @@ def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", as_
         return
     found, cpu_ms = answer
     stars = found if isinstance(found, Stars) else found.stars
+    left_out = 0 if isinstance(found, Stars) else found.left_out
     if as_json:
-        common.print_json({"file": path, "stars": _rows(stars), "cpu_ms": cpu_ms})
+        cut = {"left_out": left_out} if left_out else {}
+        common.print_json({"file": path, "stars": _rows(stars), "cpu_ms": cpu_ms} | cut)
     elif isinstance(found, Stars):
         print(f"{path}: a list of {len(stars)} stars", flush=True)
     else:
         print(
             f"{path}: {len(stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
-            f"FWHM {found.fwhm_px:.2f} px, chi2 {found.typical_chi2:.2f}, {cpu_ms:.0f} ms",
+            f"FWHM {found.fwhm_px:.2f} px, chi2 {found.typical_chi2:.2f}, {cpu_ms:.0f} ms"
+            + (f"; {left_out} fainter peaks were too many and are left out" if left_out else ""),
             flush=True,
         )
 

@@ -49,12 +49,14 @@ class Peaks:
     """Peaks of the smoothed frame, highest first: x, y (N,) int px and height (N,) in sigma of the smoothed noise.
 
     correlation  noise of the smoothed frame, over what independent pixels would give; 1 or more
+    left_out     how many lower peaks there were besides
     """
 
     x: np.ndarray
     y: np.ndarray
     height: np.ndarray
     correlation: float
+    left_out: int = 0
 
 
 def find_peaks(plane: np.ndarray, background: Background, threshold: float, limit: int) -> Peaks:
@@ -150,6 +152,7 @@ def _peaks_of(
     x, y, value = np.concatenate(found, 1)
     local, sigma = (ndimage.map_coordinates(m, background.cell(x, y), order=1) for m in (level, noise))
     height = (value - local) / sigma
+    left_out = max(0, len(height) - 4 * limit)
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
     x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
     starlike = ~are_alone(plane, background, x, y)
@@ -163,7 +166,8 @@ def _peaks_of(
     keep = np.flatnonzero(height > _above_tail(height, threshold))
     keep = keep[np.argsort(-height[keep], kind="stable")]
     x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
-    return Peaks(x[:limit], y[:limit], height[:limit], correlation)
+    left_out += max(0, len(x) - limit)
+    return Peaks(x[:limit], y[:limit], height[:limit], correlation, left_out)
 
 
 def _smooth(plane: np.ndarray, kernel: Kernel, top: int, bottom: int) -> tuple[np.ndarray, int]:

@@ -20,6 +20,9 @@ from starpos.frames.stars import Stars, no_stars
 CHUNK_PIXELS = 12_000, 60_000
 # Peaks looked at, or twice the stars wanted if that is more: hot pixels are peaks too.
 PEAKS = 10_000
+# Pixels that are fitted, for each of so many peaks: 2 million take some 10 s. With as many stars, or with wide ones, the
+# faintest are left out. Ordinary frames have a tenth.
+PIXELS_PER_PEAK = 100
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,12 @@ class DetectionSettings:
             )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Detection:
     """The stars of a frame, its background and noise (DN, medians over the frame) and FWHM (px).
 
-    chi2  (N,) of each star's fit, per degree of freedom: about 1 for a star that PSF and noise describe
+    chi2      (N,) of each star's fit, per degree of freedom: about 1 for a star that PSF and noise describe
+    left_out  how many peaks, the lowest, were not measured because there were too many
     """
 
     stars: Stars
@@ -68,6 +72,7 @@ class Detection:
     noise: float
     fwhm_px: float
     chi2: np.ndarray
+    left_out: int = 0
 
     @property
     def typical_chi2(self) -> float:
@@ -83,7 +88,8 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         return _starless(about, float(np.median(plane)), 0.0)
     background = measure_background(plane, settings.mesh_px, mosaic)
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
-    peaks = find_peaks(plane, background, settings.threshold, max(PEAKS, 2 * settings.max_stars))
+    limit = max(PEAKS, 2 * settings.max_stars)
+    peaks = find_peaks(plane, background, settings.threshold, limit)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return _starless(about, level, noise)
@@ -91,8 +97,10 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
-    chunk = max(1, int(np.clip(plane.size // 64, *CHUNK_PIXELS)) // (2 * lesson.reach + 1) ** 2)
-    chunks = [slice(i, i + chunk) for i in range(0, len(x), chunk)]
+    pixels = (2 * lesson.reach + 1) ** 2
+    chunk = max(1, int(np.clip(plane.size // 64, *CHUNK_PIXELS)) // pixels)
+    most = min(len(x), limit * PIXELS_PER_PEAK // pixels)
+    chunks = [slice(i, min(i + chunk, most)) for i in range(0, most, chunk)]
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     columns = {name: column[: settings.max_stars] for name, column in resolve(columns, lesson.psf).items()}
@@ -106,12 +114,21 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         **about,
     )
     fwhm_px = lesson.psf.fwhm_px if len(stars) else float("nan")
-    return Detection(stars, level, noise, fwhm_px, columns["chi2"])
+    return Detection(
+        stars=stars,
+        background=level,
+        noise=noise,
+        fwhm_px=fwhm_px,
+        chi2=columns["chi2"],
+        left_out=peaks.left_out + len(x) - most,
+    )
 
 
 def _starless(about: dict[str, Any], level: float, noise: float) -> Detection:
     """The Detection of a frame without stars."""
-    return Detection(no_stars(**about), level, noise, float("nan"), np.zeros(0))
+    return Detection(
+        stars=no_stars(**about), background=level, noise=noise, fwhm_px=float("nan"), chi2=np.zeros(0)
+    )
 
 
 def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: DetectionSettings) -> float:

@@ -5,17 +5,19 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from starpos.earth.geotiff import read_geotiff
 from starpos.errors import GeoidError
+from starpos.files import bytes_of, open_regular
 
 # South, west, step in latitude, step in longitude (deg), rows, columns.
 GTX_HEADER = struct.Struct(">4d2i")
 GTX_NODATA = np.float32(-88.8888)
-# A grid of the whole globe with 1 arcmin has 233 million.
-MAX_NODES = 300_000_000
+# A grid of the whole globe with 1 arcmin has 233 million nodes of 4 bytes.
+MAX_BYTES = 1_200_000_000
 LEAST_NODES = 4
 STEPS_DEG = (1e-4, 2.0)
 # Undulations are -107 to 86 m; a value beyond this limit means "no data".
@@ -123,18 +125,14 @@ def read_grid(path: Path | str) -> Grid:
     """Read a Grid from a GTX or GeoTIFF file; GeoidError says why a file cannot be used."""
     path = find(path)
     try:
-        with open(path, "rb") as file:
-            head = file.read(GTX_HEADER.size)
-            size = file.seek(0, os.SEEK_END)
-    except (OSError, ValueError) as e:
-        reason = getattr(e, "strerror", None) or e
+        with open_regular(path) as file:
+            if file.read(4) in TIFF_MAGIC:
+                return Grid(*read_geotiff(bytes_of(file, MAX_BYTES), MAX_BYTES))
+            return Grid(*_read_gtx(file))
+    except OSError as e:
         raise GeoidError(
-            f"{path}: the geoid grid cannot be read ({reason}): give a GTX or GeoTIFF file"
+            f"{path}: the geoid grid cannot be read ({e.strerror or e}): give a GTX or GeoTIFF file"
         ) from None
-    try:
-        return Grid(
-            *(read_geotiff(path, MAX_NODES) if head[:4] in TIFF_MAGIC else _read_gtx(path, head, size))
-        )
     except GeoidError as e:
         raise GeoidError(f"{path}: no geoid grid that can be used: {e}") from None
 
@@ -152,18 +150,21 @@ def find(path: Path | str) -> Path:
     return next((place for place in places if os.path.isfile(place)), path)
 
 
-def _read_gtx(path: Path, head: bytes, size: int) -> tuple[np.ndarray, float, float, float, float]:
-    """Values, south, west and steps of a GTX file (NOAA's VDatum): big endian, rows from south to north.
+def _read_gtx(file: BinaryIO) -> tuple[np.ndarray, float, float, float, float]:
+    """Values, south, west and steps of an open GTX file (NOAA's VDatum): big endian, rows from south to north.
 
     The values stay in the file until they are used.
     """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    head = file.read(GTX_HEADER.size)
     if len(head) < GTX_HEADER.size:
         raise GeoidError("it is shorter than a header")
     south, west, step_latitude, step_longitude, rows, columns = GTX_HEADER.unpack(head)
-    if rows <= 0 or columns <= 0 or rows * columns > MAX_NODES:
+    if rows <= 0 or columns <= 0 or 4 * rows * columns > MAX_BYTES:
         raise GeoidError(f"its header claims {columns} x {rows} nodes: is it a GTX or GeoTIFF file?")
     missing = GTX_HEADER.size + 4 * rows * columns - size
     if missing > 0:
         raise GeoidError(f"{missing} bytes are missing at its end: copy it again")
-    values = np.memmap(path, ">f4", "r", GTX_HEADER.size, (rows, columns))
+    values = np.memmap(file, ">f4", "r", GTX_HEADER.size, (rows, columns))
     return values, south, west, step_latitude, step_longitude

@@ -7,36 +7,33 @@ Sources: GeoTIFF 1.1 (OGC 19-008r4), and PROJ's specification of geodetic TIFF g
 import math
 import re
 import struct
-from pathlib import Path
 
 import numpy as np
 
 from starpos.errors import GeoidError
 from starpos.frames.pictures import decode_picture
 
-WIDTH, HEIGHT, SAMPLES = 256, 257, 277
+WIDTH, HEIGHT, BITS, SAMPLES = 256, 257, 258, 277
 PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
 # Two keys, and the value of each that is read.
 MODEL_TYPE, RASTER_TYPE, GEOGRAPHIC, PIXEL_IS_POINT = 1024, 1025, 2, 2
 # The types of these tags: BYTE, ASCII, SHORT, LONG, DOUBLE.
 KINDS = {1: "B", 2: "s", 3: "H", 4: "I", 12: "d"}
-MAX_BYTES = 1 << 30
 MAX_TAG_BYTES = 1 << 20
 
 
-def read_geotiff(path: Path, max_pixels: int) -> tuple[np.ndarray, float, float, float, float]:
+def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float, float, float]:
     """Values (rows, columns) float32, south and west of the first, and steps in latitude and in longitude, deg.
 
-    Rows run from south to north; NaN where the file has no data. GeoidError says why a file cannot be used.
+    data is the content of a file, and most_bytes what its values may unpack to. Rows run from south to north; NaN where
+    the file has no data. GeoidError says why a file cannot be used.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise GeoidError(f"it is larger than {MAX_BYTES >> 20} MB")
-    data = path.read_bytes()
     tags = _tags(data)
     width, height = _number(tags, WIDTH), _number(tags, HEIGHT)
-    if not 0 < width * height <= max_pixels:
-        raise GeoidError(f"its header claims {width} x {height} nodes")
+    bits = max(_number(tags, BITS, 1), 8)
+    if not 0 < width * height * bits // 8 <= most_bytes:
+        raise GeoidError(f"its header claims {width} x {height} nodes of {bits} bits")
     if _number(tags, SAMPLES, 1) != 1:
         raise GeoidError(f"it has {_number(tags, SAMPLES, 1)} bands: one, of undulations, is wanted")
     south, west, step_latitude, step_longitude = _corner(tags, height)
@@ -66,6 +63,7 @@ def _tags(data: bytes) -> dict[int, tuple]:
             if tag not in (
                 WIDTH,
                 HEIGHT,
+                BITS,
                 SAMPLES,
                 PIXEL_SCALE,
                 TIEPOINT,

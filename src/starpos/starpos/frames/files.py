@@ -1,38 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a file before it is read as a frame."""
+"""Open the file of a frame, and limit what it may unpack to."""
 
-import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
+from starpos import files
 from starpos.errors import FrameError, one_line
 
-MAX_BYTES = 2_000_000_000
+# A file, and the pixels it unpacks to, may have so many bytes: both fit into a small robot's memory.
+MAX_BYTES = 800_000_000
 
 
-def check_file(path: Path) -> None:
-    """Raise FrameError or OSError unless the path is a file that is not empty and can be opened."""
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a frame's file, as a context manager; FrameError if there is none, or it is empty or too large.
+
+    OSError if the file may not be read.
+    """
     try:
-        status = path.stat()
-    # ValueError: the name contains a NUL
-    except (FileNotFoundError, NotADirectoryError, ValueError):
+        file = files.open_regular(path)
+    except (FileNotFoundError, NotADirectoryError):
         raise FrameError(f"{one_line(path)}: there is no such file; check the path.") from None
-    if stat.S_ISDIR(status.st_mode):
-        raise FrameError(f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}.")
-    if not stat.S_ISREG(status.st_mode):
-        raise FrameError(f"{path}: this is no regular file but a device or a pipe; give a frame's file.")
-    if status.st_size == 0:
-        raise FrameError(f"{path}: the file is empty; take the frame again.")
-    # a file without permission to read would otherwise be reported as a damaged image
-    path.open("rb").close()
+    except IsADirectoryError:
+        raise FrameError(
+            f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}."
+        ) from None
+    with file:
+        size = file.seek(0, 2)
+        file.seek(0)
+        if size == 0:
+            raise FrameError(f"{path}: the file is empty; take the frame again.")
+        if size > MAX_BYTES:
+            raise FrameError(f"{path}: it has over {MAX_BYTES // 10**6} MB, too many for a frame.")
+        yield file
 
 
-def bytes_of(path: Path) -> bytes:
-    """The content of a file; FrameError if it is larger than MAX_BYTES."""
-    check_size(path, MAX_BYTES)
-    return path.read_bytes()
-
-
-def check_size(path: Path, most: int) -> None:
-    """Raise FrameError if a file has more than `most` bytes."""
-    if path.stat().st_size > most:
-        raise FrameError(f"{path}: it is larger than {most // 10**6} MB, too large for a frame.")
+def check_pixels(width: int, height: int, bytes_each: float, place: str) -> None:
+    """Raise FrameError unless width x height pixels of so many bytes fit into MAX_BYTES, by what a header claims."""
+    if min(width, height) < 1 or width * height * bytes_each > MAX_BYTES:
+        raise FrameError(
+            f"{place}: its header claims {width} x {height} pixels of {bytes_each:g} bytes; a frame has at least one and "
+            f"at most {MAX_BYTES // 10**6} MB."
+        )

@@ -1,26 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read frames from FITS files, or from the bytes of one that a camera's driver has sent."""
 
+import gzip
 import io
+import itertools
 import warnings
+import zlib
 from collections.abc import Iterable, Mapping
-from pathlib import Path
+from contextlib import suppress
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from starpos.errors import FrameError, one_line
-from starpos.frames.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
+from starpos.frames.files import MAX_BYTES, check_pixels
+from starpos.frames.frame import PATTERNS, Frame, to_unsigned
 from starpos.frames.header import KEYS, focal_px, times
 
-FITS_TROUBLE = (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
+FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
+# The image is among so many first parts (HDUs) of a file.
+MOST_PARTS = 100
+# Columns of a .fz whose cells may be gzip.
+TILES = ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA")
+STEP = 1 << 20
+# zlib's name for data in the form of gzip
+GZIP_BITS = 31
 
 
-def read_fits(path: Path | str) -> Frame:
-    """Read a FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame."""
-    # opened here, because astropy leaves a damaged file open
-    with open(path, "rb") as file:
-        return _read(file, str(path))[0]
+def read_fits(file: BinaryIO, place: str) -> Frame:
+    """Read an open FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame.
+
+    place says where it is, for messages.
+    """
+    return _read(file, place)[0]
 
 
 def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
@@ -37,9 +49,13 @@ def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with fits.open(file, memmap=False, lazy_load_hdus=True) as hdus:
-                header, values = _first_image(hdus, place)
-    except (*FITS_TROUBLE, fits.VerifyError) as e:
+            plain = _plain(file, place)
+            with fits.open(plain, memmap=False, lazy_load_hdus=True) as hdus:
+                header, values = _first_image(plain, hdus, place)
+    except FrameError:
+        raise
+    # damaged bytes make astropy, zlib and CFITSIO raise any kind of exception
+    except Exception as e:
         raise FrameError(
             f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
         ) from e
@@ -56,9 +72,35 @@ def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
     return frame, header
 
 
-def _first_image(hdus: Iterable, place: str) -> tuple[dict[str, Any], np.ndarray]:
-    """Header (a dict of KEYS) and data (h, w) of the first HDU that holds an image."""
-    for hdu in hdus:
+def _plain(file: BinaryIO, place: str) -> BinaryIO:
+    """The file itself, or unpacked if it is a .gz; ValueError if it is no FITS file, FrameError if it is too large.
+
+    astropy would unpack it too, and other formats, but to any size.
+    """
+    if file.read(len(GZIP_START)) == GZIP_START:
+        file.seek(0)
+        with gzip.GzipFile(fileobj=file) as packed:
+            file = io.BytesIO()
+            while part := packed.read(STEP):
+                file.write(part)
+                _check_unpacked(file.tell(), place)
+    file.seek(0)
+    if file.read(len(FITS_START)) != FITS_START:
+        raise ValueError(f"it does not begin with {FITS_START.decode()}")
+    file.seek(0)
+    return file
+
+
+def _check_unpacked(size: int, place: str) -> None:
+    if size > MAX_BYTES:
+        raise FrameError(f"{place}: it unpacks to over {MAX_BYTES // 10**6} MB, too many for a frame.")
+
+
+def _first_image(file: BinaryIO, hdus: Iterable, place: str) -> tuple[dict[str, Any], np.ndarray]:
+    """Header (a dict of KEYS) and data (h, w) of the first HDU, of those in a file, that holds an image."""
+    from astropy.io import fits
+
+    for number, hdu in enumerate(itertools.islice(hdus, MOST_PARTS)):
         shape = [int(n) for n in hdu.shape] if hdu.is_image else []
         if not shape:
             continue
@@ -67,13 +109,36 @@ def _first_image(hdus: Iterable, place: str) -> tuple[dict[str, Any], np.ndarray
             raise FrameError(
                 f"{place}: the image has {len(shape)} axes ({size}); give one monochrome plane a file."
             )
-        if min(shape) < 1 or shape[-1] * shape[-2] > MAX_PIXELS:
-            raise FrameError(
-                f"{place}: its header claims {shape[-1]} x {shape[-2]} pixels; a frame has 1 to {MAX_PIXELS}."
-            )
+        check_pixels(shape[-1], shape[-2], abs(int(hdu.header["BITPIX"])) / 8, place)
+        if isinstance(hdu, fits.CompImageHDU):
+            _check_tiles(file, number, place)
         header = {key: hdu.header[key] for key in KEYS if key in hdu.header}
         return header, np.asarray(hdu.data).reshape(shape[-2:])
     raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
+
+
+def _check_tiles(file: BinaryIO, number: int, place: str) -> None:
+    """Raise FrameError if the gzip cells of a .fz image, the HDU of this number, unpack to over MAX_BYTES.
+
+    astropy would unpack them to any size.
+    """
+    from astropy.io import fits
+
+    file.seek(0)
+    # not closed, because that would close the file
+    table = fits.open(file, memmap=False, lazy_load_hdus=True, disable_image_compression=True)[number].data
+    size = 0
+    for cell in itertools.chain.from_iterable(table[name] for name in TILES if name in table.names):
+        data = cell.tobytes()
+        # other algorithms' cells may begin like gzip, too
+        with suppress(zlib.error):
+            while data.startswith(GZIP_START):
+                packed = zlib.decompressobj(GZIP_BITS)
+                while data and not packed.eof:
+                    size += len(packed.decompress(data, STEP))
+                    _check_unpacked(size, place)
+                    data = packed.unconsumed_tail
+                data = packed.unused_data
 
 
 def _pattern(header: Mapping, place: str) -> str:

@@ -8,13 +8,18 @@ import numpy as np
 
 from starpos.errors import FrameError
 from starpos.frames import exif
-from starpos.frames.frame import MAX_PIXELS, Frame, to_unsigned
+from starpos.frames.files import check_pixels
+from starpos.frames.frame import Frame, to_unsigned
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8\xff"
 # Segments of a JPEG that hold its size, and the one where its image begins.
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 SCAN = 0xDA
+# Samples of a decoded pixel by a PNG's type of colour: grey, colour, palette, grey with alpha, colour with alpha.
+PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
+# Tags of TIFF 6.0.
+WIDTH, HEIGHT, BITS, SAMPLES = 256, 257, 258, 277
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
@@ -25,10 +30,7 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
     size = _size(data)
     if size is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; give one, or FITS.")
-    if size[0] * size[1] > MAX_PIXELS:
-        raise FrameError(
-            f"{place}: its header claims {size[0]} x {size[1]} pixels; a frame has 1 to {MAX_PIXELS}."
-        )
+    check_pixels(*size, place)
     pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else data)
     if pixels is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; take or copy it again.")
@@ -60,36 +62,49 @@ def decode_picture(data: bytes) -> np.ndarray | None:
         log.setLogLevel(level)
 
 
-def _size(data: bytes) -> tuple[int, int] | None:
-    """Width and height by the header, known before a decoder reserves memory for them; None if this is not a picture."""
+def _size(data: bytes) -> tuple[int, int, float] | None:
+    """Width, height and bytes of a pixel by the header, known before a decoder reserves memory for them.
+
+    None if this is not a picture.
+    """
     try:
         if data.startswith(PNG_START):
-            width, height = struct.unpack_from(">II", data, 16)
-            return width, height
+            width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
+            return width, height, PNG_SAMPLES.get(colour, 4) * max(bits, 8) / 8
         return _jpeg_size(data) if data.startswith(JPEG_START) else _tiff_size(data)
     # the data end too early
     except struct.error:
         return None
 
 
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a TIFF by its header; None if this is not one."""
+def _tiff_size(data: bytes) -> tuple[int, int, float] | None:
+    """Width, height and bytes of a pixel of a TIFF by its header; None if this is not one."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         return None
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)
-    size: dict[int, int] = {}
+    # one sample of one bit, unless the file says more
+    values = {BITS: 1, SAMPLES: 1}
     for k in range(count):
-        tag, kind, _ = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
-        # ImageWidth and ImageLength are SHORT or LONG
-        if tag in (256, 257):
-            (size[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 10 + 12 * k)
-    return (size[256], size[257]) if len(size) == 2 else None
+        tag, kind, n = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
+        if tag not in (WIDTH, HEIGHT, BITS, SAMPLES):
+            continue
+        # these are SHORT or LONG, in place; only the bits, one value for each of three samples or more, lie elsewhere
+        place = at + 10 + 12 * k
+        if kind == 3 and n > 2:
+            (place,) = struct.unpack_from(order + "I", data, place)
+        (values[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, place)
+    if not {WIDTH, HEIGHT} <= values.keys():
+        return None
+    return values[WIDTH], values[HEIGHT], values[SAMPLES] * max(values[BITS], 8) / 8
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a JPEG by its header; None also if the end is missing, which a decoder would fill with grey."""
+def _jpeg_size(data: bytes) -> tuple[int, int, float] | None:
+    """Width, height and bytes of a pixel of a JPEG by its header.
+
+    None also if the end is missing, which a decoder would fill with grey.
+    """
     at, size = 2, None
     while data[at : at + 1] == b"\xff":
         (kind,) = struct.unpack_from("B", data, at + 1)
@@ -100,8 +115,8 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
         if kind == SCAN:
             return size if data.find(b"\xff\xd9", at) >= 0 else None
         if kind in SIZED:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            size = width, height
+            height, width, samples = struct.unpack_from(">HHB", data, at + 5)
+            size = width, height, float(samples)
         at += 2 + struct.unpack_from(">H", data, at + 2)[0]
     return None
 

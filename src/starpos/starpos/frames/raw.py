@@ -8,7 +8,8 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.frames import exif
-from starpos.frames.frame import MAX_PIXELS, PATTERNS, Frame, to_unsigned
+from starpos.frames.files import check_pixels
+from starpos.frames.frame import PATTERNS, Frame, to_unsigned
 
 # Tags of TIFF 6.0: offsets and lengths of an image's strips, the same of its tiles, and the IFDs below this one.
 STRIPS, TILES, BELOW = (273, 279), (324, 325), 330
@@ -32,8 +33,8 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
             raise ValueError("it breaks off")
         with rawpy.RawPy() as raw:
             raw.open_buffer(io.BytesIO(data))
-            if raw.sizes.raw_width * raw.sizes.raw_height > MAX_PIXELS:
-                raise ValueError(f"it claims more than {MAX_PIXELS} pixels")
+            # LibRaw unpacks to 16 bits
+            check_pixels(raw.sizes.raw_width, raw.sizes.raw_height, 2, place)
             raw.unpack()
             pixels = raw.raw_image_visible.copy()
             # no sensor gives a row of zeros

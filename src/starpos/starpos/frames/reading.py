@@ -3,10 +3,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 from starpos.errors import FrameError, one_line
+from starpos.files import bytes_of
 from starpos.frames.exif import CameraClock
-from starpos.frames.files import bytes_of, check_file
+from starpos.frames.files import MAX_BYTES, opened
 from starpos.frames.fits import read_fits
 from starpos.frames.frame import Frame
 from starpos.frames.pictures import JPEG_START, PNG_START, picture_frame
@@ -42,21 +44,21 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     """
     path = Path(path)
     try:
-        check_file(path)
-        return _reader_of(path)(path, clock)
+        with opened(path) as file:
+            return _reader_of(path)(file, clock)
     except OSError as e:
         reason = e.strerror or one_line(e)
         raise FrameError(f"{path}: it cannot be read ({reason}); check its permissions and the disk.") from e
 
 
-def _reader_of(path: Path) -> Callable[[Path, CameraClock | None], Frame | Stars]:
-    """The function of path and clock that reads files with this suffix."""
+def _reader_of(path: Path) -> Callable[[BinaryIO, CameraClock | None], Frame | Stars]:
+    """The function of the open file and the clock that reads files with this suffix."""
     suffix = path.suffix.lower()
     for suffixes, reader in (
-        (FITS, lambda path, _: read_fits(path)),
-        (PICTURE + JPEG, lambda path, clock: picture_frame(bytes_of(path), str(path), clock)),
-        (RAW, lambda path, clock: raw_frame(bytes_of(path), str(path), clock)),
-        ((".csv",), lambda path, _: read_star_list(path)),
+        (FITS, lambda file, _: read_fits(file, str(path))),
+        (PICTURE + JPEG, lambda file, clock: picture_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
+        (RAW, lambda file, clock: raw_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
+        ((".csv",), lambda file, _: read_star_list(file, str(path))),
     ):
         if suffix in suffixes:
             return reader

@@ -3,12 +3,14 @@
 
 import csv
 import json
+import reprlib
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from starpos.errors import FrameError, one_line
-from starpos.frames.files import check_size
+from starpos.files import bytes_of
 from starpos.frames.header import focal_px, times
 from starpos.frames.stars import Stars
 
@@ -17,13 +19,15 @@ MAX_CSV_BYTES = 20_000_000
 DEFAULT_SIGMA_PX = 0.1
 
 
-def read_star_list(path: Path) -> Stars:
-    """Read Stars from a CSV by the rules of `reading.read_frame`; FrameError if it is not one."""
-    check_size(path, MAX_CSV_BYTES)
+def read_star_list(file: BinaryIO, place: str) -> Stars:
+    """Read Stars from an open CSV by the rules of `reading.read_frame`; FrameError if it is not one.
+
+    place says where it is, for messages. OSError if it is larger than MAX_CSV_BYTES.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = bytes_of(file, MAX_CSV_BYTES).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
-        raise FrameError(f"{path}: this is not a text file; give a CSV of centroids.") from None
+        raise FrameError(f"{place}: this is not a text file; give a CSV of centroids.") from None
     first, _, rest = text.partition("\n")
     try:
         header = json.loads(first.removeprefix("#"))
@@ -33,31 +37,31 @@ def read_star_list(path: Path) -> Stars:
     except (ValueError, KeyError, TypeError, RecursionError):
         line = '# {"NAXIS1": 5616, "NAXIS2": 3744, "DATE-OBS": "...", "EXPTIME": 0.5}'
         raise FrameError(
-            f"{path}: its first line does not give the frame's size; write it like {line}."
+            f"{place}: its first line does not give the frame's size; write it like {line}."
         ) from None
     try:
         rows = [row for row in csv.reader(rest.splitlines()) if row]
     except csv.Error as e:
-        raise FrameError(f"{path}: this is not a CSV ({one_line(e)}); write one star a line.") from None
+        raise FrameError(f"{place}: this is not a CSV ({one_line(e)}); write one star a line.") from None
     names = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "flux"} <= set(names):
         raise FrameError(
-            f"{path}: its second line names the columns {names}; it must name x, y, flux and may sigma."
+            f"{place}: its second line names the columns {reprlib.repr(names)}; it must name x, y, flux and may sigma."
         )
     try:
         table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(names))
         if len(table) != len(rows) - 1:
             raise ValueError
     except ValueError:
-        raise FrameError(f"{path}: a row is not {len(names)} numbers; write one star a line.") from None
+        raise FrameError(f"{place}: a row is not {len(names)} numbers; write one star a line.") from None
     column = dict(zip(names, table.T, strict=True))
     sigma = column.get("sigma", np.full(len(table), DEFAULT_SIGMA_PX))
     if not np.all((sigma > 0) & (sigma < 1e3)):
         raise FrameError(
-            f"{path}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
+            f"{place}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
         )
     order = np.argsort(-column["flux"], kind="stable")
-    mid, exposure, rounding = times(header, str(path))
+    mid, exposure, rounding = times(header, place)
     return Stars(
         x=column["x"][order],
         y=column["y"][order],
@@ -69,7 +73,7 @@ def read_star_list(path: Path) -> Stars:
         height=height,
         mid_unix_s=mid,
         exposure_s=exposure,
-        source=str(path),
+        source=place,
         focal_px=focal_px(header),
         stamp_stddev_s=rounding,
     )

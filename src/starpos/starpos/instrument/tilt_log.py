@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A log of tilt readings: the tilt of an exposure from it, and the table on disk that holds it."""
 
+import io
 import itertools
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
 from starpos.errors import TiltError
+from starpos.files import open_regular
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 
 # The noise is measured from readings that are so close in time, if there are so many.
@@ -225,9 +229,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     path = Path(path)
     cure = "give a CSV with a line of names, utc_unix_s,theta_x_deg,theta_y_deg[,temperature_c], and readings"
     try:
-        if path.stat().st_size > MAX_CSV_BYTES:
-            raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
-        with path.open(encoding="utf-8-sig") as f, warnings.catch_warnings():
+        with _opened(path) as f, warnings.catch_warnings():
             # our own error says that a file is empty
             warnings.simplefilter("ignore")
             names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
@@ -235,7 +237,8 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     except FileNotFoundError:
         raise TiltError(f"{path}: there is no such file: {cure}") from None
     except (OSError, ValueError, UnicodeDecodeError) as e:
-        raise TiltError(f"{path}: not a readable table of tilts ({_first_line(e)}): {cure}") from None
+        reason = getattr(e, "strerror", None) or _first_line(e)
+        raise TiltError(f"{path}: not a readable table of tilts ({reason}): {cure}") from None
     need = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
     if not set(need) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(set(names)):
         raise TiltError(
@@ -253,6 +256,15 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         temperature[order],
         noise_rad,
     )
+
+
+def _opened(path: Path) -> TextIO:
+    """The open text of a table; OSError if it cannot be read, ValueError if it is too large."""
+    file = open_regular(path)
+    if os.fstat(file.fileno()).st_size > MAX_CSV_BYTES:
+        file.close()
+        raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
+    return io.TextIOWrapper(file, "utf-8-sig")
 
 
 def _check_one_sensor(path: Path, utc_unix_s: np.ndarray, rows: np.ndarray) -> None:

@@ -12,8 +12,10 @@ from types import ModuleType
 from typing import IO, Any
 
 from starpos.errors import BagError
+from starpos.files import open_regular
 
-MOST_METADATA = 1 << 24
+# a bag of a thousand files has 250 kB; a parser of YAML reads about 100 kB in a second
+MOST_METADATA = 1 << 20
 # bytes of a chunk or a message; a frame of 21 megapixels has a twelfth of it
 MOST_UNPACKED = 1 << 29
 # bytes of the chunks of a file that overlap in time: rosbags has all of them in memory
@@ -27,8 +29,14 @@ LEFT_ON_DISK = 1 << 30
 def check_folder(path: Path) -> None:
     """Check the files of a bag before it is opened.
 
-    Raises BagError if metadata.yaml is too large, or if an MCAP file begins as one and has no end.
+    Raises BagError if one is a pipe or a device, if metadata.yaml is too large, or if an MCAP file begins as one and has
+    no end.
     """
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise BagError(
+                f"{file.name} is no regular file but a pipe, a socket or a device: give a bag's files"
+            )
     for file in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
         if file.suffix == ".mcap" and _is_cut_off(file):
             raise BagError(
@@ -41,7 +49,7 @@ def check_folder(path: Path) -> None:
 
 
 def _is_cut_off(file: Path) -> bool:
-    with file.open("rb") as content:
+    with open_regular(file) as content:
         if content.read(len(MCAP)) != MCAP:
             return False
         content.seek(-len(MCAP), 2)

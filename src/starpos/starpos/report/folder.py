@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.detection import detect
 from starpos.errors import FrameError, TiltError
+from starpos.files import read_regular
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
@@ -99,9 +100,7 @@ def truth_in(folder: Path) -> Truth | None:
     if not path.is_file():
         return None
     try:
-        if path.stat().st_size > TRUTH_LIMIT:
-            raise ValueError
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_regular(path, TRUTH_LIMIT))
         place = [float(content[k]) for k in ("latitude_deg", "longitude_deg")]
         frames = content.get("frames", [])
         headings = tuple((float(f["mid_unix_s"]), float(np.radians(f["heading_deg"]))) for f in frames)

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes the files of a report: each whole or not at all, and never over a file that is no report's."""
 
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
 from starpos.errors import StarposError
+from starpos.files import open_regular, write_whole
 
 # every file of a report has this mark in its first HEAD bytes
 MARK = b"starpos"
@@ -24,7 +23,7 @@ def write(folder: Path, files: Mapping[str, bytes]) -> None:
         for name in files:
             _check_ours(folder / name)
         for name, content in files.items():
-            _write_whole(folder / name, content)
+            write_whole(folder / name, content)
     # ValueError comes from a NUL in the name
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -37,20 +36,7 @@ def _check_ours(path: Path) -> None:
     if not path.exists():
         return
     if path.is_file():
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             if MARK in file.read(HEAD):
                 return
     raise WriteError(f"{path}: it is there already and no report of starpos: move it, or give another --out")
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(content)
-        # mkstemp makes files that only their owner can read
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

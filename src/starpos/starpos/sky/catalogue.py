@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starpos.errors import CatalogueError
+from starpos.files import open_regular
 from starpos.rotation import normalised
 from starpos.sky.zones import ZONES, cell_starts, rows_near
 from starpos.units import MAS, MAS_DEG
@@ -205,7 +206,7 @@ def read(path: Path | str) -> Catalogue:
     path = Path(path)
     try:
         # numpy leaves a file open that turns out to be none of its own
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as f:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as f:
             if int(f["format"]) != FORMAT:
                 raise CatalogueError(
                     f"{path}: format {int(f['format'])}, this program reads {FORMAT}: build it again"

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import CatalogueError
+from starpos.files import open_regular, read_regular
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import EPOCH, Catalogue, pack
 
@@ -21,6 +22,8 @@ SUPPLEMENT_EPOCH = 1991.25
 MOTION_V = (3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 10.5)
 MOTION_MAS_YEAR = (79.0, 52.0, 41.0, 30.0, 23.0, 18.0, 14.0, 12.0)
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
+# Four times the largest of the original files.
+MOST_BYTES = 120_000_000
 
 _MAIN = {  # name: (first byte from 0, length)
     "tyc1": (0, 4), "tyc2": (5, 5), "tyc3": (11, 1), "pflag": (13, 1), "ra_mean": (15, 12), "dec_mean": (28, 12),
@@ -65,9 +68,9 @@ def _originals(source: Path) -> Iterator[tuple[str, bytes]]:
     try:
         if source.is_dir():
             for path in sorted(p for p in source.rglob("*") if p.name in wanted):
-                yield path.name, path.read_bytes()
+                yield path.name, read_regular(path, MOST_BYTES)
             return
-        with tarfile.open(source) as archive:
+        with open_regular(source) as packed, tarfile.open(fileobj=packed) as archive:
             for member in archive:
                 file = archive.extractfile(member) if member.isfile() else None
                 if file is not None and Path(member.name).name in wanted:

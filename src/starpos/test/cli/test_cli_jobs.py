@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """--jobs, and nights in folders: the same answers, byte by byte, whoever works them and whatever happens on the way."""
 
+import gzip
 import json
 import os
 import pty
@@ -10,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import zlib
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -83,6 +85,26 @@ def test_frames_that_cannot_be_read_do_not_tell_the_instrument(archive, capfd, t
         one = run(capfd, command)
         assert one[0] == status
         assert run(capfd, [*command, "--jobs", "2"]) == one
+
+
+@pytest.mark.parametrize("more", [(), ("--jobs", "2")], ids=["here", "jobs"])
+def test_a_damaged_gz_and_a_pipe_cost_their_own_frames(more, archive, capfd, tmp_path):
+    whole, other = frames(archive / "still", "*.fits")
+    packed = bytearray(gzip.compress(Path(whole).read_bytes()))
+    # where zlib itself finds it
+    packed[10] ^= 255
+    with pytest.raises(zlib.error):
+        gzip.decompress(packed)
+    (tmp_path / "damaged.fits.gz").write_bytes(packed)
+    os.mkfifo(tmp_path / "pipe.fits")
+    given = [whole, *map(str, tmp_path.iterdir()), other]
+    status, out, err = run(capfd, ["detect", *given, "--json", *more])
+    assert status == 2 and len(err.splitlines()) == 2 and "this program failed" not in err
+    assert ['"stars": []' in line for line in out.splitlines()] == [False, True, True, False]
+    command = ["solve", *given, "--tilt", str(archive / "still" / "tilt.csv"), "--json", *more]
+    status, out, err = run(capfd, command)
+    told = [json.loads(line) for line in out.splitlines()]
+    assert status == 2 and [frame["stars_matched"] > 0 for frame in told[:4]] == [True, False, False, True]
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slopes of grids that are known exactly, in every orientation; the stated error; grids that are none."""
 
+import os
 import struct
 import zlib
 
@@ -297,6 +298,11 @@ def refused(path, words):
 BROKEN_TIFF = {
     "in a projection": ({"model": 1}, "projection"),
     "too wide": ({"extra": [(256, "I", (2**31,))]}, "claims"),
+    # 18000 x 9000 nodes of 32 bits would be few enough
+    "too many bytes": (
+        {"extra": [(256, "I", (18_000,)), (257, "I", (9_000,)), (258, "H", (64,))]},
+        "64 bits",
+    ),
     "three bands": ({"heights": np.zeros((40, 50, 3)), "samples": 3}, "3 bands"),
     "whole numbers": ({"kind": "u2"}, "uint16"),
     "a shift between heights": (
@@ -349,6 +355,9 @@ def test_files_that_are_cut_off_or_changed_raise_one_error_or_still_hold(tmp_pat
 def test_files_that_cannot_be_read(tmp_path):
     refused(tmp_path / "missing.gtx", "No such file")
     refused(tmp_path, "directory")
+    os.mkfifo(tmp_path / "pipe.gtx")
+    refused(tmp_path / "pipe.gtx", "no regular file")
+    refused("/dev/zero", "no regular file")
 
 
 def test_a_bare_name_is_found_among_projs_grids(tmp_path, monkeypatch):

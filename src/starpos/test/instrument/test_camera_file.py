@@ -110,6 +110,28 @@ def test_another_reader_finds_every_key_where_it_should_be(tmp_path):
     assert camera_file.read(path) == CAMERA
 
 
+def test_a_file_is_parsed_up_to_64_kb_only(tmp_path):
+    path = tmp_path / "camera.yaml"
+    camera_file.write(path, CAMERA, "camera")
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"#" * (64_000 - len(whole)))
+    assert camera_file.read(path) == CAMERA
+    path.write_bytes(whole + b"#" * (64_001 - len(whole)))
+    with pytest.raises(InstrumentError, match="64001 bytes, and may have 64000"):
+        camera_file.read(path)
+
+
+def test_a_link_stays_one_when_a_calibration_is_written_through_it(tmp_path):
+    (tmp_path / "store").mkdir()
+    path = tmp_path / "camera.yaml"
+    path.symlink_to("store/cam1.yaml")
+    camera_file.write(path, CAMERA, "camera")
+    other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=1.0, cy=2.0)
+    camera_file.write(path, other, "camera")
+    assert path.is_symlink() and camera_file.read(tmp_path / "store" / "cam1.yaml") == other
+    assert [p.name for p in (tmp_path / "store").iterdir()] == ["cam1.yaml"]
+
+
 def test_a_pipe_is_not_waited_for(tmp_path):
     path = tmp_path / "camera.yaml"
     os.mkfifo(path)

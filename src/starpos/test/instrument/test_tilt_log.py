@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
 import warnings
 
 import numpy as np
@@ -219,6 +220,13 @@ def test_hostile_csv_gives_one_sentence_that_names_the_file(tmp_path, kind):
 def test_missing_csv_and_folder(tmp_path):
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(TiltError, match=r"no such file|not a readable table"):
+            read_tilt_csv(path)
+
+
+def test_a_pipe_is_no_table_and_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "tilt.csv")
+    for path in (tmp_path / "tilt.csv", "/dev/zero"):
+        with pytest.raises(TiltError, match=r"no regular file.*give a CSV"):
             read_tilt_csv(path)
 
 

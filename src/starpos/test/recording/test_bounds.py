@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags that unpack to more than they may are refused in a sentence; the frames of an honest night are not."""
 
+import os
 import struct
 
 import pytest
@@ -124,3 +125,13 @@ def test_a_compressed_file_is_unpacked_only_where_there_is_room(tmp_path, monkey
     monkeypatch.setattr(bounds, "LEFT_ON_DISK", 1 << 60)  # as on a disk that is nearly full
     with pytest.raises(BagError, match="more than there is room for"):
         read(path)
+
+
+@pytest.mark.parametrize("name", ["metadata.yaml", "a.mcap", "a.db3"])
+def test_a_pipe_in_a_bag_is_not_waited_for(tmp_path, name):
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(BagError, match="no regular file"), BagReader(path):
+            pass

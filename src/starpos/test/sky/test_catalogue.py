@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,12 @@ def random_catalogue(rng, n):
         rng.normal(0, 50, n), rng.normal(0, 50, n), rng.uniform(1, 300, n), rng.uniform(0.2, 50, n),
         rng.uniform(1915, 1992, n),
     )  # fmt: skip
+
+
+def test_a_pipe_is_no_catalogue_and_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "tycho2.npz")
+    with pytest.raises(CatalogueError, match="no regular file"):
+        read(tmp_path / "tycho2.npz")
 
 
 def test_pack_save_read(tmp_path, rng):

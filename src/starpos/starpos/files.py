@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that others wrote, read so that none of them can hang the program; and files written whole or not at all."""
+
+import errno
+import os
+import stat
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+
+def open_regular(path: Path | str) -> BinaryIO:
+    """Open a regular file to read its bytes; OSError, whose `strerror` says why, if it cannot be or is another thing.
+
+    Whoever opens a pipe would wait until somebody writes into it, and a device may do something when it is opened.
+    """
+    try:
+        _check_regular(os.stat(path))
+        # the caller closes it
+        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
+    # the name contains a NUL
+    except ValueError:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)) from None
+    try:
+        # a pipe may have taken its place since
+        _check_regular(os.fstat(file.fileno()))
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def bytes_of(file: BinaryIO, most: int) -> bytes:
+    """The content of an open file from its start; OSError if it has more than `most` bytes."""
+    size = os.fstat(file.fileno()).st_size
+    if size > most:
+        raise OSError(errno.EFBIG, f"it has {size} bytes, and may have {most}")
+    file.seek(0)
+    # not to the end: the file may grow meanwhile
+    return file.read(size)
+
+
+def read_regular(path: Path | str, most: int) -> bytes:
+    """The content of a regular file; OSError as by `open_regular`, and if it has more than `most` bytes."""
+    with open_regular(path) as file:
+        return bytes_of(file, most)
+
+
+def write_whole(path: Path | str, content: bytes) -> None:
+    """Write a file so that at any moment, even after a power cut, either the old or the new one is there, whole.
+
+    Where path is a symbolic link, the file is written that it leads to, and the link stays. Folders that are missing are
+    made. OSError if the file cannot be written; ValueError if its name contains a NUL.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+    with suppress(FileNotFoundError):
+        _check_regular(os.stat(target))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        # mkstemp makes a file that only its owner may read
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Open without waiting for the other end of a pipe, and without a terminal becoming ours."""
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
+
+
+def _check_regular(status: os.stat_result) -> None:
+    """Raise OSError unless a status is that of a regular file."""
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, no regular file")
