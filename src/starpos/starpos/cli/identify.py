@@ -64,6 +64,7 @@ def as_json(path: str, s: Solution) -> dict:
         "log_odds": a.log_odds if a else None,
         "mirrored": a.mirrored if a else None,
         "status": s.status.value,
+        "warnings": list(s.warnings),
     }
 
 
@@ -74,5 +75,7 @@ def _line(path: str, s: Solution) -> str:
     return (
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "
         f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
-        f"focal length {a.focal_px:.1f} px, log-odds {a.log_odds:.0f}" + (", mirrored" if a.mirrored else "")
+        f"focal length {a.focal_px:.1f} px, log-odds {a.log_odds:.0f}"
+        + (", mirrored" if a.mirrored else "")
+        + "".join(f", {name}" for name in s.warnings)
     )

@@ -133,11 +133,13 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
 def _tell(args: argparse.Namespace, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
     """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status."""
     solved: list[Solved] = []
+    warnings: set[str] = set()
     unreadable = False
     for path, answer in rows:
         if isinstance(answer, FrameError):
             unreadable = True
             answer = Solution(Status.BAD_INPUT, str(answer), source=path, utc_unix_s=None, stars_detected=0)
+        warnings |= set(answer.warnings)
         if answer.fix:
             solved.append(Solved.of(answer, answer.fix))
         else:
@@ -151,7 +153,7 @@ def _tell(args: argparse.Namespace, night: NightFolder, rows: Iterable, vertical
     if solved:
         last = solved[-1].fix
         common.tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        _print_combined(night, together, solved, args, vertical)
+        _print_combined(night, together, solved, warnings, args, vertical)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
 
@@ -257,6 +259,7 @@ def _json_about(s: Solution) -> dict:
         "residual_arcsec": s.fix.residual_arcsec if s.fix else None,
         "log_odds": a.log_odds if a else None,
         "status": s.status.value,
+        "warnings": list(s.warnings),
     }
 
 
@@ -278,6 +281,7 @@ def _print_combined(
     night: NightFolder,
     all_together: Average | None,
     solved: list[Solved],
+    warnings: set[str],
     args: argparse.Namespace,
     vertical: Vertical,
 ) -> None:
@@ -289,6 +293,7 @@ def _print_combined(
             "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved])),
             "log_odds": sum(s.log_odds for s in solved),
             "status": (Status.OK if all_together else Status.POOR_FIT).value,
+            "warnings": sorted(warnings),
         }
         common.print_json(
             {"combined": True}

@@ -19,6 +19,7 @@ from starpos.frames.stars import SATURATED, Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangle_cache
 from starpos.identification.hint import Hint
 from starpos.identification.triangles import TriangleCatalogue
+from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
@@ -28,6 +29,8 @@ from starpos.sky.catalogue import Catalogue
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
+# A name in `Solution.warnings`: bright stars that were not identified are a sky of their own.
+TWO_SKIES = "two_skies"
 
 
 class Status(str, Enum):
@@ -63,6 +66,7 @@ class Solution:
     star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
     identify_s, fix_s: seconds that the two steps took.
     extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
+    warnings: names, sorted, of what is suspicious about an identification; TWO_SKIES is the only one.
     hint: helps to identify the next frame.
     """
 
@@ -82,6 +86,7 @@ class Solution:
     fix_s: float = 0.0
     extrapolated_days: float = 0.0
     hint: Hint | None = None
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
@@ -118,19 +123,21 @@ class Solver:
         try:
             camera = self._camera(stars.width, stars.height)
             sky = Sky.at(self.catalogue, self._triangles(camera), stars.mid_unix_s)
-            found = identify_directions(camera.directions(stars.x, stars.y), stars.sigma, camera, sky)
+            directions = camera.directions(stars.x, stars.y)
+            found = identify_directions(directions, stars.sigma, camera, sky)
         except StarposError as e:
             return _failure(stars, e)
-        spent = time.perf_counter() - begin
         if found is None:
-            return replace(self._unidentified(stars), identify_s=spent)
+            return replace(self._unidentified(stars), identify_s=time.perf_counter() - begin)
+        warnings = _warnings(stars, directions, camera, sky, found)
         return replace(
             Solution.failed(stars, Status.OK, "identified"),
             names=tuple(self.catalogue.names(found.catalogue)),
             star=found.star,
             magnitudes=self.catalogue.vmag(found.catalogue),
             attitude=_attitude(found, sky, camera),
-            identify_s=spent,
+            identify_s=time.perf_counter() - begin,
+            warnings=warnings,
         )
 
     def solve(
@@ -164,9 +171,10 @@ class Solver:
             found = identify_directions(directions, stars.sigma, camera, sky, priors)
         except StarposError as e:
             return _failure(stars, e)
-        identified = time.perf_counter()
         if found is None:
-            return replace(self._unidentified(stars), tilt=tilt, identify_s=identified - begin)
+            return replace(self._unidentified(stars), tilt=tilt, identify_s=time.perf_counter() - begin)
+        warnings = _warnings(stars, directions, camera, sky, found)
+        identified = time.perf_counter()
         names, magnitudes = self.catalogue.names(found.catalogue), self.catalogue.vmag(found.catalogue)
         solution = replace(
             Solution.failed(stars, Status.OK, "fix"),
@@ -176,8 +184,14 @@ class Solver:
             names=tuple(names),
             star=found.star,
             magnitudes=magnitudes,
+            warnings=warnings,
         )
         try:
+            if TWO_SKIES in warnings:
+                raise FixError(
+                    f"{stars.source or 'the frame'}: two skies in one frame, its bright stars are those of two "
+                    "pointings: keep the camera still while it exposes, and expose once"
+                )
             fix = self._fix(stars, found, camera, tilt, state)
         except StarposError as e:
             return replace(solution, status=_status(stars, e), message=str(e))
@@ -276,6 +290,13 @@ def _status(stars: Stars, error: StarposError) -> Status:
         (FixError, Status.POOR_FIT),
     )
     return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
+
+
+def _warnings(
+    stars: Stars, directions: np.ndarray, camera: Camera, sky: Sky, found: Identification
+) -> tuple[str, ...]:
+    """Names, sorted, of what is suspicious about the identification of stars in the directions (N, 3)."""
+    return (TWO_SKIES,) if two_skies(directions, stars.sigma, stars.flux, camera, sky, found) else ()
 
 
 def _attitude(found: Identification, sky: Sky, camera: Camera) -> Attitude:

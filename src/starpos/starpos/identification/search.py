@@ -52,6 +52,11 @@ def identify_directions(
     priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
     """Identify stars as `identify` does, from unit vectors (N, 3) in C, with refraction removed, of any camera."""
+    return _identify(frame_stars(directions, sigma_px, camera), sky, priors)
+
+
+def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars:
+    """Make FrameStars from unit vectors (N, 3) in C and errors (N,) px. ValueError if one is not a finite number."""
     # a camera with square pixels, as `identify` needs
     squeeze = camera.fx / camera.fy
     width, height = camera.width, max(1, round(camera.height * squeeze))
@@ -69,32 +74,39 @@ def identify_directions(
         cx=cx + margin,
         cy=cy + margin,
     )
-    return _identify(FrameStars.of(xy + margin, sigma_px, ideal, margin), sky, priors)
+    return FrameStars.of(xy + margin, sigma_px, ideal, margin)
 
 
 def _identify(field: FrameStars, sky: Sky, priors: Priors) -> Identification | None:
     """The first attempt that is accepted; None if there is none."""
     if len(field) < FEWEST_STARS:
         return None
-    for pose, radius_px, prior in _attempts(field, sky, priors):
+    for pose, radius_px, prior in attempts(field, sky, priors, STAGES):
         if found := identified(field, sky, pose, radius_px, prior):
             return found
     return None
 
 
-def _attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[Attempt]:
-    """Yield the attempts in their order. Half of the probability is that of the priors, if there are any."""
+def attempts(
+    field: FrameStars, sky: Sky, priors: Priors, stages: Sequence[tuple[int, float]]
+) -> Iterator[Attempt]:
+    """Yield the attempts in their order: by the priors, then lost in space by `stages`.
+
+    Half of the probability is that of the priors, if there are any.
+    """
     for prior in priors:
         yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
     lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
-    for pose, radius_px in _lost_in_space(field, sky):
+    for pose, radius_px in _lost_in_space(field, sky, stages):
         yield pose, radius_px, lost
 
 
-def _lost_in_space(field: FrameStars, sky: Sky) -> Iterator[tuple[Pose, np.ndarray]]:
+def _lost_in_space(
+    field: FrameStars, sky: Sky, stages: Sequence[tuple[int, float]]
+) -> Iterator[tuple[Pose, np.ndarray]]:
     """Yield poses from triangles, stage by stage, and the distance (N,) px by which each star may be off."""
     lookup = Lookup(field, sky.triangles)
-    for stars, error_px in STAGES:
+    for stars, error_px in stages:
         candidates = lookup.candidates(min(stars, len(field)), error_px)
         # mostly the first one is right
         if len(candidates):

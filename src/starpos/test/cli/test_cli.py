@@ -19,9 +19,9 @@ PLACE = {"latitude": 47.3, "longitude": -122.8}
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",
               "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched",
-              "residual_arcsec", "log_odds", "status"}  # fmt: skip
+              "residual_arcsec", "log_odds", "status", "warnings"}  # fmt: skip
 IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-                 "log_odds", "status", "cpu_ms"}  # fmt: skip
+                 "log_odds", "status", "warnings", "cpu_ms"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -133,7 +133,7 @@ def test_the_priors_share_half_of_the_probability(catalogue, rng):
     field = FrameStars.of(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL)
     priors = PointingPrior(attitude, SMALL.fx), PlumbPrior(attitude[2], np.eye(3)[2], 1e-3)
     expected = Pose(attitude, SMALL.fx, False)
-    tried = {id(prior): prior for _, _, prior in search._attempts(field, sky, priors)}
+    tried = {id(prior): prior for _, _, prior in search.attempts(field, sky, priors, search.STAGES)}
     *led, lost = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
     assert sorted(led) == pytest.approx([1 / 8, 1 / 8, 1 / 4])
     assert lost < 1 / 2

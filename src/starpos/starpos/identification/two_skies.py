@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find a second sky on a frame: a double exposure, or a camera that was moved while it exposed.
+
+The bright stars that an identification leaves over are mostly few. If they are not, two things are looked for. The first
+is a constant offset: every star is there twice, which shows whatever the lens does and however few stars were matched.
+The second is another pose of the same camera: what is left over is identified as any frame is, and accepted by the same
+evidence. In both the second sky must be about as bright as the first: ghosts and glare are much fainter.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from starpos.identification.evidence import DOUBLE_PX, TEST_STARS
+from starpos.identification.full import ENOUGH, Identification, identified
+from starpos.identification.pairs import close_pairs
+from starpos.identification.pose import FrameStars, Pose
+from starpos.identification.prior import PointingPrior
+from starpos.identification.search import STAGES, attempts, frame_stars
+from starpos.identification.sky import Sky
+from starpos.instrument.camera import Camera
+
+# A second sky leaves at least so many of the TEST_STARS brightest over, and this share of them.
+LEAST_LEFT, LEAST_SHARE_LEFT = 4, 0.12
+# So many of the brightest are looked at for twins, and so many of those left over for another pose.
+MOST_STARS = 2 * TEST_STARS
+# The shares of the two skies in the exposure differ by at most this (2.5 mag: 1 to 10).
+MOST_FAINTER_MAG = 2.5
+# The brightness of a star in one sky, less that in the other, differs from that of the others by at most this.
+SAME_MAG = 1.0
+# Offsets of twins agree to one of these: the widest is for a camera that was turned too, or a lens that bends.
+OFFSETS_PX = 0.5, 2.0, 8.0
+# An offset is at least so long, and so many times that, or the twins are one image with a tail; at most it is this share
+# of the frame.
+NEAREST_PX, NEAREST, FARTHEST = 4.0, 2.0, 0.25
+# Chance is counted around the offset, out to so many times that: the companions of stars lie in a ring.
+AROUND = 4
+# Twins make up this share of the bright stars, lie apart by this share of the frame in every direction, and at most
+# this share of them is a twin on both sides, as in a row or a lattice of lights.
+LEAST_SHARE, LEAST_SPREAD, MOST_IN_ROWS = 0.25, 0.05, 0.25
+# At least so many twins have one star that is identified and one that is not.
+LEAST_LINKED = 3
+# Stages of the search for another pose; the poor ones are for lenses that the first identification has dealt with.
+QUICK_STAGES = STAGES[:2]
+# The other pose has the same focal length to this share, and residuals of so many times those of the first plus so much.
+SAME_FOCAL, WORSE, WORSE_PX = 0.01, 2.0, 0.5
+# Of those left over that are as bright, this share belongs to the second sky.
+LEAST_SHARE_SECOND = 0.5
+# From a star of the first sky to its neighbour, what a lens bends changes by at most this share of their distance.
+STEEPEST_BEND = 0.2
+
+
+def two_skies(
+    directions: np.ndarray,
+    sigma_px: np.ndarray,
+    flux: np.ndarray,
+    camera: Camera,
+    sky: Sky,
+    found: Identification,
+) -> bool:
+    """Whether the stars that an identification has left over are a sky of their own.
+
+    directions, sigma_px  (N, 3), (N,): as given to `identify_directions`
+    flux                  (N,): in any unit, brightest first
+    """
+    left = np.ones(len(flux), bool)
+    left[found.star] = False
+    bright = left[:TEST_STARS]
+    if bright.sum() < max(LEAST_LEFT, LEAST_SHARE_LEFT * len(bright)):
+        return False
+    field = frame_stars(directions, sigma_px, camera)
+    mag = -2.5 * np.log10(np.maximum(flux, np.finfo(float).tiny))
+    return _every_star_twice(field.xy[0], mag, left, 2 * field.half) or _another_pose(
+        field, mag, left, sky, found
+    )
+
+
+def _every_star_twice(xy: np.ndarray, mag: np.ndarray, left: np.ndarray, size: np.ndarray) -> bool:
+    """Whether the brightest of the stars xy (N, 2), on a frame of size (2,) px, have twins at one offset.
+
+    left (N,): which of them are not identified.
+    """
+    xy, mag, left = xy[:MOST_STARS], mag[:MOST_STARS], left[:MOST_STARS]
+    one, other = np.triu_indices(len(xy), 1)
+    farthest = FARTHEST * size.max() + AROUND * max(OFFSETS_PX)
+    offset = xy[other] - xy[one]
+    near = (mag[other] - mag[one] < MOST_FAINTER_MAG + SAME_MAG) & (np.square(offset).sum(1) < farthest**2)
+    one, other, offset = one[near], other[near], offset[near]
+    # from left to right
+    swap = offset[:, 0] < 0
+    one, other, offset = (
+        np.where(swap, other, one),
+        np.where(swap, one, other),
+        np.where(swap[:, None], -offset, offset),
+    )
+    for within_px in OFFSETS_PX:
+        twin, log_chance = _most_alike(offset, mag[other] - mag[one], within_px, FARTHEST * size.max())
+        if log_chance < -ENOUGH and _are_a_sky(xy, left, one[twin], other[twin], size):
+            return True
+    return False
+
+
+def _most_alike(
+    offset: np.ndarray, fainter: np.ndarray, within_px: float, farthest_px: float
+) -> tuple[np.ndarray, float]:
+    """Pairs of stars with nearly the same offset, and the logarithm of the probability that chance makes as many.
+
+    offset, fainter  (P, 2) px, (P,): of all pairs; how much fainter the second star of each is
+    """
+    none, apart2 = np.zeros(0, int), np.square(offset).sum(1)
+    votes = np.bincount(np.concatenate(close_pairs(offset, within_px)), minlength=len(offset))
+    votes[(apart2 < max(NEAREST_PX, NEAREST * within_px) ** 2) | (apart2 > farthest_px**2)] = 0
+    if not votes.any():
+        return none, 0.0
+    centre = offset[votes.argmax()]
+    centre = np.median(offset[np.square(offset - centre).sum(1) < within_px**2], axis=0)
+    away2 = np.square(offset - centre).sum(1)
+    twin = np.flatnonzero(away2 < within_px**2)
+    share = np.median(fainter[twin])
+    twin = twin[np.abs(fainter[twin] - share) < SAME_MAG]
+    if abs(share) > MOST_FAINTER_MAG or len(twin) < 2:
+        return none, 0.0
+    # each pair counts in both directions
+    nearest2 = np.minimum(away2, np.square(offset + centre).sum(1))
+    around = np.sum(nearest2 < (AROUND * within_px) ** 2) - len(twin)
+    expected, others = (around + 1) / (AROUND**2 - 1), len(twin) - 1
+    # so many others around any one of the offsets, by Poisson's distribution
+    return twin, math.log(len(offset)) + others * math.log(expected) - math.lgamma(others + 1)
+
+
+def _are_a_sky(
+    xy: np.ndarray, left: np.ndarray, one: np.ndarray, other: np.ndarray, size: np.ndarray
+) -> bool:
+    """Whether twins, the rows `one` and `other` (K,) of xy (N, 2), are many, spread out, and partly identified."""
+    linked, known = np.sum(left[one] != left[other]), np.sum(~left[one] & ~left[other])
+    return bool(
+        2 * len(one) >= LEAST_SHARE * len(xy)
+        and len(np.intersect1d(one, other)) <= MOST_IN_ROWS * len(one)
+        and linked >= max(LEAST_LINKED, known)
+        and np.linalg.eigvalsh(np.cov(xy[one].T))[0] > (LEAST_SPREAD * size.min()) ** 2
+    )
+
+
+def _another_pose(
+    field: FrameStars, mag: np.ndarray, left: np.ndarray, sky: Sky, found: Identification
+) -> bool:
+    """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
+    row, first = np.flatnonzero(left)[:MOST_STARS], _pose(field, found)
+    while len(row) >= LEAST_LEFT:
+        rest = replace(field, focal_px=first.focal_px, xy=field.xy[:, row], sigma=field.sigma[row])
+        second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
+        if second is None:
+            return False
+        new = _new(field, mag, row[second.star], sky, found, second)
+        if new.all():
+            # what lies beside many stars, as companions do, is near any pose that is a little off
+            bright = int(np.median(second.star)) + 1
+            return bool(np.sum(second.star < bright) >= LEAST_SHARE_SECOND * bright)
+        # the evidence must do without the others
+        row = np.delete(row, second.star[~new])
+    return False
+
+
+def _same_camera(rest: FrameStars, sky: Sky, first: Pose, most_residual_px: float) -> Identification | None:
+    """Identify the rest of a frame's stars near the first pose, or anywhere, with its parity and focal length."""
+    # a prior is for frames that are not mirrored
+    priors = () if first.mirrored else (PointingPrior(first.attitude, first.focal_px),)
+    for pose, radius_px, prior in attempts(rest, sky, priors, QUICK_STAGES):
+        second = identified(rest, sky, pose, radius_px, prior) if pose.mirrored == first.mirrored else None
+        if (
+            second is not None
+            and abs(math.log(second.focal_scale)) < SAME_FOCAL
+            and second.residual_px < most_residual_px
+        ):
+            return second
+    return None
+
+
+def _new(
+    field: FrameStars,
+    mag: np.ndarray,
+    row: np.ndarray,
+    sky: Sky,
+    found: Identification,
+    second: Identification,
+) -> np.ndarray:
+    """Which stars (M,) of a second identification, of the field's stars `row`, are not the first sky's, bent by the lens.
+
+    New is a star that is seen in its place in the first sky as well, or is farther from there than a lens bends that
+    has its neighbours in place.
+    """
+    share = _zero(mag[row], sky, second) - _zero(mag[found.star], sky, found)
+    if abs(share) > MOST_FAINTER_MAG:
+        return np.zeros(len(row), bool)
+    first, xy = _pose(field, found), field.xy[int(found.mirrored)]
+    away = np.linalg.norm(xy[row][:, None] - xy[found.star], axis=2).min(1)
+    bend, their_bend = (
+        np.linalg.norm(xy[star] - first.project(sky.directions(index)), axis=1)
+        for star, index in ((found.star, found.catalogue), (row, second.catalogue))
+    )
+    new = their_bend > 2 * bend.max() + STEEPEST_BEND * away
+    _, here, there = np.intersect1d(second.catalogue, found.catalogue, return_indices=True)
+    one, other = found.star[there], row[here]
+    alike = np.abs(mag[other] - mag[one] - share) < SAME_MAG
+    new[here] |= alike & (np.linalg.norm(xy[one] - xy[other], axis=1) > DOUBLE_PX)
+    return new
+
+
+def _pose(field: FrameStars, found: Identification) -> Pose:
+    return Pose(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
+
+
+def _zero(mag: np.ndarray, sky: Sky, found: Identification) -> float:
+    """Median of the brightness (M,) of identified stars, less that of the catalogue."""
+    return float(np.median(mag - sky.catalogue.vmag(found.catalogue)))
