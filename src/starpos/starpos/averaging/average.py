@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.claim import Claim, Seen
+from starpos.averaging.claim import Claim, Remembered
 from starpos.averaging.filter import PlaceFilter
 from starpos.averaging.slip import slip_s
 from starpos.errors import FixError
@@ -147,7 +147,7 @@ class _Track:
 
     def _extended(self, f: Fix, extended: PlaceFilter) -> "_Track":
         frames, poses = self.frames + 1, self.poses + (self.in_pose == 0)
-        seen = Seen.of(f, self.pose, poses, extended.plane)
+        seen = Remembered.of(f, self.pose, poses, extended.plane)
         return replace(
             self,
             place_filter=extended,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the fixes of one place say of their own scatter, and what the average has to claim for it.
 
-The filter takes each error as its budget states it. This keeps what is needed of the fixes to see whether they scatter more,
-and how alike those next to each other are: the mean of errors that are alike is not much better than one of them.
+The filter takes each error as its budget states it. This keeps what is needed of the fixes to see whether they scatter
+more, and how alike those next to each other are: the mean of errors that are alike is not much better than one of them.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ NEWS = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
+class Remembered:
     """A fix, or the mean of some that follow each other in a pose.
 
     place (2,): east, north in m in the plane.  to_rad (2, 2): m to the inclinometer's axes in rad.
@@ -43,7 +43,7 @@ class Seen:
     pose_sigma: float
 
     @classmethod
-    def of(cls, f: Fix, first: Fix, pose: int, plane: Plane) -> "Seen":
+    def of(cls, f: Fix, first: Fix, pose: int, plane: Plane) -> "Remembered":
         """What is remembered of a fix of a pose that began with `first`."""
         own = [t for t in f.terms if not t.common and t.shared != EACH_POSE]
         new = [t for t in f.terms if t.shared == EACH_POSE]
@@ -60,7 +60,7 @@ class Seen:
             pose_sigma=_sigma(new),
         )
 
-    def with_next(self, other: "Seen") -> "Seen":
+    def with_next(self, other: "Remembered") -> "Remembered":
         """The mean of this and the next one of its pose."""
         n = self.fixes + other.fixes
         a, b = self.fixes / n, other.fixes / n
@@ -85,13 +85,13 @@ class Claim:
     beyond (2, 2): covariance in m2 of east, north beyond what the filter states.
     """
 
-    seen: tuple[Seen, ...] = ()
+    seen: tuple[Remembered, ...] = ()
     fixes: int = 0
     looked: int = 0
     frame_sigma: float = 0.0
     beyond: np.ndarray | None = None
 
-    def with_fix(self, seen: Seen, east_north_m: np.ndarray) -> "Claim":
+    def with_fix(self, seen: Remembered, east_north_m: np.ndarray) -> "Claim":
         """The claim with one more fix, after which the filter has the place at east_north_m (2,)."""
         kept = (*self.seen, seen)
         more = replace(self, seen=_shortened(kept) if len(kept) > MOST_SEEN else kept, fixes=self.fixes + 1)
@@ -142,9 +142,9 @@ class Claim:
         )
 
 
-def _shortened(seen: tuple[Seen, ...]) -> tuple[Seen, ...]:
+def _shortened(seen: tuple[Remembered, ...]) -> tuple[Remembered, ...]:
     """Neighbours of a pose averaged two by two; where poses have one each, only the later half."""
-    short: list[Seen] = []
+    short: list[Remembered] = []
     for s in seen:
         if short and short[-1].pose == s.pose and short[-1].fixes <= s.fixes:
             short[-1] = short[-1].with_next(s)

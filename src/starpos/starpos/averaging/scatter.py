@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much frames scatter beyond what they state, and what that makes of the answer of all.
 
-An inclinometer may have an error that is new at each pose (hysteresis, flexure, a soft footing), or one that wanders (wind,
-soft ground, warming up), or more noise than stated, and its axes may err with the lean. Nobody need have stated any of it;
-the frames tell. Every kind and size is tried, weighted by its evidence, and the answer is the mean over all, so that few
-frames make a wide claim and many a narrow one.
+An inclinometer may have an error that is new at each pose (hysteresis, flexure, a soft footing), or one that wanders
+(wind, soft ground, warming up), or more noise than stated, and its axes may err with the lean. Nobody need have stated
+any of it; the frames tell. Every kind and size is tried, weighted by its evidence, and the answer is the mean over all,
+so that few frames make a wide claim and many a narrow one.
 """
 
 from dataclasses import dataclass
@@ -63,8 +63,8 @@ class Frames:
 class Scatter:
     """What the frames tell, as means over all hypotheses.
 
-    pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same of
-    all that a frame has beside its own stated error.
+    pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
+    of all that a frame has beside its own stated error.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated.
     """
 

@@ -240,8 +240,8 @@ def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     up = up_of(np.radians(found.tilt_deg))
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
-    # the errors of single tilts would seem to tell the turn, unless the instrument really leans from pose to pose; if it does
-    # and nothing tells the turn, `_with_zenith_error` accounts for it
+    # the errors of single tilts would seem to tell the turn, unless the instrument really leans from pose to pose; if
+    # it does and nothing tells the turn, `_with_zenith_error` accounts for it
     if plumb.astray or not agreement.readings.lean(agreement.scatter.pose_sigma):
         about = 0.0
     covariance = np.eye(3) * across**2 + np.outer(up, up) * (about**2 - across**2)

@@ -44,7 +44,8 @@ MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
 
 @dataclass(frozen=True)
 class Linear:
-    """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the columns.
+    """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the
+    columns.
 
     residual (K, 2) in rad with p = 0 for the columns, design (K, 2, n): its derivatives.  prior_sigma (n,).
     turns (3, 3): axes in S, two across the plumb line and it.  across (2, 3): axes in ITRS, across the zenith.

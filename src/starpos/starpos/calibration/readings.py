@@ -34,8 +34,8 @@ class FixedFrame:
 class Readings:
     """Attitudes and tilts of K frames.
 
-    utc_unix_s (K,).  to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.  heading (K,) in rad.
-    sigma (K,) in rad: of the zenith from each frame alone.
+    utc_unix_s (K,).  to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.  heading
+    (K,) in rad. sigma (K,) in rad: of the zenith from each frame alone.
     pose (K,): number of each frame's pose, from 0.  pose_sigma (rad): of an error that is new at each pose.
     columns (K, 3, M): change of `plumb` for each of M errors of the inclinometer that frames share: its drift and its
     temperature in units of their sigma, then its response.  column_sigma (M,): 1 sigma of these.

@@ -72,9 +72,9 @@ class Fix:
     used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
     jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
     focal_scale: factor on the given focal length.
-    levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the inclinometer.
-    camera_to_itrs (3, 3): attitude of the camera against the Earth by the stars alone; camera_covariance (3, 3) in rad2:
-    of its small rotation about the Earth's axes.
+    levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the
+    inclinometer. camera_to_itrs (3, 3): attitude of the camera against the Earth by the stars alone; camera_covariance
+    (3, 3) in rad2: of its small rotation about the Earth's axes.
     """
 
     utc_unix_s: float

@@ -132,8 +132,8 @@ class InclinometerErrors:
         if most > self.range_rad:
             x, y = np.degrees(tilt.theta[:2])
             raise TiltRangeError(
-                f"tilt ({x:.3f}, {y:.3f}) deg is beyond +-{np.degrees(self.range_rad):.3g} deg, the inclinometer's range: "
-                "set the instrument more upright"
+                f"tilt ({x:.3f}, {y:.3f}) deg is beyond +-{np.degrees(self.range_rad):.3g} deg, "
+                "the inclinometer's range: set the instrument more upright"
             )
 
     def undithered_rad(self, tilt: Tilt) -> float:

@@ -22,8 +22,8 @@ class Mounting:
     inclinometer              its errors
     calibrated_unix_s         time of the calibration; NaN: unknown, then the covariance includes the drift until now
     calibrated_temperature_c  temperature of the inclinometer then; NaN: unknown
-    calibrated_tilt           its two or three angles then, rad; an error of its response grows with the distance from them
-    response                  (m,) coefficients of its response that were found, or none
+    calibrated_tilt           its two or three angles then, rad; an error of its response grows with the distance from
+    them response                  (m,) coefficients of its response that were found, or none
     response_covariance       (m, m) of these
     """
 

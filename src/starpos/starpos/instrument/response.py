@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The response of an inclinometer: how its angles err at another lean than that of the calibration.
 
-Each axis has a zero and a scale, and each pair of axes an angle that is not square. A3 is fitted at the calibration's lean,
-so these count only away from it; a zero does so because an angle that is wrong by a constant is no rotation.
+Each axis has a zero and a scale, and each pair of axes an angle that is not square. A3 is fitted at the calibration's
+lean, so these count only away from it; a zero does so because an angle that is wrong by a constant is no rotation.
 """
 
 from itertools import combinations
@@ -24,8 +24,8 @@ def response_columns(theta: np.ndarray, calibrated_up: np.ndarray) -> np.ndarray
     """Change (3, m) of up in S, as read at the angles theta (axes,), for each coefficient of the response.
 
     calibrated_up (3,): up in S at the calibration. There all columns are 0, because A3 holds the rest.
-    The m coefficients are the zeros (rad), the scales (shares) and, for each pair of axes, the share of one axis' angle that
-    the other shows.
+    The m coefficients are the zeros (rad), the scales (shares) and, for each pair of axes, the share of one axis' angle
+    that the other shows.
     """
     axes, then = len(theta), angles_at(calibrated_up, len(theta))
     slope, lean = up_slope(theta), theta - then
