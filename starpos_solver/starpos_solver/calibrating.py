@@ -14,7 +14,6 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from starpos.calibration.misalignment import Calibrated, calibrate_at
-from starpos.calibration.plumb_line import UNKNOWN_ARCSEC
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
@@ -83,7 +82,7 @@ class Calibrating:
 
     @property
     def unknown(self) -> bool:
-        """Whether A3 is unknown, so that fixes carry its error."""
+        """Whether A3 is unknown and is being looked for, so that fixes carry its error."""
         given = self.found is None and not self._values["self_calibration"]
         return not self._is_told and not given
 
@@ -145,7 +144,7 @@ class Calibrating:
         self.forget()
         if self.found is not None:
             self._log.warning("another camera_info: the calibration found with the other one is unknown now")
-            self._drop(Calibration.of(self.found.misalignment_deg, UNKNOWN_ARCSEC))
+            self._drop(Calibration.of(self.found.misalignment_deg))
 
     def parameters_set(self, names: frozenset[str]) -> None:
         """Apply a change of these parameters."""

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from starpos.calibration.plumb_line import UNKNOWN_ARCSEC
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
@@ -20,6 +19,8 @@ from starpos_common.paths import path_of
 NAN = math.nan
 # Share by which the focal length of one camera may change.
 SAME_FOCAL = 0.05
+# A clock is trusted no further than this without an instrument file.
+LEAST_CLOCK_S = 0.01
 
 PARAMETERS = (
     Parameter(
@@ -42,9 +43,9 @@ PARAMETERS = (
     ),
     Parameter(
         "misalignment_stddev",
-        instrument.UNSTATED_CALIBRATION_ARCSEC,
+        NAN,
         "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. Too small "
-        "makes fixes claim more than they hold.",
+        "makes fixes claim more than they hold; unset, the misalignment is not known: 10 deg, 1100 km.",
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,
@@ -100,11 +101,19 @@ PARAMETERS = (
     ),
     Parameter(
         "refraction.humidity",
-        0.3,
-        "Relative humidity; it hardly matters in visible light.",
+        NAN,
+        "Relative humidity; it hardly matters in visible light. Unset is 0.3, give or take 0.25.",
         unit="",
         minimum=0.0,
         maximum=1.0,
+    ),
+    Parameter(
+        "refraction.wavelength",
+        NAN,
+        "Middle of the light that the camera sees; unset is 0.55, give or take 0.08.",
+        unit="um",
+        minimum=0.2,
+        maximum=10.0,
     ),
     Parameter(
         "altitude",
@@ -185,6 +194,12 @@ PARAMETERS = (
 )
 
 
+def _stated(values: Mapping) -> Calibration:
+    """The calibration of the parameters; without its error it is not known."""
+    stddev = values["misalignment_stddev"]
+    return Calibration.of(values["misalignment"], *(() if math.isnan(stddev) else ((stddev,) * 3,)))
+
+
 def instrument_of(
     values: Mapping, camera: Camera, known: Instrument | None, found: Calibration | None = None
 ) -> Instrument:
@@ -196,11 +211,13 @@ def instrument_of(
     if known is None:
         known = Instrument(
             camera.fx,
-            calibration=Calibration.of(values["misalignment"], (values["misalignment_stddev"],) * 3),
+            calibration=_stated(values),
+            # each host states its own
+            clock_stddev_s=LEAST_CLOCK_S,
         )
     calibration = found or known.calibration
     if values["self_calibration"] and found is None:
-        calibration = Calibration.of(calibration.misalignment_deg, UNKNOWN_ARCSEC)
+        calibration = Calibration.of(calibration.misalignment_deg)
     clock, tilt = values["clock_stddev"], values["tilt_stddev"]
     errors = known.inclinometer
     return replace(
@@ -229,12 +246,9 @@ def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
 
 def atmosphere_of(values: Mapping) -> Atmosphere:
     """Make the Atmosphere from the parameters; what is not set keeps its default."""
-    pressure, temperature = (values[f"refraction.{name}"] for name in ("pressure", "temperature"))
-    return Atmosphere.measured(
-        None if math.isnan(pressure) else pressure,
-        None if math.isnan(temperature) else temperature,
-        values["refraction.humidity"],
-    )
+    names = ("pressure", "temperature", "humidity", "wavelength")
+    set_to = [values[f"refraction.{name}"] for name in names]
+    return Atmosphere.measured(*(None if math.isnan(value) else value for value in set_to))
 
 
 def geoid_file(name: str) -> Geoid | None:

@@ -65,6 +65,7 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
         heading=heading_of(link),
         link_to_enu=link,
         terms=terms,
+        levelling=np.vstack([np.eye(2) * 6.371e6, np.zeros((4, 2))]),
         used=np.arange(3),
         residual_px=np.zeros((3, 2)),
         residual_arcsec=0.2,

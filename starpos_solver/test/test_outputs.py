@@ -32,6 +32,7 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
         heading=heading_of(link),
         link_to_enu=link,
         terms=(ErrorTerm("all", factor),),
+        levelling=np.vstack([np.eye(2) * 6.371e6, np.zeros((4, 2))]),
         used=np.arange(3),
         residual_px=np.zeros((3, 2)),
         residual_arcsec=0.2,

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.scatter import Scatter
-from starpos.calibration.plumb_line import UNKNOWN_ARCSEC, PlumbLine, hang, settled, typical
+from starpos.calibration.plumb_line import PlumbLine, hang, settled, typical
 from starpos.calibration.readings import FixedFrame, Readings
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
@@ -18,7 +18,7 @@ from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt, up_of
-from starpos.instrument.instrument import MOST_C, Calibration, Instrument
+from starpos.instrument.instrument import MOST_C, UNKNOWN_ARCSEC, Calibration, Instrument
 from starpos.instrument.response import angles_at, stated_variances
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
@@ -110,7 +110,7 @@ def calibrate(
 
     Raises FixError if the frames do not agree.
     """
-    unknown = Calibration.of(solver.instrument.calibration.misalignment_deg, UNKNOWN_ARCSEC)
+    unknown = Calibration.of(solver.instrument.calibration.misalignment_deg)
     errors = solver.instrument.inclinometer
     solver = _with(solver, unknown, errors)
     solutions: list[Solution] = []
@@ -170,7 +170,7 @@ class _Agreement:
     def check(self) -> None:
         """Raise FixError if the frames are not of one zenith."""
         of = len(self.sound) + len(self.left_out)
-        why = "the instrument was moved between them, its inclinometer or clock was disturbed, or the place given is wrong"
+        why = "the instrument was moved, its inclinometer or clock was disturbed, or the place given is wrong"
         if len(self.left_out) > MOST_OUTLIERS * of:
             raise FixError(
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"

@@ -14,10 +14,9 @@ from starpos import rotation
 from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.calibration.readings import KNOWN, Readings
 from starpos.errors import FixError
+from starpos.instrument.instrument import UNKNOWN_ARCSEC
 from starpos.units import ARCSEC
 
-# sigma of A3 about S's axes before anything is known of it
-UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)
 # a frame further off than this pulls no harder
 ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10
 TURNS_TRIED = 8

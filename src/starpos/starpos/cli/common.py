@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file
+from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 from starpos.instrument.camera import Camera
 
 # sigma of a deflection that is given by hand without one
@@ -96,6 +98,19 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         metavar=("RX", "RY", "RZ"),
         help="A3 in deg: camera to inclinometer",
     )
+    parser.add_argument(
+        "--misalignment-stddev",
+        type=number(0, 360_000),
+        metavar="ARCSEC",
+        help="error of A3 about each axis; without it A3 is not known (10 deg, 1100 km)",
+    )
+    parser.add_argument(
+        "--clock-stddev",
+        type=number(0, 86400),
+        metavar="S",
+        help=f"error of the clock that stamped the frames (that of the instrument file, else {UNKNOWN_CLOCK_S:g}; 1 s is "
+        "464 m at the equator)",
+    )
 
 
 def add_turn(parser: argparse.ArgumentParser) -> None:
@@ -154,7 +169,10 @@ def add_air(parser: argparse.ArgumentParser) -> None:
         "--pressure-hpa", type=float, metavar="HPA", help="air pressure at the instrument, not reduced"
     )
     parser.add_argument("--temperature-c", type=float, metavar="C", help="air temperature")
-    parser.add_argument("--humidity", type=float, default=0.3, metavar="0..1", help="relative humidity (0.3)")
+    parser.add_argument("--humidity", type=float, metavar="0..1", help="relative humidity")
+    parser.add_argument(
+        "--wavelength-um", type=float, metavar="UM", help="middle of the light that the camera sees (0.55)"
+    )
 
 
 def add_vertical(parser: argparse.ArgumentParser) -> None:
@@ -203,7 +221,7 @@ def number(low: float, high: float, kind: type[int] | type[float] = float) -> Ca
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
     """The air from the options, as far as they give it."""
     pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100
-    return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity)
+    return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity, args.wavelength_um)
 
 
 def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> instrument.Instrument:
@@ -213,13 +231,16 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
     """
     path = getattr(args, "instrument", None)
     misalignment = getattr(args, "misalignment", None)
-    flat = args.focal_mm is not None or args.pixel_um is not None or misalignment is not None
+    stddev = getattr(args, "misalignment_stddev", None)
+    flat = (args.focal_mm, args.pixel_um, misalignment, stddev) != (None,) * 4
+    if stddev is not None and misalignment is None:
+        raise InstrumentError("--misalignment-stddev is the error of --misalignment: give both")
     if path is not None:
         if flat:
             raise InstrumentError(
                 "--instrument holds focal length and misalignment: give either it or the options"
             )
-        return instrument_file.read(path)
+        return _with_clock(instrument_file.read(path), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
     if args.focal_mm is not None:
@@ -230,8 +251,19 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
         raise InstrumentError(
             "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
         )
-    rx, ry, rz = misalignment or (0.0, 0.0, 0.0)
-    return instrument.Instrument(focal_px, calibration=instrument.Calibration(misalignment_deg=(rx, ry, rz)))
+    known = () if stddev is None else ((stddev,) * 3,)
+    return _with_clock(
+        instrument.Instrument(
+            focal_px, calibration=instrument.Calibration.of(misalignment or (0.0, 0.0, 0.0), *known)
+        ),
+        args,
+    )
+
+
+def _with_clock(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:
+    """The instrument with the error of its clock from --clock-stddev, if that is given."""
+    stddev = getattr(args, "clock_stddev", None)
+    return known if stddev is None else replace(known, clock_stddev_s=stddev)
 
 
 class HasFocalLength(Protocol):

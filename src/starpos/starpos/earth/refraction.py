@@ -4,7 +4,7 @@
 The paper puts aberration beside it; docs/the_paper.md#matrix-a2 says where that is instead.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import erfa
 import numpy as np
@@ -27,6 +27,8 @@ class Atmosphere:
     wavelength_um: float = 0.55
     pressure_stddev_pa: float = 200.0
     temperature_stddev_c: float = 2.0
+    humidity_stddev: float = 0.25
+    wavelength_stddev_um: float = 0.08
 
     def __post_init__(self) -> None:
         checks = (
@@ -43,17 +45,24 @@ class Atmosphere:
 
     @classmethod
     def measured(
-        cls, pressure_pa: float | None, temperature_c: float | None, humidity: float = 0.3
+        cls,
+        pressure_pa: float | None,
+        temperature_c: float | None,
+        humidity: float | None = None,
+        wavelength_um: float | None = None,
     ) -> "Atmosphere":
-        """The air as far as it was measured.
+        """The air as far as it was measured, and the middle of the light that the camera sees.
 
         An unknown pressure or temperature (None) becomes a middle value with a sigma that covers sea level to 3000 m, or
-        frost to summer.
+        frost to summer; an unknown humidity or wavelength one that covers dry to damp, or the filters of cameras.
         """
         return cls(
             pressure_pa=90_000.0 if pressure_pa is None else pressure_pa,
             temperature_c=10.0 if temperature_c is None else temperature_c,
-            humidity=humidity,
+            humidity=0.3 if humidity is None else humidity,
+            wavelength_um=0.55 if wavelength_um is None else wavelength_um,
+            humidity_stddev=0.25 if humidity is None else 0.05,
+            wavelength_stddev_um=0.08 if wavelength_um is None else 0.02,
             pressure_stddev_pa=9_000.0 if pressure_pa is None else 200.0,
             temperature_stddev_c=12.0 if temperature_c is None else 2.0,
         )
@@ -63,12 +72,17 @@ class Atmosphere:
         """Standard deviation of the refraction over the refraction, which is proportional to pressure / temperature."""
         if self.pressure_pa == 0:
             return 0.0
-        return float(
-            np.hypot(
-                self.pressure_stddev_pa / self.pressure_pa,
-                self.temperature_stddev_c / (self.temperature_c + 273.15),
-            )
+        here = self.refraction().a
+        # steps to the side where the model has values
+        drier = replace(self, humidity=abs(self.humidity - self.humidity_stddev)).refraction().a
+        redder = replace(self, wavelength_um=self.wavelength_um + self.wavelength_stddev_um).refraction().a
+        parts = (
+            self.pressure_stddev_pa / self.pressure_pa,
+            self.temperature_stddev_c / (self.temperature_c + 273.15),
+            drier / here - 1,
+            redder / here - 1,
         )
+        return float(np.linalg.norm(parts))
 
     def refraction(self, factor: float = 1.0) -> "Refraction":
         """The model, with its bending multiplied by `factor` (1, or a step for a derivative)."""

@@ -17,11 +17,13 @@ from starpos.utc import utc_text
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (docs/frames_and_symbols.md#frames)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-# 1 sigma about each axis of an A3 that is given without its error.
-UNSTATED_CALIBRATION_ARCSEC = 5.0
+# 1 sigma about S's axes of an A3 of which nobody has said how well it is known: 10 deg, and any turn about the plumb line
+UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)
 # An error of several turns means that nothing is known; no inclinometer is so hot.
 MOST_ARCSEC, MOST_C = 1e7, 200.0
 MOST_CLOCK_S = 86400.0
+# 1 sigma of a clock of which nobody has said anything, if it is kept by NTP
+UNKNOWN_CLOCK_S = 0.1
 MOST_RESPONSE = 0.5
 
 
@@ -41,7 +43,7 @@ class Calibration:
     """
 
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
-    covariance_arcsec2: tuple = tuple(map(tuple, np.eye(3) * UNSTATED_CALIBRATION_ARCSEC**2))
+    covariance_arcsec2: tuple = tuple(map(tuple, np.diag(UNKNOWN_ARCSEC) ** 2))
     utc_unix_s: float = float("nan")
     temperature_c: float = float("nan")
     tilt_deg: tuple[float, ...] = (0.0, 0.0)
@@ -102,15 +104,15 @@ class Calibration:
         ] > -1e-9 * np.trace(covariance)
         if max(abs(c) for c in self.response) > MOST_RESPONSE or not sound:
             raise InstrumentError(
-                f"the calibration's response is none: its coefficients are at most {MOST_RESPONSE:g}, their covariance is "
-                "symmetric and without negative variances"
+                f"the calibration's response is none: its coefficients are at most {MOST_RESPONSE:g}, their covariance "
+                "is symmetric and without negative variances"
             )
 
     @classmethod
     def of(
         cls,
         misalignment_deg: Sequence[float],
-        stddev_arcsec: Sequence[float] = (UNSTATED_CALIBRATION_ARCSEC,) * 3,
+        stddev_arcsec: Sequence[float] = UNKNOWN_ARCSEC,
     ) -> "Calibration":
         """Make a Calibration from three angles and the standard deviations (3,) about S's axes."""
         if len(stddev_arcsec) != 3:
@@ -151,6 +153,12 @@ class Calibration:
         slope = ((differences + 180) % 360 - 180).T / np.degrees(2 * step)
         return slope @ np.asarray(self.covariance_arcsec2) @ slope.T / 3600**2
 
+    @property
+    def unknown(self) -> bool:
+        """Whether nothing is known of how the inclinometer lies against the camera."""
+        variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
+        return bool(variances[1] >= (UNKNOWN_ARCSEC[0] / 2) ** 2)
+
     def check_age(self, utc_unix_s: float) -> None:
         """Raise InstrumentError if it is too old, or too new, for a frame of that time."""
         age_days = abs(utc_unix_s - self.utc_unix_s) / DAY_S
@@ -179,7 +187,7 @@ class Instrument:
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
     inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
-    clock_stddev_s: float = 0.01
+    clock_stddev_s: float = UNKNOWN_CLOCK_S
 
     def __post_init__(self) -> None:
         for name, numbers in (

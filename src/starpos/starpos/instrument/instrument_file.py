@@ -58,7 +58,7 @@ def read(path: Path | str) -> Instrument:
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
             or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path
-    misalignment_deg: [rx, ry, rz]
+    misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
     calibrated: {utc, temperature_c, tilt_deg, frames, valid_days, response, response_covariance}
@@ -72,7 +72,7 @@ def read(path: Path | str) -> Instrument:
     tilt_cross: 0                                        share of one axis' angle that the other shows
     tilt_pose_arcsec: 0                                  new at each pose: hysteresis, nonlinearity, flexure
     tilt_range_deg: 90
-    clock_stddev_s: 0.01
+    clock_stddev_s: 0.1
     """
     path = Path(path)
     content = yaml_file.load(path, "instrument file")

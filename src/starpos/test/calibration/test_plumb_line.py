@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.calibration.plumb_line import Readings, hang, level
-from starpos.instrument.inclinometer import a2_matrix
+from starpos.calibration.plumb_line import hang, level
+from starpos.calibration.readings import KNOWN, Readings
+from starpos.instrument.inclinometer import up_of
 from starpos.units import ARCSEC
 
 SCA100T, QUIET = 12.6 * ARCSEC, 0.1 * ARCSEC
@@ -30,7 +31,7 @@ def upright(rng) -> np.ndarray:
 def readings(rng, headings, noise=SCA100T, lean=0.0, wander=0.0, leans=None) -> tuple[Readings, Truth]:
     """Of an instrument turned to these headings (deg) about an axis that is `lean` deg off the zenith.
 
-    wander: deg C or so that the inclinometer's zero follows, 1 sigma of each is its `wandering`.  leans: of each frame
+    wander: 1 sigma of what the inclinometer's zero follows, like a temperature.  leans: of each frame
     (deg), by a tilted foot instead of a turn.
     """
     a3 = rotation.from_vector(rng.normal(size=3) * [0.05, 0.05, 2.0])
@@ -50,15 +51,26 @@ def readings(rng, headings, noise=SCA100T, lean=0.0, wander=0.0, leans=None) -> 
         to_camera.append(attitude)
         read.append(theta)
     read, n = np.array(read), len(headings)
-    shared = np.zeros((n, 3, 2))
+    # drift and temperature of either axis, and a response of five coefficients
+    shared = np.zeros((n, 3, 9))
     if wander:
         warm = np.linspace(-1, 1, n)
         read = read + np.outer(warm, rng.normal(0, wander, 2))
         for axis_of in range(2):
-            shared[:, axis_of, axis_of] = warm * wander
-    rows = np.array([a2_matrix(*theta)[2] for theta in read])
+            shared[:, axis_of, 2 + axis_of] = warm * wander
+    rows = up_of(read)
     given = rotation.from_vector(rng.normal(0, 0.05, 3) * [1, 1, 0] + [0, 0, rng.uniform(-3, 3)]) @ a3
-    made = Readings(np.array(to_camera), rows, np.radians(headings), np.full(n, noise), shared)
+    made = Readings(
+        utc_unix_s=60.0 * np.arange(n),
+        to_camera=np.array(to_camera),
+        plumb=rows,
+        heading=np.radians(headings),
+        sigma=np.full(n, noise),
+        pose=np.arange(n),
+        pose_sigma=0.0,
+        columns=shared,
+        column_sigma=np.repeat([1.0, KNOWN], [4, 5]),
+    )
     return made, Truth(a3, zenith, given)
 
 

@@ -12,7 +12,7 @@ from starpos.calibration.turning import turn
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.fix.solver import Solver, Status
 from starpos.frames.stars import no_stars
-from starpos.instrument.inclinometer import Tilt, a2_matrix
+from starpos.instrument.inclinometer import Tilt, up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.site import camera_to_enu
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
@@ -114,8 +114,8 @@ def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
     misalignment, zero = (1.5, -2.0, 130.0), (0.2, -0.1)
     answer, scene = turned(catalogue, rng, range(0, 360, 30), misalignment, zero)
     s = answer.solutions[-1].tilt  # what the inclinometer says, its zero off, and what is so
-    read = a2_matrix(s.theta_x, s.theta_y)[2]
-    true = a2_matrix(*(np.array([s.theta_x, s.theta_y]) - np.radians(zero)))[2]
+    read = s.up
+    true = up_of(s.theta - np.radians(zero))
     truth = (
         replace(scene.instrument, calibration=Calibration(misalignment_deg=misalignment)).mounting.a3.T @ true
     )

@@ -4,8 +4,18 @@ import warnings
 import numpy as np
 import pytest
 
-from starpos.errors import TiltError
-from starpos.instrument.inclinometer import Tilt, a2_matrix, sca100t_angle, sca100t_volts
+from starpos import rotation
+from starpos.errors import TiltError, TiltRangeError
+from starpos.instrument.inclinometer import (
+    InclinometerErrors,
+    Tilt,
+    level_of,
+    levelling_of,
+    sca100t_angle,
+    sca100t_volts,
+    up_of,
+    up_slope,
+)
 
 DEG = np.pi / 180
 NO_ERROR = np.zeros((2, 2))
@@ -15,19 +25,58 @@ def test_a2_turns_up_as_the_sensor_feels_it_into_z(rng):
     """The paper, section 4.2: a sensor whose axes rise by theta sees up at (sin theta_x, sin theta_y, rest)."""
     for _ in range(300):
         tx, ty = rng.uniform(-30, 30, 2) * DEG
-        a2 = a2_matrix(tx, ty)
+        up = np.array([np.sin(tx), np.sin(ty), np.sqrt(1 - np.sin(tx) ** 2 - np.sin(ty) ** 2)])
+        np.testing.assert_allclose(Tilt(tx, ty, NO_ERROR, utc_unix_s=0.0).up, up, atol=1e-15)
+        a2 = level_of(up)
         np.testing.assert_allclose(a2 @ a2.T, np.eye(3), atol=1e-15)
         assert np.linalg.det(a2) == pytest.approx(1)
-        up = np.array([np.sin(tx), np.sin(ty), np.sqrt(1 - np.sin(tx) ** 2 - np.sin(ty) ** 2)])
         np.testing.assert_allclose(a2[2], up, atol=1e-15)
         assert a2[1, 0] == 0  # R2 R1: X' stays above the X axis of L
 
 
-def test_a2_refuses_axes_that_cannot_be_at_right_angles():
-    with pytest.raises(TiltError, match="cannot hold together"):
-        a2_matrix(60 * DEG, 60 * DEG)
+def test_a_sensor_of_three_axes_leans_in_any_way(rng):
+    """Upside down and on its side too: the third row of A2 is up, and the slopes are those of differences."""
+    for up in [
+        *rotation.normalised(rng.normal(size=(200, 3))),
+        np.array([1.0, 0, 0]),
+        np.array([0, 0, -1.0]),
+    ]:
+        theta = np.arcsin(up)
+        tilt = Tilt(theta[0], theta[1], NO_ERROR, utc_unix_s=0.0, theta_z=theta[2])
+        np.testing.assert_allclose(tilt.up, up, atol=1e-12)
+        a2 = level_of(tilt.up)
+        np.testing.assert_allclose(a2 @ a2.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(a2) == pytest.approx(1)
+        np.testing.assert_allclose(a2[2], up, atol=1e-12)
+        for axis in np.flatnonzero(np.abs(theta) < 1.5):
+            step = np.eye(3)[axis] * 1e-6
+            change = (up_of(theta + step) - up_of(theta - step)) / 2e-6
+            np.testing.assert_allclose(tilt.slope[:, axis], change, atol=1e-8)
+
+
+def test_levelling_turns_the_level_as_the_errors_of_the_angles_do(rng):
+    for _ in range(50):
+        theta = rng.uniform(-0.6, 0.6, 2)
+        before, error = up_of(theta), rng.normal(0, 1e-6, 2)
+        turn = rotation.from_vector(levelling_of(before, up_slope(theta)) @ error)
+        up = level_of(before).T @ turn.T @ [0, 0, 1.0]
+        np.testing.assert_allclose(up, up_of(theta + error), atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "angles", [(60.0, 60.0), (np.nan, 0.0), (0.0, 91.0), (45.0, 45.0, 45.0), (0.0, 0.0, 0.0)]
+)
+def test_angles_that_no_gravity_makes_are_refused(angles):
+    x, y, *z = np.radians(angles)
     with pytest.raises(TiltError):
-        a2_matrix(np.nan, 0.0)
+        Tilt(x, y, NO_ERROR, utc_unix_s=0.0, theta_z=z[0] if z else np.nan)
+
+
+def test_a_tilt_beyond_the_sensors_range_is_refused():
+    tilt = Tilt(40 * DEG, 0.0, NO_ERROR, utc_unix_s=0.0)
+    InclinometerErrors().check_range(tilt)
+    with pytest.raises(TiltRangeError, match=r"beyond \+-30 deg"):
+        InclinometerErrors(range_rad=30 * DEG).check_range(tilt)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.frames.reading import read_frame
-from starpos.instrument.inclinometer import a2_matrix
+from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.tilt_log import read_tilt_csv
 from starpos.simulation.night_on_disk import write_night
 from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render
@@ -42,7 +42,7 @@ def test_tilt_is_what_turns_the_frame_level(rng):
             pointing_deg=(float(rng.uniform(0, 360)), float(rng.uniform(66, 90)), float(rng.uniform(0, 360))),
             misalignment_deg=tuple(rng.uniform(-3, 3, 3).tolist()),
         )
-        up = a2_matrix(*scene.tilt) @ scene.instrument.mounting.a3 @ scene.attitude[2]
+        up = level_of(up_of(scene.tilt)) @ scene.instrument.mounting.a3 @ scene.attitude[2]
         np.testing.assert_allclose(up, [0, 0, 1], atol=1e-14)
 
 
