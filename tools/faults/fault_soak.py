@@ -144,8 +144,9 @@ class Soak:
     def settle(self, image: bool = False) -> tuple[int, float]:
         """Send good frames until one gives a fix; return their number, 0 if none does, and the seconds."""
         begin = time.monotonic()
+        sent: list[tuple[int, int]] = []
         for n in range(1, PATIENCE + 1):
-            if self.world.good_image() if image else self.world.good():
+            if self.world.good_image(sent) if image else self.world.good(sent):
                 return n, time.monotonic() - begin
             self.watch()
         return 0, time.monotonic() - begin
