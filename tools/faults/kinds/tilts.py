@@ -4,7 +4,7 @@
 import math
 from copy import deepcopy
 
-from accelerated import CADENCE_S, World
+from accelerated import ANSWER_S, CADENCE_S, World
 
 from kinds.registry import HOSTILE, kind, shift, some_time
 from starpos_interfaces.msg import Tilt
@@ -59,8 +59,9 @@ def tilts_from_the_future(w: World):
 
 @kind(0.2)
 def tilts_of_a_clock_ahead(w: World):
-    """The inclinometer's clock is 2 to 10 s ahead, steadily, while the instrument is turned now and then."""
-    frames = int(w.rng.integers(3, 13))
+    """The inclinometer's clock is 4 to 10 s ahead, steadily, while the instrument is turned now and then."""
+    # further than a clock that ticks once a frame can be behind
+    frames = int(w.rng.integers(5, 13))
     for k in range(frames + 4):
         if k % 4 == 2:
             w.turn()
@@ -70,10 +71,9 @@ def tilts_of_a_clock_ahead(w: World):
         w.tick()
         for tilt in early:
             w.graph.tilt.publish(tilt)
-        w.spin(0.02)
         w.stars(shot)
-        # the frames that have tilts of another time at their own
-        w.spin(0.02 if k < frames else 0.3)
+        # the solver has read them before their time comes, also here, where a second takes 50 ms
+        w.graph.comes(lambda stamp=shot.stamp: stamp in w.graph.solutions, ANSWER_S)
 
 
 @kind(2)
