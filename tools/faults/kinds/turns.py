@@ -152,7 +152,7 @@ def second_inclinometer(w: World):
     w.graph.node.destroy_publisher(other)
 
 
-@kind(0.03)
+@kind(0.1)
 def second_inclinometer_killed(w: World):
     """A second inclinometer, a process of its own, is killed: DDS does not hear of its end for a while."""
     command = [sys.executable, str(STRANGER), *map(str, np.add(w.scene.tilt, OFF_RAD))]
