@@ -37,6 +37,8 @@ CADENCE_S, LATENCY_S = 0.8, 0.5
 # Shorter than the solver's default, so that a missing tilt costs less time.
 TILT_TIMEOUT_S = 0.2
 WRONG_SIGMA = 5.0
+# So long the answers to good frames that are still under way are waited for.
+LEFT_S = 5.0
 # If a good frame has no answer by then, a fault still has an effect.
 ANSWER_S = 1.0
 # An instrument far better than usual, so that small errors count: 15 m, where the paper's claims 190.
@@ -205,7 +207,11 @@ class World:
             return any(s.status == Solution.OK for t in sent for s in solutions.get(t, ()))
 
         self.graph.comes(lambda: fixed() or (stamp in fixes and stamp in solutions), ANSWER_S)
-        return fixed()
+        if not fixed():
+            return False
+        # what is still under way would come after the next fault, as if of the pose before it
+        self.graph.comes(lambda: all(t in solutions for t in sent), LEFT_S)
+        return True
 
     # answers ---------------------------------------------------------------------------------------------------------
 
