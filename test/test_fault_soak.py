@@ -16,7 +16,7 @@ FAULTS, SEED = 60, 20778
 
 @pytest.mark.timeout(5 * WAIT_S)
 def test_random_faults_make_no_wrong_fix_and_no_crash():
-    command = [sys.executable, str(TOOL), "--faults", str(FAULTS), "--seed", str(SEED)]
+    command = [sys.executable, str(TOOL), "--faults", str(FAULTS), "--lanes", "1", "--seed", str(SEED)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as tool:
         try:
             out, _ = tool.communicate(timeout=4 * WAIT_S)

@@ -22,14 +22,18 @@ EARLY_S = 0.2
 LATE_S = 2.0
 # Samples that are read so late, and fast, come from a backlog.
 BACKLOG_S = 0.25
-# Shares of the usual spacing of samples: closer ones are read from a backlog, wider ones come late.
-SLOWEST_PACE, FASTEST_PACE = 0.5, 1.5
+# Samples that come closer than this share of their spacing are read from a backlog.
+FASTEST_PACE = 0.5
+# A new relation of the clocks is believed when it has held for so long, to BACKLOG_S: that of a backlog changes faster.
+HELD_S = 1.0
 # On a busy machine a line may be late by so much and still count as coming at its pace.
 JITTER_S = 0.05
-# It takes so long to see that the device's clock stood still.
-STANDING_S = 1.0
+# Lines come as they are sent again when so many in a row take this share of their usual time; a backlog comes faster.
+PACED, SLOWEST_BACKLOG = 4, 0.75
+# The time at which a line is due runs a little slow, so that it follows the earliest lines.
+DUE_CREEP = 1.05
 MAX_POINTS = 4096
-# The usual time between lines is the median of so many.
+# The usual time between lines is the mean of so many.
 USUAL_OF = 21
 
 
@@ -37,8 +41,8 @@ class ArrivalFilter:
     """Finds how late each sample arrived beyond the shortest recent delay, from the device's own milliseconds.
 
     After this process stood still it reads a backlog, whose samples keep the times at which they were taken. The time of
-    a sample is unknown in two cases: after the start or a reset, until samples come at their usual pace; and at a leap,
-    until it is clear whether a backlog follows or the device's clock stood still.
+    a sample is unknown in two cases: after the start or a reset, until the clocks have kept one relation for HELD_S; and
+    at a leap, until it is clear whether a backlog follows or the device's clock stood still.
     """
 
     def __init__(self) -> None:
@@ -50,12 +54,12 @@ class ArrivalFilter:
         self._time = 0.0
         self._level = self._slope = 0.0
         self._next_fit = 0.0
-        # Whether a sample has come at its pace since the start.
+        # Whether the relation of the clocks is known.
         self._live = False
         # Whether the present samples are read from a backlog.
         self._backlog = False
-        # Time and arrival of the first sample that was too late.
-        self._leap: tuple[float, float] | None = None
+        # Time and offset of the first sample of a relation that is not believed yet.
+        self._new: tuple[float, float] | None = None
 
     @property
     def rate_ppm(self) -> float:
@@ -82,16 +86,18 @@ class ArrivalFilter:
         if late < -EARLY_S and self._live:
             self._start(milliseconds, arrival_s)
             return None
-        catching_up = apart_s < SLOWEST_PACE * elapsed * 1e-3
+        catching_up = apart_s < FASTEST_PACE * elapsed * 1e-3
         self._last_ms, self._last_arrival_s, self._time = milliseconds, arrival_s, time
         if not self._live:
-            self._level = min(self._level, offset)
-            self._live = not catching_up and apart_s <= FASTEST_PACE * elapsed * 1e-3 + JITTER_S
+            self._live = self._has_held(offset)
             self._keep(time, offset)
+            self._level = min(o for _, o in self._points)
             return max(offset - self._level, 0.0) if self._live else None
-        if late > LATE_S:
-            return self._too_late(late, arrival_s, catching_up)
-        self._leap = None
+        # Before the rates of the clocks are known, lateness may come from them.
+        rates_known = self._points[-1][0] - self._points[0][0] >= MIN_SPAN_S
+        if late > (BACKLOG_S if rates_known else LATE_S):
+            return self._too_late(late, offset, arrival_s, catching_up)
+        self._new = None
         # The samples of a backlog do not show the delay of the line, and would replace those that do.
         self._backlog = catching_up and (self._backlog or late > BACKLOG_S)
         if self._backlog:
@@ -105,17 +111,22 @@ class ArrivalFilter:
             self._level += late
         return max(late, 0.0)
 
-    def _too_late(self, late: float, arrival_s: float, catching_up: bool) -> float | None:
-        """Delay of a sample that is later than a line can be: a backlog is read, or the device's clock stood still."""
+    def _too_late(self, late: float, offset: float, arrival_s: float, catching_up: bool) -> float | None:
+        """Delay of a sample that is very late: this process stood still, or the device's clock did."""
         self._backlog = True
-        if self._leap is None:
-            self._leap = self._time, arrival_s
-        since = self._time - self._leap[0]
-        if since >= STANDING_S and arrival_s - self._leap[1] >= SLOWEST_PACE * since:
+        if self._has_held(offset):
             self._start(self._last_ms, arrival_s)
             self._live = True
             return 0.0
-        return late if catching_up else None
+        return late if catching_up or late <= LATE_S else None
+
+    def _has_held(self, offset: float) -> bool:
+        """Whether the offset of the clocks has been about this one for HELD_S; forgets the points of another one."""
+        if self._new is None or abs(offset - self._new[1]) > BACKLOG_S:
+            self._new = self._time, offset
+            if not self._live:
+                self._points.clear()
+        return self._time - self._new[0] >= HELD_S
 
     def _keep(self, time: float, offset: float) -> None:
         self._points.append((time, offset))
@@ -129,7 +140,7 @@ class ArrivalFilter:
         self._points.clear()
         self._points.append((0.0, arrival_s))
         self._next_fit = REFIT_S
-        self._live, self._backlog, self._leap = False, False, None
+        self._live, self._backlog, self._new = False, False, (0.0, arrival_s)
 
     def _fit(self) -> None:
         points = self._points
@@ -149,21 +160,36 @@ class PaceWatch:
     def __init__(self) -> None:
         self._spacings: deque[float] = deque(maxlen=USUAL_OF)
         self._last_s: float | None = None
-        self._doubtful = False
+        # When the present line was to come at the latest.
+        self._due_s = 0.0
+        # The spacings since the last silence, while it is not clear whether a backlog is read.
+        self._doubtful: deque[float] | None = None
 
     def on_time(self, arrival_s: float) -> bool:
         """Whether this line was sent about when it arrived, judged by the pace of the lines."""
         if self._last_s is None:
-            self._last_s = arrival_s
+            self._last_s = self._due_s = arrival_s
             return True
         apart_s, self._last_s = arrival_s - self._last_s, arrival_s
-        usual_s = sorted(self._spacings)[len(self._spacings) // 2] if self._spacings else apart_s
-        silence = apart_s > 2 * usual_s + JITTER_S
-        if not silence and not self._doubtful:
-            self._spacings.append(apart_s)
-        # The line after a silence may be the first of a backlog; lines that follow too fast belong to it.
-        self._doubtful = silence or (self._doubtful and apart_s < SLOWEST_PACE * usual_s)
-        return not self._doubtful
+        usual_s = sum(self._spacings) / len(self._spacings) if self._spacings else apart_s
+        self._due_s = min(arrival_s, self._due_s + DUE_CREEP * usual_s)
+        if self._doubtful is None:
+            if arrival_s - self._due_s <= usual_s + JITTER_S:
+                self._spacings.append(apart_s)
+                return True
+            self._doubtful = deque(maxlen=PACED)
+            return False
+        self._doubtful.append(apart_s)
+        if usual_s and apart_s > 2 * usual_s + JITTER_S:
+            # Another silence.
+            self._doubtful.clear()
+        # A single pause in the reading of a backlog does not count for all of them.
+        took_s = sum(min(spacing, 2 * usual_s or spacing) for spacing in self._doubtful)
+        if len(self._doubtful) < PACED or took_s <= SLOWEST_BACKLOG * PACED * usual_s:
+            return False
+        self._spacings.extend(self._doubtful)
+        self._doubtful, self._due_s = None, arrival_s
+        return True
 
 
 def _lower_hull(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:

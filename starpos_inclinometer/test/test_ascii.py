@@ -15,7 +15,7 @@ from starpos_inclinometer.emulator import Pty
 from starpos_inclinometer.host_clock import HostClock, Moment
 from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
-from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Phase
+from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Phase
 from starpos_inclinometer.sources.source import Surroundings
 from starpos_testing.patience import WAIT_S
 
@@ -271,7 +271,7 @@ def test_a_meter_that_talks(meter):
     got, health = readings(path, 300, **{"ascii.period": 0.02})
     assert health.phase is Phase.RECEIVING and health.counts.malformed <= 1
     assert np.degrees([(r.x, r.y) for r in got]).mean(0) == pytest.approx([3, -11], abs=0.001)
-    assert {r.flags for r in got} == {0}
+    assert {r.flags & ~TIME_UNKNOWN for r in got} == {0}
     assert np.degrees(np.sqrt(got[-1].covariance[::3])) == pytest.approx([0.002] * 2, rel=0.4)
     assert np.diff([r.sequence for r in got]).tolist() == [1] * (len(got) - 1)
     stamps = np.array([r.stamp_ns for r in got]) * 1e-9
@@ -305,7 +305,8 @@ def test_a_device_clock_takes_the_jitter_out(meter):
 def test_stuck_and_steep_and_reopened(meter):
     device = meter(lambda k: b"%d,2\n" % (45 if k > 60 else 1))
     got, _ = readings(device.path, 100, **{"ascii.stuck_samples": 20, "ascii.resolution": 0.01})
-    flags = [r.flags for r in got]
+    # on a busy machine lines may come after a silence
+    flags = [r.flags & ~TIME_UNKNOWN for r in got]
     assert flags[:19] == [0] * 19 and set(flags[19:50]) == {STUCK}
     assert flags[90] == STUCK | OUT_OF_RANGE
     assert not any(f & GAP for f in flags)

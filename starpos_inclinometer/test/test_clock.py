@@ -29,7 +29,7 @@ def test_jitter_is_filtered_whatever_the_drift(drift_ppm):
     true, ms, arrivals = jittery(np.random.default_rng(3), 3000, drift_ppm=drift_ppm)
     estimate, clock = stamps(ms, arrivals)
     error = (estimate - true)[600:]
-    assert np.isnan(estimate).sum() < 5
+    assert np.isnan(estimate).sum() < 40
     assert np.abs(error).max() < 0.005
     assert np.abs(arrivals - true - LATENCY_S)[600:].max() > 0.2
     assert clock.restarts == 0
@@ -50,7 +50,7 @@ def test_a_reset_starts_anew():
     clock = stamps(ms, arrivals)[1]
     estimate, clock = stamps(ms, arrivals + 61.5, clock)
     assert clock.restarts == 1
-    assert np.isnan(estimate[0]) and np.isnan(estimate).sum() < 5
+    assert np.isnan(estimate[:10]).all() and np.isnan(estimate).sum() < 40
     assert np.abs(estimate - true - 61.5)[50:].max() < 0.006
 
 
@@ -76,17 +76,43 @@ def test_a_backlog_keeps_the_times_it_was_sampled_at(stall_s, rate_hz):
     error = np.abs(estimate - true)
     assert clock.restarts == 0
     assert np.nanmax(error[int(10 * rate_hz) :]) < (0.03 if stall_s < 30 else 0.1)
-    assert np.isnan(error).sum() < 5
+    assert np.isnan(error[int(10 * rate_hz) :]).sum() < 5
 
 
-def test_a_reset_within_a_stall_is_not_dated_before_samples_come_at_their_pace():
+def read_by_a_process_that_stands(true, stalls):
+    """When lines are read: all that are there, whenever the process runs; stalls: (begin, end) of each."""
+    read = true + LATENCY_S
+    for begin, end in stalls:
+        read[(read >= begin) & (read < end)] = end
+    return read
+
+
+STANDS_AGAIN = [(1020, 1024), (1024.01, 1028), (1028.02, 1031), (1031.3, 1035)]
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 50.0])
+def test_a_process_that_stands_again_while_it_reads_its_backlog_dates_it_rightly(rate_hz):
+    """Two seconds of backlog, read in two parts, looked like a device's clock that had stood still."""
+    true = 1000 + np.arange(int(60 * rate_hz)) / rate_hz
+    ms = np.round((true - 1000) * 1e3)
+    read = read_by_a_process_that_stands(true, STANDS_AGAIN)
+    # of the backlog one part is read before the process stands again, one after
+    part = (true > 1020) & (true < 1022)
+    read[part] = 1024.0
+    read[(true >= 1022) & (true < 1024)] = 1028.0
+    estimate, clock = stamps(ms, read)
+    assert clock.restarts == 0
+    assert np.nanmax(np.abs(estimate - true)[int(10 * rate_hz) :]) < 0.02
+
+
+def test_a_reset_within_a_stall_is_not_dated_before_the_clocks_have_kept_their_relation():
     clock = ArrivalFilter()
-    for i in range(100):
+    for i in range(150):
         clock.delay(100 * i, 10 + 0.1 * i)
     backlog = [clock.delay(100 * i, 30.0 + 1e-4 * i) for i in range(50)]  # booted at 25, read at 30
     assert backlog == [None] * 50
-    live = [clock.delay(5000 + 100 * i, 30.1 + 0.1 * i) for i in range(5)]
-    assert live == pytest.approx([0.0] * 5, abs=0.01)
+    live = [clock.delay(5000 + 100 * i, 30.1 + 0.1 * i) for i in range(20)]
+    assert None in live[:10] and live[11:] == pytest.approx([0.0] * 9, abs=0.01)
 
 
 def test_lines_without_a_clock_are_not_dated_after_a_silence_until_they_come_at_their_pace():
@@ -94,8 +120,28 @@ def test_lines_without_a_clock_are_not_dated_after_a_silence_until_they_come_at_
     assert all(watch.on_time(10 + 0.1 * i) for i in range(50))
     backlog = [watch.on_time(18.0 + 1e-4 * i) for i in range(31)]
     assert backlog == [False] * 31
-    assert all(watch.on_time(18.1 + 0.1 * i) for i in range(20))
-    assert [watch.on_time(t) for t in (25.0, 25.1, 25.2)] == [False, True, True]
+    live = [watch.on_time(18.1 + 0.1 * i) for i in range(20)]
+    assert live[3:] == [True] * 17
+    assert [watch.on_time(25.0 + 0.1 * i) for i in range(6)] == [False] * 4 + [True] * 2
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+def test_lines_without_a_clock_are_not_dated_by_a_process_that_stands_again_or_reads_slowly(rate_hz):
+    true = 1000 + np.arange(int(60 * rate_hz)) / rate_hz
+    read = read_by_a_process_that_stands(true, STANDS_AGAIN)
+    # a pause between two reads of one backlog, about as long as from line to line
+    read[(true > 1033) & (read == 1035)] += 0.9 / rate_hz
+    watch = PaceWatch()
+    told = np.array([watch.on_time(t) for t in np.maximum.accumulate(read)])
+    assert (read - true - LATENCY_S)[told].max() < 2 / rate_hz
+    assert told[true < 1019.9].all() and told[true > 1037].all()
+
+
+def test_lines_that_come_in_bursts_do_not_make_a_backlog_look_like_lines_on_time():
+    watch = PaceWatch()
+    for t in np.repeat(np.arange(0, 6, 0.06), 3):
+        watch.on_time(t)
+    assert not any(watch.on_time(12.0 + 1e-4 * i) for i in range(300))
 
 
 def test_slow_and_uneven_lines_are_on_time():

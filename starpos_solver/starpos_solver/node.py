@@ -25,7 +25,6 @@ from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
 from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.sky import catalogue
-from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.job import JobRunner, Outcome
 from starpos_common.paths import path_of
@@ -37,6 +36,7 @@ from starpos_solver.calibrating import Calibrating
 from starpos_solver.clock_doubt import ClockDoubt
 from starpos_solver.inputs import Inputs
 from starpos_solver.memory import Seen
+from starpos_solver.node_time import NodeTime
 from starpos_solver.publishing import SolutionPublishers
 from starpos_solver.settings import SolverSettings
 from starpos_solver.tilts import TiltBuffer
@@ -45,12 +45,7 @@ from starpos_solver.tilts import TiltBuffer
 WAITING = 4
 POLL_S = 0.02
 TILT_QUEUE = 1000
-PLAYED_LAG_S = 10.0
-# Times that differ by more are not of the same evening.
-ANOTHER_TIME_S = 3600.0
 J2000_UNIX_S = 946_728_000.0
-# A clock that goes back by so much was set.
-CLOCK_STEP_NS = 50_000_000
 # A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
 CLOCK_SIGMAS = 6.0
 
@@ -83,7 +78,7 @@ class SolverNode(Node):
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._was_ns = 0  # this node's clock when the last message came
+        self._time = NodeTime(self)
         self._tilts = TiltBuffer()
         self._waiting: deque[Waiting] = deque()
         self._solver: Solver | None = None
@@ -202,9 +197,21 @@ class SolverNode(Node):
         try:
             now_s = self._steady.now().nanoseconds * 1e-9
             self._tilts.heard(message, info.get("publication_sequence_number"), now_s)
-            ahead_s = self._ahead_s(stamp_to_unix(message.header.stamp))
-            # The instrument may lean otherwise when the time of its stamp comes.
-            if ahead_s > reports.AHEAD_S:
+            if self._time.played and self._ahead_s(message) > reports.AHEAD_S:
+                self._time.at_next_tick(lambda: self._add_tilt(message))
+                return
+        except StarposError as e:
+            self._inputs.refuse("tilt", str(e))
+            return
+        self._add_tilt(message)
+
+    def _ahead_s(self, message: msg.Tilt) -> float:
+        return self._time.ahead_s(stamp_to_unix(message.header.stamp))
+
+    def _add_tilt(self, message: msg.Tilt) -> None:
+        """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
+        try:
+            if (ahead_s := self._ahead_s(message)) > reports.AHEAD_S:
                 raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
             self._tilts.add(message, self._settings.tilt_stddev_rad)
             self._inputs.came("tilt")
@@ -231,7 +238,7 @@ class SolverNode(Node):
                 ),
             )
             return
-        ahead_s = self._ahead_s(stars.mid_unix_s)
+        ahead_s = self._time.ahead_s(stars.mid_unix_s)
         self._waiting.append(Waiting(message, stars, self._steady.now().nanoseconds, ahead_s))
         while len(self._waiting) > WAITING:
             self._waiting.popleft()
@@ -240,25 +247,9 @@ class SolverNode(Node):
 
     def _watch_clock(self) -> None:
         """Drop the tilts from the future if this node's clock was set back."""
-        now_ns = self.get_clock().now().nanoseconds
-        if now_ns < self._was_ns - CLOCK_STEP_NS:
-            self._tilts.forget_after(now_ns * 1e-9)
-        self._was_ns = now_ns
-
-    def _ahead_s(self, unix_s: float | None) -> float:
-        """How far a time is ahead of this node's clock (s); 0 if one of them is not known (no /clock yet).
-
-        It is also 0 if the two are not of the same evening: a night is played without /clock, or the robot does not
-        know the date.
-        """
-        now_ns = self.get_clock().now().nanoseconds
-        if unix_s is None or not now_ns:
-            return 0.0
-        ahead_s = unix_s - now_ns * 1e-9
-        if time_is_simulated(self):
-            # A clock that is played comes after the messages that it dates, on a busy machine by seconds.
-            return ahead_s - PLAYED_LAG_S
-        return 0.0 if ahead_s > ANOTHER_TIME_S else ahead_s
+        now_s = self._time.set_back_to()
+        if now_s is not None:
+            self._tilts.forget_after(now_s)
 
     # work ------------------------------------------------------------------------------------------------------------
 
@@ -266,11 +257,16 @@ class SolverNode(Node):
         """Solve the frames that have everything they need; poll only while a frame waits."""
         while self._waiting and self._ready(self._waiting[0]):
             self._take_arrived_tilts()
-            self._solve(self._waiting.popleft())
+            self._solve(self._dated(self._waiting.popleft()))
         if self._waiting and self._poll.is_canceled():
             self._poll.reset()
         elif not self._waiting and not self._poll.is_canceled():
             self._poll.cancel()
+
+    def _dated(self, frame: Waiting) -> Waiting:
+        """The frame with how far it is ahead of a clock that is played, which may have been heard only after it."""
+        ahead_s = self._time.ahead_s(frame.stars.mid_unix_s)
+        return replace(frame, ahead_s=min(ahead_s, frame.ahead_s)) if self._time.played else frame
 
     def _ready(self, frame: Waiting) -> bool:
         waited_s = (self._steady.now().nanoseconds - frame.since_ns) * 1e-9

@@ -37,6 +37,8 @@ CADENCE_S, LATENCY_S = 0.8, 0.5
 # Shorter than the solver's default, so that a missing tilt costs less time.
 TILT_TIMEOUT_S = 0.2
 WRONG_SIGMA = 5.0
+# So long the answers to good frames that are still under way are waited for.
+LEFT_S = 5.0
 # If a good frame has no answer by then, a fault still has an effect.
 ANSWER_S = 1.0
 # An instrument far better than usual, so that small errors count: 15 m, where the paper's claims 190.
@@ -183,21 +185,33 @@ class World:
         """Spin for a while, for things that nobody waits for."""
         self.graph.comes(lambda: False, seconds)
 
-    def good(self) -> bool:
-        """Send a good frame; return whether a fix answered it."""
+    def good(self, sent: list | None = None) -> bool:
+        """Send a good frame; return whether it is answered by a fix, or one of those already sent (their stamps)."""
         shot = self.shot()
         self.send(shot)
-        return self._is_fix(shot.stamp)
+        return self._is_fix(shot.stamp, sent)
 
-    def good_image(self) -> bool:
-        """Send a good frame through the detector; return whether a fix answered it."""
+    def good_image(self, sent: list | None = None) -> bool:
+        """Send a good frame through the detector; see `good`."""
         shot, image, capture = self.photograph()
         self.send_image(shot, image, capture)
-        return self._is_fix(shot.stamp)
+        return self._is_fix(shot.stamp, sent)
 
-    def _is_fix(self, stamp) -> bool:
-        self.graph.comes(lambda: stamp in self.graph.fixes and stamp in self.graph.solutions, ANSWER_S)
-        return any(s.status == Solution.OK for s in self.graph.solutions.get(stamp, ()))
+    def _is_fix(self, stamp, sent: list | None) -> bool:
+        # on a busy machine the answer to an image may come after the next image was sent, each time
+        sent = [] if sent is None else sent
+        sent.append(stamp)
+        solutions, fixes = self.graph.solutions, self.graph.fixes
+
+        def fixed():
+            return any(s.status == Solution.OK for t in sent for s in solutions.get(t, ()))
+
+        self.graph.comes(lambda: fixed() or (stamp in fixes and stamp in solutions), ANSWER_S)
+        if not fixed():
+            return False
+        # what is still under way would come after the next fault, as if of the pose before it
+        self.graph.comes(lambda: all(t in solutions for t in sent), LEFT_S)
+        return True
 
     # answers ---------------------------------------------------------------------------------------------------------
 

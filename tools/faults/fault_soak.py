@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thousands of random faults from all inputs into the installed nodes, and the outcome of each kind.
 
-    python tools/faults/fault_soak.py [--faults 10000] [--seed S]
+    python tools/faults/fault_soak.py [--faults 10000] [--lanes 3] [--seed S]
 
 A simulated instrument in accelerated time (/clock) sends star lists to the solver and small images to the detector;
-between the faults it turns and drives.  Every fix of every topic is held against where it truly was: one further off
+between the faults it turns and drives.  Nodes wait more than they compute, so several such instruments run at a time,
+each in a ROS domain of its own.  Every fix of every topic is held against where it truly was: one further off
 than 5 of its own sigmas is wrong.  Prints a table in Markdown.  Exit status 0 only with no wrong fix, no crash, no
 defect in a log, recovery after every fault, and memory that stays.
 """
 
 import argparse
 import math
+import multiprocessing
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -49,6 +52,43 @@ class Row:
     # Good frames until a fix, including the one with the fix.
     frames: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+
+
+@dataclass(kw_only=True)
+class Outcome:
+    """What came of the faults of one instrument, or of several; see `Row` and `accelerated.World`."""
+
+    rows: dict[str, Row] = field(default_factory=dict)
+    right: Counter = field(default_factory=Counter)
+    sigmas: dict[str, list[float]] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+    crashes: list[str] = field(default_factory=list)
+    stuck: list[str] = field(default_factory=list)
+    # Most memory (MB) of a node, early and late.
+    memory: list[tuple[str, float, float]] = field(default_factory=list)
+
+    @property
+    def injected(self) -> int:
+        return sum(row.injected for row in self.rows.values())
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing went wrong, and no node has grown."""
+        told = self.injected >= FEWEST_FOR_MEMORY
+        flat = not told or all(last - first < GROWN_MB for _, first, last in self.memory)
+        return flat and not (self.wrong or self.crashes or self.stuck)
+
+    def add(self, other: "Outcome"):
+        """Take in those of another instrument."""
+        for name, row in other.rows.items():
+            mine = self.rows.setdefault(name, Row(about=row.about))
+            for counted in ("injected", "statuses", "right", "wrong", "frames", "seconds"):
+                setattr(mine, counted, getattr(mine, counted) + getattr(row, counted))
+        for topic, of in other.sigmas.items():
+            self.sigmas.setdefault(topic, []).extend(of)
+        self.right += other.right
+        for kept in ("wrong", "crashes", "stuck", "memory"):
+            getattr(self, kept).extend(getattr(other, kept))
 
 
 class Soak:
@@ -104,8 +144,9 @@ class Soak:
     def settle(self, image: bool = False) -> tuple[int, float]:
         """Send good frames until one gives a fix; return their number, 0 if none does, and the seconds."""
         begin = time.monotonic()
+        sent: list[tuple[int, int]] = []
         for n in range(1, PATIENCE + 1):
-            if self.world.good_image() if image else self.world.good():
+            if self.world.good_image(sent) if image else self.world.good(sent):
                 return n, time.monotonic() - begin
             self.watch()
         return 0, time.monotonic() - begin
@@ -177,29 +218,51 @@ def _yaml(value) -> str:
     return {True: "true", False: "false"}[value] if isinstance(value, bool) else str(value)
 
 
-def run(faults: int, seed: int, folder: Path, restarts: int) -> tuple[Soak, dict[str, tuple[float, float]]]:
-    """Run the soak; return it, and the memory (MB) of each node early and late."""
+def run(faults: int, seed: int) -> Outcome:
+    """Inject so many faults into one instrument, in a ROS domain of its own."""
     from starpos_testing.processes import memory_mb
 
-    soak, sizes, begin = Soak(folder, seed), {}, time.monotonic()
-    try:
-        assert soak.settle()[0] and soak.settle(image=True)[0], "no fix before any fault"
-        soak.world.judge()
-        for k in range(faults - restarts):
-            soak.any_fault()
-            if k >= WARM * faults:
-                for name, node in soak.nodes.items():
-                    sizes.setdefault(name, []).append(memory_mb(node.process.pid))
-            if sys.stderr.isatty() or k % 500 == 0:
-                passed = time.monotonic() - begin
-                print(
-                    f"{k} faults, {passed:.0f} s, {len(soak.world.wrong)} wrong", file=sys.stderr, flush=True
-                )
-        for _ in range(restarts):
-            soak.restart()
-    finally:
-        soak.close()
-    return soak, {name: _halves(mb) for name, mb in sizes.items()}
+    restarts = max(4, faults // FAULTS_A_RESTART)
+    with own_domain(), tempfile.TemporaryDirectory() as folder:
+        soak, sizes, begin = Soak(Path(folder), seed), {}, time.monotonic()
+        world = soak.world
+        try:
+            assert soak.settle()[0] and soak.settle(image=True)[0], "no fix before any fault"
+            world.judge()
+            for k in range(faults - restarts):
+                soak.any_fault()
+                if k >= WARM * faults:
+                    for name, node in soak.nodes.items():
+                        sizes.setdefault(name, []).append(memory_mb(node.process.pid))
+                if k % 500 == 0:
+                    passed = time.monotonic() - begin
+                    print(
+                        f"seed {seed}: {k} faults, {passed:.0f} s, {len(world.wrong)} wrong",
+                        file=sys.stderr,
+                        flush=True,
+                    )
+            for _ in range(restarts):
+                soak.restart()
+        finally:
+            soak.close()
+    return Outcome(
+        rows=soak.rows,
+        right=world.right,
+        sigmas=world.sigmas,
+        wrong=world.wrong,
+        crashes=soak.crashes,
+        stuck=soak.stuck,
+        memory=[(f"{name} {seed}", *_halves(mb)) for name, mb in sizes.items()],
+    )
+
+
+def run_lanes(faults: int, seed: int, lanes: int) -> list[Outcome]:
+    """Share the faults among so many instruments at a time."""
+    if lanes == 1:
+        return [run(faults, seed)]
+    shares = [len(range(k, faults, lanes)) for k in range(lanes)]
+    with ProcessPoolExecutor(lanes, multiprocessing.get_context("spawn")) as pool:
+        return list(pool.map(run, shares, range(seed, seed + lanes)))
 
 
 def _halves(mb: list[float]) -> tuple[float, float]:
@@ -237,33 +300,35 @@ def main(arguments=None) -> int:
     parser.add_argument("--faults", type=int, default=10000)
     today = int(time.time() // 86400)
     parser.add_argument("--seed", type=int, default=today, help="default: of the day")
+    parser.add_argument("--lanes", type=int, default=3, help="instruments at a time")
     options = parser.parse_args(arguments)
-    begin = time.monotonic()
-    with own_domain(), tempfile.TemporaryDirectory() as folder:
-        restarts = max(4, options.faults // FAULTS_A_RESTART)
-        soak, memory = run(options.faults, options.seed, Path(folder), restarts)
-    return report(soak, memory, f"--faults {options.faults} --seed {options.seed}", time.monotonic() - begin)
+    begin, outcome = time.monotonic(), Outcome()
+    each = run_lanes(options.faults, options.seed, options.lanes)
+    for one in each:
+        outcome.add(one)
+    report(
+        outcome,
+        f"--faults {options.faults} --lanes {options.lanes} --seed {options.seed}",
+        time.monotonic() - begin,
+    )
+    return int(not all(one.good for one in each))
 
 
-def report(soak: Soak, memory: dict[str, tuple[float, float]], options: str, seconds: float) -> int:
-    """Print what happened; return the exit status."""
+def report(outcome: Outcome, options: str, seconds: float):
+    """Print what happened."""
     from kinds import UNTOLD
 
     print(f"`tools/faults/fault_soak.py {options}`:\n")
-    print(table(soak.rows))
-    injected = sum(row.injected for row in soak.rows.values())
-    right = ", ".join(f"{n} of {topic}" for topic, n in soak.world.right.items())
-    print(f"\n{injected} faults in {seconds / 60:.0f} min; right: {right}; wrong: {len(soak.world.wrong)}; "
-          f"crashes and defects: {len(soak.crashes)}; without recovery: {len(soak.stuck)}")  # fmt: skip
-    print(f"off by, in their own sigmas, rms and most: {_spread(soak.world.sigmas)}")
-    grown = [f"{name} {first:.0f} then {last:.0f} MB" for name, (first, last) in memory.items()]
+    print(table(outcome.rows))
+    right = ", ".join(f"{n} of {topic}" for topic, n in outcome.right.items())
+    print(f"\n{outcome.injected} faults in {seconds / 60:.0f} min; right: {right}; wrong: {len(outcome.wrong)}; "
+          f"crashes and defects: {len(outcome.crashes)}; without recovery: {len(outcome.stuck)}")  # fmt: skip
+    print(f"off by, in their own sigmas, rms and most: {_spread(outcome.sigmas)}")
+    grown = [f"{name} {first:.0f} then {last:.0f} MB" for name, first, last in outcome.memory]
     print(f"most memory in the first and in the last half: {'; '.join(grown)}")
     print(f"\n{UNTOLD}")
-    for line in (*soak.world.wrong, *soak.crashes, *soak.stuck):
+    for line in (*outcome.wrong, *outcome.crashes, *outcome.stuck):
         print(line, file=sys.stderr)
-    told = sum(row.injected for row in soak.rows.values()) >= FEWEST_FOR_MEMORY
-    flat = not told or all(last - first < GROWN_MB for first, last in memory.values())
-    return int(bool(soak.world.wrong or soak.crashes or soak.stuck or not flat))
 
 
 if __name__ == "__main__":

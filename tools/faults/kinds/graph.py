@@ -8,38 +8,26 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
-from kinds.registry import HOSTILE, INF, NAN, kind, shift
-from starpos_interfaces.msg import Tilt
+from kinds.registry import HOSTILE, INF, NAN, kind
 from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate, Solve
 
 
-@kind(1)
+@kind(0.7)
 def second_publisher(w: World):
-    """Another node publishes on stars (the same frames again), tilt (another inclinometer) or camera_info."""
+    """Another node publishes on stars (the same frames again) or camera_info."""
     node, shot = w.graph.node, w.shot()
-    topic = w.rng.choice(["stars", "tilt", "camera/camera_info"])
-    depth = QoSProfile(depth=100)
-    kind_of = {"stars": type(shot.stars), "tilt": Tilt, "camera/camera_info": CameraInfo}[topic]
-    other = node.create_publisher(kind_of, topic, depth)
+    topic = w.rng.choice(["stars", "camera/camera_info"])
+    kind_of = {"stars": type(shot.stars), "camera/camera_info": CameraInfo}[topic]
+    other = node.create_publisher(kind_of, topic, QoSProfile(depth=100))
     w.graph.comes(lambda: other.get_subscription_count() > 0, 1.0)
     for _ in range(3):
         shot = w.shot()
-        if topic == "tilt":
-            w.tick()
-            for tilt in shot.tilts:
-                w.graph.tilt.publish(tilt)
-                foreign = deepcopy(tilt)
-                shift([foreign], 0.05)
-                foreign.x += 0.1
-                other.publish(foreign)
-            w.stars(shot)
-        elif topic == "stars":
-            w.send(shot)
+        w.send(shot)
+        if topic == "stars":
             other.publish(shot.stars)
         else:
             foreign = deepcopy(shot.info)
             foreign.k[0] = foreign.k[4] = foreign.k[0] * w.rng.choice([0.9, 1.02, 1.1])
-            w.send(shot)
             other.publish(foreign)
         w.spin(0.03)
     node.destroy_publisher(other)

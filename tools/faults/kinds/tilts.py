@@ -2,8 +2,9 @@
 """Tilts that are late, missing or wrong."""
 
 import math
+from copy import deepcopy
 
-from accelerated import World
+from accelerated import ANSWER_S, CADENCE_S, World
 
 from kinds.registry import HOSTILE, kind, shift, some_time
 from starpos_interfaces.msg import Tilt
@@ -54,6 +55,25 @@ def tilts_from_the_future(w: World):
     # The tilts arrive before their time comes, also here, where a second takes 50 ms.
     w.spin(0.3)
     w.turn()
+
+
+@kind(0.2)
+def tilts_of_a_clock_ahead(w: World):
+    """The inclinometer's clock is 4 to 10 s ahead, steadily, while the instrument is turned now and then."""
+    # further than a clock that ticks once a frame can be behind
+    frames = int(w.rng.integers(5, 13))
+    for k in range(frames + 4):
+        if k % 4 == 2:
+            w.turn()
+        shot = w.shot()
+        early = deepcopy(shot.tilts)
+        shift(early, CADENCE_S * frames)
+        w.tick()
+        for tilt in early:
+            w.graph.tilt.publish(tilt)
+        w.stars(shot)
+        # the solver has read them before their time comes, also here, where a second takes 50 ms
+        w.graph.comes(lambda stamp=shot.stamp: stamp in w.graph.solutions, ANSWER_S)
 
 
 @kind(2)

@@ -94,19 +94,19 @@ def shot_of(scene: Scene, start: float, rng) -> SimulatedShot:
 
 
 def tilts_of(scene: Scene, start: float, rng) -> list[msg.Tilt]:
+    return tilts_at(scene, start + (np.arange(SAMPLES) + 0.5) * EXPOSURE_S / SAMPLES, rng)
+
+
+def tilts_at(scene: Scene, times_s, rng) -> list[msg.Tilt]:
+    """The inclinometer's readings at these times (Unix s), numbered from 0."""
     covariance = np.eye(2) * np.radians(NOISE_DEG) ** 2
     return [
         tilt_to_message(
-            Tilt(
-                *read_tilt(scene, 0.0, rng),
-                covariance,
-                utc_unix_s=start + (j + 0.5) * EXPOSURE_S / SAMPLES,
-                temperature_c=TEMPERATURE_C,
-            ),
+            Tilt(*read_tilt(scene, 0.0, rng), covariance, utc_unix_s=float(t), temperature_c=TEMPERATURE_C),
             "starpos_inclinometer_frame",
             j,
         )
-        for j in range(SAMPLES)
+        for j, t in enumerate(times_s)
     ]
 
 
