@@ -81,7 +81,7 @@ def _sigma(terms: Sequence[ErrorTerm]) -> float:
 class Claim:
     """What is remembered of the fixes of a place, and what they told when they were last looked at.
 
-    looked: number of fixes then.  frame_sigma (rad): of what a fix has beside its stated errors.
+    looked: number of fixes then.  frame_sigma (rad): of what a fix evidently has beside its stated errors.
     beyond (2, 2): covariance in m2 of east, north beyond what the filter states.
     """
 
@@ -107,7 +107,9 @@ class Claim:
         return replace(
             self,
             looked=self.fixes,
-            frame_sigma=float(np.sqrt(max(scatter.frame_sigma**2 - pose_sigma**2, 0.0))),
+            frame_sigma=float(np.sqrt(max(scatter.frame_sigma**2 - pose_sigma**2, 0.0)))
+            if scatter.evident
+            else 0.0,
             beyond=(vectors * np.maximum(values, 0.0)) @ vectors.T,
         )
 

@@ -15,8 +15,11 @@ from starpos.units import ARCSEC
 
 # sizes: from a share of a frame's own error to the most that any sensor has
 LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 18
-# times in which an error forgets itself; the first makes it noise
-FORGETS_S = (0.01, 15.0, 60.0, 240.0, 1000.0, 4000.0)
+# times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the whole
+# time cannot be told from a constant
+FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
+# the scatter is evident where it is so improbable that all is as stated
+EVIDENT = 0.25
 # sizes of the coefficients of the response, beside what is stated
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
@@ -65,11 +68,13 @@ class Scatter:
 
     pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
     of all that a frame has beside its own stated error.
+    evident: whether it is improbable that all is as stated.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated.
     """
 
     pose_sigma: float
     frame_sigma: float
+    evident: bool
     moved: np.ndarray
     covariance: np.ndarray
     stated: np.ndarray
@@ -130,6 +135,7 @@ def scatter_of(frames: Frames) -> Scatter:
     return Scatter(
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
+        evident=bool(weight[:number].sum() < EVIDENT),
         moved=mean,
         covariance=np.asarray(total),
         stated=answers[0][1],
@@ -143,19 +149,15 @@ def _pose_means(frames: Frames) -> np.ndarray:
 
 
 def _wandering(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]:
-    """Errors that wander about 0 and forget themselves in a time (Ornstein and Uhlenbeck), walk away from 0, or grow."""
+    """Errors that are noise, walk away from 0, grow, or wander and forget themselves in a time (Ornstein, Uhlenbeck)."""
     t = frames.utc_unix_s - frames.utc_unix_s.min()
     apart, longest = np.abs(t[:, None] - t), float(t.max())
-    kinds = []
+    kinds = [_kind(share, poses, np.eye(len(t)))]
     if longest:
-        walk, growth = np.minimum(t[:, None], t) / longest, np.outer(t, t) / longest**2
-        kinds = [_kind(share, poses, walk), _kind(share, poses, growth)]
-    for forgets_s in FORGETS_S:
-        # what hardly changes in the whole time cannot be told from a constant
-        if forgets_s > max(longest, FORGETS_S[0]):
-            break
-        kinds.append(_kind(share, poses, np.exp(-apart / forgets_s)))
-    return kinds
+        kinds.append(_kind(share, poses, np.minimum(t[:, None], t) / longest))
+        kinds.append(_kind(share, poses, np.outer(t, t) / longest**2))
+    alike = [np.exp(-apart / forgets_s) for forgets_s in FORGETS_S]
+    return kinds + [_kind(share, poses, a) for a in alike if a.mean() < MOST_ALIKE]
 
 
 def _kind(share: np.ndarray, poses: np.ndarray, covariance: np.ndarray) -> _Kind:
