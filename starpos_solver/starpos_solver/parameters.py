@@ -10,7 +10,7 @@ from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError
-from starpos.instrument import instrument, instrument_file, sensors
+from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos_common.parameters import FRAME_NAME, Parameter
