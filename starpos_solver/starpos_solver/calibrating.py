@@ -40,6 +40,7 @@ OF_AVERAGE = OF_CALIBRATION | {
     "refraction.temperature",
     "refraction.humidity",
     "clock_stddev",
+    "inclinometer.model",
     "tilt_stddev",
 }
 

@@ -10,7 +10,7 @@ from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError
-from starpos.instrument import instrument, instrument_file
+from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos_common.parameters import FRAME_NAME, Parameter
@@ -29,9 +29,9 @@ PARAMETERS = (
     Parameter(
         "calibration_url",
         "",
-        "Instrument file (YAML): misalignment and its error, mount, tilt noise, clock; '' uses the next two parameters. "
-        "A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km. One whose focal length "
-        "is 5 % from camera_info's is refused.",
+        "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock; '' uses the next three "
+        "parameters. A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km. One "
+        "whose focal length is 5 % from camera_info's is refused.",
     ),
     Parameter(
         "misalignment",
@@ -49,6 +49,12 @@ PARAMETERS = (
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,
+    ),
+    Parameter(
+        "inclinometer.model",
+        "",
+        f"Take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)}; used without "
+        "calibration_url, whose file names its own. '' for an SCA100T with a good converter, compensated and calibrated.",
     ),
     Parameter(
         "calibration_frames",
@@ -186,7 +192,7 @@ PARAMETERS = (
     Parameter(
         "tilt_stddev",
         NAN,
-        "Error of a tilt sample whose message states none; unset takes the instrument file's, or 0.0035.",
+        "Error of a tilt sample whose message states none; unset takes the instrument file's, or inclinometer.model's.",
         unit="deg",
         minimum=1e-7,
         maximum=10.0,
@@ -209,11 +215,14 @@ def instrument_of(
     replaces that of file and parameters; with self_calibration, and before there is a `found`, it counts as unknown.
     """
     if known is None:
+        model, errors = sensors.find(values["inclinometer.model"])
         known = Instrument(
             camera.fx,
             calibration=_stated(values),
             # each host states its own
             clock_stddev_s=LEAST_CLOCK_S,
+            inclinometer=errors,
+            inclinometer_model=model,
         )
     calibration = found or known.calibration
     if values["self_calibration"] and found is None:

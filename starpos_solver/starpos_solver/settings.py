@@ -10,8 +10,8 @@ from starpos.earth.geoid import Geoid
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
+from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.catalogue import Catalogue
 from starpos_common.parameters import declare
@@ -76,7 +76,10 @@ class SolverSettings:
         stated = math.radians(self.values["tilt_stddev"])
         if not math.isnan(stated):
             return stated
-        return self._known.inclinometer.noise_rad if self._known else SCA100T_NOISE_RAD
+        errors = (
+            self._known.inclinometer if self._known else sensors.find(self.values["inclinometer.model"])[1]
+        )
+        return errors.noise_rad
 
     def solver(self, camera: Camera, found: Calibration | None, catalogue: Catalogue) -> Solver:
         """Make a Solver for a camera, with the calibration from frames (`found`, or None).

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from starpos.errors import GeoidError, InstrumentError
+from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos_solver.parameters import (
     PARAMETERS,
@@ -39,6 +41,17 @@ def test_the_cameras_intrinsics_come_from_camera_info():
     assert instrument.camera is CAMERA
     sigma = np.sqrt(np.diag(instrument.mounting.calibration_covariance))
     assert sigma == pytest.approx(np.radians(7.0 / 3600))
+
+
+def test_a_named_inclinometer_has_its_sheets_errors_unless_a_file_states_them():
+    named = instrument_of(values(inclinometer__model="SCL3300"), CAMERA, None)
+    assert (named.inclinometer, named.inclinometer_model) == (sensors.SCL3300, "scl3300")
+    assert instrument_of(values(), CAMERA, None).inclinometer == InclinometerErrors()
+    known = Instrument(1000.0, inclinometer=InclinometerErrors(scale=0.01))
+    of_file = instrument_of(values(inclinometer__model="scl3300"), CAMERA, known)
+    assert (of_file.inclinometer, of_file.inclinometer_model) == (known.inclinometer, "")
+    with pytest.raises(InstrumentError, match="'x' is not known: the models are sca100t, scl3300"):
+        instrument_of(values(inclinometer__model="x"), CAMERA, None)
 
 
 def test_an_instrument_file_is_read_and_the_camera_replaced(tmp_path):

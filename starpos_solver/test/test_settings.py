@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The solver's parameters with the files they name, on a real node."""
 
+import math
+
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_solver.settings import SolverSettings
@@ -55,6 +57,17 @@ def test_a_file_is_read_again_when_it_is_set_again_and_a_broken_one_changes_noth
     path.unlink()
     result = change(node, calibration_url=str(path), min_stars=7)
     assert not result.successful and clock_s() == 0.25 and settings.values["min_stars"] == 6  # all or none
+
+
+def test_the_model_of_the_inclinometer_is_its_noise_until_one_is_stated(make):
+    node, settings, _ = make()
+    assert math.degrees(settings.tilt_stddev_rad) == pytest.approx(0.0035)
+    assert change(node, **{"inclinometer.model": "bmi088"}).successful
+    assert settings.tilt_stddev_rad == sensors.BMI088.noise_rad
+    result = change(node, **{"inclinometer.model": "bmi"})
+    assert not result.successful and "'bmi' is not known" in result.reason
+    assert change(node, tilt_stddev=0.01).successful
+    assert math.degrees(settings.tilt_stddev_rad) == pytest.approx(0.01)
 
 
 def test_a_file_of_another_camera_is_refused_when_it_is_set(make, tmp_path):

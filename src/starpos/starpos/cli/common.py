@@ -21,9 +21,9 @@ from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.instrument import instrument, instrument_file
-from starpos.instrument.instrument import UNKNOWN_CLOCK_S
+from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 
 # sigma of a deflection that is given by hand without one
 GIVEN_STDDEV_ARCSEC = 1.0
@@ -88,7 +88,7 @@ def add_optics(parser: argparse.ArgumentParser) -> None:
 def add_instrument(parser: argparse.ArgumentParser) -> None:
     """Add the options that `instrument_of` reads."""
     parser.add_argument(
-        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the three options below"
+        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the five options below"
     )
     add_optics(parser)
     parser.add_argument(
@@ -103,6 +103,12 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         type=number(0, 360_000),
         metavar="ARCSEC",
         help="error of A3 about each axis; without it A3 is not known (10 deg, 1100 km)",
+    )
+    parser.add_argument(
+        "--inclinometer",
+        metavar="MODEL",
+        help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
+        "(else those of an SCA100T with a good converter, compensated and calibrated)",
     )
     parser.add_argument(
         "--clock-stddev",
@@ -232,13 +238,14 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
     path = getattr(args, "instrument", None)
     misalignment = getattr(args, "misalignment", None)
     stddev = getattr(args, "misalignment_stddev", None)
-    flat = (args.focal_mm, args.pixel_um, misalignment, stddev) != (None,) * 4
+    model = getattr(args, "inclinometer", None)
+    flat = (args.focal_mm, args.pixel_um, misalignment, stddev, model) != (None,) * 5
     if stddev is not None and misalignment is None:
         raise InstrumentError("--misalignment-stddev is the error of --misalignment: give both")
     if path is not None:
         if flat:
             raise InstrumentError(
-                "--instrument holds focal length and misalignment: give either it or the options"
+                "--instrument holds focal length, misalignment and the inclinometer: give either it or the options"
             )
         return _with_clock(instrument_file.read(path), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
@@ -252,12 +259,14 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
             "no focal length: give --focal-mm and --pixel-um, or frames whose header has them"
         )
     known = () if stddev is None else ((stddev,) * 3,)
-    return _with_clock(
-        instrument.Instrument(
-            focal_px, calibration=instrument.Calibration.of(misalignment or (0.0, 0.0, 0.0), *known)
-        ),
-        args,
+    model, errors = sensors.find(model or "")
+    made = instrument.Instrument(
+        focal_px,
+        calibration=instrument.Calibration.of(misalignment or (0.0, 0.0, 0.0), *known),
+        inclinometer=errors,
+        inclinometer_model=model,
     )
+    return _with_clock(made, args)
 
 
 def _with_clock(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:

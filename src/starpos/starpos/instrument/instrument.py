@@ -173,12 +173,13 @@ class Calibration:
 class Instrument:
     """The instrument of the paper, or another one; InstrumentError for impossible values.
 
-    focal_px        focal length, px
-    camera          full intrinsics; None: an ideal camera of any size
-    calibration     A3 and its errors
-    link_to_camera  (3, 3): base link into C
-    inclinometer    its errors
-    clock_stddev_s  standard deviation of the clock against UTC, s
+    focal_px            focal length, px
+    camera              full intrinsics; None: an ideal camera of any size
+    calibration         A3 and its errors
+    link_to_camera      (3, 3): base link into C
+    inclinometer        its errors
+    inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
+    clock_stddev_s      standard deviation of the clock against UTC, s
     """
 
     focal_px: float
@@ -187,6 +188,7 @@ class Instrument:
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
     inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
+    inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import InstrumentError, TimeError
-from starpos.instrument import camera_file, yaml_file
+from starpos.instrument import camera_file, sensors, yaml_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
 from starpos.instrument.inclinometer import InclinometerErrors
@@ -47,6 +47,7 @@ KEYS = (
     "calibration_covariance_arcsec2",
     "calibrated",
     "link_to_camera",
+    "inclinometer",
     *INCLINOMETER,
     "clock_stddev_s",
 )
@@ -64,6 +65,7 @@ def read(path: Path | str) -> Instrument:
     calibrated: {utc, temperature_c, tilt_deg, frames, valid_days, response, response_covariance}
                                                          which `starpos calibrate` writes
     link_to_camera: [[..], [..], [..]]
+    inclinometer: {model: scl3300}                       fills the tilt_* keys that the file leaves out (sensors.py)
     tilt_noise_deg: 0.0035                               for one reading; the others are errors of zero and scale
     tilt_quantum_deg: 0.0005
     tilt_drift_arcsec_per_sqrt_hour: 2
@@ -113,6 +115,8 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
             content["calibrated"]["response"] = [float(r) for r in c.response]
             content["calibrated"]["response_covariance"] = np.asarray(c.response_covariance, float).tolist()
     content["link_to_camera"] = np.asarray(instrument.link_to_camera, float).tolist()
+    if instrument.inclinometer_model:
+        content["inclinometer"] = {"model": instrument.inclinometer_model}
     for key, (name, unit) in INCLINOMETER.items():
         content[key] = float(getattr(instrument.inclinometer, name) / unit)
     content["clock_stddev_s"] = float(instrument.clock_stddev_s)
@@ -126,10 +130,9 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
-    errors = {
-        name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content
-    }
-    instrument = replace(instrument, inclinometer=InclinometerErrors(**errors))
+    model, errors = _sensor(content)
+    given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
+    instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=model)
     if "clock_stddev_s" in content:
         instrument = replace(instrument, clock_stddev_s=_number(content, "clock_stddev_s"))
     return instrument
@@ -212,6 +215,15 @@ def _calibration(content: dict) -> Calibration:
     if isinstance(frames, bool) or not isinstance(frames, int) or not 0 <= frames < MOST_FRAMES:
         raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
+
+
+def _sensor(content: dict) -> tuple[str, InclinometerErrors]:
+    """Model of the inclinometer ('' without one) and the errors that this gives."""
+    about = content.get("inclinometer", {"model": ""})
+    if not isinstance(about, dict) or not isinstance(about.get("model"), str):
+        raise InstrumentError(f"inclinometer is {_short(about)}: give {{model: NAME}}")
+    _refuse_others(about, ("model",))
+    return sensors.find(about["model"])
 
 
 def _matrix(rows: object, key: str) -> tuple:
