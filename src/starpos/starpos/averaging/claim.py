@@ -19,7 +19,7 @@ from starpos.fix.fix import Fix
 # sigma of a place in rad before anything is known of it
 ANYWHERE_RAD = np.pi
 # so many remembered fixes are averaged two by two
-MOST_SEEN = 2 * MOST_ROWS
+MOST_REMEMBERED = 2 * MOST_ROWS
 # a fix more changes little where many are seen: the scatter is looked at again after so large a share more
 NEWS = 0.1
 
@@ -94,7 +94,9 @@ class Claim:
     def with_fix(self, seen: Remembered, east_north_m: np.ndarray) -> "Claim":
         """The claim with one more fix, after which the filter has the place at east_north_m (2,)."""
         kept = (*self.seen, seen)
-        more = replace(self, seen=_shortened(kept) if len(kept) > MOST_SEEN else kept, fixes=self.fixes + 1)
+        more = replace(
+            self, seen=_shortened(kept) if len(kept) > MOST_REMEMBERED else kept, fixes=self.fixes + 1
+        )
         return more if more.fixes < (1 + NEWS) * self.looked else more.looked_at(east_north_m)
 
     def looked_at(self, east_north_m: np.ndarray) -> "Claim":
@@ -152,4 +154,4 @@ def _shortened(seen: tuple[Remembered, ...]) -> tuple[Remembered, ...]:
             short[-1] = short[-1].with_next(s)
         else:
             short.append(s)
-    return tuple(short[-MOST_ROWS:] if len(short) > MOST_SEEN - MOST_ROWS // 2 else short)
+    return tuple(short[-MOST_ROWS:] if len(short) > MOST_REMEMBERED - MOST_ROWS // 2 else short)

@@ -15,8 +15,8 @@ from starpos.units import ARCSEC
 
 # sizes: from a share of a frame's own error to the most that any sensor has
 LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 18
-# times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the whole
-# time cannot be told from a constant
+# times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the
+# whole time cannot be told from a constant
 FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
 # the scatter is evident where it is so improbable that all is as stated
 EVIDENT = 0.25

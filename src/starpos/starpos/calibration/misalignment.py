@@ -293,7 +293,9 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     ).turned_to(plumb.a3)
     stated = np.diag(stated_variances(errors, axes))
     known, most = np.sqrt(np.diag(plumb.response_covariance)), np.sqrt(np.diag(stated))
-    if (np.abs(known - most) <= WORTH * np.maximum(known, most)).all():
+    # poses that scatter too much tell no response; they will be refused
+    told = (np.abs(known - most) > WORTH * np.maximum(known, most)).any()
+    if not told or agreement.scatter.pose_sigma > MOST_POSE_RAD:
         return found
     return replace(
         found,

@@ -12,7 +12,7 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.solver import Status
 from starpos.frames.stars import no_stars
-from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.inclinometer import EXACT
 from starpos.instrument.instrument import Calibration
 from starpos.units import DAY_S
 from starpos_testing.skies.scenes import START
@@ -50,11 +50,15 @@ def budget_m(f, name) -> np.ndarray:
     return np.sqrt(np.diag(term.covariance)[:2])
 
 
+# a few frames cannot exclude that they scatter more than they say
+WIDER = 1.3
+
+
 @pytest.mark.parametrize("frames", [1, 5])
 def test_one_lean_is_right_at_that_lean_and_wide_at_another(catalogue, rng, frames):
     shot = shots(catalogue, rng, [0.0] * frames)
     found = found_at(shot, catalogue)
-    assert found.plumb_stddev_arcsec == pytest.approx(NOISE_ARCSEC / np.sqrt(frames), rel=0.1)
+    assert 0.9 < found.plumb_stddev_arcsec / (NOISE_ARCSEC / np.sqrt(frames)) < WIDER
     assert np.sqrt(np.linalg.eigvalsh(found.instrument.calibration.covariance_arcsec2)[-1]) > 90 * 3600
     same, metres, sigmas = solved(shots(catalogue, rng, [0.0], start=START + 900), found, catalogue)
     assert sigmas < 4
@@ -81,7 +85,8 @@ def test_two_leans_tell_all_of_a3(catalogue, rng, given):
     assert chi2 < 25
     # 12.6 arcsec / sqrt(2) at both ends of 6 deg, of which one axis across tells the turn
     turn = np.sqrt(np.linalg.eigvalsh(found.instrument.calibration.covariance_arcsec2)[-1])
-    assert turn == pytest.approx(NOISE_ARCSEC / np.sin(np.radians(6)), rel=0.3)
+    # two leans cannot tell it from axes that are not square
+    assert 0.7 < turn / (NOISE_ARCSEC / np.sin(np.radians(6))) < 3
     elsewhere, metres, sigmas = solved(shots(catalogue, rng, [-3.0], start=START + 900), found, catalogue)
     assert sigmas < 4
     assert metres < 4 * sigma_m(elsewhere) < 4 * 1200
@@ -115,7 +120,7 @@ def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, off_deg, which):
         return
     assert np.all(moved < stddev(expected))
     assert found.frames == 9
-    assert stddev(found) == pytest.approx(stddev(expected), rel=0.25)
+    assert stddev(found) == pytest.approx(stddev(expected), rel=0.4)
 
 
 @pytest.mark.parametrize("bad", [[0], [0, 1], [1, 2, 3]])
@@ -137,7 +142,7 @@ def test_frames_that_scatter_more_than_they_say_claim_less(catalogue):
     for k in range(8):
         creeping.spoil(k, rng.normal(0, 24 / 3600))
     claims = [found_at(s, catalogue).plumb_stddev_arcsec for s in (calm, creeping)]
-    assert claims[0] == pytest.approx(NOISE_ARCSEC / np.sqrt(8), rel=0.1)
+    assert 0.9 < claims[0] / (NOISE_ARCSEC / np.sqrt(8)) < WIDER
     assert 2 < claims[1] / claims[0] < 4
 
 
@@ -171,7 +176,7 @@ def test_frames_without_a_fix_are_left_out(catalogue, rng):
 def test_a_site_that_is_not_known_well(catalogue, rng):
     shot = shots(catalogue, rng, [0.0] * 9)
     sharp, blunt = (found_at(shot, catalogue, site_stddev_arcsec=s).plumb_stddev_arcsec for s in (0.0, 30.0))
-    assert sharp == pytest.approx(NOISE_ARCSEC / 3, rel=0.1)
+    assert 0.9 < sharp / (NOISE_ARCSEC / 3) < WIDER
     assert blunt == pytest.approx(np.hypot(sharp, 30.0), rel=0.05)
 
 
@@ -239,8 +244,8 @@ def test_time_temperature_tilt_and_number_are_recorded(catalogue, rng):
     mids = list(shot.tilts)
     assert c.utc_unix_s == pytest.approx(np.mean(mids), abs=1e-6)
     assert c.temperature_c == pytest.approx(11.0)
-    tilts = np.degrees([[t.theta_x, t.theta_y] for t in shot.tilts.values()])
-    assert c.tilt_deg == pytest.approx(tilts.mean(0))
+    up = np.mean([t.up for t in shot.tilts.values()], axis=0)
+    assert c.tilt_deg == pytest.approx(np.degrees(np.arcsin(up / np.linalg.norm(up)))[:2])
     assert (c.frames, c.valid_days) == (2, VALID_DAYS)
     silent = shots(catalogue, rng)
     assert np.isnan(found_at(silent, catalogue).instrument.calibration.temperature_c)
@@ -268,7 +273,7 @@ def test_what_the_calibration_costs_elsewhere_and_later(catalogue, rng):
         assert budget_m(f, "tilt drift") == pytest.approx(drift, rel=0.05)
         assert budget_m(f, "tilt temperature") == pytest.approx(3.0 * abs(warmer) * arcsec_m, rel=0.05)
         scale = 1e-4 * abs(lean) * 3600 * arcsec_m
-        assert np.linalg.norm(budget_m(f, "tilt scale")) == pytest.approx(scale, rel=0.05, abs=flat)
+        assert np.linalg.norm(budget_m(f, "tilt response")) == pytest.approx(scale, rel=0.05, abs=flat)
         assert metres < 4 * sigma_m(f)
 
 
@@ -307,7 +312,7 @@ def test_a_steadier_inclinometer_is_taken_at_its_word(catalogue):
     """0.1 arcsec: A3 to a fraction of an arcsec, and true."""
     noise = 0.1 / 3600
     shot = shots(catalogue, np.random.default_rng(11), [0.0, 0.0, 4.0, 4.0], noise_deg=noise)
-    errors = InclinometerErrors(np.radians(noise), np.radians(noise) / 8, 0.0, 0.0, 0.0)
+    errors = replace(EXACT, noise_rad=np.radians(noise), quantum_rad=np.radians(noise) / 8)
     solver = shot.solver(catalogue)
     solver = replace(solver, instrument=replace(solver.instrument, inclinometer=errors, clock_stddev_s=0.0))
     found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site)

@@ -67,16 +67,16 @@ def test_scale_counts_from_the_tilt_it_was_calibrated_at(rng):
         azimuth=0.0, altitude=80.0, roll=0.0
     )  # leans to the north, about the camera's x axis alone
     fix = fixed(field, rng, errors)
-    east, north = sigma_m(fix, "tilt scale")
+    east, north = sigma_m(fix, "tilt response")
     assert north == pytest.approx(3.6 * ARCSEC_M[1], rel=0.01)
     assert east < 0.5
     at = field.tilt()
     assert (
-        sigma_m(fixed(field, rng, errors, calibrated_tilt=(at.theta_x, at.theta_y)), "tilt scale").max()
+        sigma_m(fixed(field, rng, errors, calibrated_tilt=(at.theta_x, at.theta_y)), "tilt response").max()
         < 1e-6
     )
     half = fixed(field, rng, errors, calibrated_tilt=(at.theta_x / 2, at.theta_y / 2))
-    assert sigma_m(half, "tilt scale")[1] == pytest.approx(1.8 * ARCSEC_M[1], rel=0.02)
+    assert sigma_m(half, "tilt response")[1] == pytest.approx(1.8 * ARCSEC_M[1], rel=0.02)
 
 
 @pytest.mark.parametrize("turn_deg", [0.1, 5.0, 60.0, 180.0])

@@ -202,6 +202,8 @@ def drawn(
         humidity=0.3,
         temperature_stddev_c=0.0,
         pressure_stddev_pa=refraction * field.air.pressure_pa,
+        humidity_stddev=0.0,
+        wavelength_stddev_um=0.0,
     )
     true_air = replace(air, pressure_pa=air.pressure_pa * (1 + rng.normal(0, refraction)))
     # the true mount is the told one and a little more about the inclinometer's axes
@@ -297,14 +299,14 @@ def test_the_budget_says_which_errors_are_common(rng):
     field = SkyField()
     xy, places = field.places(STATE, rng)
     common = {t.name: t.common for t in field.solve(xy, places, STATE).terms}
-    new = {"centroids", "tilt", "tilt quantisation"}
+    new = {"centroids", "tilt", "tilt quantisation", "tilt pose"}
     assert {name for name, is_common in common.items() if not is_common} == new
     assert set(common) - new == {
         "catalogue",
         "calibration",
         "tilt drift",
         "tilt temperature",
-        "tilt scale",
+        "tilt response",
         "refraction",
         "clock",
         "time stamp",

@@ -269,7 +269,9 @@ def test_tilt_out_of_range(night):
     def leaning(mid, exposure, spread):
         return Tilt(0.6, 0.0, np.eye(2), utc_unix_s=mid)
 
-    assert "30 deg" in refused(solver.solve(stars, leaning), Status.TILT_OUT_OF_RANGE)
+    errors = replace(solver.instrument.inclinometer, range_rad=np.radians(30))
+    upright = replace(solver, instrument=replace(solver.instrument, inclinometer=errors))
+    assert "30 deg" in refused(upright.solve(stars, leaning), Status.TILT_OUT_OF_RANGE)
 
 
 @pytest.mark.parametrize("utc", [0.0, 4e9, -1e12, 1e300])

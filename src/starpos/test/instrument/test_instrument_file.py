@@ -3,6 +3,7 @@
 
 import resource
 import warnings
+from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -219,9 +220,9 @@ REFUSED = {
     "valid for no time": (DATED % "valid_days: 0", "valid_days is 0.0: must be positive"),
     "valid for nobody knows how long": (DATED % "valid_days: .nan", "valid_days is nan"),
     "valid for words": (DATED % "valid_days: soon", "valid_days is 'soon': give a number"),
-    "three tilts": (DATED % "tilt_deg: [1, 2, 3]", "tilt_deg of a calibration two"),
+    "four tilts": (DATED % "tilt_deg: [1, 2, 3, 4]", "tilt_deg of a calibration two or three"),
     "one tilt": (DATED % "tilt_deg: 5", "tilt_deg is 5: give a list"),
-    "a tilt beyond range": (DATED % "tilt_deg: [80, 80]", "beyond 30 deg"),
+    "a tilt beyond range": (DATED % "tilt_deg: [80, 80]", "cannot be: give the elevations"),
     "as hot as a star": (DATED % "temperature_c: 6000", "temperature_c of the calibration is 6000"),
     "a drift back": (
         SIMPLE + "tilt_drift_arcsec_per_sqrt_hour: -1\n",
@@ -278,7 +279,8 @@ def random_instrument(rng, full: bool) -> Instrument:
         cy=rng.uniform(50, 4000),
         distortion=tuple(rng.normal(0, 0.1, 5).tolist()),
     )
-    errors = InclinometerErrors(*(10 ** rng.uniform(-8, -3, 5)).tolist())
+    names = [f.name for f in fields(InclinometerErrors)]
+    errors = InclinometerErrors(**dict(zip(names, (10 ** rng.uniform(-8, -3, 8)).tolist(), strict=True)))
     link = tuple(map(tuple, from_vector(rng.normal(size=3)).tolist()))
     clock = float(10 ** rng.uniform(-6, 1))
     return Instrument(
@@ -352,11 +354,11 @@ def test_times_as_people_and_yaml_write_them(utc, reads):
 def test_every_error_of_the_inclinometer_has_its_unit(reads):
     i = reads(
         SIMPLE + "tilt_noise_deg: 0.01\ntilt_quantum_deg: 0.02\ntilt_drift_arcsec_per_sqrt_hour: 3\n"
-        "tilt_temperature_arcsec_per_c: 4\ntilt_scale: 5e-4\n"
+        "tilt_temperature_arcsec_per_c: 4\ntilt_scale: 5e-4\ntilt_cross: 6e-3\ntilt_pose_arcsec: 7\ntilt_range_deg: 45\n"
     )
     arcsec = np.pi / 648000
     assert list(vars(i.inclinometer).values()) == pytest.approx(
-        [36 * arcsec, 72 * arcsec, 3 * arcsec, 4 * arcsec, 5e-4]
+        [36 * arcsec, 72 * arcsec, 3 * arcsec, 4 * arcsec, 5e-4, 6e-3, 7 * arcsec, np.pi / 4]
     )
 
 

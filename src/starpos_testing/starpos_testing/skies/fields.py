@@ -35,7 +35,13 @@ class SkyField:
     utc: float = UTC
     camera: Camera = PAPER
     air: Atmosphere = field(
-        default_factory=lambda: Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
+        default_factory=lambda: Atmosphere(
+            pressure_pa=88000.0,
+            temperature_c=12.0,
+            humidity=0.3,
+            humidity_stddev=0.0,
+            wavelength_stddev_um=0.0,
+        )
     )
 
     @property
