@@ -18,6 +18,8 @@ LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 18
 # times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the
 # whole time cannot be told from a constant
 FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
+# the response errs more than stated where that is so probable
+SHOWN = 0.75
 # the scatter is evident where it is so improbable that all is as stated
 EVIDENT = 0.25
 # sizes of the coefficients of the response, beside what is stated
@@ -126,6 +128,11 @@ def scatter_of(frames: Frames) -> Scatter:
             log_weights.append(evidence + np.log(prior[n] * share_of))
     weight = np.exp(np.array(log_weights) - max(log_weights))
     weight /= weight.sum()
+    # nobody's word against a sensor is enough to doubt its response: the frames have to show it
+    wider = np.arange(len(weight)) % number > 0
+    if weight[wider].sum() < SHOWN:
+        weight[wider] = 0.0
+        weight /= weight.sum()
     mean = weight @ np.array([moved for moved, _, _ in answers])
     total = sum(
         w * (spread + np.outer(moved - mean, moved - mean))

@@ -34,7 +34,9 @@ TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all, and so often are those left judged again
 OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # poses that scatter more than any inclinometer were moved, or are of several places
-MOST_POSE_RAD = np.radians(0.25)
+MOST_POSE_RAD = np.radians(0.15)
+# fewer poses tell no response of the inclinometer
+FEWEST_POSES = 3
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
 WORTH = 0.05
 
@@ -175,16 +177,17 @@ class _Agreement:
             raise FixError(
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
-        if max(self.scatter.pose_sigma, self.scatter_left) > MOST_POSE_RAD:
+        scatter = max(self.scatter.pose_sigma, self.scatter_left)
+        if scatter > MOST_POSE_RAD:
             raise FixError(
                 f"{of} frames do not agree on one zenith (they scatter by "
-                f"{np.degrees(max(self.scatter.pose_sigma, self.scatter_left)):.2f} deg): {why}"
+                f"{np.degrees(scatter):.2f} deg): {why}"
             )
 
     @property
     def scatter_left(self) -> float:
-        """Root mean square in rad of what the fit leaves of the frames, per axis."""
-        return float(np.sqrt(np.mean(self.plumb.left**2)))
+        """Root mean square in rad of what the fit leaves of the frames."""
+        return float(np.sqrt(np.mean(np.sum(self.plumb.left**2, 1))))
 
     def judged(self, solution: Solution) -> Solution:
         """The solution, without a fix if its frame disagrees."""
@@ -293,8 +296,9 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     ).turned_to(plumb.a3)
     stated = np.diag(stated_variances(errors, axes))
     known, most = np.sqrt(np.diag(plumb.response_covariance)), np.sqrt(np.diag(stated))
-    # poses that scatter too much tell no response; they will be refused
-    told = (np.abs(known - most) > WORTH * np.maximum(known, most)).any()
+    # few poses tell no response, nor do those that scatter so much that they will be refused
+    enough = agreement.readings.pose.max() + 1 >= FEWEST_POSES
+    told = enough and (np.abs(known - most) > WORTH * np.maximum(known, most)).any()
     if not told or agreement.scatter.pose_sigma > MOST_POSE_RAD:
         return found
     return replace(

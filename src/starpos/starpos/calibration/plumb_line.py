@@ -198,6 +198,8 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
     moved, covariance, at = scatter.moved, scatter.covariance, 5 + readings.response.start
     if not leans:
         covariance[2, 2] = linear.prior_sigma[2] ** 2
+    # as in the fit, without the turn about the plumb line
+    given_turn = covariance[3:5, 3:5] - np.outer(covariance[3:5, 2], covariance[3:5, 2]) / covariance[2, 2]
     a3 = rotation.from_vector(linear.turns @ moved[:3]) @ plumb.a3
     up = rotation.normalised(plumb.zenith + moved[3:5] @ linear.across)
     answer = replace(
@@ -205,7 +207,7 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
         a3=a3,
         covariance=_symmetric(linear.turns @ covariance[:3, :3] @ linear.turns.T),
         zenith=up,
-        zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[-1])),
+        zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(given_turn)[-1])),
         response=moved[at:],
         response_covariance=_symmetric(covariance[at:, at:]),
     )

@@ -89,7 +89,7 @@ def test_two_leans_tell_all_of_a3(catalogue, rng, given):
     assert 0.7 < turn / (NOISE_ARCSEC / np.sin(np.radians(6))) < 3
     elsewhere, metres, sigmas = solved(shots(catalogue, rng, [-3.0], start=START + 900), found, catalogue)
     assert sigmas < 4
-    assert metres < 4 * sigma_m(elsewhere) < 4 * 1200
+    assert metres < 4 * sigma_m(elsewhere) < 4 * 1800
 
 
 @pytest.mark.montecarlo
@@ -129,7 +129,7 @@ def test_frames_that_do_not_agree(catalogue, rng, bad):
     shot = shots(catalogue, rng, [0.0] * max(2, 2 * len(bad)))
     for k in bad:
         shot.spoil(k, 0.2 * (k + 1))
-    with pytest.raises(FixError, match=r"frames do not agree on one zenith .* moved between them") as e:
+    with pytest.raises(FixError, match=r"frames do not agree on one zenith .* was moved") as e:
         found_at(shot, catalogue)
     assert "\n" not in str(e.value)
 
