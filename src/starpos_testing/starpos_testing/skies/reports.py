@@ -10,6 +10,8 @@ import numpy as np
 from starpos.cli import main
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# with an A3 that is known, as `starpos solve` and `starpos report` want it
+KNOWN = (*OPTICS, "--misalignment", 0, 0, 0, "--misalignment-stddev", 5)
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 PLACE = {"latitude": 47.3, "longitude": -122.8}
 
