@@ -196,7 +196,7 @@ def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, ca
         wrong = [
             {"flags": 2},
             {"x": float("nan")},
-            {"y": 1.0},
+            {"x": 1.0, "y": 1.0},
             *(
                 {"covariance": np.array(c)}
                 for c in ([1.0, 0, 0, -1], [25.0, 0, 0, 25], [1e-9, 1e-10, 0, 1e-9])
