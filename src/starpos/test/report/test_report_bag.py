@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starpos_testing.skies.reports import AIR, KNOWN, Page, assert_drawn, run, simulate, solved
+from starpos_testing.skies.reports import A3, AIR, KNOWN, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rosbags")
@@ -53,7 +53,7 @@ def record(path, lists, tilts, **how):
 
 
 def report(capsys, bag, out, *more):
-    status, said, errors = run(capsys, "report", bag, "-o", out, *AIR, *more)
+    status, said, errors = run(capsys, "report", bag, "-o", out, *A3, *AIR, *more)
     return status, (Page(out / "index.html") if said else None), errors
 
 
