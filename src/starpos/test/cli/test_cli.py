@@ -124,6 +124,25 @@ def test_solve_without_json(night, capsys):
     assert "geodetic, WGS 84" in out
 
 
+@pytest.mark.parametrize(
+    "given", [(), ("--misalignment", "0", "0", "0")], ids=["not given", "without its error"]
+)
+def test_an_a3_that_nobody_vouches_for_is_1100_km_and_said_in_a_sentence(given, lists, capsys):
+    status, out, errors = solve(capsys, lists, *WIDE, *given, "--json", frames="stars_0000.csv")
+    assert status == 0
+    (said,) = errors
+    for words in (
+        "misalignment",
+        "not known",
+        " km wide",
+        "--self-calibrate",
+        "--site",
+        "--misalignment-stddev",
+    ):
+        assert words in said
+    assert 1e6 < objects(out)[0]["sigma_north_m"] < 3e6
+
+
 def test_the_header_gives_the_focal_length(night, capsys):
     assert solve(capsys, night, "--json")[0] == 0
 

@@ -61,6 +61,13 @@ def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys)
     assert any("not written" in line for line in errors) and not (tmp_path / "no.yaml").exists()
 
 
+def test_a_frames_own_place_waits_for_the_turn_and_no_loose_angles_are_printed(turned, capsys):
+    status, out, errors = solve(capsys, turned, *WIDE, "--self-calibrate")
+    (said,) = errors
+    assert status == 0 and out.count("its place waits for the whole turn") == 8
+    assert "--misalignment" not in said and "the plumb line" in said and "--save OUT keeps A3" in said
+
+
 def test_save_needs_self_calibrate(turned, tmp_path, capsys):
     status, _, errors = solve(capsys, turned, *WIDE, "--save", tmp_path / "no.yaml")
     assert status == 2 and "give both" in errors[0]
