@@ -84,7 +84,12 @@ def test_it_converges_and_its_sigma_falls_as_noise_does(graph, solver, averaged,
     known = Calibration.of((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
     instrument_file.write(
         path,
-        Instrument(FULL_FOCAL_PX, camera=None, calibration=known, inclinometer=InclinometerErrors(scale=0.0)),
+        Instrument(
+            FULL_FOCAL_PX,
+            calibration=known,
+            inclinometer=InclinometerErrors(scale=0.0),
+            clock_stddev_s=0.01,
+        ),
     )
     assert graph.set("solver", calibration_url=str(path)) == (True, "")
     one = average_after(graph, averaged, noisy(rng))

@@ -178,6 +178,16 @@ def test_the_mode_is_wide_until_the_headings_tell_and_right_then(graph, solver):
     assert sigmas(SITE, average.latitude, average.longitude, average.position_covariance) < 4
 
 
+def test_an_a3_whose_error_nobody_stated_is_a_warning_and_is_not_saved(graph, solver):
+    assert graph.set("solver", misalignment_stddev=math.nan)[0]
+    _, solution = headings(graph, [40], 1, instrument=WRONG)[-1]
+    assert solution.status == Solution.OK and sigma_m(solution.covariance) > 1e6
+    assert graph.state("solver: Calibration", "misalignment_stddev").level == b"\x01"
+    assert "not known" in save(graph, "/nowhere/x.yaml").message
+    assert graph.set("solver", misalignment_stddev=0.5)[0]
+    assert graph.state("solver: Calibration", "that of the parameters").level == b"\x00"
+
+
 def test_a_calibration_of_another_camera_info_counts_as_unknown(graph, solver):
     headings(graph, [40, 220], 1, instrument=WRONG)
     assert calibrate(graph).success

@@ -27,7 +27,10 @@ def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
         ({"misalignment": [1.0, 2.0]}, "misalignment must be 3 values"),
         ({"calibration_url": "/nowhere/instrument.yaml"}, "/nowhere/instrument.yaml"),
         ({"deflection__geoid": "/nowhere/egm.gtx"}, "/nowhere/egm.gtx GTX GeoTIFF"),
-        ({"refraction__humidity": 1.5}, "refraction.humidity must be a number from 0 to 1; 1.5 was given."),
+        (
+            {"refraction__humidity": 1.5},
+            "refraction.humidity must be a number from 0 to 1, or nan for unset; 1.5 was given.",
+        ),
         ({"min_stars": 2}, "min_stars must be a whole number from 4 to 1000; 2 was given."),
         (
             {"clock_stddev": 0.5, "min_stars": 0},
@@ -42,7 +45,7 @@ def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
         ({"refraction__temperature": "warm"}, "refraction.temperature must be a number 'warm' was given."),
         (
             {"misalignment_stddev": -1},
-            "misalignment_stddev must be a number from 0 to 36000 arcsec; -1 was given.",
+            "misalignment_stddev must be a number from 0 to 36000 arcsec, or nan for unset; -1 was given.",
         ),
     ],
 )

@@ -5,7 +5,7 @@ Both are here because they must forget at the same events: an average holds for 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
@@ -24,10 +24,16 @@ from starpos_common.job import JobRunner, Outcome
 from starpos_interfaces.srv import Calibrate, SelfCalibrate
 from starpos_solver.averaging import Averaging, News
 from starpos_solver.memory import PoseMemory, RecentFrames, Seen, tilts_of
+from starpos_solver.settings import SolverSettings
 from starpos_solver.turned import Turned, turn_on_the_spot
 
 # Fewer headings cannot show that they are of one place. The caller of the service asserts it, so it needs one less.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
+TURN_IT = "turn it on the spot"
+CALIBRATE_IT = (
+    "fixes are 1100 km wide. Set calibration_url or misalignment_stddev, call solver/calibrate at a known place, or set "
+    "self_calibration and turn it on the spot"
+)
 # So many old frames in a row, in order, are not late: a bag is played again.
 LATE_FRAMES = 3
 # A calibration replaces one that the solver has found itself only if its error is smaller by this factor.
@@ -53,13 +59,14 @@ class Calibrating:
     """
 
     def __init__(
-        self, node: Node, values: Mapping, solver: Callable[[], Solver], changed: Callable[[], None]
+        self, node: Node, settings: SolverSettings, solver: Callable[[], Solver], changed: Callable[[], None]
     ) -> None:
         self.found: Calibration | None = None
         self.average = Averaging()
         self._log = node.get_logger()
-        self._values, self._solver, self._changed = values, solver, changed
-        self._recent = RecentFrames(values["calibration_frames"])
+        self._settings, self._solver, self._changed = settings, solver, changed
+        self._values = settings.values
+        self._recent = RecentFrames(self._values["calibration_frames"])
         self._poses = PoseMemory()
         self._newest_unix_s = self._late_unix_s = -math.inf
         # Number of frames in a row that are older than the newest, each younger than the one before.
@@ -83,9 +90,8 @@ class Calibrating:
 
     @property
     def unknown(self) -> bool:
-        """Whether A3 is unknown and is being looked for, so that fixes carry its error."""
-        given = self.found is None and not self._values["self_calibration"]
-        return not self._is_told and not given
+        """Whether A3 is not known, so that fixes carry its error."""
+        return not self._is_told and self._settings.calibration(self.found).unknown
 
     @property
     def _is_told(self) -> bool:
@@ -341,8 +347,8 @@ class Calibrating:
         if self._is_told and self.found is not None:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
-            sentence = "camera against inclinometer is not known: " + (self._said or "turn it on the spot")
-            return Diagnosis(Level.WARN, sentence, values)
+            remedy = (self._said or TURN_IT) if self._values["self_calibration"] else CALIBRATE_IT
+            return Diagnosis(Level.WARN, f"camera against inclinometer is not known: {remedy}", values)
         return Diagnosis(Level.OK, self._about or "that of the parameters", values)
 
 

@@ -101,7 +101,7 @@ class SolverNode(Node):
         self.create_service(Solve, "solver/solve", self._on_solve)
         self.create_service(Trigger, "solver/reset", self._on_reset)
         self.create_service(SaveCalibration, "solver/save_calibration", self._on_save_calibration)
-        self._calibrating = Calibrating(self, self._values, self._solver_now, self._remake_solver)
+        self._calibrating = Calibrating(self, self._settings, self._solver_now, self._remake_solver)
         group = MutuallyExclusiveCallbackGroup()
         self._poll = self.create_timer(
             POLL_S, self._work, callback_group=group, clock=self._steady, autostart=False
@@ -110,6 +110,7 @@ class SolverNode(Node):
             "Solution": self._report_solution,
             "Inputs": lambda: self._inputs.report(len(self._tilts)),
             "Clock": self._report_clock,
+            "Conditions": self._report_conditions,
             "Calibration": self._calibrating.report,
             "Average": self._calibrating.average.report,
         }
@@ -436,3 +437,7 @@ class SolverNode(Node):
         clock_s = self._solver.clock_stddev_s(stars) if self._solver else stars.clock_stddev_s
         doubt_s = self._doubt.seconds if self._latest.doubted else 0.0
         return reports.of_clock(clock_s, stars.stamp_stddev_s, self._latest.ahead_s, doubt_s)
+
+    def _report_conditions(self) -> Diagnosis:
+        calibration = self._settings.calibration(self._calibrating.found)
+        return reports.of_conditions(self._values, calibration, self._answer and self._answer.tilt)

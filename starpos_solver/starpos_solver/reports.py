@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the solver about its frames."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from starpos.fix.solver import Solution
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.instrument import Calibration
 from starpos_common.diagnostics import Diagnosis, Level
 
 WIDE_CLOCK_S = 0.1
@@ -69,3 +72,34 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
             values,
         )
     return Diagnosis(Level.OK, f"the time is known to {wide:.2g} s", values)
+
+
+def of_conditions(values: Mapping, calibration: Calibration, tilt: Tilt | None) -> Diagnosis:
+    """Report which of the air's pressure and temperature, and of the inclinometer's temperatures, nobody knows.
+
+    values: the parameters.  tilt: of the newest frame, None without one.
+    """
+    now_c = math.nan if tilt is None else tilt.temperature_c
+    pressure_pa, air_c = values["refraction.pressure"], values["refraction.temperature"]
+    unknown = []
+    if math.isnan(pressure_pa):
+        unknown.append("the air's pressure is not known, which widens the fix: set refraction.pressure")
+    if math.isnan(air_c):
+        unknown.append("the air's temperature is not known, which widens the fix: set refraction.temperature")
+    if tilt is not None and math.isnan(now_c):
+        unknown.append(
+            "the inclinometer's temperature is not known, on which its zero depends: let its tilts carry it"
+        )
+    elif math.isnan(calibration.temperature_c) and not math.isnan(calibration.utc_unix_s):
+        unknown.append(
+            "the inclinometer's temperature at its calibration is not known, which widens the fix: calibrate again"
+        )
+    shown = {
+        "pressure (Pa)": pressure_pa,
+        "temperature (deg C)": air_c,
+        "inclinometer (deg C)": now_c,
+        "inclinometer at its calibration (deg C)": calibration.temperature_c,
+    }
+    if unknown:
+        return Diagnosis(Level.WARN, "; ".join(unknown), shown)
+    return Diagnosis(Level.OK, "air and temperatures are known", shown)

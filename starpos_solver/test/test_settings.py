@@ -76,3 +76,10 @@ def test_a_file_of_another_camera_is_refused_when_it_is_set(make, tmp_path):
     result = change(node, calibration_url=f"file://{tmp_path}/other.yaml")
     assert not result.successful and "of another camera" in result.reason
     assert settings.values["calibration_url"] == ""
+
+
+def test_a_misalignment_without_its_error_is_not_known(make):
+    _, nobody, _ = make(misalignment=[1.0, 2.0, 3.0])
+    assert nobody.calibration(None).unknown
+    _, known, _ = make(misalignment=[1.0, 2.0, 3.0], misalignment_stddev=5.0)
+    assert not known.calibration(None).unknown

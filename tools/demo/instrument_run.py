@@ -119,6 +119,7 @@ class Processes:
 def known_of(place: Place) -> dict:
     """Parameters of the solver that a user knows who sets up the instrument there, without the place."""
     known = {f"refraction.{k}": getattr(place, k) for k in ("pressure", "temperature", "humidity")}
+    known["misalignment_stddev"] = 5.0
     known["misalignment"] = "[" + ", ".join(f"{v:.9f}" for v in place.misalignment) + "]"
     return known
 

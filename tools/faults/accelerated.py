@@ -46,6 +46,7 @@ KNOWN = Instrument(
     focal_of(SMALL),
     calibration=Calibration.of((0.0, 0.0, 0.0), (0.5, 0.5, 0.5)),
     inclinometer=InclinometerErrors(scale=0.0, drift_rad_per_sqrt_hour=0.0, temperature_rad_per_c=0.0),
+    clock_stddev_s=0.01,
 )
 STATUS = {getattr(Solution, name): name for name in dir(Solution) if name.isupper() and name != "SLOT_TYPES"}
 

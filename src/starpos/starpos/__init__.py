@@ -3,9 +3,10 @@
 
 Data flows one way: frame -> detection -> star vectors -> identification -> apparent places -> local frame -> fix.
 
-    from starpos import Instrument, Solver, detect, load_catalogue, read_frame, read_tilt_csv
+    from starpos import Calibration, Instrument, Solver, detect, load_catalogue, read_frame, read_tilt_csv
 
-    solver = Solver(Instrument(focal_px=600e3 / 6.4), load_catalogue())
+    known = Calibration.of((0.91, -0.48, 20.0), (5.0, 5.0, 5.0))  # A3 in deg, its errors in arcsec
+    solver = Solver(Instrument(focal_px=600e3 / 6.4, calibration=known), load_catalogue())
     solution = solver.solve(detect(read_frame("frame.fits")).stars, read_tilt_csv("tilt.csv").average)
 
 The names below are the public ones. Each is imported when it is first asked for, so that `import starpos` takes no time.

@@ -67,7 +67,8 @@ def nodes(context):
     }
     camera = {"source": "simulated", "cadence": float(told["cadence"]), **simulated}
     solver = {f"refraction.{name}": value for name, value in AIR.items()} | {
-        "misalignment": list(MISALIGNMENT_DEG)
+        "misalignment": list(MISALIGNMENT_DEG),
+        "misalignment_stddev": 5.0,
     }
     emulator = ExecutableInPackage("emulator", "starpos_inclinometer")
     device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]

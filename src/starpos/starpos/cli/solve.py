@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.averaging.average import Average, average
 from starpos.calibration.turning import turn
+from starpos.calibration.unknown import unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
             if args.self_calibrate:
                 rows = _turned(args, plan, list(rows))
-            statuses.append(_tell(args, plan.night, rows, vertical))
+            statuses.append(_tell(args, plan, rows, vertical))
     return max(statuses)
 
 
@@ -130,8 +131,9 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     )
 
 
-def _tell(args: argparse.Namespace, night: NightFolder, rows: Iterable, vertical: Vertical) -> int:
+def _tell(args: argparse.Namespace, plan: Plan, rows: Iterable, vertical: Vertical) -> int:
     """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status."""
+    night = plan.night
     solved: list[Solved] = []
     warnings: set[str] = set()
     unreadable = False
@@ -147,12 +149,16 @@ def _tell(args: argparse.Namespace, night: NightFolder, rows: Iterable, vertical
         if args.json:
             common.print_json({"file": path} | _json_of(answer.fix, vertical) | _json_about(answer))
         else:
-            print(_line(path, answer), flush=True)
+            print(_line(path, answer, args.self_calibrate), flush=True)
     common.tell_extrapolation("solve", solved)
     together = _combine(night, solved)
     if solved:
         last = solved[-1].fix
         common.tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
+        if plan.solver is not None and not args.self_calibrate:
+            wide = last if together is None else together
+            if unknown := unknown_a3(plan.solver.instrument.calibration, wide.covariance):
+                _say(night, unknown)
         _print_combined(night, together, solved, warnings, args, vertical)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
@@ -180,10 +186,10 @@ def _solved_by_turning(
         kept = "" if args.save is None else f" {args.save} is not written:"
         _say(night, f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further")
         return turned.solutions
-    angles = "{:.5f} {:.5f} {:.5f}".format(*turned.instrument.calibration.misalignment_deg)
-    _say(night, f"calibrated: --misalignment {angles}; {error}")
     if args.save is not None:
         instrument_file.write(Path(args.save), turned.instrument, f"A3 by turning on the spot: {error}")
+    kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
+    _say(night, f"calibrated: {error}; {kept}")
     return turned.solutions
 
 
@@ -263,10 +269,12 @@ def _json_about(s: Solution) -> dict:
     }
 
 
-def _line(path: str, s: Solution) -> str:
+def _line(path: str, s: Solution, turning: bool) -> str:
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
-    return f"{path}: {_where(s.fix)}, {len(s.names)} of {s.stars_detected} stars"
+    # one frame of a turn does not tell A3, so its own place would be 1100 km wide
+    where = "its place waits for the whole turn" if turning else _where(s.fix)
+    return f"{path}: {where}, {len(s.names)} of {s.stars_detected} stars"
 
 
 def _where(fix: Fix | Average) -> str:

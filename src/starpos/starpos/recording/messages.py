@@ -68,7 +68,7 @@ def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD)
     """Tilt from a message; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
     An impossible temperature becomes NaN, unknown.  The flags are left to the caller.  Raises TiltError for NaN, no
-    stamp, an angle over 30 deg, or an impossible covariance.
+    stamp, angles that cannot hold together, or an impossible covariance.
     """
     covariance = np.array(message.covariance, float).reshape(2, 2)
     unix_s = stamp_to_unix(message.header.stamp)

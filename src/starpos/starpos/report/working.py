@@ -9,6 +9,7 @@ import numpy as np
 
 from starpos.averaging.average import average
 from starpos.calibration.turning import turn
+from starpos.calibration.unknown import unknown_a3
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
@@ -72,6 +73,9 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
         shop.progress(exposures.name[:20], done / exposures.count)
     combined, why_not, said = _combined(fixes, shots)
     remarks += said
+    if instrument and shop.turn_stddev_deg is None:
+        unknown = unknown_a3(instrument.calibration, (combined or fixes[-1]).covariance)
+        remarks += [unknown] if unknown else []
     if extrapolated_days > 0:
         remarks.append(
             f"the Earth's rotation is extrapolated {extrapolated_days:.0f} days beyond the IERS table, which the budget "
@@ -136,9 +140,8 @@ def _turned(exposures: StarLists, shop: Workshop, turn_stddev_deg: float) -> Ite
         try:
             turned = turn(solver, good, exposures.tilt, turn_stddev_deg, shop.progress)
             solutions, instrument = list(turned.solutions), turned.instrument
-            angles = " ".join(f"{a:.5f}" for a in instrument.calibration.misalignment_deg)
             remarks = (
-                f"A3 was found from the headings: --misalignment {angles}, the plumb line in the camera to "
+                "A3 was found from the headings: the plumb line in the camera is known to "
                 f"{turned.plumb_stddev_arcsec:.2f} arcsec",
             )
         except FixError as error:

@@ -44,7 +44,9 @@ SCA100T = InclinometerErrors()
 def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
     """Errors of a tiltmeter whose drift is as small as its noise."""
     noise = noise_arcsec * ARCSEC
-    return InclinometerErrors(noise, noise / 8, noise, noise, SCA100T.scale)
+    return InclinometerErrors(
+        noise_rad=noise, quantum_rad=noise / 8, drift_rad_per_sqrt_hour=noise, temperature_rad_per_c=noise
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,8 @@ from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site, camera_to_enu
 
 FWHM_PER_SIGMA = 2.354820045
+# how well the A3 of a simulated instrument is said to be known
+STATED_ARCSEC = (5.0, 5.0, 5.0)
 STAMP_SIGMAS = 5.0
 STRIP_PX = 1 << 20
 CENTROID_FLOOR_PX, DETECTED_SNR = 0.02, 6.0
@@ -204,7 +206,7 @@ def scene_of(
     azimuth_deg, altitude_deg, roll_deg = pointing_deg
     return Scene(
         camera=Camera.from_focal(size[0], size[1], focal_px),
-        instrument=Instrument(focal_px, calibration=Calibration(misalignment_deg=misalignment_deg)),
+        instrument=Instrument(focal_px, calibration=Calibration.of(misalignment_deg, STATED_ARCSEC)),
         site=Site(latitude_deg, longitude_deg, atmosphere),
         azimuth_deg=azimuth_deg,
         altitude_deg=altitude_deg,

@@ -15,6 +15,8 @@ from starpos.cli import COMMANDS, main
 from starpos_testing.patience import WAIT_S
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# the same, with an A3 that is known
+KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 PLACE = {"latitude": 47.3, "longitude": -122.8}
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",
@@ -81,7 +83,7 @@ def solve(capsys, folder, *more, frames="frame_*.fits"):
 
 
 def test_solve_a_night_of_frames(night, capsys):
-    status, out, errors = solve(capsys, night, *WIDE, "--json")
+    status, out, errors = solve(capsys, night, *KNOWN, "--json")
     assert (status, errors) == (0, [])
     truth = json.loads((night / "truth.json").read_text())
     *each, combined = objects(out)
@@ -102,7 +104,7 @@ def test_solve_a_night_of_frames(night, capsys):
 
 
 def test_solve_star_lists_that_turn(lists, capsys):
-    status, out, _ = solve(capsys, lists, *WIDE, "--json", frames="stars_*.csv")
+    status, out, _ = solve(capsys, lists, *KNOWN, "--json", frames="stars_*.csv")
     assert status == 0
     *each, combined = objects(out)
     assert combined["poses"] == 3
@@ -115,11 +117,30 @@ def test_solve_star_lists_that_turn(lists, capsys):
 
 
 def test_solve_without_json(night, capsys):
-    status, out, errors = solve(capsys, night, *WIDE)
+    status, out, errors = solve(capsys, night, *KNOWN)
     assert (status, errors) == (0, [])
     assert "2 frames together" in out
     assert "calibration" in out
     assert "geodetic, WGS 84" in out
+
+
+@pytest.mark.parametrize(
+    "given", [(), ("--misalignment", "0", "0", "0")], ids=["not given", "without its error"]
+)
+def test_an_a3_that_nobody_vouches_for_is_1100_km_and_said_in_a_sentence(given, lists, capsys):
+    status, out, errors = solve(capsys, lists, *WIDE, *given, "--json", frames="stars_0000.csv")
+    assert status == 0
+    (said,) = errors
+    for words in (
+        "misalignment",
+        "not known",
+        " km wide",
+        "--self-calibrate",
+        "--site",
+        "--misalignment-stddev",
+    ):
+        assert words in said
+    assert 1e6 < objects(out)[0]["sigma_north_m"] < 3e6
 
 
 def test_the_header_gives_the_focal_length(night, capsys):
@@ -130,6 +151,7 @@ def test_an_instrument_file(lists, tmp_path, capsys):
     path = tmp_path / "instrument.yaml"
     path.write_text(
         "starpos_instrument: 1\ncamera: {focal_mm: 29.67, pixel_um: 6.4}\nlink_to_camera: [[1,0,0],[0,1,0],[0,0,1]]\n"
+        "misalignment_deg: [0, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\n"
     )
     status, out, _ = solve(capsys, lists, "--instrument", path, "--json", frames="stars_0000.csv")
     assert status == 0
@@ -146,7 +168,7 @@ def test_an_instrument_file(lists, tmp_path, capsys):
 
 def test_a_deflection_moves_the_geodetic_position_only(lists, capsys):
     plain, moved = (
-        objects(solve(capsys, lists, *WIDE, "--json", *xi, frames="stars_0000.csv")[1])[0]
+        objects(solve(capsys, lists, *KNOWN, "--json", *xi, frames="stars_0000.csv")[1])[0]
         for xi in ((), ("--xi", "10", "--eta", "-5"))
     )
     assert moved["latitude"] == plain["latitude"]
@@ -160,7 +182,7 @@ def test_a_geoid_gives_the_deflection_of_the_place_or_says_that_it_cannot(lists,
         header = struct.pack(">4d2i", south, -140, 1, 1, *heights.shape)
         (tmp_path / "slope.gtx").write_bytes(header + heights.astype(">f4").tobytes())
         geoid = ("--geoid", tmp_path / "slope.gtx")
-        status, out, errors = solve(capsys, lists, *WIDE, "--json", *geoid, frames="stars_0000.csv")
+        status, out, errors = solve(capsys, lists, *KNOWN, "--json", *geoid, frames="stars_0000.csv")
         assert status == 0
         return objects(out), errors
 
@@ -179,7 +201,7 @@ def test_a_geoid_gives_the_deflection_of_the_place_or_says_that_it_cannot(lists,
 
 def test_a_wrong_misalignment_is_a_wrong_place(lists, capsys):
     _, out, _ = solve(
-        capsys, lists, *WIDE, "--misalignment", "0.1", "0", "0", "--json", frames="stars_0000.csv"
+        capsys, lists, *KNOWN, "--misalignment", "0.1", "0", "0", "--json", frames="stars_0000.csv"
     )
     answer = objects(out)[0]
     off = np.hypot(
@@ -193,7 +215,7 @@ def test_an_unreadable_frame_among_good_ones(night, tmp_path, capsys):
     for path in night.iterdir():
         shutil.copy(path, tmp_path)
     (tmp_path / "frame_0000a.fits").write_bytes(b"SIMPLE  = nothing of the kind")
-    status, out, errors = solve(capsys, tmp_path, *WIDE, "--json")
+    status, out, errors = solve(capsys, tmp_path, *KNOWN, "--json")
     assert status == 2
     assert len(errors) == 1
     assert errors[0].startswith("starpos solve: ")

@@ -17,7 +17,9 @@ from starpos.utc import utc_text
 from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
-INSTRUMENT = "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncamera: {}\n"
+INSTRUMENT = (
+    "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\ncamera: {}\n"
+)
 OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10")  # 2750 px: 25 deg
 
 A3_TOO = "starpos calibrate: an A3 belongs to the camera it was found with: find it again with this one"

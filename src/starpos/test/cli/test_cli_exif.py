@@ -13,6 +13,7 @@ from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 LONGITUDE_DEG, OFFSET_H = -122.8, -8.0
 M_PER_S = 464.0 * np.cos(np.radians(47.3))
@@ -38,7 +39,7 @@ def solve(capsys, folder, *more):
     """Exit status, the objects printed, what was said."""
     frames = [str(path) for path in sorted(folder.glob("*.dng"))]
     tilts = ("--tilt", str(folder / "tilt.csv"))
-    status = main(["solve", *frames, *tilts, *OPTICS, *AIR, "--json", *more])
+    status = main(["solve", *frames, *tilts, *OPTICS, *A3, *AIR, "--json", *more])
     said = capsys.readouterr()
     return status, [json.loads(line) for line in said.out.splitlines()], said.err
 

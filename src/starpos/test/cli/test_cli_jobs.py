@@ -22,6 +22,8 @@ from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
+# the same, with an A3 that is known
+KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 SIZE = ("--size", "1000", "700", *WIDE)
 
 
@@ -41,7 +43,7 @@ def frames(night, pattern="*.csv"):
 
 
 def solve(night, *more):
-    return ["solve", *frames(night), "--tilt", str(night / "tilt.csv"), *WIDE, *map(str, more)]
+    return ["solve", *frames(night), "--tilt", str(night / "tilt.csv"), *KNOWN, *map(str, more)]
 
 
 def run(capfd, command):
@@ -110,12 +112,12 @@ def test_a_damaged_gz_and_a_pipe_cost_their_own_frames(more, archive, capfd, tmp
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_folder_is_a_night_and_each_makes_its_own_fix(jobs, archive, capfd):
     nights = [archive / "turned", archive / "still"]
-    status, out, _ = run(capfd, ["solve", *map(str, nights), *WIDE, "--json", "--jobs", jobs])
+    status, out, _ = run(capfd, ["solve", *map(str, nights), *KNOWN, "--json", "--jobs", jobs])
     assert status == 2
     alone = ""
     for night in nights:
         given = frames(night, "*.fits") or frames(night)
-        alone += run(capfd, ["solve", *given, "--tilt", str(night / "tilt.csv"), *WIDE, "--json"])[1]
+        alone += run(capfd, ["solve", *given, "--tilt", str(night / "tilt.csv"), *KNOWN, "--json"])[1]
     rows = [json.loads(line) for line in out.splitlines()]
     assert [r.pop("night") for r in rows if "combined" in r] == [str(n) for n in nights]
     assert rows == [json.loads(line) for line in alone.splitlines()]
@@ -127,12 +129,12 @@ def test_a_night_that_is_none_is_that_nights_failure(archive, tmp_path, capfd):
     untold.mkdir()
     shutil.copy(archive / "turned" / "stars_0000.csv", untold)
     still = str(archive / "still")
-    status, out, err = run(capfd, ["solve", str(empty), still, str(untold), *WIDE])
+    status, out, err = run(capfd, ["solve", str(empty), still, str(untold), *KNOWN])
     assert (status, len(err.splitlines())) == (2, 2)
     assert f"{empty}: no frames in it" in err
     assert str(untold / "tilt.csv") in err
     assert f"{still}: 2 frames together" in out
-    assert run(capfd, ["solve", str(empty), *WIDE])[0] == 2
+    assert run(capfd, ["solve", str(empty), *KNOWN])[0] == 2
 
 
 def test_a_night_without_a_fix_is_exit_1(archive, tmp_path, capfd):
@@ -141,8 +143,8 @@ def test_a_night_without_a_fix_is_exit_1(archive, tmp_path, capfd):
     rows = (archive / "turned" / "stars_0000.csv").read_text().splitlines()
     (dark / "stars.csv").write_text("\n".join(rows[:4]) + "\n")
     shutil.copy(archive / "turned" / "tilt.csv", dark)
-    assert run(capfd, ["solve", str(dark), str(archive / "still"), *WIDE])[0] == 1
-    assert run(capfd, ["solve", str(archive / "still"), *WIDE])[0] == 0
+    assert run(capfd, ["solve", str(dark), str(archive / "still"), *KNOWN])[0] == 1
+    assert run(capfd, ["solve", str(archive / "still"), *KNOWN])[0] == 0
 
 
 BAD_CALLS = {
@@ -167,7 +169,7 @@ def test_a_bad_call_is_exit_2_and_one_line(kind, command, archive, capfd):
 
 
 def test_frames_without_tilts_and_save_of_several_nights_are_refused(archive, tmp_path, capfd):
-    status, _, err = run(capfd, ["solve", *frames(archive / "turned"), *WIDE])
+    status, _, err = run(capfd, ["solve", *frames(archive / "turned"), *KNOWN])
     assert (status, len(err.splitlines())) == (2, 1)
     assert "--tilt" in err
     astray = str(tmp_path / "astray")
@@ -175,11 +177,11 @@ def test_frames_without_tilts_and_save_of_several_nights_are_refused(archive, tm
         ([str(archive / "still"), astray], "no such file or folder"),
         ([__file__], "no tilts"),
     ):
-        status, _, err = run(capfd, ["solve", *given, *WIDE])
+        status, _, err = run(capfd, ["solve", *given, *KNOWN])
         assert status == 2 and err.startswith(f"starpos solve: {given[-1]}: ") and why in err
     nights = [str(archive / "turned"), str(archive / "still")]
     save = ["--self-calibrate", "--save", str(tmp_path / "a.yaml")]
-    status, _, err = run(capfd, ["solve", *nights, *WIDE, *save])
+    status, _, err = run(capfd, ["solve", *nights, *KNOWN, *save])
     assert (status, len(err.splitlines())) == (2, 1)
     assert "one night" in err
 
@@ -199,7 +201,7 @@ def started(archive, **options):
     """
     night = archive / "turned"
     many = [p for p in frames(night) if "2b" not in p] * 13
-    command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *WIDE, "--json", "--jobs", "2"]
+    command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *KNOWN, "--json", "--jobs", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     process = subprocess.Popen(
         [

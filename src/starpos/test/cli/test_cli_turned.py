@@ -39,7 +39,8 @@ def test_the_place_is_found_and_a3_saved_for_another_night(turned, tmp_path, cap
     assert status == 0 and len(each) == 8
     assert max(arcsec_off(combined)) < 4 * max(combined["sigma_north_m"], combined["sigma_east_m"]) / 20
     assert combined["sigma_north_m"] < 400
-    assert any("calibrated: --misalignment" in line for line in errors)
+    (said,) = errors
+    assert "the plumb line in the camera is known to" in said and f"{saved} is written" in said
     assert read(saved).calibration.frames == 8
 
     later = simulated(tmp_path / "later", "-n", "4", "--seed", "9", "--azimuth", "100")
@@ -58,6 +59,13 @@ def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys)
     )
     assert status == 0 and json.loads(out.splitlines()[-1])["sigma_north_m"] > 1e5
     assert any("not written" in line for line in errors) and not (tmp_path / "no.yaml").exists()
+
+
+def test_a_frames_own_place_waits_for_the_turn_and_no_loose_angles_are_printed(turned, capsys):
+    status, out, errors = solve(capsys, turned, *WIDE, "--self-calibrate")
+    (said,) = errors
+    assert status == 0 and out.count("its place waits for the whole turn") == 8
+    assert "--misalignment" not in said and "the plumb line" in said and "--save OUT keeps A3" in said
 
 
 def test_save_needs_self_calibrate(turned, tmp_path, capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starpos_testing.skies.reports import AIR, OPTICS, Page, assert_drawn, run, simulate, solved
+from starpos_testing.skies.reports import A3, AIR, KNOWN, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rosbags")
@@ -53,7 +53,7 @@ def record(path, lists, tilts, **how):
 
 
 def report(capsys, bag, out, *more):
-    status, said, errors = run(capsys, "report", bag, "-o", out, *AIR, *more)
+    status, said, errors = run(capsys, "report", bag, "-o", out, *A3, *AIR, *more)
     return status, (Page(out / "index.html") if said else None), errors
 
 
@@ -69,7 +69,7 @@ def test_a_bag_gives_what_solve_gives_of_the_same_night(plugin, night, lists, ti
     bag = record(tmp_path / "bag", lists, tilts, plugin=plugin)
     status, page, errors = report(capsys, bag, tmp_path / "out")
     assert (status, errors) == (0, [])
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
     assert "6: 6 with a fix" in page.text and "solved from stars and tilt of the bag" in page.text
     for png in page.pictures.values():
         assert_drawn(png)
@@ -81,7 +81,7 @@ def test_one_file_of_a_bag_is_a_bag(night, lists, tilts, tmp_path, capsys):
     (file,) = bag.glob("*.mcap")
     status, page, _ = report(capsys, file, tmp_path / "out")
     assert status == 0
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
 
 
 @pytest.mark.usefixtures("unpainted")
@@ -91,7 +91,7 @@ def test_the_recorded_night_of_the_repository(tmp_path, capsys):
     truth = json.loads(RECORDED.with_suffix(".json").read_text())
     air = ("--pressure-hpa", truth["pressure_pa"] / 100, "--temperature-c", truth["temperature_c"],
            "--humidity", truth["humidity"])  # fmt: skip
-    about = (*air, "--misalignment", *truth["misalignment_deg"])
+    about = (*air, "--misalignment", *truth["misalignment_deg"], "--misalignment-stddev", 5)
     status, _, errors = run(capsys, "report", RECORDED, "-o", tmp_path / "out", *about)
     page = Page(tmp_path / "out" / "index.html")
     assert (status, errors) == (0, [])
@@ -116,7 +116,7 @@ def test_of_several_instruments_one_is_chosen(night, lists, tilts, tmp_path, cap
     assert (status, len(errors)) == (2, 1)
     status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", "--namespace", "north")
     assert status == 0
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
     _, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", "--namespace", "/far/south")
     assert "2: 2 with a fix" in page.text
 
@@ -126,7 +126,7 @@ def said(night, capsys):
     """What `starpos solve` says of each frame."""
     frames = sorted(night.glob("stars_*.csv"))
     _, out, _ = run(
-        capsys, "solve", *frames, "--tilt", night / "tilt.csv", "--json", *OPTICS, *AIR, "--eta", "20"
+        capsys, "solve", *frames, "--tilt", night / "tilt.csv", "--json", *KNOWN, *AIR, "--eta", "20"
     )
     return [json.loads(line) for line in out.splitlines()[:-1]]
 
@@ -196,7 +196,7 @@ def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, ca
         wrong = [
             {"flags": 2},
             {"x": float("nan")},
-            {"y": 1.0},
+            {"x": 1.0, "y": 1.0},
             *(
                 {"covariance": np.array(c)}
                 for c in ([1.0, 0, 0, -1], [25.0, 0, 0, 25], [1e-9, 1e-10, 0, 1e-9])
@@ -208,7 +208,7 @@ def test_flagged_and_broken_tilts_are_left_out(night, lists, tilts, tmp_path, ca
                 bag.write("tilt", bag.message("Tilt", at, **{"x": 0.1, "y": 0.1} | broken), at)
     status, page, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
     assert status == 0
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
     assert f"{len(wrong) * len(lists)} tilts of the bag were left out" in errors[0]
 
 
@@ -221,9 +221,9 @@ def test_a_bag_without_a_camera_takes_the_options(night, lists, tilts, tmp_path,
     status, _, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
     assert (status, len(errors)) == (2, 1)
     assert "focal" in errors[0]
-    status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", *OPTICS)
+    status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out", *KNOWN)
     assert status == 0
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
 
 
 def without_definitions(bag):
@@ -252,7 +252,7 @@ def test_definitions_a_bag_lacks_come_from_the_workspace(night, lists, tilts, tm
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{prefix}")
     status, page, _ = report(capsys, bag, tmp_path / "out")
     assert status == 0
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "metadata", "other"])
@@ -299,7 +299,7 @@ def test_broken_star_lists_cost_their_frame_only(night, lists, tilts, tmp_path, 
         bag.write("stars", bag.message("StarArray", at, width=1000, height=700, stars=rows), at)
     status, page, _ = report(capsys, tmp_path / "bag", tmp_path / "out")
     assert status == 0
-    assert place(solved(capsys, night, *OPTICS, *AIR)) in page.text
+    assert place(solved(capsys, night, *KNOWN, *AIR)) in page.text
     assert "7: 6 with a fix, 1 bad input" in page.text
 
 

@@ -14,7 +14,7 @@ from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solver import Status
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, ReportedPlace, Shot, Truth
 from starpos.report.working import Workshop, worked
@@ -33,7 +33,7 @@ def lists(tmp_path_factory):
 
 def work(lists, catalogue):
     shop = Workshop(
-        instrument_for=lambda stars: Instrument(FOCAL_PX),
+        instrument_for=lambda stars: Instrument(FOCAL_PX, calibration=Calibration.of((0.0,) * 3, (5.0,) * 3)),
         catalogue=catalogue,
         atmosphere=AIR,
         vertical=Deflection(),

@@ -10,6 +10,9 @@ import numpy as np
 from starpos.cli import main
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# that A3 is known
+A3 = ("--misalignment", 0, 0, 0, "--misalignment-stddev", 5)
+KNOWN = (*OPTICS, *A3)
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 PLACE = {"latitude": 47.3, "longitude": -122.8}
 
