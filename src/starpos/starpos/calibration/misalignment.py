@@ -35,6 +35,8 @@ TURN_SIGMA = 3.0
 OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # poses that scatter more than any inclinometer were moved, or are of several places
 MOST_POSE_RAD = np.radians(0.15)
+# chi-square per degree of freedom of frames too few to tell their scatter
+MOST_SCATTER = 16.0
 # fewer poses tell no response of the inclinometer
 FEWEST_POSES = 3
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
@@ -178,7 +180,8 @@ class _Agreement:
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
         scatter = max(self.scatter.pose_sigma, self.scatter_left)
-        if scatter > MOST_POSE_RAD:
+        # too few to tell how much they scatter, they must agree as they state
+        if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not self.scatter.evident):
             raise FixError(
                 f"{of} frames do not agree on one zenith (they scatter by "
                 f"{np.degrees(scatter):.2f} deg): {why}"
