@@ -60,11 +60,7 @@ class TiltBuffer:
         if message.flags & UNUSABLE:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
             return
-        try:
-            sample = message_to_tilt(message, unknown_stddev_rad)
-        except TiltRangeError:
-            self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, OUT_OF_RANGE))
-            raise
+        sample = message_to_tilt(message, unknown_stddev_rad)
         self._came += 1
         self._good.append((self._came, sample))
         self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
@@ -121,7 +117,7 @@ class TiltBuffer:
                 flags |= flag
         if flags & (OUT_OF_RANGE | SATURATED):
             raise TiltRangeError(
-                "tilt: the inclinometer is beyond its +-30 deg: set the instrument more upright"
+                "tilt: the inclinometer is beyond its range: set the instrument more upright"
             )
         if flags & STUCK:
             raise TiltError("tilt: the inclinometer repeats the same value: check its converter's wiring")

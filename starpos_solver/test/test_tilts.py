@@ -74,7 +74,7 @@ def test_a_gap_before_a_sample_does_not_spoil_it():
 
 @pytest.mark.parametrize("flag", [Tilt.OUT_OF_RANGE, Tilt.SATURATED])
 def test_flagged_samples_explain_a_missing_tilt(flag):
-    with pytest.raises(TiltRangeError, match="30 deg"):
+    with pytest.raises(TiltRangeError, match="beyond its range"):
         buffer_of([sample(0.0, flags=flag)]).average(T0, 0.5)
 
 
@@ -95,8 +95,6 @@ def test_broken_samples_are_refused_and_not_kept():
     for broken in (sample(0.0, math.nan), sample(0.0, variance=-1.0), Tilt(x=0.1)):
         with pytest.raises(TiltError):
             buffer.add(broken, NOISE)
-    with pytest.raises(TiltRangeError):
-        buffer.add(sample(0.0, 31.0), NOISE)
     assert len(buffer) == 0
 
 
