@@ -110,7 +110,7 @@ def _about_one_place(in_order: Sequence[Fix]) -> list[Fix]:
     means = np.array([zeniths[pose == k].mean(0) for k in range(pose[-1] + 1)])
     steps = np.sort(np.linalg.norm(np.diff(means, axis=0), axis=1))
     off = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    # squares in units of the sigma per axis are exponential: of a step, which two poses share, with a mean of 4, else of 2
+    # squares in units of the sigma per axis are exponential, with a mean of 2; of a step, which two poses share, of 4
     by_steps = steps[int(SMALLER * len(steps))] / np.sqrt(-4 * np.log(1 - SMALLER))
     by_middle = np.median(off) / np.sqrt(2 * np.log(2))
     if by_middle > MOST_POSE_RAD or np.mean(off < GATE_SIGMA * by_steps) < MOST_OF_ALL:

@@ -2,7 +2,7 @@
 """A log of tilt readings: the tilt of an exposure from it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 
 import numpy as np
@@ -54,6 +54,7 @@ class TiltLog:
     theta_y: np.ndarray
     temperature_c: np.ndarray
     covariance: np.ndarray
+    _: KW_ONLY
     theta_z: np.ndarray | None = None
     variance_z: np.ndarray | None = None
 
