@@ -52,9 +52,9 @@ class TiltLog:
     utc_unix_s: np.ndarray
     theta_x: np.ndarray
     theta_y: np.ndarray
+    _: KW_ONLY
     temperature_c: np.ndarray
     covariance: np.ndarray
-    _: KW_ONLY
     theta_z: np.ndarray | None = None
     variance_z: np.ndarray | None = None
 
@@ -71,7 +71,12 @@ class TiltLog:
         """Make a log of readings (N,); noise_rad: 1 sigma of the white noise of all of them, or of each (N,)."""
         variance = np.broadcast_to(np.square(noise_rad), np.shape(utc_unix_s))
         return cls(
-            utc_unix_s, theta_x, theta_y, temperature_c, np.eye(2) * variance[:, None, None], theta_z=theta_z
+            utc_unix_s,
+            theta_x,
+            theta_y,
+            temperature_c=temperature_c,
+            covariance=np.eye(2) * variance[:, None, None],
+            theta_z=theta_z,
         )
 
     @classmethod
@@ -81,8 +86,8 @@ class TiltLog:
             np.array([r.utc_unix_s for r in readings]),
             np.array([r.theta_x for r in readings]),
             np.array([r.theta_y for r in readings]),
-            np.array([r.temperature_c for r in readings]),
-            np.array([r.covariance for r in readings]),
+            temperature_c=np.array([r.temperature_c for r in readings]),
+            covariance=np.array([r.covariance for r in readings]),
             theta_z=np.array([r.theta_z for r in readings]),
             variance_z=np.array([r.variance_z for r in readings]),
         )

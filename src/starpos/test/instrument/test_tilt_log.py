@@ -75,7 +75,8 @@ def test_each_axis_keeps_its_stated_error_and_their_correlation():
     stated = np.array([[1e-6, 9e-7], [9e-7, 1e-6]])
     t = 1000 + 0.1 * np.arange(5)
     zeros = np.zeros(5)
-    tilt = TiltLog(t, zeros, zeros, zeros, np.tile(stated, (5, 1, 1))).average(1000.2, 0.5)
+    tilt = TiltLog(t, zeros, zeros, temperature_c=zeros, covariance=np.tile(stated, (5, 1, 1)))
+    tilt = tilt.average(1000.2, 0.5)
     np.testing.assert_allclose(tilt.covariance, stated / 5)
 
 

@@ -33,7 +33,7 @@ class FirstRelease:
     def upgraded(self, data: bytes, type_name: str) -> bytes:
         """The bytes of such a message as the type of today has them; as they are if they are broken."""
         try:
-            message = self._then.deserialize_cdr(data, type_name)
+            message: Any = self._then.deserialize_cdr(data, type_name)
             if type_name == TILT:
                 message = self._tilt(message)
             else:
