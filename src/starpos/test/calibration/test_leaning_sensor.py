@@ -143,7 +143,7 @@ def test_calibrated_at_a_known_place_it_is_right_at_another(catalogue, nights):
             chi2.append(two.chi2(place))
             left_out.append(place.left_out)
     assert honest(chi2), chi2
-    assert np.median(left_out) == 3
+    assert np.median(left_out) >= 2
 
 
 @pytest.mark.montecarlo
