@@ -11,7 +11,7 @@ from starpos.earth import geoid_file
 from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file, instrument_file
-from starpos.instrument.tilt_log import read_tilt_csv
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.recording.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 

@@ -65,6 +65,7 @@ class InclinometerNode(Node):
         message.temperature = reading.temperature_c
         message.sequence = reading.sequence
         message.flags = reading.flags
+        message.z, message.z_variance = reading.z, reading.z_variance
         return message
 
     def _log(self, health: Health) -> bool:

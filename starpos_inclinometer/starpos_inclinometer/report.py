@@ -52,7 +52,7 @@ class Reporter:
                 "the sensor is stuck: the same values again and again; check its wiring, clock and reference."
             )
         elif flags["saturated"] or flags["out of range"]:
-            level, text = Level.WARN, "tilt beyond +-30 deg: set the instrument more upright."
+            level, text = Level.WARN, "tilt beyond the sensor's range: set the instrument more upright."
         elif health.complaint:
             level, text = Level.WARN, health.complaint
         elif step and now_s - step.monotonic_s < STEP_SHOWN_S:

@@ -113,6 +113,22 @@ def test_what_is_no_reading_gives_none(line):
     assert feeder.send(data, data) == []
 
 
+THREE = rf"{PLAIN},(?P<z>{NUMBER})"
+
+
+def test_a_third_axis_and_angles_that_are_counted_to_360_deg():
+    got = Feeder(THREE).send(*["330,45.5,229.95"] * 2)[-1]
+    assert np.degrees([got.x, got.y, got.z]) == pytest.approx([-30, 45.5, -49.95])
+    assert math.degrees(got.step) == pytest.approx(1.0)
+    # upside down, as the third axis tells
+    over = Feeder(THREE).send(*["170,0,-80"] * 2)[-1]
+    assert np.degrees([over.x, over.y, over.z]) == pytest.approx([10, 0, -80])
+    two = Feeder().send(*["359.5,0.5"] * 2)[-1]
+    assert np.degrees([two.x, two.y]) == pytest.approx([-0.5, 0.5]) and two.z is None
+    sines = Feeder(THREE, unit="g").send(*["0.5,-0.5,-0.70710678"] * 2)[-1]
+    assert np.degrees([sines.x, sines.y, sines.z]) == pytest.approx([30, -30, -45])
+
+
 def test_numbers_lost_doubled_wrapped():
     send = Feeder(FULL).send
     got = send(*(f"$TILT,{k},{100 * k},1,2,20" for k in (5, 6, 6, 9, 10)))
@@ -187,7 +203,7 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
     [
         ("(?P<x>[", "no regular expression"),
         (r"(?P<x>\d+)", "needs the named groups x and y"),
-        (r"(?P<x>\d+),(?P<y>\d+),(?P<z>\d+)", "has a group z"),
+        (r"(?P<x>\d+),(?P<y>\d+),(?P<w>\d+)", "has a group w"),
         (r"(?P<x>.),(?P<y>.),(?P<seconds>.),(?P<milliseconds>.)", "keep one"),
         ("(" * 500, "no regular expression"),
     ],
@@ -304,7 +320,8 @@ def test_a_device_clock_takes_the_jitter_out(meter):
 
 def test_stuck_and_steep_and_reopened(meter):
     device = meter(lambda k: b"%d,2\n" % (45 if k > 60 else 1))
-    got, _ = readings(device.path, 100, **{"ascii.stuck_samples": 20, "ascii.resolution": 0.01})
+    some = {"ascii.stuck_samples": 20, "ascii.resolution": 0.01, "ascii.range": 30.0}
+    got, _ = readings(device.path, 100, **some)
     # on a busy machine lines may come after a silence
     flags = [r.flags & ~TIME_UNKNOWN for r in got]
     assert flags[:19] == [0] * 19 and set(flags[19:50]) == {STUCK}
@@ -312,6 +329,21 @@ def test_stuck_and_steep_and_reopened(meter):
     assert not any(f & GAP for f in flags)
     never, _ = readings(device.path, 150, **{"ascii.stuck_samples": 0, "ascii.resolution": 0.01})
     assert not any(r.flags & STUCK for r in never)
+
+
+def test_a_third_axis_is_published_and_no_lean_is_too_far(meter):
+    device = meter(lambda k: b"45.%02d,-40.00,16.80\n" % (k % 7))
+    got, _ = readings(device.path, 60, **{"ascii.pattern": THREE})
+    assert not any(r.flags & ~TIME_UNKNOWN for r in got)
+    assert np.degrees([(r.y, r.z) for r in got]) == pytest.approx(np.array([[-40, 16.8]] * len(got)))
+    assert all(0 < r.z_variance < 1e-6 for r in got)
+
+
+def test_upside_down_without_a_third_axis_is_out_of_range(meter):
+    device = meter(lambda k: b"%d,2\n" % (170 + k % 3))
+    got, _ = readings(device.path, 20)
+    assert all(r.flags & OUT_OF_RANGE for r in got)
+    assert all(math.isnan(r.z) and math.isnan(r.z_variance) for r in got)
 
 
 def test_readings_that_all_stand_on_one_step_may_be_half_a_step_off(meter):

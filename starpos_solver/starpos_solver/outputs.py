@@ -101,6 +101,8 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     if answer.tilt:
         message.tilt = tilt_to_message(answer.tilt, "")
         message.tilt_samples = answer.tilt.samples
+    else:
+        message.tilt.z = message.tilt.z_variance = NAN
     if fix is None or ground is None:
         for name in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading", "heading_stddev",
                      "refraction", "diurnal_aberration", "ut1_minus_utc", "xi", "eta"):  # fmt: skip

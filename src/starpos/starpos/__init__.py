@@ -43,7 +43,7 @@ _HOMES = {
     "geodetic": "earth.vertical",
     "load_catalogue": "sky.catalogue",
     "read_frame": "frames.reading",
-    "read_tilt_csv": "instrument.tilt_log",
+    "read_tilt_csv": "instrument.tilt_table",
     "turn": "calibration.turning",
 }
 __all__ = list(_HOMES)

@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a replay refuses of a bag, in a sentence that names it."""
 
+import math
+
+import numpy as np
 import pytest
 
 pytest.importorskip("rosbags")
 
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from starpos.errors import BagError
 from starpos.recording import bounds
 from starpos_bringup.recording.bag import Bag
 from starpos_bringup.recording.bag_writer import BagWriter
+from starpos_testing.skies.bags import NightBag
 
 KIND = "std_msgs/msg/UInt8MultiArray"
 
@@ -49,3 +53,65 @@ def test_a_recording_that_was_killed_says_how_to_get_it_back(tmp_path):
     writer.close()
     with Bag(tmp_path / "night"):
         pass
+
+
+FIRST_TILT = """
+uint8 OUT_OF_RANGE=1
+uint8 STUCK=2
+uint8 SATURATED=4
+uint8 GAP=8
+std_msgs/Header header
+float64 x
+float64 y
+float64[4] covariance
+float64 temperature
+uint32 sequence
+uint8 flags
+"""
+ORIGINAL = "starpos_interfaces/msg/Tilt"
+
+
+class FirstReleaseBag(NightBag):
+    """Writes a bag as the first release did, whose Tilt had no third axis."""
+
+    def __init__(self, path):
+        super().__init__(path)
+        del self.store.fielddefs[ORIGINAL]
+        self.store.register(get_types_from_msg(FIRST_TILT, ORIGINAL))
+
+
+@pytest.mark.parametrize("frame_id", ["", "s", "starpos_inclinometer_frame"])
+def test_tilts_and_solutions_of_the_first_release_are_played_as_those_of_two_axes(tmp_path, frame_id):
+    from rclpy.serialization import deserialize_message
+
+    with FirstReleaseBag(tmp_path / "night") as bag:
+        tilt = bag.message(
+            "Tilt", 1000.5, x=0.1, y=-0.2, covariance=np.array([1e-9, 0, 0, 2e-9]), sequence=7, flags=8
+        )
+        tilt.header.frame_id = frame_id
+        bag.write("tilt", tilt, 1000.5)
+        ids = ["TYC 1", "a"]
+        terms = [bag.message("ErrorTerm", name="tilt", east=1.5, common=True)]
+        solution = bag.message(
+            "Solution", 1001.0, tilt=tilt, tilt_samples=3, ids=ids, budget=terms, fix_seconds=0.25, xi=4.0
+        )
+        bag.write("solver/solution", solution, 1001.0)
+    with Bag(tmp_path / "night") as bag:
+        topics = bag.topics(None, left_out=pytest.fail)
+        said = {t.name: deserialize_message(data, t.kind) for t, _, data in bag.messages(topics)}
+    played, solved = said["/tilt"], said["/solver/solution"]
+    for got in (played, solved.tilt):
+        assert (got.x, got.y, got.sequence, got.flags) == (0.1, -0.2, 7, 8)
+        assert got.header.frame_id == frame_id and got.covariance.tolist() == [1e-9, 0, 0, 2e-9]
+        assert math.isnan(got.z) and math.isnan(got.z_variance)
+    assert (solved.tilt_samples, solved.ids, solved.xi, solved.fix_seconds) == (3, ids, 4.0, 0.25)
+    assert [(t.name, t.east, t.common) for t in solved.budget] == [("tilt", 1.5, True)]
+
+
+def test_a_broken_tilt_of_the_first_release_is_left_to_the_player(tmp_path):
+    with FirstReleaseBag(tmp_path / "night") as bag:
+        bag.write("tilt", bag.message("Tilt", 1000.5), 1000.5)
+        bag._writer.write(bag._connections["/tilt"], 2, b"\0\1\0\0short")
+    with Bag(tmp_path / "night") as bag:
+        *_, (_, _, data) = sorted(bag.messages(bag.topics(None, left_out=pytest.fail)), key=lambda m: -m[1])
+        assert data == b"\0\1\0\0short"

@@ -66,6 +66,8 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
         temperature=float(tilt.temperature_c),
         sequence=sequence,
         flags=flags,
+        z=float(tilt.theta_z),
+        z_variance=float(tilt.variance_z),
     )
 
 

@@ -131,11 +131,56 @@ def test_tilt_round_trip_and_unknown_covariance(heard):
     assert np.array_equal(message_to_tilt(heard(message), 1e-4).covariance, np.eye(2) * 1e-8)
 
 
+def leaning(**third):
+    """A message of x, y at 40 and 30 deg."""
+    x, y = math.radians(40), math.radians(30)
+    message = messages.tilt_to_message(Tilt(x, y, np.eye(2) * 1e-9, utc_unix_s=MID), "s")
+    for name, value in third.items():
+        setattr(message, name, value)
+    return message
+
+
+THIRD = math.asin(math.sqrt(1 - math.sin(math.radians(40)) ** 2 - 0.25))
+
+
+def test_a_third_axis_comes_and_goes(heard):
+    tilt = message_to_tilt(heard(leaning(z=-THIRD, z_variance=4e-9)))
+    assert (tilt.axes, tilt.theta_z, tilt.variance_z) == (3, -THIRD, 4e-9)
+    again = messages.tilt_to_message(tilt, "s")
+    assert (again.z, again.z_variance) == (-THIRD, 4e-9)
+    for unknown in (0.0, math.nan):
+        assert math.isnan(message_to_tilt(heard(leaning(z=-THIRD, z_variance=unknown))).variance_z)
+
+
+def test_a_third_axis_that_nobody_filled_in_is_none(heard):
+    """A publisher that knows of two axes leaves new fields at 0, which would be a third axis that lies level."""
+    assert math.isnan(leaning().z)
+    for message in (leaning(), leaning(z=0.0, z_variance=0.0), leaning(z=math.nan, z_variance=1e-9)):
+        tilt = message_to_tilt(heard(message))
+        assert tilt.axes == 2 and tilt.up[2] == pytest.approx(math.sin(THIRD))
+
+
+@pytest.mark.parametrize(
+    ("third", "words"),
+    [
+        ({"z": 0.0, "z_variance": 1e-9}, "cannot hold together"),
+        ({"z": 0.9, "z_variance": 1e-9}, "cannot hold together"),
+        ({"x": math.radians(50), "y": math.radians(38), "z": 0.0, "z_variance": 0.0}, "on its side"),
+        ({"z": math.inf}, "not a finite number"),
+        ({"z": THIRD, "z_variance": -1e-9}, "z_variance"),
+        ({"z": THIRD, "z_variance": math.inf}, "z_variance"),
+    ],
+)
+def test_a_third_axis_that_cannot_be_is_refused(third, words, heard):
+    with pytest.raises(TiltError, match=words):
+        message_to_tilt(heard(leaning(**third)))
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("x", math.nan),
-        ("y", 0.6),
+        ("y", 1.6),
         ("covariance", [1.0, 0.0, 0.0, -1.0]),
         ("covariance", [1.0, 2.0, 2.0, 1.0]),
         ("covariance", [1.0, 0.5, 0.0, 1.0]),

@@ -23,7 +23,7 @@ STALE, ERROR = 3, 2  # levels of DiagnosticStatus
 # By so much the length of a quaternion may differ from 1.
 UNIT = 1e-3
 TILT_FLAGS = (
-    (Tilt.OUT_OF_RANGE, "beyond ±30°"),
+    (Tilt.OUT_OF_RANGE, "beyond the sensor's range"),
     (Tilt.STUCK, "the sensor repeats one value"),
     (Tilt.SATURATED, "the converter is at its limit"),
     (Tilt.GAP, "readings were lost"),

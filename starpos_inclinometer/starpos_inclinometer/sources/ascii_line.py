@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from typing import Any
 
-from starpos.instrument.inclinometer import LIMIT_RAD, SCA100T_NOISE_RAD
+import numpy as np
+
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, elevations
 from starpos.units import ARCSEC
 from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
@@ -30,8 +32,11 @@ from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 MAX_LINE = 256  # bytes
 NEAR_RAD = math.radians(0.05)
+AXES = ("x", "y", "z")
 NEEDED = {"x", "y"}
-OPTIONAL = {"temperature", "sequence", "milliseconds", "seconds"}
+# Angles from 0 to 360 deg are unwrapped; a rounded 360 is one.
+FULL_CIRCLE = 2 * math.pi + 1e-9
+OPTIONAL = {"z", "temperature", "sequence", "milliseconds", "seconds"}
 ANGLES_RAD = {
     "deg": math.radians(1),
     "arcmin": math.radians(1 / 60),
@@ -51,24 +56,32 @@ PARAMETERS = (
         "ascii.pattern",
         rf"(?P<x>{NUMBER})[,;\s]+(?P<y>{NUMBER})",
         "Regular expression (Python's) that a whole line must match, with the named groups x, y, and where the device "
-        "tells them temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
+        "tells them z, temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
         read_only=True,
     ),
     Parameter(
         "ascii.unit",
         "deg",
-        "Unit of x and y; g, mg and percent_g are the sine of the tilt. A wrong one is wrong by its factor.",
+        "Unit of x, y and z; g, mg and percent_g are the sine of the tilt. A wrong one is wrong by its factor.",
         choices=UNITS,
         read_only=True,
     ),
     Parameter(
         "ascii.resolution",
         math.nan,
-        "Step of x and y in ascii.unit; unset takes the last digit a line shows.",
+        "Step of x, y and z in ascii.unit; unset takes the last digit a line shows.",
         unit="",
         minimum=0.0,
         maximum=1e6,
         read_only=True,
+    ),
+    Parameter(
+        "ascii.range",
+        math.nan,
+        "Largest tilt of x and y that the device measures; unset: any. Beyond it readings are flagged and not used.",
+        unit="deg",
+        minimum=0.1,
+        maximum=90.0,
     ),
     Parameter(
         "ascii.period",
@@ -99,10 +112,11 @@ _END = re.compile(rb"[\r\n]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """Content of one line: x, y and the step of the last digit in rad; None where the line says nothing."""
+    """Content of one line: elevations and the step of the last digit in rad; None where the line says nothing."""
 
     x: float
     y: float
+    z: float | None
     step: float
     # NaN if the line does not tell it; not compared, because NaN is not equal to itself.
     temperature_c: float = field(compare=False)
@@ -199,7 +213,9 @@ class LineDecoder:
         if any("_" in value for value in said.values()):
             return None
         try:
-            (x, step_x), (y, step_y) = self._angle(said["x"]), self._angle(said["y"])
+            angles, steps = zip(
+                *(self._angle(said[axis]) for axis in AXES if axis in said or axis in NEEDED), strict=True
+            )
             temperature = float(said.get("temperature", "nan"))
             sequence = int(said["sequence"]) if "sequence" in said else None
             milliseconds = float(said["milliseconds"]) if "milliseconds" in said else None
@@ -209,13 +225,16 @@ class LineDecoder:
                 milliseconds = round(milliseconds) & 0xFFFFFFFF
         except (ValueError, OverflowError, ArithmeticError, KeyError):
             return None
-        if not (abs(x) <= math.pi and abs(y) <= math.pi) or math.isinf(temperature):
+        # NaN is not smaller
+        if not all(abs(angle) <= FULL_CIRCLE for angle in angles) or math.isinf(temperature):
             return None
+        x, y, *z = elevations(np.array(angles)).tolist()
         number = self._good if sequence is None and milliseconds is None else 0
         return Line(
             x=x,
             y=y,
-            step=max(step_x, step_y),
+            z=z[0] if z else None,
+            step=max(steps),
             temperature_c=temperature,
             sequence=sequence,
             milliseconds=milliseconds,
@@ -310,7 +329,7 @@ class AsciiSource(TiltSource):
         self._arrivals, self._pace = ArrivalFilter(), PaceWatch()
         self._noise = NoiseTracker()
         self._equal = 0
-        self._last = (math.nan, math.nan)
+        self._last: tuple[float | None, ...] = (math.nan, math.nan)
         self._sequence = -1
         self.configure(values)
 
@@ -331,6 +350,9 @@ class AsciiSource(TiltSource):
         self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
         self._latency = 0.0 if math.isnan(values["latency"]) else values["latency"]
         self._stuck_samples = values["ascii.stuck_samples"]
+        self._range = (
+            math.pi / 2 if math.isnan(values["ascii.range"]) else math.radians(values["ascii.range"])
+        )
 
     def take(self) -> list[Reading]:
         return [self._read(arrival) for arrival in self._link.take()]
@@ -348,12 +370,11 @@ class AsciiSource(TiltSource):
         flags = self._flags(line) | (TIME_UNKNOWN if known_s is None else 0)
         if flags & GAP:
             self._noise.interrupt()
+        angles = (line.x, line.y) if line.z is None else (line.x, line.y, line.z)
         if not flags & (OUT_OF_RANGE | STUCK):
-            self._noise.add(moment.monotonic_s - late, line.x, line.y)
-        stated = max(SCA100T_NOISE_RAD, line.step)
-        variances = [
-            max(s, self._floor) ** 2 + line.step**2 / 12 for s in self._noise.sigma or (stated, stated)
-        ]
+            self._noise.add(moment.monotonic_s - late, *angles)
+        sigmas = self._noise.sigma or (max(SCA100T_NOISE_RAD, line.step),) * len(angles)
+        variances = [max(s, self._floor) ** 2 + line.step**2 / 12 for s in sigmas]
         self._sequence = (self._sequence + 1 + line.lost) & 0xFFFFFFFF
         stamp_ns = moment.host_ns - round((late + self._latency) * 1e9)
         covariance = (variances[0], 0.0, 0.0, variances[1])
@@ -365,15 +386,18 @@ class AsciiSource(TiltSource):
             temperature_c=line.temperature_c,
             sequence=self._sequence,
             flags=flags,
+            z=math.nan if line.z is None else line.z,
+            z_variance=math.nan if line.z is None else variances[2],
         )
 
     def _flags(self, line: Line) -> int:
-        self._equal = self._equal + 1 if (line.x, line.y) == self._last else 1
-        self._last = line.x, line.y
+        self._equal = self._equal + 1 if (line.x, line.y, line.z) == self._last else 1
+        self._last = line.x, line.y, line.z
         flags = GAP if line.lost or line.broken else 0
         if 0 < self._stuck_samples <= self._equal:
             flags |= STUCK
-        if max(abs(line.x), abs(line.y)) > LIMIT_RAD:
+        # Of a sensor without z, beyond 90 deg is upside down.
+        if max(abs(line.x), abs(line.y)) > self._range:
             flags |= OUT_OF_RANGE
         return flags
 
@@ -383,7 +407,7 @@ class AsciiSource(TiltSource):
             "openings": state.connections,
             "unfetched samples": state.dropped,
             "clock rate error (ppm)": self._arrivals.rate_ppm,
-            "noise x, y (arcsec)": noise_text(self._noise.sigma),
+            "noise by axis (arcsec)": noise_text(self._noise.sigma),
         }
         return Health(
             phase=state.phase,

@@ -11,11 +11,10 @@ import numpy as np
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from starpos.instrument.inclinometer import LIMIT_RAD
 from starpos_common.parameters import Parameter
 from starpos_common.topics import subscription
 from starpos_inclinometer.noise import NoiseTracker, noise_text
-from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, Counts, Health, Phase, Reading
+from starpos_inclinometer.sources.reading import GAP, STUCK, Counts, Health, Phase, Reading
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 TOPIC = "imu/data"
@@ -130,13 +129,13 @@ class MeanForce:
             return f"it turns at {math.degrees(self.rotation):.2g} deg/s"
         return ""
 
-    def tilt(self) -> tuple[float, float]:
-        """Tilt of x and y, rad."""
-        x, y, _ = (self.force / np.linalg.norm(self.force)).tolist()
-        return math.asin(x), math.asin(y)
+    def tilt(self) -> tuple[float, float, float]:
+        """Elevations of x, y and z, rad."""
+        x, y, z = np.arcsin(np.clip(self.force / np.linalg.norm(self.force), -1, 1)).tolist()
+        return x, y, z
 
     def covariance(self) -> np.ndarray:
-        """Covariance of the tilt, (2, 2) rad2, from the scatter of the forces, or the stated variance if that is more."""
+        """Covariance of the tilt, (3, 3) rad2, from the scatter of the forces, or the stated variance if that is more."""
         scatter = np.cov(self.forces, rowvar=False)
         more = np.sqrt(np.maximum(self.variance, np.diag(scatter)))
         stddev = np.sqrt(np.diag(scatter))
@@ -145,9 +144,9 @@ class MeanForce:
         strength = np.linalg.norm(self.force)
         up = self.force / strength
         # d asin(u) = du / cos, du = (1 - u u^T) df / |f|
-        slope = (np.eye(3) - np.outer(up, up))[:2] / strength
-        slope /= np.sqrt(np.maximum(1 - up[:2] ** 2, 0.01))[:, None]
-        return slope @ forces @ slope.T / len(self.forces) + LEAST_STDDEV_RAD**2 * np.eye(2)
+        slope = (np.eye(3) - np.outer(up, up)) / strength
+        slope /= np.sqrt(np.maximum(1 - up**2, 0.01))[:, None]
+        return slope @ forces @ slope.T / len(self.forces) + LEAST_STDDEV_RAD**2 * np.eye(3)
 
 
 class ForceAverager:
@@ -260,40 +259,40 @@ class ImuSource(TiltSource):
         self._wake()
 
     def _reading(self, average: MeanForce) -> Reading:
-        x, y = average.tilt()
-        flags = self._flags(average, x, y)
+        x, y, z = average.tilt()
+        flags = self._flags(average)
         if flags & GAP:
             self._noise.interrupt()
-        if not flags & (OUT_OF_RANGE | STUCK):
-            self._noise.add(average.mid_ns * 1e-9, x, y)
+        if not flags & STUCK:
+            self._noise.add(average.mid_ns * 1e-9, x, y, z)
         self._sequence += 1
+        covariance = self._covariance(average)
         return Reading(
             stamp_ns=max(average.mid_ns - self._latency_ns, 0),
             x=x,
             y=y,
-            covariance=tuple(self._covariance(average).ravel().tolist()),
+            covariance=tuple(covariance[:2, :2].ravel().tolist()),
+            z=z,
+            z_variance=float(covariance[2, 2]),
             temperature_c=math.nan,
             sequence=(self._sequence - 1) & 0xFFFFFFFF,
             flags=flags,
         )
 
-    def _flags(self, average: MeanForce, x: float, y: float) -> int:
+    def _flags(self, average: MeanForce) -> int:
         flags = GAP if self._gap else 0
         self._gap = False
         still = not np.ptp(average.forces, axis=0).any()
         if still and (self._has_noise or average.variance.any()):
             flags |= STUCK
         self._has_noise |= not still
-        # An instrument upside down would look level.
-        if max(abs(x), abs(y)) > LIMIT_RAD or average.force[2] <= 0:
-            flags |= OUT_OF_RANGE
         return flags
 
     def _covariance(self, average: MeanForce) -> np.ndarray:
         """Covariance from the messages, or from the scatter of the averages if that is more (IMU noise is not white)."""
         covariance = average.covariance()
         found = np.sqrt(np.diag(covariance))
-        least = np.maximum(self._noise.sigma or (0.0, 0.0), self._floor)
+        least = np.maximum(self._noise.sigma or (0.0,) * 3, self._floor)
         grown = np.maximum(least / found, 1.0)
         return covariance * np.outer(grown, grown)
 
@@ -307,7 +306,7 @@ class ImuSource(TiltSource):
             "messages from the future": self._future,
             "messages out of order": averager.disordered,
             "IMU's frame": self._frame or "unknown",
-            "noise x, y (arcsec)": noise_text(self._noise.sigma),
+            "noise by axis (arcsec)": noise_text(self._noise.sigma),
         }
         phase, sentence = self._phase(now_s)
         return Health(

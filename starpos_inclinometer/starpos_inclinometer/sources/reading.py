@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The results of a source: readings, and the state of the source."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -55,6 +56,7 @@ class Reading:
 
     stamp_ns: the host's time.  x, y: rad, always finite.  covariance: rad2 (xx, xy, yx, yy).
     temperature_c: deg C, or NaN if it is not known.
+    z, z_variance: rad, rad2; NaN of a two-axis sensor.
     """
 
     stamp_ns: int
@@ -64,6 +66,8 @@ class Reading:
     temperature_c: float
     sequence: int
     flags: int
+    z: float = math.nan
+    z_variance: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)

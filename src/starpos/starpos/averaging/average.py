@@ -8,11 +8,12 @@ The stars tell the two apart: a camera that has not turned against the Earth has
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import erfa
 import numpy as np
 
 from starpos.averaging.claim import Claim, Remembered
 from starpos.averaging.filter import PlaceFilter
-from starpos.averaging.slip import slip_s
+from starpos.averaging.slip import poses_of, slip_s
 from starpos.errors import FixError
 from starpos.fix.budget import ErrorTerm, total_covariance
 from starpos.fix.fix import Fix
@@ -23,6 +24,10 @@ SCATTER = "scatter"
 GATE_SIGMA = 6.0
 # so many fixes of a turned camera, so far off, are of another place
 MOVED_FIXES, MOVED_SIGMA = 3, 4.5
+# so many steps from pose to pose tell of their scatter, by the smaller share of them; no inclinometer errs by more
+FEWEST_STEPS, SMALLER, MOST_POSE_RAD = 6, 1 / 3, np.radians(0.25)
+# an average of a smaller share of the fixes is none of one place that scatters
+MOST_OF_ALL = 2 / 3
 # a rival with fewer fixes is kept when the camera is touched again
 RIVAL_FIXES = 10
 
@@ -64,17 +69,18 @@ def average(fixes: Sequence[Fix]) -> Average:
     """
     different = {(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values()
     in_order = sorted(different, key=lambda f: f.utc_unix_s)
-    averager = Averager()
-    for f in in_order:
-        averager.add(f)
+    averager = _averaged(in_order, 0.0)
     if averager.frame_sigma:
         # the first fixes were judged before anything showed how much all scatter
-        averager = Averager(averager.frame_sigma)
-        for f in in_order:
-            averager.add(f)
+        averager = _averaged(in_order, averager.frame_sigma)
     whole = averager.average
     if whole is None:
         raise FixError("there is no fix to average: none of the frames has one")
+    if whole.frames < MOST_OF_ALL * len(in_order) and (sound := _about_one_place(in_order)):
+        # fixes that scatter from pose to pose look like moves before it shows how much they do
+        at_rest = _averaged(sound, 0.0).average
+        if at_rest is not None and not at_rest.moved and at_rest.frames > whole.frames:
+            whole = replace(at_rest, left_out=at_rest.left_out + len(in_order) - len(sound))
     if whole.left_out >= whole.frames:
         raise FixError(
             f"of {whole.frames + whole.left_out} frames {whole.left_out} lie further from the others than their errors "
@@ -82,6 +88,35 @@ def average(fixes: Sequence[Fix]) -> Average:
             "instrument turned and its A3 is not what it was said to be (--self-calibrate finds it)"
         )
     return whole
+
+
+def _averaged(in_order: Sequence[Fix], frame_sigma: float) -> "Averager":
+    averager = Averager(frame_sigma)
+    for f in in_order:
+        averager.add(f)
+    return averager
+
+
+def _about_one_place(in_order: Sequence[Fix]) -> list[Fix]:
+    """The fixes of many poses that scatter about one place, with that scatter in their budgets; [] if most do not.
+
+    How much they scatter shows from the smaller steps from pose to pose, as moves and wrong fixes make large ones, and
+    then from how far the poses lie from their middle.
+    """
+    pose = poses_of(in_order)
+    if pose[-1] < FEWEST_STEPS:
+        return []
+    zeniths = np.array([erfa.s2c(f.longitude, f.latitude) for f in in_order])
+    means = np.array([zeniths[pose == k].mean(0) for k in range(pose[-1] + 1)])
+    steps = np.sort(np.linalg.norm(np.diff(means, axis=0), axis=1))
+    off = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    # squares in units of the sigma per axis are exponential, with a mean of 2; of a step, which two poses share, of 4
+    by_steps = steps[int(SMALLER * len(steps))] / np.sqrt(-4 * np.log(1 - SMALLER))
+    by_middle = np.median(off) / np.sqrt(2 * np.log(2))
+    if by_middle > MOST_POSE_RAD or np.mean(off < GATE_SIGMA * by_steps) < MOST_OF_ALL:
+        return []
+    near = off < GATE_SIGMA * by_middle
+    return [_with_scatter(f, by_middle) for f, k in zip(in_order, pose, strict=True) if near[k]]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,6 +33,8 @@ VALID_DAYS = 365.0
 TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all, and so often are those left judged again
 OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
+# of so many poses two thirds leave the fit, with its five parameters, free enough to judge the others
+MANY_POSES = 10
 # poses that scatter more than any inclinometer were moved, or are of several places
 MOST_POSE_RAD = np.radians(0.15)
 # chi-square per degree of freedom of frames too few to tell their scatter
@@ -209,15 +211,7 @@ def _agreed(
 ) -> _Agreement:
     """The plumb line that `find` gives for the frames that agree with each other."""
     whole = Readings.of(solved, errors)
-    rows = np.arange(len(solved))
-    for _ in range(JUDGED):
-        plumb = find(whole.take(rows), a3, [solved[k].fix for k in rows])
-        size = np.linalg.norm(plumb.left, axis=1)
-        usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
-        agree = size < OUTLIER_SIGMA * usual
-        if agree.all() or agree.sum() < (1 - MOST_OUTLIERS) * len(solved):
-            break
-        rows = rows[agree]
+    rows, plumb = _agreeing(find, whole, solved, a3, errors)
     sound = [solved[k] for k in rows]
     fixes = [s.fix for s in sound]
     readings = whole.take(rows)
@@ -231,10 +225,55 @@ def _agreed(
     left_out = {}
     if len(rows) < len(solved):
         # how far the others are off shows against the answer of these
-        turned = whole.plumb - np.einsum("ij,kjl,l->ki", plumb.a3, whole.to_camera, plumb.zenith)
+        off = np.linalg.norm(_left(whole, plumb), axis=1)
         for k in np.setdiff1d(np.arange(len(solved)), rows):
-            left_out[solved[k].fix.utc_unix_s] = float(np.linalg.norm(turned[k]))
+            left_out[solved[k].fix.utc_unix_s] = float(off[k])
     return _Agreement(plumb, readings, sound, scatter, left_out)
+
+
+def _agreeing(
+    find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray, errors: InclinometerErrors
+) -> tuple[np.ndarray, PlumbLine]:
+    """Indices of the frames that agree with most of the others, and the plumb line of these."""
+    rows = _unhidden(find, whole, solved, a3)
+    for _ in range(JUDGED):
+        plumb = find(whole.take(rows), a3, [solved[k].fix for k in rows])
+        size = np.linalg.norm(plumb.left, axis=1)
+        usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
+        agree = size < OUTLIER_SIGMA * usual
+        if agree.all() or agree.sum() < (1 - MOST_OUTLIERS) * len(solved):
+            break
+        rows = rows[agree]
+    return rows, plumb
+
+
+def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray) -> np.ndarray:
+    """Indices of the frames without those that pull the fit of all towards them, and hide in the scatter that this makes.
+
+    Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
+    Few poses fit almost anything; then these are all.
+    """
+    rows = everyone = np.arange(len(solved))
+    most = int(np.ceil((1 - MOST_OUTLIERS) * len(solved)))
+    if len(np.unique(whole.pose)) < MANY_POSES:
+        return everyone
+    # the closest alone, until they are the same; then all that agree with them, until these are
+    for closest in (True, False):
+        for _ in range(JUDGED):
+            left = _left(whole, find(whole.take(rows), a3, [solved[k].fix for k in rows]))
+            usual = np.hypot(whole.sigma, max(typical(left[rows], 5), whole.pose_sigma))
+            off = np.linalg.norm(left, axis=1) / usual
+            before, rows = rows, np.sort(np.argsort(off, kind="stable")[:most])
+            if not closest:
+                rows = np.union1d(rows, np.flatnonzero(off < OUTLIER_SIGMA))
+            if np.array_equal(before, rows):
+                break
+    return rows
+
+
+def _left(whole: Readings, plumb: PlumbLine) -> np.ndarray:
+    """What a plumb line leaves (K, 3) of readings, in S, whether it was fitted to them or not."""
+    return whole.plumb - np.einsum("ij,kjl,l->ki", plumb.a3, whole.to_camera, plumb.zenith)
 
 
 def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:

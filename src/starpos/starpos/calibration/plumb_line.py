@@ -352,5 +352,6 @@ def _axis_of_turn(readings: Readings, given: np.ndarray) -> np.ndarray:
     # frames of one heading have no axis
     if strength[0] - strength[1] < SAME_AXIS:
         return given
-    up = directions[0] * np.sign(directions[0] @ given.T @ mean)
+    # a camera that sees stars looks above the horizon; the given A3 may stand the sensor on its head
+    up = directions[0] * np.sign(directions[0][2])
     return rotation.shortest_turn(given @ up, mean) @ given

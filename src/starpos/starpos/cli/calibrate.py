@@ -21,7 +21,8 @@ from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilt_log import TiltLog, read_tilt_csv
+from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.sky import catalogue
 
 NOTHING = 1  # exit status
@@ -44,7 +45,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tilt",
         metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]: refraction is undone",
+        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]: refraction is undone",
     )
     common.add_air(parser)
     calibrate_site.define(parser)

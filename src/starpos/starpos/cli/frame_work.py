@@ -21,7 +21,8 @@ from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilt_log import TiltLog, read_tilt_csv
+from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:

@@ -35,7 +35,8 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tilt",
         metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; not with nights: folders of frames with tilt.csv",
+        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
+        "frames with tilt.csv",
     )
     common.add_exif(parser)
     common.add_instrument(parser)

@@ -91,7 +91,13 @@ class Tilt:
 
     @property
     def slope(self) -> np.ndarray:
-        """Derivatives (3, axes) of `up` by `theta`."""
+        """Change (3, axes) of `up` for an error of each axis in rad: of the angle of two, of the sine of three.
+
+        Three accelerometers err alike whichever way they lean, and so does the direction that they give.
+        """
+        if self.axes == 3:
+            up = self.up
+            return (np.eye(3) - np.outer(up, up)) / np.linalg.norm(np.sin(self.theta))
         return up_slope(self.theta)
 
 
@@ -157,6 +163,19 @@ class InclinometerErrors:
 EXACT = InclinometerErrors(
     noise_rad=0.0, quantum_rad=0.0, drift_rad_per_sqrt_hour=0.0, temperature_rad_per_c=0.0, scale=0.0
 )
+
+
+def elevations(angles: np.ndarray) -> np.ndarray:
+    """Elevations (..., axes) in rad from angles (..., axes) in rad that a sensor may count from 0 to 360 deg.
+
+    A third axis tells which way is up, so of three axes an angle beyond 90 deg has the elevation of its supplement.
+    Of two it stays, and `Tilt` refuses it: the sensor is upside down.
+    """
+    angles = np.asarray(angles, float)
+    unwrapped = np.where(np.abs(angles) > np.pi, (angles + np.pi) % (2 * np.pi) - np.pi, angles)
+    if angles.shape[-1] == 2:
+        return unwrapped
+    return np.where(np.abs(unwrapped) > np.pi / 2, np.sign(unwrapped) * np.pi - unwrapped, unwrapped)
 
 
 def up_of(theta: np.ndarray) -> np.ndarray:

@@ -1,20 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A log of tilt readings: the tilt of an exposure from it, and the table on disk that holds it."""
+"""A log of tilt readings: the tilt of an exposure from it."""
 
-import io
-import itertools
-import os
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from starpos.errors import TiltError
-from starpos.files import open_regular
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 
 # The noise is measured from readings that are so close in time, if there are so many.
@@ -27,8 +20,6 @@ SIGMA_PER_MAD = 1.4826
 KEPT, KEPT_VARIANCE = 0.8, 0.4377
 # Over sqrt(steps) it is three times the relative error of `white_noise`.
 SIGNIFICANT = 4.0
-# A week at 10 Hz.
-MAX_CSV_BYTES = 300_000_000
 # by how much a reading may miss the exposure's edge: rounding
 TOUCH_S = 1e-6
 # two readings that are further apart do not bracket an exposure
@@ -50,13 +41,22 @@ def white_noise(steps: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TiltLog:
-    """N readings: utc_unix_s (N,), theta_x, theta_y (N,) rad, temperature_c (N,), covariance (N, 2, 2) rad2 of each."""
+    """N readings of one sensor.
+
+    utc_unix_s (N,).  theta_x, theta_y (N,) in rad.  temperature_c (N,).
+    covariance (N, 2, 2) in rad2 of each reading's theta_x, theta_y.
+    theta_z (N,) in rad; None or NaN of a two-axis sensor.
+    variance_z (N,) in rad2; None or NaN: that of the other two.
+    """
 
     utc_unix_s: np.ndarray
     theta_x: np.ndarray
     theta_y: np.ndarray
+    _: KW_ONLY
     temperature_c: np.ndarray
     covariance: np.ndarray
+    theta_z: np.ndarray | None = None
+    variance_z: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -65,15 +65,18 @@ class TiltLog:
         theta_x: np.ndarray,
         theta_y: np.ndarray,
         temperature_c: np.ndarray,
-        noise_rad: float = SCA100T_NOISE_RAD,
+        noise_rad: float | np.ndarray = SCA100T_NOISE_RAD,
+        theta_z: np.ndarray | None = None,
     ) -> "TiltLog":
-        """Make a log of readings (N,) that have the same white noise, 1 sigma."""
+        """Make a log of readings (N,); noise_rad: 1 sigma of the white noise of all of them, or of each (N,)."""
+        variance = np.broadcast_to(np.square(noise_rad), np.shape(utc_unix_s))
         return cls(
             utc_unix_s,
             theta_x,
             theta_y,
-            temperature_c,
-            np.tile(np.eye(2) * noise_rad**2, (len(utc_unix_s), 1, 1)),
+            temperature_c=temperature_c,
+            covariance=np.eye(2) * variance[:, None, None],
+            theta_z=theta_z,
         )
 
     @classmethod
@@ -83,9 +86,27 @@ class TiltLog:
             np.array([r.utc_unix_s for r in readings]),
             np.array([r.theta_x for r in readings]),
             np.array([r.theta_y for r in readings]),
-            np.array([r.temperature_c for r in readings]),
-            np.array([r.covariance for r in readings]),
+            temperature_c=np.array([r.temperature_c for r in readings]),
+            covariance=np.array([r.covariance for r in readings]),
+            theta_z=np.array([r.theta_z for r in readings]),
+            variance_z=np.array([r.variance_z for r in readings]),
         )
+
+    @cached_property
+    def theta(self) -> np.ndarray:
+        """The elevations (N, axes) in rad; where some readings have a third axis, it is NaN of those without."""
+        if self.theta_z is None or np.isnan(self.theta_z).all():
+            return np.stack([self.theta_x, self.theta_y], -1)
+        return np.stack([self.theta_x, self.theta_y, self.theta_z], -1)
+
+    @cached_property
+    def variance(self) -> np.ndarray:
+        """The stated variance (N, axes) in rad2 of each elevation."""
+        two = np.diagonal(self.covariance, axis1=1, axis2=2)
+        if self.theta.shape[1] == 2:
+            return two
+        third = np.full(len(two), np.nan) if self.variance_z is None else self.variance_z
+        return np.column_stack([two, np.where(np.isnan(third), two.mean(1), third)])
 
     @cached_property
     def excess(self) -> float:
@@ -95,8 +116,8 @@ class TiltLog:
         near = (apart > 0) & (apart < NEIGHBOURS_S)
         if near.sum() < ENOUGH_NEIGHBOURS:
             return 1.0
-        steps = np.diff(np.stack([self.theta_x, self.theta_y], -1)[order], axis=0)[near]
-        stated = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2).mean() / 2)
+        steps = np.diff(self.theta[order], axis=0)[near]
+        stated = np.sqrt(self.variance.mean())
         # of an instrument at rest: while it moves, readings differ by more than any noise that is let pass
         steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * REST * stated).all(1)]
         if len(steps) < ENOUGH_NEIGHBOURS:
@@ -118,12 +139,19 @@ class TiltLog:
 
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
+        if not self._finite.all():
+            raise TiltError("some tilts have two axes and some three: give those of one inclinometer")
         return self._mean(np.arange(len(self.utc_unix_s)))
+
+    @property
+    def _finite(self) -> np.ndarray:
+        """Mask (N,) of the readings whose time and angles are all there."""
+        return np.isfinite(self.utc_unix_s) & np.isfinite(self.theta).all(1)
 
     def _mean(self, use: np.ndarray) -> Tilt:
         """The mean tilt of the readings `use` (indices)."""
-        theta = np.stack([self.theta_x[use], self.theta_y[use]], -1)
-        noise = self.excess * np.sqrt(np.trace(self.covariance[use], axis1=1, axis2=2).mean() / 2)
+        theta = self.theta[use]
+        noise = self.excess * np.sqrt(self.variance[use].mean())
         from_middle = np.abs(theta - np.median(theta, axis=0))
         spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
         if spread.max() > REST * noise:
@@ -134,17 +162,21 @@ class TiltLog:
         sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)
         theta, use = theta[sane], use[sane]
         n = len(use)
+        variance = self.variance[use].mean(0) * self.excess**2
         covariance = self.covariance[use].mean(0) * self.excess**2
         # the scatter of a few readings is uncertain: it counts only if it clearly exceeds the noise
         if n > 1:
-            scatter = theta.var(0, ddof=1) / np.diag(covariance)
+            scatter = theta.var(0, ddof=1) / variance
             widen = np.sqrt(np.where(scatter > 1 + 2 * np.sqrt(2 / (n - 1)), scatter * (1 + 2 / n), 1.0))
-            covariance = covariance * np.outer(widen, widen)
-        theta_x, theta_y = theta.mean(0).tolist()
+            variance = variance * widen**2
+            covariance = covariance * np.outer(widen[:2], widen[:2])
+        theta_x, theta_y, *third = theta.mean(0).tolist()
         return Tilt(
             theta_x,
             theta_y,
             covariance / n,
+            theta_z=third[0] if third else np.nan,
+            variance_z=float(variance[2]) / n if third else np.nan,
             utc_unix_s=float(self.utc_unix_s[use].mean()),
             samples=n,
             temperature_c=float(self.temperature_c[use].mean()),
@@ -157,8 +189,7 @@ class TiltLog:
         They are those inside the exposure, which must cover it. If none is inside, two do that bracket it closely and
         agree: what happened between two readings that differ nobody knows.
         """
-        readings = np.stack([self.utc_unix_s, self.theta_x, self.theta_y])
-        index = np.flatnonzero(np.isfinite(readings).all(0))
+        index = np.flatnonzero(self._finite)
         index = index[np.unique(self.utc_unix_s[index], return_index=True)[1]]
         t, half = self.utc_unix_s[index], max(exposure_s, 0.0) / 2 + TOUCH_S
         first, end = np.searchsorted(t, [mid_unix_s - half, mid_unix_s + half])
@@ -219,70 +250,5 @@ class TiltLog:
 
     def _agree(self, a: int, b: int) -> bool:
         """Whether two readings are of one lean, as far as their noise tells."""
-        off = np.array([self.theta_x[a] - self.theta_x[b], self.theta_y[a] - self.theta_y[b]])
-        variance = np.diag(self.covariance[a] + self.covariance[b]) * self.excess**2
-        return bool((off**2 <= AGREE_SIGMA**2 * variance).all())
-
-
-def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
-    """Read a TiltLog from CSV columns utc_unix_s, theta_x_deg, theta_y_deg[, temperature_c]; TiltError if impossible."""
-    path = Path(path)
-    cure = "give a CSV with a line of names, utc_unix_s,theta_x_deg,theta_y_deg[,temperature_c], and readings"
-    try:
-        with _opened(path) as f, warnings.catch_warnings():
-            # our own error says that a file is empty
-            warnings.simplefilter("ignore")
-            names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
-            rows = np.loadtxt(f, delimiter=",", ndmin=2)
-    except FileNotFoundError:
-        raise TiltError(f"{path}: there is no such file: {cure}") from None
-    except (OSError, ValueError, UnicodeDecodeError) as e:
-        reason = getattr(e, "strerror", None) or _first_line(e)
-        raise TiltError(f"{path}: not a readable table of tilts ({reason}): {cure}") from None
-    need = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
-    if not set(need) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(set(names)):
-        raise TiltError(
-            f"{path}: a tilt table needs the columns {', '.join(need)} and at least one row: {cure}"
-        )
-    column = dict(zip(names, rows.T, strict=True))
-    _check_one_sensor(path, column["utc_unix_s"], rows)
-    order = np.argsort(column["utc_unix_s"], kind="stable")
-    order = order[np.isfinite(column["utc_unix_s"][order])]
-    temperature = column.get("temperature_c", np.full(len(rows), np.nan))
-    return TiltLog.of(
-        column["utc_unix_s"][order],
-        np.radians(column["theta_x_deg"][order]),
-        np.radians(column["theta_y_deg"][order]),
-        temperature[order],
-        noise_rad,
-    )
-
-
-def _opened(path: Path) -> TextIO:
-    """The open text of a table; OSError if it cannot be read, ValueError if it is too large."""
-    file = open_regular(path)
-    if os.fstat(file.fileno()).st_size > MAX_CSV_BYTES:
-        file.close()
-        raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
-    return io.TextIOWrapper(file, "utf-8-sig")
-
-
-def _check_one_sensor(path: Path, utc_unix_s: np.ndarray, rows: np.ndarray) -> None:
-    """TiltError if the times go back into those that the table already holds: readings of two sensors, it seems.
-
-    A table may hold nights in any order, and a part of itself once more.
-    """
-    finite = np.isfinite(utc_unix_s)
-    _, first = np.unique(rows[finite], axis=0, return_index=True)
-    t = utc_unix_s[finite][np.sort(first)]
-    runs = np.split(t, np.flatnonzero(np.diff(t) < 0) + 1)
-    ranges = sorted((run[0], run[-1]) for run in runs if len(run))
-    if any(later < end for (_, end), (later, _) in itertools.pairwise(ranges)):
-        raise TiltError(
-            f"{path}: its times go back into those that it already holds, as if it had the readings of two "
-            "inclinometers: give the table of one"
-        )
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        variance = (self.variance[a] + self.variance[b]) * self.excess**2
+        return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())

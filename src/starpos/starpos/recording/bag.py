@@ -46,7 +46,7 @@ class BagReader:
             with ExitStack() as stack:
                 self._reader: Reader | AnyReader
                 if self._typed:
-                    decoder = AnyReader([self.path], default_typestore=_installed_types())
+                    decoder = AnyReader([self.path], default_typestore=installed_types())
                     self._reader, self._types = decoder, stack.enter_context(decoder).typestore
                     readers = decoder.readers
                 else:
@@ -100,7 +100,7 @@ class BagReader:
         return BagError(f"{self.path}: not a readable bag ({type(error).__name__}: {one_line(error)})")
 
 
-def _installed_types() -> "Typestore":
+def installed_types() -> "Typestore":
     """Message types for a bag without definitions: ROS's own, and ours if a workspace was entered."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -13,7 +13,7 @@ from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, SQUARE, Tilt
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16
@@ -67,6 +67,7 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
 def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
     """Tilt from a message; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
+    A tilt has two axes where the third is NaN, not filled in, or not there, as in the first release's messages.
     An impossible temperature becomes NaN, unknown.  The flags are left to the caller.  Raises TiltError for NaN, no
     stamp, angles that cannot hold together, or an impossible covariance.
     """
@@ -85,7 +86,41 @@ def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD)
         if max(xx, yy) > MOST_TILT_VARIANCE:
             raise TiltError("a tilt message's covariance is beyond 1 rad2: send zeros where it is unknown.")
     celsius = message.temperature if abs(message.temperature) <= MOST_CELSIUS else math.nan
-    return Tilt(message.x, message.y, covariance, utc_unix_s=unix_s, samples=1, temperature_c=celsius)
+    z, z_variance = _third_axis(message)
+    return Tilt(
+        message.x,
+        message.y,
+        covariance,
+        utc_unix_s=unix_s,
+        temperature_c=celsius,
+        theta_z=z,
+        variance_z=z_variance,
+    )
+
+
+def _third_axis(message: Any) -> tuple[float, float]:
+    """Elevation in rad and variance in rad2 of the third axis, NaN where they are not known; TiltError if they cannot be.
+
+    A publisher that knows of two axes only may leave both at 0. Where x and y leave room for no third axis but a level
+    one, 0 may as well be what it reads; such a tilt is refused, because the two differ by degrees.
+    """
+    z, variance = getattr(message, "z", math.nan), getattr(message, "z_variance", math.nan)
+    if math.isnan(z):
+        return math.nan, math.nan
+    if z == variance == 0:
+        if math.sin(message.x) ** 2 + math.sin(message.y) ** 2 > 1 - SQUARE:
+            raise TiltError(
+                "a tilt message leaves z and z_variance at 0, and its x and y alone are those of a sensor on its side: "
+                "send z and its variance, or NaN for a sensor of two axes."
+            )
+        return math.nan, math.nan
+    if not math.isfinite(z):
+        raise TiltError("a tilt message's z is not a finite number: send NaN for a sensor of two axes.")
+    if variance < 0 or variance > MOST_TILT_VARIANCE:
+        raise TiltError(
+            "a tilt message's z_variance is not from 0 to 1 rad2: send NaN or 0 where it is unknown."
+        )
+    return z, variance or math.nan
 
 
 def message_to_camera(message: Any, source: str = "camera_info") -> Camera:

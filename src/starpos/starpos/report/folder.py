@@ -14,7 +14,7 @@ from starpos.files import read_regular
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import read_tilt_csv
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.report.night import Truth
 
 TILTS, TRUTH = "tilt.csv", "truth.json"

@@ -270,8 +270,9 @@ def calibrated_night(
     stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)
     lower = replace(world, scene=replace(world.scene, altitude_deg=world.scene.altitude_deg - 5))
     more, readings, _ = photograph(lower, zero, begin + 3600, [0.0], frames, rng)
+    columns = ("utc_unix_s", "theta_x", "theta_y", "temperature_c", "covariance")
     tilts = TiltLog(
-        *(np.concatenate(pair) for pair in zip(vars(tilts).values(), vars(readings).values(), strict=True))
+        **{name: np.concatenate([getattr(tilts, name), getattr(readings, name)]) for name in columns}
     )
     solver = Solver(world.told, catalogue, world.air)
     later = begin + DAY_S * rng.uniform(0.1, 20)

@@ -13,7 +13,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
 from starpos.instrument.instrument import Instrument, focal_px_of
-from starpos.instrument.tilt_log import read_tilt_csv
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.simulation.scene import scene_of
 from starpos.units import ARCSEC
 

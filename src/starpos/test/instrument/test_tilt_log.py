@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from starpos.errors import TiltError
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
-from starpos.instrument.tilt_log import TiltLog, read_tilt_csv
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
+from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
 
 DEG = np.pi / 180
 NO_ERROR = np.zeros((2, 2))
@@ -74,7 +75,8 @@ def test_each_axis_keeps_its_stated_error_and_their_correlation():
     stated = np.array([[1e-6, 9e-7], [9e-7, 1e-6]])
     t = 1000 + 0.1 * np.arange(5)
     zeros = np.zeros(5)
-    tilt = TiltLog(t, zeros, zeros, zeros, np.tile(stated, (5, 1, 1))).average(1000.2, 0.5)
+    tilt = TiltLog(t, zeros, zeros, temperature_c=zeros, covariance=np.tile(stated, (5, 1, 1)))
+    tilt = tilt.average(1000.2, 0.5)
     np.testing.assert_allclose(tilt.covariance, stated / 5)
 
 
@@ -184,6 +186,68 @@ def test_csv_in_any_order_without_temperature(tmp_path, text):
     tilt = read_tilt_csv(path).average(10.0, 0.1)
     assert (tilt.theta_x, tilt.theta_y) == pytest.approx((DEG, -2 * DEG))
     assert np.isnan(tilt.temperature_c)
+
+
+def test_a_third_axis_and_the_error_of_each_row(tmp_path):
+    path = tmp_path / "tilt.csv"
+    path.write_text(
+        "utc_unix_s,theta_x_deg,theta_y_deg,theta_z_deg,sigma_deg\n10,-30,324.7356,-35.2644,0.05\n20,30,0,120,nan\n"
+    )
+    read = read_tilt_csv(path)
+    one, other = read.average(10.0, 0.1), read.average(20.0, 0.1)
+    assert one.theta / DEG == pytest.approx([-30, -35.2644, -35.2644])
+    assert np.sqrt(np.diag(one.noise)) / DEG == pytest.approx([0.05] * 3)
+    # of three axes an angle over the zenith is the elevation of its supplement
+    assert other.theta / DEG == pytest.approx([30, 0, 60])
+    assert np.sqrt(np.diag(other.noise)) == pytest.approx([SCA100T_NOISE_RAD] * 3)
+
+
+@pytest.mark.parametrize("sigma", ["0", "-0.01", "inf", "90"])
+def test_an_error_that_cannot_be_is_refused_in_a_sentence(tmp_path, sigma):
+    path = tmp_path / "tilt.csv"
+    path.write_text(f"utc_unix_s,theta_x_deg,theta_y_deg,sigma_deg\n10,1,2,{sigma}\n")
+    with pytest.raises(TiltError, match=r"tilt.csv: a sigma_deg is .*above 0"):
+        read_tilt_csv(path)
+
+
+def three(theta_z_deg, t=None, theta_deg=(40.0, 30.0)):
+    """Readings of a three-axis sensor whose first two axes do not change."""
+    z = np.asarray(theta_z_deg, float) * DEG
+    t = 1000 + 0.1 * np.arange(len(z)) if t is None else t
+    x, y = (np.full(len(z), angle * DEG) for angle in theta_deg)
+    return TiltLog.of(t, x, y, np.full(len(z), 15.0), theta_z=z)
+
+
+THIRD_DEG = np.degrees(np.arcsin(np.sqrt(1 - np.sin(40 * DEG) ** 2 - np.sin(30 * DEG) ** 2)))
+
+
+def test_the_third_axis_is_averaged_with_an_error_of_its_own(rng):
+    shaken = rng.normal(0, 3 * SCA100T_NOISE_RAD, 60) / DEG
+    tilt = three(THIRD_DEG + np.clip(shaken, -0.03, 0.03)).average(1002.95, 6.0)
+    assert (tilt.axes, tilt.samples) == (3, 60)
+    assert tilt.theta_z / DEG == pytest.approx(THIRD_DEG, abs=0.01)
+    assert np.sqrt(tilt.variance_z * 60) == pytest.approx(3 * SCA100T_NOISE_RAD, rel=0.4)
+
+
+def test_a_turn_that_only_the_third_axis_shows_is_seen():
+    below = np.concatenate([np.full(5, THIRD_DEG), np.full(5, -THIRD_DEG)])
+    with pytest.raises(TiltError, match="not at rest"):
+        three(below).average(1000.45, 1.0)
+    with pytest.raises(TiltError, match="differs before and after"):
+        three(below).average(1000.45, 0.01)
+    wild = np.full(11, THIRD_DEG)
+    wild[4] = -THIRD_DEG
+    assert three(wild).average(1000.5, 1.0).samples == 10
+
+
+def test_readings_of_two_and_of_three_axes_are_not_mixed():
+    tilts = [Tilt(0.1, 0.2, np.eye(2) * 1e-10, utc_unix_s=1000.0 + k) for k in range(3)]
+    deep = Tilt(0.1, 0.2, np.eye(2) * 1e-10, theta_z=-np.arcsin(np.sqrt(1 - np.sin(0.1) ** 2 - np.sin(0.2) ** 2)),
+                variance_z=4e-10, utc_unix_s=1000.4)  # fmt: skip
+    with pytest.raises(TiltError, match="two axes and some three"):
+        TiltLog.of_readings([*tilts, deep]).mean()
+    mean = TiltLog.of_readings([deep, deep]).mean()
+    assert (mean.theta_z, mean.variance_z) == pytest.approx((deep.theta_z, 2e-10))
 
 
 HOSTILE = {

@@ -17,7 +17,7 @@ pytest.importorskip("rosbags")
 from rosbags.rosbag2 import StoragePlugin
 
 from starpos.frames.reading import read_frame
-from starpos.instrument.tilt_log import read_tilt_csv
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos_testing.skies.bags import NightBag, typestore
 
 RECORDED = Path(__file__).resolve().parents[4] / "test" / "data" / "night"

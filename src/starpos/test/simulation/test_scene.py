@@ -12,7 +12,7 @@ from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, TimeError
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import level_of, up_of
-from starpos.instrument.tilt_log import read_tilt_csv
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.simulation.night_on_disk import write_night
 from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render
 from starpos.sky.site import Site, camera_to_enu

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.errors import BagError
 from starpos.recording.bag import BagReader
+from starpos_bringup.recording.first_release import FirstRelease
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -20,12 +21,16 @@ LAST_NS = (2**31 - 1) * 10**9
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too."""
+    """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too.
+
+    old: its messages are of a type as the first release had it, and are upgraded.
+    """
 
     name: str
     kind: type
     type_name: str
     latched: bool
+    old: bool
 
 
 class Bag:
@@ -34,6 +39,7 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._reader = BagReader(path)
+        self._first_release = FirstRelease()
 
     def __enter__(self) -> "Bag":
         self._reader.__enter__()
@@ -67,7 +73,7 @@ class Bag:
             if c.topic == "/clock" or (wanted and c.topic not in wanted):
                 continue
             try:
-                topics[c.id] = _topic(c)
+                topics[c.id] = _topic(c, self._first_release)
             except BagError as error:
                 left_out(f"{self.path}: {c.topic!r} is left out: {error}")
         if not topics:
@@ -82,10 +88,11 @@ class Bag:
                 raise BagError(
                     f"{self.path}: a message of {connection.topic} was logged at {log_ns} ns, no time until 2038"
                 )
-            yield topics[connection.id], log_ns, data
+            topic = topics[connection.id]
+            yield topic, log_ns, self._first_release.upgraded(data, topic.type_name) if topic.old else data
 
 
-def _topic(connection: "Connection") -> Topic:
+def _topic(connection: "Connection", first_release: FirstRelease) -> Topic:
     """Make the topic of a connection; raises BagError if its type is not installed here, or differs."""
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.validate_full_topic_name import validate_full_topic_name
@@ -96,13 +103,15 @@ def _topic(connection: "Connection") -> Topic:
         raise BagError("it is no topic's name") from None
     kind = _message_class(connection.msgtype)
     known = _type_hash(connection.msgtype)
-    if connection.digest.startswith("RIHS01_") and known and connection.digest != known:
+    differs = connection.digest.startswith("RIHS01_") and bool(known) and connection.digest != known
+    old = differs and first_release.knows(connection.msgtype, connection.digest)
+    if differs and not old:
         raise BagError(
             f"its {connection.msgtype} differs from the one installed here: use the version it was recorded with"
         )
     durabilities = [q.durability.name for q in getattr(connection.ext, "offered_qos_profiles", ())]
     latched = bool(durabilities) and all(name == "TRANSIENT_LOCAL" for name in durabilities)
-    return Topic(connection.topic, kind, connection.msgtype, latched)
+    return Topic(connection.topic, kind, connection.msgtype, latched, old)
 
 
 def _message_class(name: str) -> type:

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of tilt readings on disk, a CSV."""
+
+import io
+import itertools
+import os
+import warnings
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from starpos.errors import TiltError
+from starpos.files import open_regular
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, elevations
+from starpos.instrument.tilt_log import TiltLog
+
+# A week at 10 Hz.
+MAX_CSV_BYTES = 300_000_000
+NEEDED = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
+OPTIONAL = ("theta_z_deg", "temperature_c", "sigma_deg")
+CURE = (
+    f"give a CSV with a line of names, {','.join(NEEDED)}[,{','.join(OPTIONAL)}], and readings: the elevations of "
+    "the sensor's axes"
+)
+# no angle is less certain, and still one
+MOST_SIGMA_DEG = 45.0
+
+
+def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
+    """Read a TiltLog from a CSV, one reading of a sensor a line; TiltError if it cannot be one.
+
+    Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c; sigma_deg, 1 sigma
+    of the white noise of that line's angles. Where no sigma is stated (no column, or NaN) it is noise_rad.
+    """
+    path = Path(path)
+    try:
+        with _opened(path) as f, warnings.catch_warnings():
+            # our own error says that a file is empty
+            warnings.simplefilter("ignore")
+            names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
+            rows = np.loadtxt(f, delimiter=",", ndmin=2)
+    except FileNotFoundError:
+        raise TiltError(f"{path}: there is no such file: {CURE}") from None
+    except (OSError, ValueError, UnicodeDecodeError) as e:
+        reason = getattr(e, "strerror", None) or _first_line(e)
+        raise TiltError(f"{path}: not a readable table of tilts ({reason}): {CURE}") from None
+    if not set(NEEDED) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(set(names)):
+        raise TiltError(
+            f"{path}: a tilt table needs the columns {', '.join(NEEDED)} and at least one row: {CURE}"
+        )
+    column = dict(zip(names, rows.T, strict=True))
+    _check_one_sensor(path, column["utc_unix_s"], rows)
+    order = np.argsort(column["utc_unix_s"], kind="stable")
+    order = order[np.isfinite(column["utc_unix_s"][order])]
+    unknown = np.full(len(rows), np.nan)
+    z = column.get("theta_z_deg", unknown)
+    axes = ["theta_x_deg", "theta_y_deg"] + ([] if np.isnan(z).all() else ["theta_z_deg"])
+    theta = elevations(np.radians([column[axis][order] for axis in axes]).T).T
+    sigma = np.radians(_sigma_deg(path, column.get("sigma_deg", unknown)))[order]
+    return TiltLog.of(
+        column["utc_unix_s"][order],
+        theta[0],
+        theta[1],
+        column.get("temperature_c", unknown)[order],
+        np.where(np.isnan(sigma), noise_rad, sigma),
+        theta_z=theta[2] if len(theta) == 3 else None,
+    )
+
+
+def _sigma_deg(path: Path, sigma: np.ndarray) -> np.ndarray:
+    """The stated sigmas (N,), in deg; TiltError if one cannot be."""
+    wrong = ~np.isnan(sigma) & ~((sigma > 0) & (sigma <= MOST_SIGMA_DEG))
+    if wrong.any():
+        raise TiltError(
+            f"{path}: a sigma_deg is {sigma[wrong][0]:g}: give 1 sigma of the angles in deg, above 0 and at most "
+            f"{MOST_SIGMA_DEG:g}, or nan where it is not known"
+        )
+    return sigma
+
+
+def _opened(path: Path) -> TextIO:
+    """The open text of a table; OSError if it cannot be read, ValueError if it is too large."""
+    file = open_regular(path)
+    if os.fstat(file.fileno()).st_size > MAX_CSV_BYTES:
+        file.close()
+        raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
+    return io.TextIOWrapper(file, "utf-8-sig")
+
+
+def _check_one_sensor(path: Path, utc_unix_s: np.ndarray, rows: np.ndarray) -> None:
+    """TiltError if the times go back into those that the table already holds: readings of two sensors, it seems.
+
+    A table may hold nights in any order, and a part of itself once more.
+    """
+    finite = np.isfinite(utc_unix_s)
+    _, first = np.unique(rows[finite], axis=0, return_index=True)
+    t = utc_unix_s[finite][np.sort(first)]
+    runs = np.split(t, np.flatnonzero(np.diff(t) < 0) + 1)
+    ranges = sorted((run[0], run[-1]) for run in runs if len(run))
+    if any(later < end for (_, end), (later, _) in itertools.pairwise(ranges)):
+        raise TiltError(
+            f"{path}: its times go back into those that it already holds, as if it had the readings of two "
+            "inclinometers: give the table of one"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
