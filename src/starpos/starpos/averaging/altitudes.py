@@ -91,7 +91,7 @@ def circle_of(
     if np.sqrt(terms[0].covariance[0, 0]) > MOST_A3_RAD:
         raise FixError(
             f"{pointing.place}: without a roll A3 has to be known to {MOST_A3_RAD / ARCSEC:.0f} arcsec: calibrate it at "
-            "a known place, or give pointings with their roll"
+            "a known place, say how well it is known, or give pointings with their roll"
         )
     true = atmosphere.refraction().unbend(seen[None])[0]
     z = float(np.arctan2(np.hypot(true[0], true[1]), true[2]))

@@ -86,9 +86,10 @@ def check(args: argparse.Namespace) -> None:
             "--xi, --eta, --deflection-stddev and --geoid are of a place on WGS 84: say --geodetic, or leave them out"
         )
     if args.fixed:
-        if args.tilt is not None or args.turn_stddev is not None or args.misalignment is not None:
+        if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
             raise InstrumentError(
-                "--fixed is of a camera without an inclinometer: leave out --tilt, --misalignment and --turn-stddev"
+                "--fixed is of a camera without an inclinometer: leave out --tilt, --misalignment, --turn-stddev and "
+                "--inclinometer"
             )
     elif args.sag is not None:
         raise InstrumentError("--sag is of a camera fixed to the ground: give --fixed too")

