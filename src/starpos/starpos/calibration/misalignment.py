@@ -14,10 +14,11 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Solver, Status
+from starpos.fix.solver import Solution, Solver, Status, Tilts
+from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt, up_of
+from starpos.instrument.inclinometer import InclinometerErrors, up_of
 from starpos.instrument.instrument import MOST_C, UNKNOWN_ARCSEC, Calibration, Instrument
 from starpos.instrument.response import angles_at, stated_variances
 from starpos.progress import Progress, quiet
@@ -44,8 +45,6 @@ FEWEST_POSES = 3
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
 WORTH = 0.05
 
-# the tilt at (mid_unix_s, exposure_s, spread_s)
-Tilts = Callable[[float, float, float], Tilt]
 # A3 and the zenith from readings, A3 as it is, and the fixes
 FindPlumbLine = Callable[[Readings, np.ndarray, list[Fix]], PlumbLine]
 
@@ -70,7 +69,7 @@ class Calibrated:
 
 def calibrate_at(
     solver: Solver,
-    frames: Sequence[Stars],
+    frames: Sequence[Stars | Pointing],
     tilt: Tilts,
     site: Site,
     site_stddev_arcsec: float = 0.0,
@@ -106,7 +105,7 @@ def calibrate_at(
 
 def calibrate(
     solver: Solver,
-    frames: Sequence[Stars],
+    frames: Sequence[Stars | Pointing],
     tilt: Tilts,
     find: FindPlumbLine,
     fewest: int,

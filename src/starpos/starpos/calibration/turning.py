@@ -9,6 +9,7 @@ from starpos.calibration.misalignment import Calibrated, calibrate
 from starpos.calibration.plumb_line import PlumbLine, Readings, level
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
+from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.progress import Progress, quiet
@@ -16,7 +17,7 @@ from starpos.progress import Progress, quiet
 
 def turn(
     solver: Solver,
-    frames: Sequence[Stars],
+    frames: Sequence[Stars | Pointing],
     tilt: Callable[[float, float, float], Tilt],
     turn_stddev_deg: float = 180.0,
     progress: Progress = quiet,

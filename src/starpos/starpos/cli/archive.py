@@ -12,22 +12,26 @@ from starpos.errors import FrameError, TiltError
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path.  folder: None if the frames were named one by one.
+    tilt: absolute path; None of a camera that is its own level.  folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
-    tilt: str
+    tilt: str | None
     folder: str | None = None
 
 
-def nights_of(given: list[str], tilt: str | None) -> list[NightFolder | FrameError]:
-    """One night from frames and a table; without a table a night for each folder, or the error why it is none.
+def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> list[NightFolder | FrameError]:
+    """One night from frames and a table, or without one of a camera that is its own level.
+
+    Else a night for each folder, or the error why it is none.
 
     A folder's frames are its FITS files, or if there are none its CSV files, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:
         return [NightFolder(tuple(given), os.path.abspath(tilt))]
+    if own_level:
+        return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
         raise FrameError(f"{missing}: there is no such file or folder")
     if single := next((path for path in given if not os.path.isdir(path)), None):

@@ -13,8 +13,10 @@ from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.camera_adjustment import PARAMETERS, UNLEVELLED, UNTIMED
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
+from starpos.cli.frame_work import NO_CAMERA
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
+from starpos.frames.pointings import read_pointings
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
 from starpos.instrument import camera_file
@@ -31,7 +33,9 @@ CAMERA_NAME = "camera"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser, "one JSON object for --camera and one for --site instead of text")
+    common.add_frames(
+        parser, "one JSON object for --camera and one for --site instead of text", pointings=True
+    )
     parser.add_argument(
         "--camera",
         metavar="OUT",
@@ -57,9 +61,14 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
     if args.map is not None and args.camera is None:
         raise InstrumentError("--map is of the camera: give --camera OUT.yaml too")
+    common.check_frames(args)
+    if args.pointings is not None and args.camera is not None:
+        raise InstrumentError("--pointings say nothing of the camera: give frames for --camera")
     calibrate_site.check(args)
     if args.map is not None and find_spec("matplotlib") is None:
         raise InstrumentError("--map draws with matplotlib, which is not here: pip install matplotlib")
+    if args.pointings is not None:
+        return _from_pointings(args)
     frames, unreadable = _stars_of_all(args)
     if not frames:
         return common.UNREADABLE
@@ -74,13 +83,27 @@ def run(args: argparse.Namespace) -> int:
                 )
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.site is not None:
-            if tilts is None:
-                raise InstrumentError("--site needs the tilts: give --tilt CSV")
             calibrate_site.run(args, frames, instrument, tilts)
     except (CalibrationError, FixError) as e:
         common.complain("calibrate", e)
         return common.UNREADABLE if unreadable else NOTHING
     return common.UNREADABLE if unreadable else 0
+
+
+def _from_pointings(args: argparse.Namespace) -> int:
+    """Calibrate from the pointings of a plate solver; returns the exit status."""
+    pointings = read_pointings(args.pointings)
+    whole = [p for p in pointings if p.has_roll]
+    if len(whole) < len(pointings):
+        common.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
+    instrument = common.instrument_of(args, NO_CAMERA)
+    tilts = None if args.tilt is None else read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
+    try:
+        calibrate_site.run(args, whole, instrument, tilts)
+    except FixError as e:
+        common.complain("calibrate", e)
+        return NOTHING
+    return 0
 
 
 def _stars_of_all(args: argparse.Namespace) -> tuple[list[Stars], bool]:

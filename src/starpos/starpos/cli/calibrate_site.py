@@ -2,22 +2,27 @@
 """`starpos calibrate --site`: A3 at a known place, written into an instrument file."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.cli import common
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
+from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
+from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, SAG_ARCSEC_PER_SQRT_HOUR
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.sky.site import Site
+from starpos.units import ARCSEC
 
 # an angle with a larger sigma counts as unknown
 UNKNOWN_DEG = 60.0
@@ -29,7 +34,21 @@ def define(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar=("LAT", "LON"),
-        help="find A3 at this place, deg, by gravity (as a fix has them); needs --tilt and -o",
+        help="find A3 at this place, deg, by gravity (as a fix has them); needs -o, and --tilt or --fixed",
+    )
+    parser.add_argument(
+        "--fixed",
+        action="store_true",
+        help="a camera that is fixed to the ground, without an inclinometer: its pose at --site is its vertical, and "
+        "`solve` with the file that -o writes needs no --tilt; it gives place and heading while the stars show it in "
+        "that pose, and else says that it has moved; where to, it cannot tell",
+    )
+    parser.add_argument(
+        "--sag",
+        type=common.number(0, MOST_SAG_ARCSEC),
+        metavar="ARCSEC",
+        help="how far a --fixed camera sags in an hour, 1 sigma about each axis; it grows with the root of the time "
+        f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times that)",
     )
     parser.add_argument(
         "--geodetic",
@@ -51,32 +70,59 @@ def check(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid) != (None,) * 4
     if args.site is None:
-        if deflection or args.geodetic or (args.output, args.valid_days, args.turn_stddev) != (None,) * 3:
+        if (
+            deflection
+            or args.geodetic
+            or args.fixed
+            or (args.output, args.valid_days, args.turn_stddev, args.sag) != (None,) * 4
+        ):
             raise InstrumentError(
-                "-o, --geodetic, --turn-stddev, --valid-days and the deflection are for a calibration at a known place: "
-                "give --site LAT LON"
+                "-o, --fixed, --sag, --geodetic, --turn-stddev, --valid-days and the deflection are for a "
+                "calibration at a known place: give --site LAT LON"
             )
         return
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev and --geoid are of a place on WGS 84: say --geodetic, or leave them out"
         )
-    if args.output is None or args.tilt is None:
+    if args.fixed:
+        if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
+            raise InstrumentError(
+                "--fixed is of a camera without an inclinometer: leave out --tilt, --misalignment, --turn-stddev and "
+                "--inclinometer"
+            )
+    elif args.sag is not None:
+        raise InstrumentError("--sag is of a camera fixed to the ground: give --fixed too")
+    if args.output is None or (args.tilt is None and not args.fixed):
         raise InstrumentError(
-            "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml"
+            "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
+            "--tilt)"
         )
     latitude, longitude = args.site
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise InstrumentError(f"--site {latitude:g} {longitude:g}: give latitude and longitude in deg")
 
 
-def run(args: argparse.Namespace, frames: list[Stars], instrument: Instrument, tilts: TiltLog) -> None:
-    """Find A3, write and print it; raises FixError if the frames do not tell it."""
+def run(
+    args: argparse.Namespace,
+    frames: Sequence[Stars | Pointing],
+    instrument: Instrument,
+    tilts: TiltLog | None,
+) -> None:
+    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not tell it."""
     solver = Solver(instrument, catalogue.load_catalogue(), common.atmosphere_of(args))
     site, stddev_arcsec = _site(args)
-    found = calibrate_at(
-        solver, frames, tilts.average, site, stddev_arcsec, common.turn_of(args), common.ProgressBar()
-    )
+    if tilts is None:
+        sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
+        found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, common.ProgressBar())
+    elif instrument.vertical is not None:
+        raise InstrumentError(
+            f"{args.instrument} is of a camera that is fixed to the ground: give --fixed, or another instrument file"
+        )
+    else:
+        found = calibrate_at(
+            solver, frames, tilts.average, site, stddev_arcsec, common.turn_of(args), common.ProgressBar()
+        )
     for solution in found.solutions:
         if solution.fix is None:
             common.complain("calibrate", f"left out: {solution.message}")
@@ -103,6 +149,12 @@ def _site(args: argparse.Namespace) -> tuple[Site, float]:
 
 def _about(found: Calibrated, site: Site) -> str:
     c = found.instrument.calibration
+    if found.instrument.vertical is not None:
+        sag = found.instrument.inclinometer.drift_rad_per_sqrt_hour / ARCSEC
+        return (
+            f"the vertical of a fixed camera of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} "
+            f"(by gravity), known to {found.plumb_stddev_arcsec:.2f} arcsec, and {sag:g} arcsec of sag in an hour\n"
+        )
     turns = np.sqrt(np.linalg.eigvalsh(np.asarray(c.covariance_arcsec2))) / 3600
     lines = [
         f"A3 of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} (by gravity): "

@@ -30,13 +30,45 @@ GIVEN_STDDEV_ARCSEC = 1.0
 
 
 def add_frames(
-    parser: argparse.ArgumentParser, json_help: str = "one JSON object a frame instead of a table"
+    parser: argparse.ArgumentParser,
+    json_help: str = "one JSON object a frame instead of a table",
+    pointings: bool = False,
 ) -> None:
-    """Add the frames and --json."""
+    """Add the frames and --json; with `pointings` also --pointings, which may stand in for frames."""
     parser.add_argument(
-        "frames", nargs="+", metavar="FRAME", help="FITS, TIFF, PNG, raw, or a CSV of centroids"
+        "frames",
+        nargs="*" if pointings else "+",
+        metavar="FRAME",
+        help="FITS, TIFF, PNG, raw, or a CSV of centroids",
     )
+    if pointings:
+        parser.add_argument(
+            "--pointings",
+            metavar="CSV",
+            help="instead of frames, what a plate solver found of them: utc_unix_s (mid-exposure), ra_deg, dec_deg, "
+            "roll_deg, sigma_arcsec, sigma_roll_arcsec[, exposure_s]: ICRS of the frame's centre, the position angle of "
+            "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
+            "without a roll elevations alone tell the place, from three directions or more, and no heading",
+        )
     parser.add_argument("--json", action="store_true", help=json_help)
+
+
+def check_frames(args: argparse.Namespace) -> None:
+    """Raise InstrumentError unless there are either frames or --pointings."""
+    if bool(args.frames) == (args.pointings is not None):
+        raise InstrumentError("give either frames or --pointings CSV" + (", not both" if args.frames else ""))
+
+
+def has_own_level(args: argparse.Namespace) -> bool:
+    """Whether --instrument is the file of a camera fixed to the ground; InstrumentError if there is a --tilt too."""
+    if args.instrument is None or instrument_file.read(args.instrument).vertical is None:
+        return False
+    if args.tilt is not None or getattr(args, "self_calibrate", False):
+        raise InstrumentError(
+            f"{args.instrument} is of a camera that is fixed to the ground, without an inclinometer: leave out --tilt "
+            "and --self-calibrate, or give another instrument file"
+        )
+    return True
 
 
 def add_exif(parser: argparse.ArgumentParser) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from starpos.cli.common import stars_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
+from starpos.fix.pointing import IDEAL
 from starpos.fix.solver import Solution, Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
@@ -55,6 +56,10 @@ class About:
     width: int
     height: int
     focal_px: float | None
+
+
+# of pointings only the camera's axes count
+NO_CAMERA = About(IDEAL.width, IDEAL.height, IDEAL.fx)
 
 
 @dataclass(frozen=True)
@@ -117,21 +122,26 @@ class Identifying:
 
 @dataclass(frozen=True)
 class Solving:
-    """Work of `solve`: the Solution of a frame; tilt: absolute path of the table."""
+    """Work of `solve`: the Solution of a frame.
+
+    tilt: absolute path of the table; None of a camera that is its own level.
+    """
 
     read: Reader
     instrument: Instrument
     atmosphere: Atmosphere
-    tilt: str
+    tilt: str | None
 
     @property
     def files(self) -> tuple[str, ...]:
         """Files that it reads besides the frame."""
-        return (self.tilt,)
+        return () if self.tilt is None else (self.tilt,)
 
     def __call__(self, path: str) -> Solution:
         stars = stars_of(self.read(path))
         solver = Solver(self.instrument, catalogue.load_catalogue(), self.atmosphere)
+        if self.tilt is None:
+            return solver.solve(stars)
         return solver.solve(stars, tilts(self.tilt, self.instrument.inclinometer.noise_rad).average)
 
 

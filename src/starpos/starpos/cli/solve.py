@@ -18,8 +18,10 @@ from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
+from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Calibration
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.utc import utc_text
@@ -31,12 +33,19 @@ COUNTS = ("frames", "poses", "left_out", "moved")
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser)
+    common.add_frames(parser, pointings=True)
+    parser.add_argument(
+        "--near",
+        type=float,
+        nargs=2,
+        metavar=("LAT", "LON"),
+        help="pointings without a roll: which of two places it is, where their elevations leave two, deg",
+    )
     parser.add_argument(
         "--tilt",
         metavar="CSV",
         help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
-        "frames with tilt.csv",
+        "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground",
     )
     common.add_exif(parser)
     common.add_instrument(parser)
@@ -82,8 +91,15 @@ def run(args: argparse.Namespace) -> int:
     common.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
+    common.check_frames(args)
+    if args.pointings is not None:
+        from starpos.cli import solve_pointings
+
+        return solve_pointings.run(args)
+    if args.near is not None:
+        raise InstrumentError("--near is for --pointings without a roll: leave it out")
     vertical, read = common.vertical_of(args), Reader(common.clock_of(args))
-    given = nights_of(args.frames, args.tilt)
+    given = nights_of(args.frames, args.tilt, common.has_own_level(args))
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
@@ -104,7 +120,8 @@ def run(args: argparse.Namespace) -> int:
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
             if args.self_calibrate:
                 rows = _turned(args, plan, list(rows))
-            statuses.append(_tell(args, plan, rows, vertical))
+            known = None if plan.solver is None or args.self_calibrate else plan.solver.instrument.calibration
+            statuses.append(tell(args, plan.night, rows, vertical, known))
     return max(statuses)
 
 
@@ -121,7 +138,7 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     if about is None:
         return Plan(night, Listing(read))
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
-    table = tilts(night.tilt, instrument.inclinometer.noise_rad)
+    table = None if night.tilt is None else tilts(night.tilt, instrument.inclinometer.noise_rad)
     jobs.prepare(instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=common.ProgressBar())
     return Plan(
@@ -132,9 +149,14 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     )
 
 
-def _tell(args: argparse.Namespace, plan: Plan, rows: Iterable, vertical: Vertical) -> int:
+def tell(
+    args: argparse.Namespace,
+    night: NightFolder,
+    rows: Iterable,
+    vertical: Vertical,
+    calibration: Calibration | None = None,
+) -> int:
     """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status."""
-    night = plan.night
     solved: list[Solved] = []
     warnings: set[str] = set()
     unreadable = False
@@ -148,7 +170,7 @@ def _tell(args: argparse.Namespace, plan: Plan, rows: Iterable, vertical: Vertic
         else:
             common.complain("solve", answer.message)
         if args.json:
-            common.print_json({"file": path} | _json_of(answer.fix, vertical) | _json_about(answer))
+            common.print_json({"file": path} | json_of(answer.fix, vertical) | _json_about(answer))
         else:
             print(_line(path, answer, args.self_calibrate), flush=True)
     common.tell_extrapolation("solve", solved)
@@ -156,11 +178,11 @@ def _tell(args: argparse.Namespace, plan: Plan, rows: Iterable, vertical: Vertic
     if solved:
         last = solved[-1].fix
         common.tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        if plan.solver is not None and not args.self_calibrate:
+        if calibration is not None:
             wide = last if together is None else together
-            if unknown := unknown_a3(plan.solver.instrument.calibration, wide.covariance):
+            if unknown := unknown_a3(calibration, wide.covariance):
                 _say(night, unknown)
-        _print_combined(night, together, solved, warnings, args, vertical)
+        print_combined(night, together, solved, warnings, args, vertical)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
 
 
@@ -169,13 +191,17 @@ def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> Iterator:
     frames = [stars for _, stars in rows if isinstance(stars, Stars)]
     answers: Iterator[Solution] = iter(())
     if frames and plan.solver is not None and plan.tilts is not None:
-        answers = iter(_solved_by_turning(args, plan.night, plan.solver, plan.tilts, frames))
+        answers = iter(solved_by_turning(args, plan.night, plan.solver, plan.tilts, frames))
     for path, item in rows:
         yield path, next(answers) if isinstance(item, Stars) else item
 
 
-def _solved_by_turning(
-    args: argparse.Namespace, night: NightFolder, solver: Solver, tilts: TiltLog, frames: list[Stars]
+def solved_by_turning(
+    args: argparse.Namespace,
+    night: NightFolder,
+    solver: Solver,
+    tilts: TiltLog,
+    frames: Sequence[Stars | Pointing],
 ) -> Sequence[Solution]:
     """Find A3 and the solutions of a night's frames, and write A3 as --save asks."""
     try:
@@ -216,7 +242,7 @@ def _combine(night: NightFolder, solved: list[Solved]) -> Average | None:
     return whole
 
 
-def _json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
+def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
     """The keys of --json that come from a fix; None for each if there is none."""
     keys = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
             "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
@@ -276,17 +302,19 @@ def _line(path: str, s: Solution, turning: bool) -> str:
     # one frame of a turn does not tell A3, so its own place would be 1100 km wide
     where = "its place waits for the whole turn" if turning else _where(s.fix)
     return f"{path}: {where}, {len(s.names)} of {s.stars_detected} stars"
+    stars = f", {len(s.names)} of {s.stars_detected} stars" if s.stars_detected else ""
+    return f"{path}: {place_text(s.fix)}{stars}"
 
 
-def _where(fix: Fix | Average) -> str:
+def place_text(fix: Fix | Average) -> str:
     east, north, heading = np.sqrt(np.diag(_in_degrees(fix.covariance)))
     facing = f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
     if np.isnan(fix.heading):
-        facing = "heading not known since the camera was touched"
+        facing = "heading not known: the camera was touched, or nobody knows its roll"
     return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
 
 
-def _print_combined(
+def print_combined(
     night: NightFolder,
     all_together: Average | None,
     solved: list[Solved],
@@ -299,8 +327,8 @@ def _print_combined(
         about = {
             "stars_detected": sum(s.stars_detected for s in solved),
             "stars_matched": sum(s.stars_matched for s in solved),
-            "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved])),
-            "log_odds": sum(s.log_odds for s in solved),
+            "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved] or [np.nan])),
+            "log_odds": sum(s.log_odds for s in solved) if solved else None,
             "status": (Status.OK if all_together else Status.POOR_FIT).value,
             "warnings": sorted(warnings),
         }
@@ -312,7 +340,7 @@ def _print_combined(
                 if all_together is None
                 else {k: getattr(all_together, k) for k in COUNTS}
             )
-            | _json_of(all_together, vertical)
+            | json_of(all_together, vertical)
             | about
         )
         return
@@ -321,11 +349,12 @@ def _print_combined(
     ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, vertical)
     turned = f" (the last of {all_together.poses} poses)" if all_together.poses > 1 else ""
     folder = "" if night.folder is None else f"{night.folder}: "
-    print(f"{folder}{all_together.frames} frames together: {_where(all_together)}{turned} (astronomic)")
+    print(f"{folder}{all_together.frames} frames together: {place_text(all_together)}{turned} (astronomic)")
     sigma = np.sqrt(np.diag(ground.covariance))
     print(
         f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
         f"+- {sigma[1]:.0f} m N {sigma[0]:.0f} m E (the deflection of the vertical included)"
     )
     for name, (east, north, heading) in budget_of(all_together, vertical).items():
-        print(f"  {name:<28} {east:8.2f} m E {north:8.2f} m N {heading * 3600:8.2f} arcsec")
+        turn = "" if np.isnan(all_together.heading) else f" {heading * 3600:8.2f} arcsec"
+        print(f"  {name:<28} {east:8.2f} m E {north:8.2f} m N{turn}")

@@ -191,29 +191,45 @@ def error_terms(
     def factor_from_stars(covariance: np.ndarray) -> np.ndarray:
         return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
 
-    prime, _ = curvature_radii_m(latitude)
-    east, north = np.eye(6)[:, :1], np.eye(6)[:, 1:2]
-    second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
-    pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
+    calibration, *readings = tilt_terms(sensitivity.level, tilt, mounting, earth.utc_unix_s)
+    return (
+        ErrorTerm("centroids", factor_from_stars(stars.centroids)),
+        ErrorTerm("catalogue", factor_from_stars(stars.catalogue), shared=stars.same_stars),
+        calibration,
+        *readings,
+        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
+        *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s),
+    )
+
+
+def tilt_terms(level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float) -> tuple[ErrorTerm, ...]:
+    """The sources of error of the level, A3's first; level (rows, 3): rows of the factors for a small rotation of L."""
     up = mounting.up(tilt)
     columns, response = mounting.response_at(tilt)
     calibration = np.hstack(
         [level_of(up) @ symmetric_root(mounting.calibration_covariance), _turn_error(up, mounting)]
     )
     return (
-        ErrorTerm("centroids", factor_from_stars(stars.centroids)),
-        ErrorTerm("catalogue", factor_from_stars(stars.catalogue), shared=stars.same_stars),
-        ErrorTerm("calibration", sensitivity.level @ calibration, shared=ALWAYS, posed=True),
-        *_inclinometer_terms(
-            sensitivity.level @ levelling_of(up, tilt.slope), tilt, mounting, earth.utc_unix_s
-        ),
+        ErrorTerm("calibration", level @ calibration, shared=ALWAYS, posed=True),
+        *_inclinometer_terms(level @ levelling_of(up, tilt.slope), tilt, mounting, utc_unix_s),
         ErrorTerm(
             "tilt response",
-            sensitivity.level @ levelling_of(up, columns) @ symmetric_root(response),
+            level @ levelling_of(up, columns) @ symmetric_root(response),
             shared=ALWAYS,
             posed=True,
         ),
-        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
+    )
+
+
+def time_terms(
+    latitude: float, earth: EarthState, clock_stddev_s: float, stamp_stddev_s: float
+) -> tuple[ErrorTerm, ...]:
+    """The sources of error of the Earth's rotation, which are the same for all directions."""
+    prime, _ = curvature_radii_m(latitude)
+    east, north = np.eye(6)[:, :1], np.eye(6)[:, 1:2]
+    second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
+    pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
+    return (
         ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
         # a constant lag does not average away, and nobody can exclude one
         ErrorTerm("time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS),

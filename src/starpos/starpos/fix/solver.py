@@ -14,6 +14,9 @@ from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
+from starpos.fix.pointing import IDEAL, pointing_fix
+from starpos.fix.unmoved import check_unmoved
+from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import SATURATED, Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangle_cache
@@ -21,6 +24,7 @@ from starpos.identification.hint import Hint
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
+from starpos.instrument.camera_vertical import own_level
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
@@ -31,6 +35,9 @@ ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
 # A name in `Solution.warnings`: bright stars that were not identified are a sky of their own.
 TWO_SKIES = "two_skies"
+
+# the tilt at (mid_unix_s, exposure_s, spread_s)
+Tilts = Callable[[float, float, float], Tilt]
 
 
 class Status(str, Enum):
@@ -89,11 +96,10 @@ class Solution:
     warnings: tuple[str, ...] = ()
 
     @classmethod
-    def failed(cls, stars: Stars, status: Status, message: str) -> "Solution":
+    def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
         """A solution that has nothing but its status and message."""
-        return cls(
-            status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=len(stars)
-        )
+        number = len(stars) if isinstance(stars, Stars) else 0
+        return cls(status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=number)
 
     @property
     def ok(self) -> bool:
@@ -141,27 +147,22 @@ class Solver:
         )
 
     def solve(
-        self, stars: Stars, tilt: Tilt | Callable[[float, float, float], Tilt], hint: Hint | None = None
+        self, stars: Stars | Pointing, tilt: Tilt | Tilts | None = None, hint: Hint | None = None
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
-        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s, spread_s) that gives it.
+        stars: or the pointing of the frame, if it has a roll.
+        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s, spread_s) that gives it; a
+        camera that is its own level needs none.
         hint: of an earlier solution; one that no longer holds costs half a millisecond and does no harm.
         """
+        if isinstance(stars, Pointing):
+            return self._solve_pointing(stars, tilt)
         if (inside := _inside(stars)) is not None:
             return _for_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
         try:
-            if stars.mid_unix_s is None:
-                place = stars.source or "the frame"
-                raise TimeError(f"{place}: no time of exposure: {why_no_time(stars.source)}")
-            state = earth_state(stars.mid_unix_s)
-            if callable(tilt):
-                # the width of an even distribution of that standard deviation, as rounding makes it
-                spread_s = math.sqrt(12) * stars.stamp_stddev_s
-                tilt = tilt(stars.mid_unix_s, stars.exposure_s or 0.0, spread_s)
-            self.instrument.calibration.check_age(stars.mid_unix_s)
+            state, tilt = self.levelled(stars, tilt)
             camera = self._camera(stars.width, stars.height)
-            self.instrument.inclinometer.check_range(tilt)
             mounting = self.instrument.mounting
             g = level_of(mounting.up(tilt)) @ mounting.a3
             begin = time.perf_counter()
@@ -194,7 +195,7 @@ class Solver:
                 )
             fix = self._fix(stars, found, camera, tilt, state)
         except StarposError as e:
-            return replace(solution, status=_status(stars, e), message=str(e))
+            return replace(solution, status=status_of(stars, e), message=str(e))
         return replace(
             solution,
             fix=fix,
@@ -204,6 +205,46 @@ class Solver:
             names=tuple(names[k] for k in fix.used),
             star=found.star[fix.used],
             magnitudes=magnitudes[fix.used],
+        )
+
+    def levelled(self, frame: Stars | Pointing, tilt: Tilt | Tilts | None) -> tuple[EarthState, Tilt]:
+        """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
+        if frame.mid_unix_s is None:
+            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame.source)}")
+        state = earth_state(frame.mid_unix_s)
+        if self.instrument.vertical is not None:
+            tilt = own_level(frame.mid_unix_s)
+        elif callable(tilt):
+            # the width of an even distribution of that standard deviation, as rounding makes it
+            spread_s = math.sqrt(12) * frame.stamp_stddev_s
+            tilt = tilt(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
+        if tilt is None:
+            raise TiltError(f"{frame.place}: no tilt: give the inclinometer's")
+        self.instrument.calibration.check_age(frame.mid_unix_s)
+        self.instrument.inclinometer.check_range(tilt)
+        return state, tilt
+
+    def _solve_pointing(self, pointing: Pointing, tilt: Tilt | Tilts | None) -> Solution:
+        begin = time.perf_counter()
+        try:
+            if not pointing.has_roll:
+                raise FixError(
+                    f"{pointing.place}: no roll: an elevation alone makes no fix, those of several do"
+                )
+            state, tilt = self.levelled(pointing, tilt)
+            camera, clock_s = self.instrument.camera or IDEAL, self.clock_stddev_s(pointing)
+            fix = pointing_fix(
+                pointing, camera, tilt, self.instrument.mounting, self.atmosphere, state, clock_s
+            )
+            check_unmoved(fix, self.instrument, clock_s)
+        except StarposError as e:
+            return _failure(pointing, e)
+        return replace(
+            Solution.failed(pointing, Status.OK, "fix"),
+            fix=fix,
+            tilt=tilt,
+            fix_s=time.perf_counter() - begin,
+            extrapolated_days=state.orientation.extrapolated_days,
         )
 
     def _fix(self, stars: Stars, found: Identification, camera: Camera, tilt: Tilt, state: EarthState) -> Fix:
@@ -232,9 +273,10 @@ class Solver:
             self.clock_stddev_s(stars),
             stars.stamp_stddev_s,
         )
+        check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
         return replace(fix, used=np.flatnonzero(use)[fix.used])
 
-    def clock_stddev_s(self, stars: Stars) -> float:
+    def clock_stddev_s(self, stars: Stars | Pointing) -> float:
         """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""
         return max(self.instrument.clock_stddev_s, stars.clock_stddev_s)
 
@@ -278,11 +320,12 @@ def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
     return replace(s, star=star, stars_detected=len(stars))
 
 
-def _failure(stars: Stars, error: StarposError) -> Solution:
-    return Solution.failed(stars, _status(stars, error), str(error))
+def _failure(stars: Stars | Pointing, error: StarposError) -> Solution:
+    return Solution.failed(stars, status_of(stars, error), str(error))
 
 
-def _status(stars: Stars, error: StarposError) -> Status:
+def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
+    """The status of a frame whose work ended with an error."""
     kinds = (
         (TiltRangeError, Status.TILT_OUT_OF_RANGE),
         (TiltError, Status.NO_TILT),

@@ -9,6 +9,7 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
+from starpos.instrument.camera_vertical import CameraVertical
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.response import COEFFICIENTS
@@ -180,6 +181,7 @@ class Instrument:
     inclinometer        its errors
     inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
     clock_stddev_s      standard deviation of the clock against UTC, s
+    vertical            of a camera fixed to the ground, which is its own level; None: there is an inclinometer
     """
 
     focal_px: float
@@ -190,6 +192,7 @@ class Instrument:
     inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
+    vertical: CameraVertical | None = None
 
     def __post_init__(self) -> None:
         for name, numbers in (

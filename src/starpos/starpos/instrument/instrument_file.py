@@ -13,6 +13,7 @@ from starpos.errors import InstrumentError, TimeError
 from starpos.instrument import camera_file, sensors, yaml_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
+from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, CameraVertical, level_errors
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
 from starpos.units import ARCSEC
@@ -50,7 +51,9 @@ KEYS = (
     "inclinometer",
     *INCLINOMETER,
     "clock_stddev_s",
+    "vertical",
 )
+VERTICAL = ("camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour")
 
 
 def read(path: Path | str) -> Instrument:
@@ -75,6 +78,8 @@ def read(path: Path | str) -> Instrument:
     tilt_pose_arcsec: 0                                  new at each pose: hysteresis, nonlinearity, flexure
     tilt_range_deg: 90
     clock_stddev_s: 0.1
+    vertical: {camera_to_itrs, covariance_arcsec2, sag_arcsec_per_sqrt_hour}
+                                                         of a camera fixed to the ground, in place of tilt_...
     """
     path = Path(path)
     content = yaml_file.load(path, "instrument file")
@@ -117,8 +122,14 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
     content["link_to_camera"] = np.asarray(instrument.link_to_camera, float).tolist()
     if instrument.inclinometer_model:
         content["inclinometer"] = {"model": instrument.inclinometer_model}
-    for key, (name, unit) in INCLINOMETER.items():
-        content[key] = float(getattr(instrument.inclinometer, name) / unit)
+    if instrument.vertical is None:
+        for key, (name, unit) in INCLINOMETER.items():
+            content[key] = float(getattr(instrument.inclinometer, name) / unit)
+    else:
+        content["vertical"] = {
+            key: np.asarray(getattr(instrument.vertical, key)).tolist() for key in VERTICAL[:2]
+        }
+        content["vertical"][VERTICAL[2]] = float(instrument.inclinometer.drift_rad_per_sqrt_hour / ARCSEC)
     content["clock_stddev_s"] = float(instrument.clock_stddev_s)
     yaml_file.save(Path(path), content, comment)
 
@@ -133,9 +144,29 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
     model, errors = _sensor(content)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=model)
+    if "vertical" in content:
+        if given or model:
+            raise InstrumentError(
+                "vertical is of a camera without an inclinometer: leave out inclinometer and the tilt_ keys"
+            )
+        instrument = _with_vertical(instrument, content["vertical"])
     if "clock_stddev_s" in content:
         instrument = replace(instrument, clock_stddev_s=_number(content, "clock_stddev_s"))
     return instrument
+
+
+def _with_vertical(instrument: Instrument, about: object) -> Instrument:
+    """The instrument of a camera that is fixed to the ground."""
+    if not isinstance(about, dict):
+        raise InstrumentError(f"vertical is {_short(about)}: give {{{', '.join(VERTICAL)}}}")
+    _refuse_others(about, VERTICAL)
+    if math.isnan(instrument.calibration.utc_unix_s):
+        raise InstrumentError("a vertical sags with time: say when it was found, calibrated: {utc: ...}")
+    sag = _number(about, VERTICAL[2])
+    if not 0 <= sag <= MOST_SAG_ARCSEC:
+        raise InstrumentError(f"{VERTICAL[2]} is {sag:g}: give a number from 0 to {MOST_SAG_ARCSEC:g}")
+    vertical = CameraVertical(*(_matrix(about.get(key), key) for key in VERTICAL[:2]))
+    return replace(instrument, vertical=vertical, inclinometer=level_errors(sag))
 
 
 def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:

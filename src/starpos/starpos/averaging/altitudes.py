@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The place from elevations alone: of frames whose centre is known but not their roll.
+
+The tilt and A3 give the zenith distance of the optical axis, and the place lies on a circle of equal altitude around the
+point below it. Circles of several directions meet in the place (Jovanovic and Enright, NAVIGATION 69(3), 2022). Frames of
+a camera that stands still are one circle, however the sky turns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.special import fdtri, stdtrit
+
+from starpos import rotation
+from starpos.averaging.average import SCATTER, Average
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
+from starpos.errors import FixError
+from starpos.fix.budget import ALWAYS, EACH_POSE, ErrorTerm, symmetric_root, tilt_terms, time_terms
+from starpos.frames.pointings import Pointing
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt, level_of
+from starpos.instrument.mounting import Mounting
+from starpos.sky.site import Site
+from starpos.units import ARCSEC
+
+# so near the zenith a direction has hardly an elevation to speak of
+LEAST_SINE = 0.01
+# with a worse A3 the circles are no longer what a linear error makes of them
+MOST_A3_RAD = 360 * ARCSEC
+# frames closer than this, or than so many sigma, look in one direction
+SAME_RAD, SAME_SIGMA = 60 * ARCSEC, 6.0
+MOST_DIRECTIONS = 1000
+# so many directions give the first places to try
+STARTS = 8
+ROUNDS, SETTLED = 30, 1e-12
+# answers closer to each other than this, in rad, are one
+ALIKE = 1e-7
+# an answer that fits worse by so many sigma is excluded; a direction as far off is left out
+EXCLUDED_SIGMA = 6.0
+MOST_OUTLIERS = 1 / 3
+# the same for directions that scatter more than stated, as a probability
+OUTLIER_CHANCE = 1e-5
+WITHIN = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class Circle:
+    """A circle of equal altitude.
+
+    itrs (3,): geocentric apparent direction of the frame's centre.  zenith_distance (rad): as it is without refraction.
+    sigma (rad): of the pointing, across the circle.  terms: errors of the zenith distance, with factors (1, m) in rad.
+    clock_stddev_s, stamp_stddev_s: as those of a fix.
+    """
+
+    utc_unix_s: float
+    itrs: np.ndarray
+    zenith_distance: float
+    sigma: float
+    terms: tuple[ErrorTerm, ...]
+    earth: EarthState
+    clock_stddev_s: float
+    stamp_stddev_s: float
+
+
+def circle_of(
+    pointing: Pointing,
+    camera: Camera,
+    tilt: Tilt,
+    mounting: Mounting,
+    atmosphere: Atmosphere,
+    earth: EarthState,
+    clock_stddev_s: float,
+) -> Circle:
+    """The circle of one frame; FixError where its direction or A3 tell no altitude."""
+    up = mounting.up(tilt)
+    axis = camera.directions(*np.array(camera.centre_px)[:, None])[0]
+    seen = level_of(up) @ mounting.a3 @ axis
+    sine = np.hypot(seen[0], seen[1])
+    if sine < LEAST_SINE or seen[2] < MIN_COS_ZENITH:
+        raise FixError(
+            f"{pointing.place}: the camera looks {np.degrees(np.arctan2(sine, seen[2])):.1f} deg from the zenith, an "
+            "elevation tells a place between 0.6 and 87: lean it"
+        )
+    # up that errs by a small rotation of L lies nearer to the axis, or further
+    level = np.array([[-seen[1], seen[0], 0.0]]) / sine
+    terms = tilt_terms(level, tilt, mounting, earth.utc_unix_s)
+    if np.sqrt(terms[0].covariance[0, 0]) > MOST_A3_RAD:
+        raise FixError(
+            f"{pointing.place}: without a roll A3 has to be known to {MOST_A3_RAD / ARCSEC:.0f} arcsec: calibrate it at "
+            "a known place, say how well it is known, or give pointings with their roll"
+        )
+    true = atmosphere.refraction().unbend(seen[None])[0]
+    z = float(np.arctan2(np.hypot(true[0], true[1]), true[2]))
+    bent = (z - np.arctan2(sine, seen[2])) * atmosphere.relative_sigma
+    return Circle(
+        utc_unix_s=earth.utc_unix_s,
+        itrs=earth.to_itrs(rotation.unit_vector([pointing.ra], [pointing.dec]))[0],
+        zenith_distance=z,
+        sigma=pointing.sigma,
+        terms=(*terms, ErrorTerm("refraction", np.array([[bent]]), shared=ALWAYS)),
+        earth=earth,
+        clock_stddev_s=clock_stddev_s,
+        stamp_stddev_s=pointing.stamp_stddev_s,
+    )
+
+
+def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None = None) -> Average:
+    """The place where circles of several directions meet; its heading is NaN.
+
+    near: latitude, longitude (rad) that tells two places apart, where the circles meet in two.
+    `poses` is the number of directions, `left_out` the frames of those that disagree.
+    Raises FixError if there are fewer than three directions, or two without `near`, or if they leave two places.
+    """
+    whole = _Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
+    number = len(whole.covariance)
+    if number < 2 or (number == 2 and near is None):
+        raise FixError(
+            f"{len(circles)} elevations in {number} {'direction' if number == 1 else 'directions'} tell no place: "
+            "without a roll it takes three (frames of a camera that stands still are one)"
+            + (", or two and --near LAT LON, because two circles meet in two places" if number == 2 else "")
+        )
+    kept, answer = _agreed(whole, near)
+    return _average(whole.take(kept), answer, len(circles), kept)
+
+
+@dataclass(frozen=True)
+class _Directions:
+    """D directions: the circles of each, and the covariance (D, D) in rad2 of their mean zenith distances by source."""
+
+    circles: list[list[Circle]]
+    sources: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, circles: Sequence[Circle]) -> "_Directions":
+        """Directions of circles in order of time; FixError if they are too many."""
+        groups: list[list[Circle]] = []
+        for c in circles:
+            if groups and _alike(groups[-1][0], c):
+                groups[-1].append(c)
+            else:
+                groups.append([c])
+        if len(groups) > MOST_DIRECTIONS:
+            raise FixError(
+                f"{len(groups)} directions, of which {MOST_DIRECTIONS} can be worked: split the table"
+            )
+        own = np.diag([sum(c.sigma**2 for c in g) / len(g) ** 2 for g in groups])
+        return cls(groups, {"pointing": own} | _tilt_sources(groups))
+
+    @property
+    def covariance(self) -> np.ndarray:
+        return np.sum(list(self.sources.values()), axis=0)
+
+    def take(self, rows: np.ndarray) -> "_Directions":
+        """Some of the directions."""
+        return _Directions(
+            [self.circles[k] for k in rows], {n: c[np.ix_(rows, rows)] for n, c in self.sources.items()}
+        )
+
+    def residual(self, zenith: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean zenith distances minus those measured (D,) at a zenith (3,), and their derivatives (D, 2).
+
+        They are by the zenith's steps east and north, in rad.
+        """
+        rows = np.repeat(np.arange(len(self.circles)), [len(g) for g in self.circles])
+        every = [c for g in self.circles for c in g]
+        v = rotation.normalised(np.array([c.itrs for c in every]) + station_velocity(zenith))
+        axes = _enu(zenith)
+        local = v @ axes.T
+        sine = np.hypot(local[:, 0], local[:, 1])
+        off = np.arctan2(sine, local[:, 2]) - [c.zenith_distance for c in every]
+        slope = -local[:, :2] / np.maximum(sine, 1e-12)[:, None]
+        number = np.bincount(rows)
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            return np.bincount(rows, values) / number
+
+        return mean(off), np.stack([mean(slope[:, 0]), mean(slope[:, 1])], -1)
+
+
+def _alike(a: Circle, b: Circle) -> bool:
+    """Whether two circles are of a camera that was not turned in between."""
+    angle = np.linalg.norm(np.cross(a.itrs, b.itrs))
+    return bool(a.itrs @ b.itrs > 0 and angle < max(SAME_RAD, SAME_SIGMA * np.hypot(a.sigma, b.sigma)))
+
+
+def _tilt_sources(groups: list[list[Circle]]) -> dict[str, np.ndarray]:
+    """Covariance (D, D) in rad2 of the mean zenith distances of each direction, for each term of the circles."""
+    first = groups[0][0].utc_unix_s
+    since = np.array([np.mean([c.utc_unix_s for c in g]) for g in groups]) - first
+    sources: dict[str, np.ndarray] = {}
+    for k, like in enumerate(groups[0][0].terms):
+        terms = [[c.terms[k] for c in g] for g in groups]
+        if like.shared == ALWAYS:
+            mean = np.array([np.mean([t.factor[0] for t in ts], axis=0) for ts in terms])
+            # what wanders has gone on together until the earlier of two times
+            variance = terms[0][0].variance + like.walk_s * np.minimum(since[:, None], since)
+            sources[like.name] = mean @ mean.T * variance
+        else:
+            sources[like.name] = np.diag([_mean_variance(ts) for ts in terms])
+    return sources
+
+
+def _mean_variance(terms: list[ErrorTerm]) -> float:
+    """Variance of the mean of an error over the frames of a direction, from the readings that they share."""
+    each = np.array([t.covariance[0, 0] for t in terms])
+    if terms[0].shared is None:
+        return float(each.sum()) / len(terms) ** 2
+    if terms[0].shared == EACH_POSE:
+        return float(each.mean())
+    keys = [t.shared or () for t in terms]
+    different = len(set().union(*keys))
+    return float(np.mean([v * len(k) for v, k in zip(each, keys, strict=True)])) / max(different, 1)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """A zenith (3,), the derivatives (D, 2) there, the gain (2, D) of the fit and its chi-square."""
+
+    zenith: np.ndarray
+    gain: np.ndarray
+    chi2: float
+    left: np.ndarray
+    precision: np.ndarray
+
+
+def _agreed(whole: _Directions, near: tuple[float, float] | None) -> tuple[np.ndarray, _Answer]:
+    """The directions that agree, as rows, and their answer."""
+    rows = np.arange(len(whole.circles))
+    while True:
+        part = whole.take(rows)
+        answer, free = _answer(part, near), len(rows) - 2
+        worst = _worst(answer, free)
+        if worst is None or len(rows) - 1 < max(3, (1 - MOST_OUTLIERS) * len(whole.circles)):
+            return rows, answer
+        rows = np.delete(rows, worst)
+
+
+def _worst(answer: _Answer, free: int) -> int | None:
+    """The direction that lies too far from what the others say; None if there is none."""
+    if free < 2:
+        return None
+    off = (answer.precision @ answer.left) ** 2 / np.maximum(np.diag(answer.precision), 1e-300)
+    worst = int(np.argmax(off))
+    others2 = max(answer.chi2 - off[worst], 0.0) / (free - 1)
+    if others2 <= 1:
+        return worst if off[worst] > EXCLUDED_SIGMA**2 else None
+    most = max(stdtrit(free - 1, 1 - OUTLIER_CHANCE / 2), EXCLUDED_SIGMA)
+    return worst if off[worst] > most**2 * others2 else None
+
+
+def _answer(part: _Directions, near: tuple[float, float] | None) -> _Answer:
+    """The one place that fits; FixError if there is none, or another fits as well."""
+    weight = np.linalg.inv(part.covariance)
+    found: list[_Answer] = []
+    for start in _starts(part):
+        one = _refined(part, weight, start)
+        if one is not None and all(np.linalg.norm(one.zenith - f.zenith) > ALIKE for f in found):
+            found.append(one)
+    if not found:
+        raise FixError(
+            "the elevations do not meet in a place: check A3, the clock, and that nothing was moved between"
+        )
+    found.sort(key=lambda f: f.chi2)
+    scatter2 = max(found[0].chi2 / max(len(part.circles) - 2, 1), 1.0)
+    left = [f for f in found if f.chi2 - found[0].chi2 <= EXCLUDED_SIGMA**2 * scatter2]
+    if near is not None:
+        there = rotation.unit_vector(near[1], near[0])
+        left.sort(key=lambda f: -f.zenith @ there)
+    elif len(left) > 1:
+        first, second = (
+            f"{lat:+.4f} {lon:+.4f}" for lat, lon in map(_degrees, (left[0].zenith, left[1].zenith))
+        )
+        raise FixError(
+            f"the elevations leave two places, {first} and {second}: turn the camera to directions that do not lie in "
+            "one plane with the zenith, or say which it is with --near LAT LON"
+        )
+    return left[0]
+
+
+def _starts(part: _Directions) -> list[np.ndarray]:
+    """Zeniths (3,) in which two circles meet, or where they are nearest to each other."""
+    some = np.unique(np.linspace(0, len(part.circles) - 1, STARTS).astype(int))
+    firsts = [part.circles[k][0] for k in some]
+    starts = []
+    for a, b in combinations(firsts, 2):
+        normal = np.cross(a.itrs, b.itrs)
+        across2 = normal @ normal
+        if across2 < 1e-12:
+            continue
+        ca, cb, c = np.cos(a.zenith_distance), np.cos(b.zenith_distance), a.itrs @ b.itrs
+        flat = ((ca - c * cb) * a.itrs + (cb - c * ca) * b.itrs) / across2
+        height = np.sqrt(max(1 - flat @ flat, 1e-6) / across2) * normal
+        starts += [rotation.normalised(flat + height), rotation.normalised(flat - height)]
+    return starts
+
+
+def _refined(part: _Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answer | None:
+    """The answer near a zenith, by Gauss-Newton; None if there is none."""
+    for _ in range(ROUNDS):
+        left, slope = part.residual(zenith)
+        normal = slope.T @ weight @ slope
+        if np.linalg.cond(normal) > 1e12:
+            return None
+        gain = np.linalg.solve(normal, slope.T @ weight)
+        step = -gain @ left
+        if np.linalg.norm(step) < SETTLED:
+            precision = weight - weight @ slope @ gain
+            return _Answer(zenith, gain, float(left @ weight @ left), left, precision)
+        step *= min(1.0, 0.3 / np.linalg.norm(step))
+        zenith = rotation.normalised(zenith + step @ _enu(zenith)[:2])
+    return None
+
+
+def _average(part: _Directions, answer: _Answer, frames: int, kept: np.ndarray) -> Average:
+    latitude, longitude = np.radians(_degrees(answer.zenith))
+    prime, meridian = curvature_radii_m(latitude)
+    metres = answer.gain * np.array([[prime], [meridian]])
+    every = [c for g in part.circles for c in g]
+
+    def term(name: str, covariance: np.ndarray, shared: tuple | None = None) -> ErrorTerm:
+        factor = np.full((6, 2), np.nan)
+        factor[:2] = symmetric_root(covariance)
+        return ErrorTerm(name, factor, shared=shared)
+
+    terms = [term(name, metres @ source @ metres.T) for name, source in part.sources.items()]
+    worst = max(every, key=lambda c: c.clock_stddev_s)
+    stamp_s = max(c.stamp_stddev_s for c in every)
+    for t in time_terms(latitude, worst.earth, worst.clock_stddev_s, stamp_s):
+        terms.append(term(t.name, t.covariance[:2, :2], ALWAYS))
+    excess = _excess(answer.chi2, len(part.circles) - 2)
+    terms.append(term(SCATTER, excess * metres @ part.covariance @ metres.T))
+    times = [c.utc_unix_s for c in every]
+    return Average(
+        utc_unix_s=float(np.mean(times)),
+        latitude=float(latitude),
+        longitude=float(longitude),
+        heading=float("nan"),
+        terms=tuple(terms),
+        frames=len(every),
+        poses=len(kept),
+        left_out=frames - len(every),
+        began_unix_s=min(times),
+        moved=0,
+    )
+
+
+def _excess(chi2: float, free: int) -> float:
+    """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
+
+    Few of them tell badly by how much; Student's t makes up for it. One alone is taken for two.
+    """
+    if free < 1 or chi2 <= free:
+        return 0.0
+    # the ellipse that holds a share WITHIN, over that of a known scatter
+    wide = fdtri(2, max(free, 2), WITHIN) / -np.log(1 - WITHIN)
+    return float((chi2 / free - 1) * wide)
+
+
+def _degrees(zenith: np.ndarray) -> tuple[float, float]:
+    """Latitude, longitude in deg of a zenith (3,)."""
+    latitude = np.degrees(np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1])))
+    return float(latitude), float(np.degrees(np.arctan2(zenith[1], zenith[0])))
+
+
+def _enu(zenith: np.ndarray) -> np.ndarray:
+    """East, north and up (3, 3) in ITRS at a zenith (3,)."""
+    return Site(*_degrees(zenith)).enu

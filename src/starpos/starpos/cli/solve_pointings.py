@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos solve --pointings`: place and heading from what a plate solver found; without a roll, the place alone."""
+
+import argparse
+from collections.abc import Sequence
+
+import numpy as np
+
+from starpos.averaging.altitudes import Circle, circle_of, place_of_circles
+from starpos.cli import common
+from starpos.cli.archive import NightFolder
+from starpos.cli.frame_work import NO_CAMERA, tilts
+from starpos.cli.solve import NO_FIX, json_of, print_combined, solved_by_turning, tell
+from starpos.earth.vertical import Vertical
+from starpos.errors import FixError, InstrumentError, StarposError
+from starpos.fix.pointing import IDEAL
+from starpos.fix.solver import Solver, status_of
+from starpos.frames.pointings import Pointing, read_pointings
+from starpos.instrument.tilt_log import TiltLog
+from starpos.sky import catalogue
+from starpos.utc import utc_text
+
+# the status of a row that tells an elevation
+ELEVATION = "elevation alone"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Work on the table of --pointings; returns the exit status."""
+    if args.near is not None and not (abs(args.near[0]) <= 90 and abs(args.near[1]) <= 360):
+        raise InstrumentError("--near {:g} {:g}: give latitude and longitude in deg".format(*args.near))
+    pointings, vertical = read_pointings(args.pointings), common.vertical_of(args)
+    own_level = common.has_own_level(args)
+    if args.tilt is None and not own_level:
+        raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
+    if args.jobs is not None or args.scheduler is not None:
+        raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
+    solver = _solver_of(args)
+    log = None if own_level else tilts(args.tilt, solver.instrument.inclinometer.noise_rad)
+    whole = [p for p in pointings if p.has_roll]
+    if not whole:
+        if args.self_calibrate:
+            raise InstrumentError(
+                "--self-calibrate needs pointings with their roll: elevations alone do not tell A3"
+            )
+        return _from_elevations(args, solver, log, pointings, vertical)
+    if args.near is not None:
+        raise InstrumentError("--near is for pointings without a roll: leave it out")
+    night = NightFolder(tuple(p.source for p in pointings), args.tilt)
+    if args.self_calibrate and log is not None:
+        solved = iter(solved_by_turning(args, night, solver, log, whole))
+        answers = [next(solved) if p.has_roll else solver.solve(p) for p in pointings]
+    else:
+        answers = [solver.solve(p, None if log is None else log.average) for p in pointings]
+    return tell(args, night, zip(night.frames, answers, strict=True), vertical)
+
+
+def _solver_of(args: argparse.Namespace) -> Solver:
+    """The solver for pointings, which needs no focal length."""
+    instrument = common.instrument_of(args, NO_CAMERA)
+    return Solver(instrument, catalogue.load_catalogue(), common.atmosphere_of(args))
+
+
+def _from_elevations(
+    args: argparse.Namespace,
+    solver: Solver,
+    log: TiltLog | None,
+    pointings: Sequence[Pointing],
+    vertical: Vertical,
+) -> int:
+    """Print the zenith distance of each row and the place that they tell together; returns the exit status."""
+    circles: list[Circle] = []
+    for p in pointings:
+        try:
+            circles.append(_circle(solver, log, p))
+            zenith_distance, status = circles[-1].zenith_distance, ELEVATION
+        except StarposError as e:
+            common.complain("solve", e)
+            zenith_distance, status = None, status_of(p, e).value
+        _print_row(args, p, zenith_distance, status, vertical)
+    together = None
+    if circles:
+        near = None if args.near is None else tuple(np.radians(args.near).tolist())
+        try:
+            together = place_of_circles(circles, near)
+            common.tell_unknown("solve", args, vertical.at(together.latitude, together.longitude))
+        except FixError as e:
+            common.complain("solve", e)
+        print_combined(NightFolder((), args.tilt), together, [], set(), args, vertical)
+    return 0 if together else NO_FIX
+
+
+def _circle(solver: Solver, log: TiltLog | None, pointing: Pointing) -> Circle:
+    state, tilt = solver.levelled(pointing, None if log is None else log.average)
+    instrument = solver.instrument
+    return circle_of(
+        pointing,
+        instrument.camera or IDEAL,
+        tilt,
+        instrument.mounting,
+        solver.atmosphere,
+        state,
+        solver.clock_stddev_s(pointing),
+    )
+
+
+def _print_row(
+    args: argparse.Namespace,
+    pointing: Pointing,
+    zenith_distance: float | None,
+    status: str,
+    vertical: Vertical,
+) -> None:
+    deg = None if zenith_distance is None else np.degrees(zenith_distance)
+    if not args.json:
+        about = status if deg is None else f"{deg:.5f} deg from the zenith"
+        print(f"{pointing.source}: {about}", flush=True)
+        return
+    utc = {} if pointing.mid_unix_s is None else {"utc": utc_text(pointing.mid_unix_s)}
+    none = dict.fromkeys(("residual_arcsec", "log_odds"))
+    about_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
+    row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
+    common.print_json({"file": pointing.source} | row)
