@@ -300,10 +300,9 @@ def _line(path: str, s: Solution, turning: bool) -> str:
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     # one frame of a turn does not tell A3, so its own place would be 1100 km wide
-    where = "its place waits for the whole turn" if turning else _where(s.fix)
-    return f"{path}: {where}, {len(s.names)} of {s.stars_detected} stars"
+    where = "its place waits for the whole turn" if turning else place_text(s.fix)
     stars = f", {len(s.names)} of {s.stars_detected} stars" if s.stars_detected else ""
-    return f"{path}: {place_text(s.fix)}{stars}"
+    return f"{path}: {where}{stars}"
 
 
 def place_text(fix: Fix | Average) -> str:
