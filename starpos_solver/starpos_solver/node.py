@@ -440,4 +440,5 @@ class SolverNode(Node):
 
     def _report_conditions(self) -> Diagnosis:
         calibration = self._settings.calibration(self._calibrating.found)
-        return reports.of_conditions(self._values, calibration, self._answer and self._answer.tilt)
+        tilt = self._answer.tilt if self._answer else None
+        return reports.of_conditions(self._values, calibration, tilt)
