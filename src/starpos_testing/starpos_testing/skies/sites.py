@@ -38,7 +38,7 @@ class Shots:
         return self.scene.instrument.calibration.a3
 
     def solver(self, catalogue, given=(0.0, 0.0, 0.0)) -> Solver:
-        """The solver of an instrument whose A3 is said to be as given, without an error."""
+        """The solver of an instrument whose A3 is said to be as given; how well, nobody says, so it is not known."""
         instrument = Instrument(FOCAL_PX, calibration=Calibration(misalignment_deg=given))
         return Solver(instrument, catalogue, self.scene.site.atmosphere)
 
