@@ -2,8 +2,8 @@
 """The place from elevations alone: of frames whose centre is known but not their roll.
 
 The tilt and A3 give the zenith distance of the optical axis, and the place lies on a circle of equal altitude around the
-point below it. Circles of several directions meet in the place (Jovanovic and Enright, NAVIGATION 69(3), 2022). Frames of
-a camera that stands still are one circle, however the sky turns.
+point below it. Circles of several directions meet in the place (after Jovanovic and Enright, NAVIGATION 69(3), 2022,
+doi 10.33012/navi.529). Frames of a camera that stands still are one circle, however the sky turns.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtri
 
 from starpos import rotation
 from starpos.averaging.average import SCATTER, Average
@@ -39,11 +39,11 @@ STARTS = 8
 ROUNDS, SETTLED = 30, 1e-12
 # answers closer to each other than this, in rad, are one
 ALIKE = 1e-7
-# an answer that fits worse by so many sigma is excluded; a direction as far off is left out
+# an answer that fits worse by so many sigma is excluded
 EXCLUDED_SIGMA = 6.0
-MOST_OUTLIERS = 1 / 3
-# the same for directions that scatter more than stated, as a probability
-OUTLIER_CHANCE = 1e-5
+# directions further off are left out, of so many or more, up to this share; and so often are they judged
+OUTLIER_SIGMA, FEWEST_JUDGED, MOST_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
+SIGMA_PER_MEDIAN = 1.4826
 WITHIN = 0.95
 
 
@@ -123,8 +123,8 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
             "without a roll it takes three (frames of a camera that stands still are one)"
             + (", or two and --near LAT LON, because two circles meet in two places" if number == 2 else "")
         )
-    kept, answer = _agreed(whole, near)
-    return _average(whole.take(kept), answer, len(circles), kept)
+    part = whole.take(_sound(whole))
+    return _average(part, _answer(part, near), len(circles))
 
 
 @dataclass(frozen=True)
@@ -218,38 +218,44 @@ def _mean_variance(terms: list[ErrorTerm]) -> float:
 
 @dataclass(frozen=True)
 class _Answer:
-    """A zenith (3,), the derivatives (D, 2) there, the gain (2, D) of the fit and its chi-square."""
+    """A zenith (3,), the gain (2, D) of the fit there and its chi-square."""
 
     zenith: np.ndarray
     gain: np.ndarray
     chi2: float
-    left: np.ndarray
-    precision: np.ndarray
 
 
-def _agreed(whole: _Directions, near: tuple[float, float] | None) -> tuple[np.ndarray, _Answer]:
-    """The directions that agree, as rows, and their answer."""
-    rows = np.arange(len(whole.circles))
-    while True:
-        part = whole.take(rows)
-        answer, free = _answer(part, near), len(rows) - 2
-        worst = _worst(answer, free)
-        if worst is None or len(rows) - 1 < max(3, (1 - MOST_OUTLIERS) * len(whole.circles)):
-            return rows, answer
-        rows = np.delete(rows, worst)
+def _sound(whole: _Directions) -> np.ndarray:
+    """The directions that agree, as rows; all if they are too few to judge, or too many disagree.
 
+    They are judged from the place with the least median of residuals, in units of what is usual (Rousseeuw and Leroy,
+    Robust Regression and Outlier Detection, 1987): a mean would hide several wrong ones behind each other.
+    """
+    number = len(whole.circles)
+    every = np.arange(number)
+    if number < FEWEST_JUDGED:
+        return every
+    sigma = np.sqrt(np.diag(whole.covariance))
 
-def _worst(answer: _Answer, free: int) -> int | None:
-    """The direction that lies too far from what the others say; None if there is none."""
-    if free < 2:
-        return None
-    off = (answer.precision @ answer.left) ** 2 / np.maximum(np.diag(answer.precision), 1e-300)
-    worst = int(np.argmax(off))
-    others2 = max(answer.chi2 - off[worst], 0.0) / (free - 1)
-    if others2 <= 1:
-        return worst if off[worst] > EXCLUDED_SIGMA**2 else None
-    most = max(stdtrit(free - 1, 1 - OUTLIER_CHANCE / 2), EXCLUDED_SIGMA)
-    return worst if off[worst] > most**2 * others2 else None
+    def size(zenith: np.ndarray) -> np.ndarray:
+        return np.abs(whole.residual(zenith)[0]) / sigma
+
+    zenith = min(_starts(whole), key=lambda start: float(np.median(size(start))), default=None)
+    rows = every
+    for _ in range(JUDGED):
+        if zenith is None:
+            return every
+        off = size(zenith)
+        usual = SIGMA_PER_MEDIAN * (1 + 5 / (number - 2)) * float(np.median(off))
+        agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual, 1.0))
+        if len(agree) < (1 - MOST_OUTLIERS) * number:
+            return every
+        if np.array_equal(agree, rows):
+            break
+        rows, part = agree, whole.take(agree)
+        found = _refined(part, np.linalg.inv(part.covariance), zenith)
+        zenith = None if found is None else found.zenith
+    return rows
 
 
 def _answer(part: _Directions, near: tuple[float, float] | None) -> _Answer:
@@ -308,14 +314,13 @@ def _refined(part: _Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answ
         gain = np.linalg.solve(normal, slope.T @ weight)
         step = -gain @ left
         if np.linalg.norm(step) < SETTLED:
-            precision = weight - weight @ slope @ gain
-            return _Answer(zenith, gain, float(left @ weight @ left), left, precision)
+            return _Answer(zenith, gain, float(left @ weight @ left))
         step *= min(1.0, 0.3 / np.linalg.norm(step))
         zenith = rotation.normalised(zenith + step @ _enu(zenith)[:2])
     return None
 
 
-def _average(part: _Directions, answer: _Answer, frames: int, kept: np.ndarray) -> Average:
+def _average(part: _Directions, answer: _Answer, frames: int) -> Average:
     latitude, longitude = np.radians(_degrees(answer.zenith))
     prime, meridian = curvature_radii_m(latitude)
     metres = answer.gain * np.array([[prime], [meridian]])
@@ -341,7 +346,7 @@ def _average(part: _Directions, answer: _Answer, frames: int, kept: np.ndarray) 
         heading=float("nan"),
         terms=tuple(terms),
         frames=len(every),
-        poses=len(kept),
+        poses=len(part.circles),
         left_out=frames - len(every),
         began_unix_s=min(times),
         moved=0,

@@ -46,13 +46,13 @@ def test_exact_elevations_give_the_exact_place(rng):
     ids=["eight directions", "four", "three", "eight, noise three times as stated"],
 )
 def test_claims_are_true_over_many_nights(azimuths, noise, least):
-    nees = []
+    found = []
     for seed in range(60):
         night = pointed_night(np.random.default_rng(seed), azimuths, frames=1, noise=noise)
-        nees.append(night.nees(place_of_circles(circles(night))))
-    assert least < np.mean(nees) < 2.8
+        found.append(night.place_nees(place_of_circles(circles(night))))
+    assert least < np.mean(found) < 2.8
     # half of them lie where half should
-    assert np.median(nees) < 1.9
+    assert np.median(found) < 1.9
 
 
 def test_an_error_of_every_pose_is_one_error_of_its_frames(rng):
@@ -75,7 +75,7 @@ def test_directions_around_the_horizon_cancel_an_error_of_a3():
     night = pointed_night(np.random.default_rng(2), FOUR, a3_sigma_arcsec=100.0)
     place = place_of_circles(circles(night))
     assert np.sqrt(place.covariance[0, 0]) < 1500 < 100 * 31
-    assert night.nees(place) < 14
+    assert night.place_nees(place) < 14
 
 
 def test_one_direction_is_no_place_however_the_sky_turns(rng):
@@ -88,7 +88,7 @@ def test_two_directions_leave_two_places_unless_somebody_says_which(rng):
     night = pointed_night(rng, (10.0, 80.0))
     with pytest.raises(FixError, match="two circles meet in two places"):
         place_of_circles(circles(night))
-    assert night.nees(place_of_circles(circles(night), near_of(night))) < 14
+    assert night.place_nees(place_of_circles(circles(night), near_of(night))) < 14
 
 
 def test_directions_in_one_plane_leave_two_places(rng):
@@ -99,7 +99,7 @@ def test_directions_in_one_plane_leave_two_places(rng):
     except FixError as e:
         assert "leave two places" in str(e)
         place = place_of_circles(circles(night), near_of(night))
-    assert night.nees(place) < 20
+    assert night.place_nees(place) < 20
 
 
 def test_a_direction_with_a_wrong_tilt_is_left_out(rng):
@@ -109,7 +109,7 @@ def test_a_direction_with_a_wrong_tilt_is_left_out(rng):
     spoilt = replace(night, tilts=tilts)
     place = place_of_circles(circles(spoilt))
     assert (place.left_out, place.poses) == (2, 7)
-    assert night.nees(place) < 14
+    assert night.place_nees(place) < 14
 
 
 def test_directions_that_disagree_widen_the_claim(rng):
@@ -121,7 +121,7 @@ def test_directions_that_disagree_widen_the_claim(rng):
     ]
     place = place_of_circles(circles(replace(night, tilts=tilts)))
     assert np.sqrt(place.covariance[0, 0]) > 1500
-    assert night.nees(place) < 14
+    assert night.place_nees(place) < 14
 
 
 def test_what_tells_no_elevation_is_refused(rng):

@@ -61,7 +61,7 @@ def test_a_later_night_needs_no_tilt(instrument, tmp_path, capsys):
     for k, v in PLACE.items():
         assert together[k] == pytest.approx(v, abs=2 / 3600)
     truth = json.loads((tmp_path / "later" / "truth.json").read_text())
-    assert together["heading"] == pytest.approx(truth["heading_deg"], abs=0.005)
+    assert together["heading"] == pytest.approx(truth["frames"][0]["heading_deg"], abs=0.005)
 
 
 def test_a_camera_that_was_moved_says_so_and_gives_no_fix(instrument, tmp_path, capsys):

@@ -80,7 +80,7 @@ def test_claims_are_true_over_many_nights(catalogue):
         night = pointed_night(np.random.default_rng(seed), frames=1)
         _, answers = solved(night, catalogue)
         whole = average([a.fix for a in answers])
-        place.append(night.nees(whole))
+        place.append(night.place_nees(whole))
         heading.append(half_turn(whole.heading - night.heading) ** 2 / whole.covariance[2, 2])
     assert 1.2 < np.mean(place) < 2.7
     assert 0.6 < np.mean(heading) < 1.5
@@ -110,7 +110,7 @@ def test_a3_by_turning_and_at_a_known_place(catalogue):
         solver, instrument=replace(solver.instrument, calibration=type(night.instrument.calibration)())
     )
     turned = turn(unknown, night.pointings, night.tilt)
-    assert night.nees(average(turned.fixes)) < 14
+    assert night.place_nees(average(turned.fixes)) < 14
     known = calibrate_at(unknown, night.pointings, night.tilt, night.site)
     up = known.instrument.mounting.calibrated_up
     off = (known.instrument.calibration.a3 - TRUE_A3).T @ up

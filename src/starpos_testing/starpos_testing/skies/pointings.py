@@ -77,7 +77,7 @@ class PointedNight:
     def tilt(self, mid_unix_s: float, _exposure_s: float, _spread_s: float) -> Tilt:
         return next(t for t in self.tilts if t.utc_unix_s == mid_unix_s)
 
-    def nees(self, answer) -> float:
+    def place_nees(self, answer) -> float:
         """Squared error of a fix or an average in units of its covariance, of the place alone."""
         off = self.off_m(answer)
         return float(off @ np.linalg.solve(answer.covariance[:2, :2], off))
