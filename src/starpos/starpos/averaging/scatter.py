@@ -25,7 +25,7 @@ EVIDENT = 0.25
 # sizes of the coefficients of the response, beside what is stated
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
-AS_STATED = 0.5
+AS_STATED = 0.7
 # with fewer degrees of freedom the frames, or the poses, do not tell
 FEWEST_FREE = 2.5
 # so many frames or means of frames are looked at; more are averaged before
@@ -142,7 +142,7 @@ def scatter_of(frames: Frames) -> Scatter:
     return Scatter(
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
-        evident=bool(weight[:number].sum() < EVIDENT),
+        evident=bool(weight[0] < EVIDENT),
         moved=mean,
         covariance=np.asarray(total),
         stated=answers[0][1],
