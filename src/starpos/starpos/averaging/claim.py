@@ -47,8 +47,8 @@ class Remembered:
         """What is remembered of a fix of a pose that began with `first`."""
         own = [t for t in f.terms if not t.common and t.shared != EACH_POSE]
         new = [t for t in f.terms if t.shared == EACH_POSE]
-        common = [first.terms[k] if t.posed else t for k, t in enumerate(f.terms) if t.common]
-        factors = [np.sqrt(t.variance) * plane.turned(f, t.factor)[:2] for t in common]
+        common = [(k, first if t.posed else f) for k, t in enumerate(f.terms) if t.common]
+        factors = [np.sqrt(f.terms[k].variance) * plane.turned(g, g.terms[k].factor)[:2] for k, g in common]
         return cls(
             utc_unix_s=f.utc_unix_s,
             pose=pose,
