@@ -94,6 +94,7 @@ def _averaged(in_order: Sequence[Fix], frame_sigma: float) -> "Averager":
     averager = Averager(frame_sigma)
     for f in in_order:
         averager.add(f)
+    averager.look_again()
     return averager
 
 
@@ -116,6 +117,9 @@ def _about_one_place(in_order: Sequence[Fix]) -> list[Fix]:
     if by_middle > MOST_POSE_RAD or np.mean(off < GATE_SIGMA * by_steps) < MOST_OF_ALL:
         return []
     near = off < GATE_SIGMA * by_middle
+    # what drove on is elsewhere at the end
+    if not near[-MOVED_FIXES:].any():
+        return []
     return [_with_scatter(f, by_middle) for f, k in zip(in_order, pose, strict=True) if near[k]]
 
 
@@ -240,6 +244,12 @@ class Averager:
     def frame_sigma(self) -> float:
         """Scatter in rad of the fixes beyond their budgets; 0 before the first fix."""
         return self._track.claim.frame_sigma if self._track else 0.0
+
+    def look_again(self) -> None:
+        """Look at the scatter of all fixes now, rather than when there are clearly more."""
+        if self._track is not None:
+            track = self._track
+            self._track = replace(track, claim=track.claim.looked_at(track.place_filter.east_north_m))
 
     def add(self, f: Fix) -> None:
         """Take in one more fix, later than all before."""

@@ -21,7 +21,7 @@ ANYWHERE_RAD = np.pi
 # so many remembered fixes are averaged two by two
 MOST_REMEMBERED = 2 * MOST_ROWS
 # a fix more changes little where many are seen: the scatter is looked at again after so large a share more
-NEWS = 0.1
+NEWS = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ import numpy as np
 from starpos.units import ARCSEC
 
 # sizes: from a share of a frame's own error to the most that any sensor has
-LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 18
+LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 12
 # times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the
 # whole time cannot be told from a constant
 FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
@@ -29,7 +29,7 @@ AS_STATED = 0.7
 # with fewer degrees of freedom the frames, or the poses, do not tell
 FEWEST_FREE = 2.5
 # so many frames or means of frames are looked at; more are averaged before
-MOST_ROWS = 120
+MOST_ROWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)

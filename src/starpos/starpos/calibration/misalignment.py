@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.scatter import Scatter
-from starpos.calibration.plumb_line import PlumbLine, hang, settled, typical
+from starpos.calibration.plumb_line import FEWEST_POSES, PlumbLine, hang, settled, typical
 from starpos.calibration.readings import FixedFrame, Readings
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
 from starpos.errors import FixError
@@ -40,8 +40,6 @@ MANY_POSES = 10
 MOST_POSE_RAD = np.radians(0.15)
 # chi-square per degree of freedom of frames too few to tell their scatter
 MOST_SCATTER = 16.0
-# fewer poses tell no response of the inclinometer
-FEWEST_POSES = 3
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
 WORTH = 0.05
 

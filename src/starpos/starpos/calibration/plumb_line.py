@@ -20,6 +20,8 @@ from starpos.units import ARCSEC
 # a frame further off than this pulls no harder
 ROBUST_SIGMA, ROBUST_ROUNDS = 3.0, 10
 TURNS_TRIED = 8
+# fewer poses tell no response of the inclinometer
+FEWEST_POSES = 3
 # chi-square per degree of freedom above which the search ended in a wrong minimum
 FOUND_SCATTER = 16.0
 # chi-square per degree of freedom above which the poses scatter
@@ -183,6 +185,8 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
     leans = readings.lean(_pose_scatter(plumb, readings))
     if not leans:
         prior_sigma[2] = KNOWN
+    response = np.zeros(len(prior_sigma), bool)
+    response[5 + readings.response.start :] = readings.pose.max() + 1 >= FEWEST_POSES
     scatter = scatter_of(
         Frames(
             utc_unix_s=readings.utc_unix_s,
@@ -192,7 +196,8 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
             sigma=readings.sigma,
             pose_sigma=readings.pose_sigma,
             prior_sigma=prior_sigma,
-            response=np.arange(len(prior_sigma)) >= 5 + readings.response.start,
+            response=(np.arange(len(prior_sigma)) >= 5 + readings.response.start)
+            & (readings.pose.max() + 1 >= FEWEST_POSES),
         )
     )
     moved, covariance, at = scatter.moved, scatter.covariance, 5 + readings.response.start

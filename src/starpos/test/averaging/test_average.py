@@ -240,7 +240,7 @@ def test_as_they_come_or_all_at_once(rng):
     assert (a.frames, a.poses) == (b.frames, b.poses) == (10, 2)
     apart = np.array([a.latitude - b.latitude, a.longitude - b.longitude]) * 6.37e6
     assert np.all(np.abs(apart) < 0.3 * sigmas(b)[:2])
-    np.testing.assert_allclose(sigmas(a)[:2], sigmas(b)[:2], rtol=0.2)
+    np.testing.assert_allclose(sigmas(a)[:2], sigmas(b)[:2], rtol=0.4)
 
 
 def test_frames_that_share_a_few_readings_are_believed_and_no_more_than_is_due(rng):
