@@ -60,7 +60,7 @@ def test_the_bubble_is_at_its_place_and_red_beyond_the_limit(page):
     page.until(lambda: page.run(place) == pytest.approx([12.0, -6.0], abs=0.6))
     page.instrument.works(tilt=said.tilt(40.0, 0.0, flags=Tilt.OUT_OF_RANGE))
     page.until(lambda: page.run(place) == pytest.approx([30.0, 0.0], abs=0.6))
-    page.shows(tilt_flags="beyond ±30°")
+    page.shows(tilt_flags="beyond the sensor's range")
     assert page.run("return document.querySelector('#bubble-dot.out') !== null")
 
 

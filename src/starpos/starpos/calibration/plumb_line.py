@@ -321,7 +321,7 @@ def _fitted(readings: Readings, start: np.ndarray, known: _Known, turned: float 
         # the prior's own units keep the loose and the tight of one size
         scaled = np.concatenate([(off * weight).ravel(), p / prior_sigma])
         step = -prior_sigma * np.linalg.lstsq(design * prior_sigma, scaled, rcond=None)[0]
-        step *= LONGEST_STEP / max(np.linalg.norm(step[:5]), LONGEST_STEP)
+        step *= LONGEST_STEP / max(float(np.linalg.norm(step[:5])), LONGEST_STEP)
         a3, p = rotation.from_vector(turns @ step[:3]) @ a3, p + step
         up = zenith + p[3:5] @ across
         if np.abs(step[:5]).max() < SETTLED_RAD:

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import erfa
 import numpy as np
 import pytest
@@ -80,8 +82,15 @@ def test_no_air_no_refraction(rng):
 
 def test_sigma_follows_what_was_measured():
     """Refraction goes with pressure and the inverse of absolute temperature."""
-    known = Atmosphere.measured(100_000.0, 0.0)
+    known = Atmosphere(
+        pressure_pa=100_000.0, temperature_c=0.0, humidity_stddev=0.0, wavelength_stddev_um=0.0
+    )
     assert known.relative_sigma == pytest.approx(np.hypot(200 / 1e5, 2 / 273.15))
+    known = Atmosphere.measured(100_000.0, 0.0)
+    # of the light that the camera sees, the 0.47 to 0.63 um in which filters lie
+    light = [replace(known, wavelength_um=known.wavelength_um + s).refraction().a for s in (0.08, -0.08)]
+    light = (light[1] - light[0]) / 2 / known.refraction().a
+    assert known.relative_sigma == pytest.approx(np.hypot(light, np.hypot(200 / 1e5, 2 / 273.15)), rel=0.1)
     guessed = Atmosphere.measured(None, None)
     assert guessed.relative_sigma > 20 * known.relative_sigma / 2
     for pressure, temperature in (
