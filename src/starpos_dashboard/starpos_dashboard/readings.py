@@ -27,6 +27,7 @@ TILT_FLAGS = (
     (Tilt.STUCK, "the sensor repeats one value"),
     (Tilt.SATURATED, "the converter is at its limit"),
     (Tilt.GAP, "readings were lost"),
+    (Tilt.TIME_UNKNOWN, "nobody knows when it was read"),
 )
 
 

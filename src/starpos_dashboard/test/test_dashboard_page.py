@@ -50,7 +50,7 @@ def test_the_needle_points_where_the_heading_is(page):
         page.until(lambda a=azimuth: abs(math.remainder(page.run(tip) - a, 360.0)) < 0.01)
 
 
-def test_the_bubble_is_at_its_place_and_red_beyond_the_limit(page):
+def test_the_bubble_is_at_its_place_and_red_where_a_flag_is_set(page):
     place = """
       const c = (id) => { const r = document.getElementById(id).getBoundingClientRect();
         return [r.x + r.width / 2, r.y + r.height / 2, r.width]; };
@@ -59,7 +59,8 @@ def test_the_bubble_is_at_its_place_and_red_beyond_the_limit(page):
     """
     page.until(lambda: page.run(place) == pytest.approx([12.0, -6.0], abs=0.6))
     page.instrument.works(tilt=said.tilt(40.0, 0.0, flags=Tilt.OUT_OF_RANGE))
-    page.until(lambda: page.run(place) == pytest.approx([30.0, 0.0], abs=0.6))
+    page.until(lambda: page.run(place) == pytest.approx([40.0 / 3, 0.0], abs=0.6))  # the rim is at 90 deg now
+    assert "90°" in page.run("return document.querySelector('#bubble').textContent")
     page.shows(tilt_flags="beyond the sensor's range")
     assert page.run("return document.querySelector('#bubble-dot.out') !== null")
 
