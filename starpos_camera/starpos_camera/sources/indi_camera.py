@@ -85,15 +85,24 @@ async def set_up(device: IndiDevice, wish: Wish) -> None:
         if width and height:
             await _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if wish.gain is not None:
-        gain = next(((v, m) for v, m in GAINS if device.value(v, m) is not None), None)
-        if gain is None:
-            raise CaptureError("it has no gain to be set: leave `gain` unset.")
-        vector, member = gain
+        vector, member = await _gain_of(device)
         _check_limits(device, vector, member, wish.gain, "`gain`")
         if device.number(vector, member) != wish.gain:
             # The driver may round the gain to one that the camera has.
             await _set(device, vector, **{member: repr(float(wish.gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", wish.exposure_s, "`exposure` (s)")
+
+
+async def _gain_of(device: IndiDevice) -> tuple[str, str]:
+    """The vector and member that set the gain; CaptureError if none comes."""
+
+    def there() -> list[tuple[str, str]]:
+        return [(v, m) for v, m in GAINS if device.value(v, m) is not None]
+
+    # A driver defines its properties one after the other, and nothing says which is the last.
+    if not await device.server.until(there, ANSWER_S):
+        raise CaptureError("it has no gain to be set: leave `gain` unset.")
+    return there()[0]
 
 
 async def expose(device: IndiDevice, wish: Wish) -> Blob:
