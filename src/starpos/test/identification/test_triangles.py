@@ -15,6 +15,7 @@ from starpos.instrument.camera import Camera
 from starpos_testing.patience import WAIT_S
 
 WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
+BROAD = np.radians(25)  # its table is built in a second
 
 
 @pytest.fixture(scope="module")
@@ -149,20 +150,20 @@ def test_every_part_of_the_sky_has_enough(table, places, catalogue, rng):
 
 def test_it_is_built_once_then_mapped(own_cache, catalogue, monkeypatch):
     built = []
-    table = triangle_cache.cached(catalogue, WIDE, lambda what, done: built.append(done))
+    table = triangle_cache.cached(catalogue, BROAD, lambda what, done: built.append(done))
     assert built[-1] == pytest.approx(1)
     (folder,) = own_cache.iterdir()
     triangle_cache._in_use.clear()
     monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built again"))
-    again = triangle_cache.cached(catalogue, WIDE)
+    again = triangle_cache.cached(catalogue, BROAD)
     np.testing.assert_array_equal(again.corners, table.corners)
     # a refined focal length does not build another
-    assert triangle_cache.cached(catalogue, WIDE * 1.0001) is not None
+    assert triangle_cache.cached(catalogue, BROAD * 1.0001) is not None
     assert [p.name for p in own_cache.iterdir()] == [folder.name]
 
 
 def test_who_waited_for_another_process_that_built_does_not_build_again(own_cache, catalogue, monkeypatch):
-    triangle_cache.cached(catalogue, WIDE)
+    triangle_cache.cached(catalogue, BROAD)
     (folder,) = own_cache.iterdir()
     away = folder.rename(own_cache.parent / "away")
     triangle_cache._in_use.clear()
@@ -177,7 +178,7 @@ def test_who_waited_for_another_process_that_built_does_not_build_again(own_cach
     other = os.open(own_cache, os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
     waiting = threading.Thread(
-        target=triangle_cache.cached, args=(catalogue, WIDE, lambda what, done: built.append(done))
+        target=triangle_cache.cached, args=(catalogue, BROAD, lambda what, done: built.append(done))
     )
     waiting.start()
     assert absent.wait(30)
@@ -212,7 +213,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_broken_cache_is_built_anew(damage, own_cache, catalogue):
-    good = triangle_cache.cached(catalogue, WIDE)
+    good = triangle_cache.cached(catalogue, BROAD)
     (folder,) = own_cache.iterdir()
     column, harm = DAMAGE[damage]
     kept = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -221,7 +222,7 @@ def test_a_broken_cache_is_built_anew(damage, own_cache, catalogue):
     path.unlink()  # or the harm would reach what is still mapped
     path.write_bytes(kept[path.name])
     harm(path)
-    again = triangle_cache.cached(catalogue, WIDE)
+    again = triangle_cache.cached(catalogue, BROAD)
     np.testing.assert_array_equal(again.corners, good.corners)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == kept
 
@@ -237,7 +238,7 @@ def test_what_older_versions_left_in_the_cache_goes(own_cache, catalogue):
     os.utime(own_cache / "unfinished-old", (0, 0))
     (own_cache / "unfinished-now").mkdir()
     (own_cache / "somebody's").mkdir()
-    triangle_cache.cached(catalogue, WIDE)
+    triangle_cache.cached(catalogue, BROAD)
     left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangle_cache.PREFIX))
     assert left == ["somebody's", "unfinished-now"]
 
@@ -247,13 +248,13 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch, catalogue):
     (tmp_path / "cache").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.warns(UserWarning, match="XDG_CACHE_HOME"):
-        assert len(triangle_cache.cached(catalogue, WIDE).corners) > 1000
+        assert len(triangle_cache.cached(catalogue, BROAD).corners) > 1000
 
 
 def test_two_processes_at_once(own_cache):
     program = (
         "import numpy as np; from starpos.sky import catalogue; from starpos.identification import triangle_cache\n"
-        f"t = triangle_cache.cached(catalogue.load_catalogue(), {WIDE}); print(len(t.corners), int(t.corners.sum()))"
+        f"t = triangle_cache.cached(catalogue.load_catalogue(), {BROAD}); print(len(t.corners), int(t.corners.sum()))"
     )
     environment = os.environ | {"XDG_CACHE_HOME": str(own_cache.parent)}
     running = [
