@@ -22,6 +22,8 @@ FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 MOST_PARTS = 100
 # Columns of a .fz whose cells may be gzip.
 TILES = ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA")
+# What astropy unpacks safely: a damaged HCOMPRESS_1 ends the whole program, with astropy 6.0 to 8.0 at least.
+PACKINGS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 STEP = 1 << 20
 # zlib's name for data in the form of gzip
 GZIP_BITS = 31
@@ -118,16 +120,22 @@ def _first_image(file: BinaryIO, hdus: Iterable, place: str) -> tuple[dict[str, 
 
 
 def _check_tiles(file: BinaryIO, number: int, place: str) -> None:
-    """Raise FrameError if the gzip cells of a .fz image, the HDU of this number, unpack to over MAX_BYTES.
+    """Raise FrameError if a .fz image, the HDU of this number, is packed otherwise than PACKINGS, or too tightly.
 
-    astropy would unpack them to any size.
+    astropy would unpack gzip cells to any size; more than MAX_BYTES is refused.
     """
     from astropy.io import fits
 
     file.seek(0)
     # not closed, because that would close the file
-    table = fits.open(file, memmap=False, lazy_load_hdus=True, disable_image_compression=True)[number].data
-    size = 0
+    hdu = fits.open(file, memmap=False, lazy_load_hdus=True, disable_image_compression=True)[number]
+    packing = str(hdu.header.get("ZCMPTYPE", "")).strip()
+    if packing not in PACKINGS:
+        raise FrameError(
+            f"{place}: it is packed by {packing[:20] or 'no method'}, and a damaged one would end the program; unpack it "
+            "with funpack, or pack it with fpack -r."
+        )
+    table, size = hdu.data, 0
     for cell in itertools.chain.from_iterable(table[name] for name in TILES if name in table.names):
         data = cell.tobytes()
         # other algorithms' cells may begin like gzip, too
