@@ -40,6 +40,7 @@ def test_exact_elevations_give_the_exact_place(rng):
     assert (place.frames, place.poses, place.left_out) == (6, 3, 0)
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize(
     ("azimuths", "noise", "least"),
     [(FOUR * 2, 1.0, 0.9), (FOUR, 1.0, 0.9), (THREE, 1.0, 0.8), (FOUR * 2, 3.0, 0.9)],

@@ -31,7 +31,7 @@ STEP_RAD, NOISE_RAD = 90 * DEG / 2**14, 0.001 * DEG * np.sqrt(10)
 DIRECTIONS, CLOCK_S, APART_S = 13, 1.0, 90.0
 ALTITUDE_DEG = (52.0, 71.0)
 FIRST, SECOND = (35.7046, 51.4106), (-33.9, 18.5)
-SEEDS = range(100, 108)
+SEEDS = range(100, 106)
 STATED = InclinometerErrors(noise_rad=NOISE_RAD, quantum_rad=STEP_RAD)
 
 
