@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
-from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
 from starpos.fix.fix import Fix
 from starpos.units import ARCSEC
 from starpos_common.diagnostics import Diagnosis, Level
@@ -120,7 +120,6 @@ def _is_wide(fix: Fix) -> bool:
 
 
 def _sigmas_apart(a: Average, b: Average) -> float:
-    prime, meridian = curvature_radii_m(b.latitude)
-    east = (a.longitude - b.longitude + np.pi) % (2 * np.pi) - np.pi
-    apart = np.array([east * prime * np.cos(b.latitude), (a.latitude - b.latitude) * meridian])
+    radii = np.array(curvature_radii_m(b.latitude))
+    apart = enu_axes(b.latitude, b.longitude)[:2] @ zenith_of(a.latitude, a.longitude) * radii
     return float(np.sqrt(apart @ np.linalg.solve((a.covariance + b.covariance)[:2, :2], apart)))

@@ -12,7 +12,6 @@ from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Status
-from starpos.units import ARCSEC
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 
@@ -68,15 +67,13 @@ def nav_sat_fix(
 
 def imu(header: Header, fix: Fix, ground: Geodetic) -> Imu:
     """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
-    to_geodetic_north = rotation.about_axis(
-        2, ground.deflection.eta_arcsec * ARCSEC * math.tan(ground.latitude)
-    )
+    # Azimuths grow clockwise.
+    to_geodetic_north = rotation.about_axis(2, -ground.azimuth_turn)
     x, y, z, w = rotation.to_quaternion(to_geodetic_north @ fix.link_to_enu).tolist()
     message = Imu(header=header)
     message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w = x, y, z, w
-    covariance = fix.attitude_covariance.copy()
-    # The deflection's share of the azimuth.
-    covariance[2, 2] += ground.covariance[2, 2] - fix.covariance[2, 2]
+    covariance = to_geodetic_north @ fix.attitude_covariance @ to_geodetic_north.T
+    covariance[2, 2] += ground.deflection_covariance[2, 2]
     message.orientation_covariance = covariance.ravel()
     message.angular_velocity_covariance[0] = -1.0
     message.linear_acceleration_covariance[0] = -1.0
@@ -121,7 +118,7 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     message.covariance_geodetic = (ground.covariance * np.outer(degrees, degrees)).ravel()
     message.heading_stddev = math.sqrt(message.covariance_geodetic[8])
     sources = [(t.name, t.covariance[:3, :3], t.common) for t in fix.terms]
-    sources.append((DEFLECTION, ground.covariance - fix.covariance, True))
+    sources.append((DEFLECTION, ground.deflection_covariance, True))
     for name, covariance, common in sources:
         east, north, heading = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) * degrees).tolist()
         message.budget.append(

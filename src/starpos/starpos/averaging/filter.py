@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.ellipsoid import curvature_radii_m, zenith_of
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith, zenith_of
 from starpos.fix.budget import EACH_POSE, ErrorTerm, correlation, symmetric_root
 from starpos.fix.fix import Fix
 from starpos.rotation import full_turn, half_turn
@@ -43,14 +43,12 @@ class Plane:
     @classmethod
     def at(cls, f: Fix) -> "Plane":
         """The plane at a fix."""
-        axes = _axes(f.latitude, f.longitude)
-        return cls(
-            zenith_of(f.latitude, f.longitude), axes, np.array(curvature_radii_m(f.latitude)), f.heading
-        )
+        axes, radii = enu_axes(f.latitude, f.longitude), np.array(curvature_radii_m(f.latitude))
+        return cls(axes[2], axes[:2], radii, f.heading)
 
     def convergence(self, latitude: float, longitude: float) -> float:
         """Azimuth (rad) in this plane of the north of a place (rad)."""
-        return float(np.arctan2(*(self.axes @ _axes(latitude, longitude)[1])))
+        return float(np.arctan2(*(self.axes @ enu_axes(latitude, longitude)[1])))
 
     def across(self, latitude: float, longitude: float) -> np.ndarray:
         """East, north (2,) in m of a place (rad)."""
@@ -69,20 +67,20 @@ class Plane:
         east, north, heading = factor[:3]
         # an error of the longitude turns the north from which the heading counts
         prime, _ = curvature_radii_m(f.latitude)
-        heading = heading - np.tan(f.latitude) / prime * east
+        heading = heading - meridian_turn(f.latitude) / prime * east
         return np.stack([c * east + s * north, c * north - s * east, heading]) / UNIT[:, None]
 
     def local(self, latitude: float, factor: np.ndarray) -> np.ndarray:
         """A factor (3, m) in UNIT, as m and rad, with the heading from the north at its own place; reverses `turned`."""
         prime, _ = curvature_radii_m(latitude)
         factor = factor * UNIT[:, None]
-        return factor + np.outer([0.0, 0.0, np.tan(latitude) / prime], factor[0])
+        return factor + np.outer([0.0, 0.0, meridian_turn(latitude) / prime], factor[0])
 
     def place(self, east_north_m: np.ndarray) -> tuple[float, float]:
         """Latitude, longitude (rad) of a point of the plane."""
         across = east_north_m / self.radii
         zenith = np.sqrt(max(1 - across @ across, 0.0)) * self.zenith + across @ self.axes
-        return float(np.arctan2(zenith[2], np.hypot(*zenith[:2]))), float(np.arctan2(zenith[1], zenith[0]))
+        return place_of_zenith(zenith)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,9 +246,3 @@ class PlaceFilter:
         values, vectors = np.linalg.eigh(beyond)
         values = np.maximum(values, 1e-3 * np.trace(part.sources.sum(0)[:2, :2]))
         return float(np.sqrt(np.sum((apart @ vectors) ** 2 / values)))
-
-
-def _axes(latitude: float, longitude: float) -> np.ndarray:
-    """East and north (2, 3) in ITRS."""
-    cl, sl, cp, sp = np.cos(longitude), np.sin(longitude), np.cos(latitude), np.sin(latitude)
-    return np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp]])

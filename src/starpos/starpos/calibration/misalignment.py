@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos import rotation
 from starpos.averaging.scatter import Scatter
 from starpos.calibration.plumb_line import FEWEST_POSES, PlumbLine, hang, settled, typical
 from starpos.calibration.readings import FixedFrame, Readings
-from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status, Tilts
 from starpos.frames.pointings import Pointing
@@ -292,19 +291,9 @@ def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
 
 def _with_zenith_error(fix: Fix, astray: float) -> Fix:
     """The fix with an error of the zenith (rad) that is the same for all frames, at any heading."""
-    here, step = np.array([fix.latitude, fix.longitude]), 1e-6
-    link = Site(*np.degrees(here)).enu.T @ fix.link_to_enu
-    prime, meridian = curvature_radii_m(fix.latitude)
-    # latitude, longitude in rad for a metre east, north
-    moves = ((0.0, 1 / (prime * max(np.cos(fix.latitude), 1e-9))), (1 / meridian, 0.0))
-    columns: list[list[float]] = []
-    for metre, attitude in zip(
-        moves, ((0, 1 / prime, np.tan(fix.latitude) / prime), (-1 / meridian, 0, 0)), strict=True
-    ):
-        there = here + np.array(metre) * step * prime
-        turned = heading_of(Site(*np.degrees(there)).enu @ link) - fix.heading
-        columns.append([*np.eye(2)[len(columns)], rotation.half_turn(turned) / (step * prime), *attitude])
-    term = ErrorTerm("turn", np.array(columns).T * astray * EARTH_RADIUS_M, shared=ALWAYS)
+    # with east, north, up for L
+    level = Sensitivity.of(enu_axes(fix.latitude, fix.longitude), fix.link_to_enu).level
+    term = ErrorTerm("turn", level[:, :2] * astray, shared=ALWAYS)
     return replace(fix, terms=(*fix.terms, term))
 
 

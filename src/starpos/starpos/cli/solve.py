@@ -279,8 +279,12 @@ def _in_degrees(covariance: np.ndarray) -> np.ndarray:
 def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
     """1 sigma (3,) of each source: east m, north m, heading deg; the deflection acts on the geodetic place only."""
     terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
-    extra = geodetic(fix.latitude, fix.longitude, 0.0, np.zeros((3, 3)), vertical).covariance
-    terms["deflection (geodetic only)"] = np.sqrt(np.diag(extra)) * [1, 1, np.degrees(1)]
+    ground = geodetic(fix.latitude, fix.longitude, 0.0, fix.covariance, vertical)
+    terms["deflection (geodetic only)"] = np.sqrt(np.diag(ground.deflection_covariance)) * [
+        1,
+        1,
+        np.degrees(1),
+    ]
     return terms
 
 

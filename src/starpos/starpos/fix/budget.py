@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.instrument.inclinometer import Tilt, level_of, levelling_of
 from starpos.instrument.mounting import Mounting
@@ -77,15 +77,11 @@ class Place:
 
 
 def place_of(a4: np.ndarray) -> Place:
-    """Place from A4 (3, 3), which takes ITRS into L.  At a pole, where north is undefined, L's X axis is north."""
-    zenith, pole = a4[2], a4[:, 2]
-    north = np.array([pole[0], pole[1], 0.0])
-    length = np.linalg.norm(north)
-    north = north / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
-    latitude = np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1]))
-    return Place(
-        float(latitude), float(np.arctan2(zenith[1], zenith[0])), np.cross(north, [0.0, 0.0, 1.0]), north
-    )
+    """Place from A4 (3, 3), which takes ITRS into L.  At a pole the longitude is 0, and north is that of longitude 0."""
+    latitude, longitude = place_of_zenith(a4[2])
+    north = a4 @ enu_axes(latitude, longitude)[1]
+    north = rotation.normalised(np.array([north[0], north[1], 0.0]))
+    return Place(latitude, longitude, np.cross(north, [0.0, 0.0, 1.0]), north)
 
 
 @dataclass(frozen=True)
@@ -108,9 +104,7 @@ class Sensitivity:
         moved = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
         ground = np.stack([p.east @ moved * prime, p.north @ moved * meridian])
         # when the pole moves, north turns in L, and the attitude turns the other way against north
-        px, py, pz = a4[:, 2]
-        flat = max(px * px + py * py, 1e-12)
-        north_turns = np.array([-px * pz, -py * pz, flat]) / flat
+        north_turns = np.array([0.0, 0.0, 1.0]) - meridian_turn(p.latitude) * p.north
         about_up = np.stack([np.zeros(3), np.zeros(3), -north_turns])
         return cls(
             *(

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith, zenith_of
 from starpos.report.night import Night, ReportedPlace, Truth
-from starpos.rotation import half_turn
 from starpos.units import ARCSEC
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
@@ -88,18 +87,16 @@ def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
 
 def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
     """East, north in m of a place from another (rad)."""
-    prime, meridian = curvature_radii_m(latitude)
-    east = half_turn(place.longitude - longitude) * prime * np.cos(latitude)
-    return float(east), float((place.latitude - latitude) * meridian)
+    across = enu_axes(latitude, longitude)[:2] @ zenith_of(place.latitude, place.longitude)
+    east, north = across * curvature_radii_m(latitude)
+    return float(east), float(north)
 
 
 def middle(night: Night) -> tuple[float, float]:
     """Latitude, longitude (rad) of the centre of the scatter: the average, or if there is none the mean of the fixes."""
     if night.combined:
         return night.combined.latitude, night.combined.longitude
-    seen = np.array([[p.latitude, p.longitude] for p in night.places])
-    latitude, longitude = seen[0] + wrapped(seen - seen[0]).mean(0)
-    return float(latitude), float(longitude)
+    return place_of_zenith(np.mean([zenith_of(p.latitude, p.longitude) for p in night.places], axis=0))
 
 
 def share_inside(night: Night, squared_distance: float) -> int:

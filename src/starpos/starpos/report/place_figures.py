@@ -155,9 +155,9 @@ def _shares(place: ReportedPlace, night: Night) -> dict[str, np.ndarray]:
     """1 sigma (3,) of each source: east m, north m, heading arcsec; the latter is NaN if there is no heading."""
     unit = np.array([1, 1, 1 / measures.ARCSEC])
     shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}
-    deflection = place.on_ground(night.vertical).covariance - place.covariance
+    deflection = place.on_ground(night.vertical).deflection_covariance
     shares = {name: share for name, share in shares.items() if share.max() >= SMALLEST_SHOWN}
-    shares[DEFLECTION] = np.sqrt(np.maximum(np.diag(deflection), 0)) * unit
+    shares[DEFLECTION] = np.sqrt(np.diag(deflection)) * unit
     if np.isnan(place.heading):
         shares = {name: np.array([*share[:2], np.nan]) for name, share in shares.items()}
     return shares

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.vertical import Deflection
+from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import FrameError, StarposError
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solver import Attitude, Status
@@ -45,10 +45,11 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
     unit = np.array([1.0, 1.0, np.radians(1.0)])
     covariance = np.asarray(m.covariance, float).reshape(3, 3) * np.outer(unit, unit)
     angles = np.radians([m.latitude, m.longitude, m.heading])
-    sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and abs(m.eta) < 3600
+    sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and np.abs([m.xi, m.eta]).max() < 3600
     sane &= bool(np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all())
     if status is Status.OK and sane:
-        heading = angles[2] + m.eta * ARCSEC * np.tan(np.radians(m.latitude_geodetic))
+        ground = geodetic(*angles, covariance, Deflection(m.xi, m.eta, 0.0))
+        heading = angles[2] - ground.azimuth_turn
         terms = tuple(
             ErrorTerm(
                 t.name,
@@ -104,9 +105,10 @@ def _finite(value: float) -> float:
 
 def deflection_of(m: Any) -> Deflection | None:
     """The deflection that the solver applied; its sigma follows from how much wider the geodetic covariance is."""
-    _, meridian = curvature_radii_m(np.radians(m.latitude))
-    wider = max(m.covariance_geodetic[4] - m.covariance[4], 0.0)
+    prime, meridian = curvature_radii_m(np.radians(m.latitude))
+    # east and north together, because the axes turn close to a pole
+    wider = sum(m.covariance_geodetic[k] - m.covariance[k] for k in (0, 4))
     try:
-        return Deflection(m.xi, m.eta, float(np.sqrt(wider) / meridian / ARCSEC))
+        return Deflection(m.xi, m.eta, float(np.sqrt(max(wider, 0.0)) / np.hypot(prime, meridian) / ARCSEC))
     except StarposError:
         return None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos import rotation
+from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.sky.catalogue import Catalogue
@@ -22,14 +23,7 @@ class Site:
     @property
     def enu(self) -> np.ndarray:
         """Rotation (3, 3) of ITRS into east, north, up."""
-        phi, lam = np.radians([self.latitude_deg, self.longitude_deg])
-        return np.array(
-            [
-                [-np.sin(lam), np.cos(lam), 0.0],
-                [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
-                rotation.unit_vector(lam, phi),
-            ]
-        )
+        return enu_axes(*np.radians([self.latitude_deg, self.longitude_deg]).tolist())
 
     def observed(self, catalogue: Catalogue, index: np.ndarray, state: EarthState) -> np.ndarray:
         """Refracted directions (n, 3) in ENU of the catalogue's rows `index` (n,)."""
