@@ -15,12 +15,13 @@ from starpos.errors import CatalogueError
 from starpos.files import open_regular, read_regular
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import EPOCH, Catalogue, pack
+from starpos.sky.fast_stars import FAST, FAST_SIGMA_MAS_YEAR
 
 SUPPLEMENT_EPOCH = 1991.25
-# 68 % of the measured proper motions of stars of magnitude V, along one axis, are below these: the sigma of an
-# unmeasured motion.
-MOTION_V = (3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 10.5)
-MOTION_MAS_YEAR = (79.0, 52.0, 41.0, 30.0, 23.0, 18.0, 14.0, 12.0)
+# 1 sigma of a motion, along one axis, that Tycho-2 does not have. It is the root mean square that Hipparcos measured of
+# these very stars, less the fast ones (63 to 97 from V = 2 to 9; tools/data/fast_stars.py). They move faster than other
+# stars, because fast stars were not found again on old plates.
+UNMEASURED_MAS_YEAR = 100.0
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
 # Four times the largest of the original files.
 MOST_BYTES = 120_000_000
@@ -29,7 +30,8 @@ _MAIN = {  # name: (first byte from 0, length)
     "tyc1": (0, 4), "tyc2": (5, 5), "tyc3": (11, 1), "pflag": (13, 1), "ra_mean": (15, 12), "dec_mean": (28, 12),
     "pm_ra": (41, 7), "pm_dec": (49, 7), "e_ra": (57, 3), "e_dec": (61, 3), "e_pm_ra": (65, 4), "e_pm_dec": (70, 4),
     "epoch_ra": (75, 7), "epoch_dec": (83, 7), "bt": (110, 6), "vt": (123, 6), "hip": (142, 6),
-    "ra": (152, 12), "dec": (165, 12), "epoch": (178, 4), "e_ra_observed": (188, 5), "e_dec_observed": (194, 5),
+    "ra": (152, 12), "dec": (165, 12), "since_ra": (178, 4), "since_dec": (183, 4),
+    "e_ra_observed": (188, 5), "e_dec_observed": (194, 5),
 }  # fmt: skip
 _SUPPLEMENT = {
     "tyc1": (0, 4), "tyc2": (5, 5), "tyc3": (11, 1), "flag": (13, 1), "ra": (15, 12), "dec": (28, 12),
@@ -42,15 +44,13 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
     """Build the catalogue of all stars with V < limit_mag from a folder of the originals, or Debian's tycho2_*.tar.xz.
 
     Every star has its own position error. It has the mean position and motion if Tycho-2 gives them; else (pflag X) the
-    observed place and an unknown motion. A pair with pflag P becomes one star at its photocentre. The epoch of
-    supplement 1 is 1991.25. CatalogueError if files are missing or damaged.
+    observed place, and the motion of `fast_stars`, or an unknown one. A pair with pflag P becomes one star at its
+    photocentre. The epoch of supplement 1 is 1991.25. CatalogueError if files are missing or damaged.
     """
     parts, seen = [], 0
-    for name, text in _originals(Path(source)):
+    for name, text in originals(Path(source)):
         supplement = name.startswith("suppl")
-        table = _read(
-            text, _SUPPLEMENT if supplement else _MAIN, SUPPLEMENT_BYTES if supplement else MAIN_BYTES, name
-        )
+        table = table_of(name, text)
         parts.append(_supplement_stars(table) if supplement else _main_stars(table))
         parts[-1] = {k: v[parts[-1]["vmag"] < limit_mag + 1] for k, v in parts[-1].items()}
         seen += 1
@@ -62,7 +62,14 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
     return pack(**{k: v[stars["vmag"] < limit_mag] for k, v in stars.items() if k != "photocentre"})
 
 
-def _originals(source: Path) -> Iterator[tuple[str, bytes]]:
+def table_of(name: str, text: bytes) -> dict[str, np.ndarray]:
+    """Columns of the original file of a name; CatalogueError if its content is no such table."""
+    if name.startswith("suppl"):
+        return _read(text, _SUPPLEMENT, SUPPLEMENT_BYTES, name)
+    return _read(text, _MAIN, MAIN_BYTES, name)
+
+
+def originals(source: Path) -> Iterator[tuple[str, bytes]]:
     """Name and content of each original file in a folder or archive."""
     wanted = {f"tyc2.dat.{i:02d}" for i in range(20)} | {"suppl_1.dat"}
     try:
@@ -113,9 +120,18 @@ def johnson_v(bt: np.ndarray, vt: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(vt), vt, bt - colour) - 0.09 * colour
 
 
-def _unmeasured_motion(t: dict) -> np.ndarray:
-    """1 sigma (mas/yr) of proper motions that are not in the catalogue; bright stars are nearer and move faster."""
-    return np.interp(johnson_v(t["bt"], t["vt"]), MOTION_V, MOTION_MAS_YEAR)
+def _motions(t: dict) -> dict[str, np.ndarray]:
+    """Proper motions and their errors, mas/yr; a motion that Tycho-2 does not have is that of `FAST`, or 0."""
+    measured = np.isfinite(t["pm_ra"])
+    motion = np.nan_to_num(np.stack([t["pm_ra"], t["pm_dec"]], -1))
+    sigma = np.where(
+        measured, np.nan_to_num(np.hypot(t["e_pm_ra"], t["e_pm_dec"])) / np.sqrt(2), UNMEASURED_MAS_YEAR
+    )
+    for k in np.flatnonzero(~measured):
+        fast = FAST.get((int(t["tyc1"][k]), int(t["tyc2"][k]), int(t["tyc3"][k])))
+        if fast is not None:
+            motion[k], sigma[k] = fast, FAST_SIGMA_MAS_YEAR
+    return {"pm_ra": motion[:, 0], "pm_dec": motion[:, 1], "sigma_pm": sigma}
 
 
 def _identity(t: dict) -> dict[str, np.ndarray]:
@@ -127,38 +143,47 @@ def _identity(t: dict) -> dict[str, np.ndarray]:
 
 
 def _main_stars(t: dict) -> dict[str, np.ndarray]:
-    mean = np.isfinite(t["ra_mean"])
-    return _identity(t) | {
-        "ra_deg": np.where(mean, t["ra_mean"], t["ra"]),
-        "dec_deg": np.where(mean, t["dec_mean"], t["dec"]),
-        "pm_ra": np.where(mean, t["pm_ra"], 0.0),
-        "pm_dec": np.where(mean, t["pm_dec"], 0.0),
-        "sigma_mas": np.where(
-            mean, np.hypot(t["e_ra"], t["e_dec"]), np.hypot(t["e_ra_observed"], t["e_dec_observed"])
-        )
-        / np.sqrt(2),
-        "sigma_pm": np.where(mean, np.hypot(t["e_pm_ra"], t["e_pm_dec"]) / np.sqrt(2), _unmeasured_motion(t)),
-        "epoch": np.where(mean, (t["epoch_ra"] + t["epoch_dec"]) / 2, 1990 + t["epoch"]),
-        "photocentre": t["pflag"] == b"P",
-    }
+    mean, motions = np.isfinite(t["ra_mean"]), _motions(t)
+    observed = 1990 + t["since_ra"], 1990 + t["since_dec"]
+    ra, dec = _at_epoch(t["ra"], t["dec"], motions, *observed)
+    return (
+        _identity(t)
+        | motions
+        | {
+            "ra_deg": np.where(mean, t["ra_mean"], ra),
+            "dec_deg": np.where(mean, t["dec_mean"], dec),
+            "sigma_mas": np.where(
+                mean, np.hypot(t["e_ra"], t["e_dec"]), np.hypot(t["e_ra_observed"], t["e_dec_observed"])
+            )
+            / np.sqrt(2),
+            "epoch": np.where(mean, t["epoch_ra"] + t["epoch_dec"], sum(observed)) / 2,
+            "photocentre": t["pflag"] == b"P",
+        }
+    )
 
 
 def _supplement_stars(t: dict) -> dict[str, np.ndarray]:
-    moving = np.isfinite(t["pm_ra"])
-    pm_ra, pm_dec = np.nan_to_num(t["pm_ra"]), np.nan_to_num(t["pm_dec"])
-    years, mas = EPOCH - SUPPLEMENT_EPOCH, 1 / 3.6e6
-    return _identity(t) | {
-        "ra_deg": (t["ra"] + years * pm_ra * mas / np.cos(np.radians(t["dec"]))) % 360,
-        "dec_deg": t["dec"] + years * pm_dec * mas,
-        "pm_ra": pm_ra,
-        "pm_dec": pm_dec,
-        "sigma_mas": np.hypot(t["e_ra"], t["e_dec"]) / np.sqrt(2),
-        "sigma_pm": np.where(
-            moving, np.nan_to_num(np.hypot(t["e_pm_ra"], t["e_pm_dec"])) / np.sqrt(2), _unmeasured_motion(t)
-        ),
-        "epoch": np.full(len(moving), SUPPLEMENT_EPOCH),
-        "photocentre": np.zeros(len(moving), bool),
-    }
+    motions, epoch = _motions(t), np.full(len(t["ra"]), SUPPLEMENT_EPOCH)
+    ra, dec = _at_epoch(t["ra"], t["dec"], motions, epoch, epoch)
+    return (
+        _identity(t)
+        | motions
+        | {
+            "ra_deg": ra,
+            "dec_deg": dec,
+            "sigma_mas": np.hypot(t["e_ra"], t["e_dec"]) / np.sqrt(2),
+            "epoch": epoch,
+            "photocentre": np.zeros(len(epoch), bool),
+        }
+    )
+
+
+def _at_epoch(
+    ra: np.ndarray, dec: np.ndarray, motions: dict[str, np.ndarray], year_ra: np.ndarray, year_dec: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (deg) at EPOCH of stars that were observed at ra, dec (deg), each in years of its own."""
+    east, north = (EPOCH - year_ra) * motions["pm_ra"], (EPOCH - year_dec) * motions["pm_dec"]
+    return (ra + east / 3.6e6 / np.cos(np.radians(dec))) % 360, dec + north / 3.6e6
 
 
 def _merge_photocentres(stars: dict) -> dict[str, np.ndarray]:

@@ -118,6 +118,33 @@ def test_barnards_star(catalogue):
     assert np.linalg.norm(now - catalogue.directions(index)[0]) / ARCSEC == pytest.approx(273, abs=2)
 
 
+# without a motion in Tycho-2: HIP, place at J2000.0 and motion as above
+UNMEASURED = {
+    "Groombridge 1830": (57939, sexagesimal(11, 52, 58.76809, 1, 37, 43, 7.2396), 4003.98, -5813.62),
+    "tau Ceti": (8102, sexagesimal(1, 44, 4.08338, -1, 15, 56, 14.9262), -1721.05, 854.16),
+}
+
+
+@pytest.mark.parametrize("name", UNMEASURED)
+def test_fast_stars_without_a_motion_in_tycho2_are_within_their_error_in_2026(name, catalogue):
+    """Groombridge 1830 was 247 arcsec off where 1.1 were claimed."""
+    hip, (ra, dec), pm_ra, pm_dec = UNMEASURED[name]
+    index, years = np.flatnonzero(catalogue.hip == hip), 26.5
+    there = unit(ra + years * pm_ra / 3.6e6 / np.cos(np.radians(dec)), dec + years * pm_dec / 3.6e6)
+    error = np.linalg.norm(catalogue.directions(index, 2000 + years)[0] - there)
+    sigma = catalogue.sigma(index, 2000 + years)[0]
+    assert error < 3 * sigma
+    assert sigma < 1.0 * ARCSEC
+
+
+def test_a_star_whose_motion_nobody_measured_may_be_arcseconds_off(catalogue):
+    """1 sigma is 100 mas/yr since 1991: as fast as such stars are, and not as fast as others of their magnitude."""
+    sigma = catalogue.sigma(slice(None), 2026.5)
+    still = (catalogue.pm_ra == 0) & (catalogue.pm_dec == 0) & (sigma > 1 * ARCSEC)
+    assert 13_000 < still.sum() < 14_000
+    assert np.all(np.abs(sigma[still] / (35.3 * 0.1 * ARCSEC) - 1) < 0.1)
+
+
 def test_space_motion_is_linear_and_needs_no_index_array(catalogue):
     index = catalogue.cone(unit(83, -5), 0.05)[:50]
     v0, v1, v2 = (catalogue.directions(index, y) for y in (1980.0, 2000.0, 2020.0))

@@ -29,6 +29,7 @@ def main(
     vt="",
     hip="",
     observed=(10.0, 20.0),
+    since=("1.50", "1.60"),
 ):
     """A record of tyc2.dat; ra None: neither mean place nor motion, as pflag X has it."""
     mean = {} if ra is None else {
@@ -40,7 +41,7 @@ def main(
     return record(
         206, tyc1=(1, f"{one:04d}"), tyc2=(6, f"{two:05d}"), tyc3=(12, str(three)), pflag=(14, pflag), **mean,
         bt=(111, f"{bt:>6}"), vt=(124, f"{vt:>6}"), hip=(143, f"{hip:>6}"), ra_o=(153, f"{observed[0]:12.8f}"),
-        dec_o=(166, f"{observed[1]:12.8f}"), ep_o=(179, "1.50"), ep_od=(184, "1.60"), e_rao=(189, " 60.0"),
+        dec_o=(166, f"{observed[1]:12.8f}"), ep_o=(179, since[0]), ep_od=(184, since[1]), e_rao=(189, " 60.0"),
         e_deo=(195, " 80.0"),
     )  # fmt: skip
 
@@ -64,6 +65,8 @@ STARS = {
     + main((1, 15, 1), 1.6, 2.5, vt=" 8.000")  # BT never measured
     + main((1, 16, 1), pflag="X", vt=" 7.000", bt=" 7.700", observed=(200.0, -30.0))
     + FAINT,
+    "tyc2.dat.04": main((3014, 574, 1), pflag="X", vt=" 6.509", bt=" 7.353", observed=(178.23344944, 37.73193528),
+        since=("1.88", "1.79")),
     "tyc2.dat.05": main((2682, 3566, 1), 300.87249478, 36.02500143, pflag="P", bt=" 7.201", vt=" 7.088", hip="98753")
     + main((2682, 3566, 2), 300.87249478, 36.02500143, pflag="P", bt=" 7.880", vt=" 7.732", hip="98753"),
     "suppl_1.dat": supplement((5949, 2777, 1), "H", 101.28854105, -16.71314306, (-546.0, -1223.1), vt="-1.088", hip=32349)
@@ -118,8 +121,20 @@ def test_a_star_without_mean_place_keeps_its_observed_one_with_a_growing_error(b
     i = star(built, 1, 16, 1)
     assert place(built, i) == pytest.approx((200.0, -30.0), abs=2e-7)
     assert (built.pm_ra[i], built.pm_dec[i]) == (0, 0)
-    assert built.sigma(i, 1991.5)[0] == pytest.approx(np.hypot(60, 80) / 2**0.5 * MAS, rel=0.1)
-    assert built.sigma(i, 2026.0)[0] > 500 * MAS
+    # the epoch 1991.55 is stored as a whole year
+    assert built.sigma(i, 1992.0)[0] == pytest.approx(np.hypot(60, 80) / 2**0.5 * MAS, rel=0.1)
+    assert built.sigma(i, 2026.0)[0] == pytest.approx(3400 * MAS, rel=0.05)
+
+
+def test_a_fast_star_without_mean_place_moves_from_when_it_was_observed(built):
+    """Groombridge 1830, as Tycho-2 saw it, in 2000 by Hipparcos: 11 52 58.76809 +37 43 07.2396."""
+    i = star(built, 3014, 574, 1)
+    there = 15 * (11 + 52 / 60 + 58.76809 / 3600), 37 + 43 / 60 + 7.2396 / 3600
+    ra, dec = np.subtract(place(built, i), there) * 3600
+    assert abs(ra * np.cos(np.radians(there[1]))) < 0.3
+    assert abs(dec) < 0.3
+    assert (built.pm_ra[i], built.pm_dec[i]) == pytest.approx((4004, -5813), abs=1)
+    assert built.sigma(i, 2026.0)[0] < 500 * MAS
 
 
 def test_a_pair_with_one_photocentre_is_one_star_with_both_lights(built):
@@ -147,8 +162,8 @@ def test_a_supplement_star_without_motion(built):
 
 def test_the_limit_is_on_v(originals):
     bright = build(originals, 7.5)
-    # 1-14-1 has V 7.24, 1-16-1 V 6.94, the pair V 6.60, Sirius
-    assert sorted(bright.tyc[:, 1].tolist()) == [14, 16, 2777, 3566]
+    # 1-14-1 has V 7.24, 1-16-1 V 6.94, the pair V 6.60, Groombridge 1830, Sirius
+    assert sorted(bright.tyc[:, 1].tolist()) == [14, 16, 574, 2777, 3566]
 
 
 def test_from_an_archive_with_progress(originals, tmp_path):
@@ -157,7 +172,7 @@ def test_from_an_archive_with_progress(originals, tmp_path):
         f.add(originals, "tycho2-2")
     seen = []
     made = build(archive, 11.0, lambda what, done: seen.append(done))
-    assert len(made) == 7
+    assert len(made) == 8
     assert len(seen) == 21
     assert seen[-1] == pytest.approx(1)
 
