@@ -8,7 +8,7 @@ from dataclasses import replace
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
+from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
@@ -124,7 +124,8 @@ PARAMETERS = (
     Parameter(
         "altitude",
         NAN,
-        "Height above the WGS 84 ellipsoid, put into fix: the height above sea level of a map plus the geoid's "
+        "Height above the WGS 84 ellipsoid, put into fix, and up to which plumb lines curve (5 m of latitude a km at 45 "
+        "deg; not where deflection.xi or deflection.eta is set): the height above sea level of a map plus the geoid's "
         "undulation there (-107 to 86 m), by which it is wrong without. The stars cannot tell it; unset leaves NaN, and "
         "some consumers drop such a fix.",
         unit="m",
@@ -144,7 +145,7 @@ PARAMETERS = (
     Parameter(
         "deflection.xi",
         0.0,
-        "Deflection of the vertical to the north; 1 arcsec is 31 m of the geodetic latitude.",
+        "Deflection of the vertical to the north, at the instrument; 1 arcsec is 31 m of the geodetic latitude.",
         unit="arcsec",
         minimum=-120.0,
         maximum=120.0,
@@ -266,12 +267,20 @@ def geoid_file(name: str) -> Geoid | None:
 
 
 def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
-    """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place."""
+    """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place.
+
+    Plumb lines curve up to the altitude, if it is set, unless the parameters give the deflection at the instrument.
+    """
     xi, eta = values["deflection.xi"], values["deflection.eta"]
     if known is None:
-        return Deflection(xi, eta, values["deflection.stddev"])
+        stated = Deflection(xi, eta, values["deflection.stddev"])
+        return (
+            stated
+            if stated != Deflection()
+            else AtHeight(stated, values["altitude"], values["altitude_stddev"])
+        )
     if xi or eta:
         raise GeoidError(
             "deflection.geoid tells the deflection: set deflection.xi and deflection.eta to 0, or it to ''"
         )
-    return known
+    return AtHeight(known, values["altitude"], values["altitude_stddev"])

@@ -106,8 +106,9 @@ def test_the_altitude_says_which_one_it_is():
 
 
 def test_the_deflection_defaults_to_knowing_nothing():
-    assert vertical_of(values(), None).stddev_arcsec > 1
-    assert not math.isnan(vertical_of(values(), None).xi_arcsec)
+    d = vertical_of(values(), None).at(math.radians(45), 0.0)
+    assert d.stddev_arcsec > 1
+    assert not math.isnan(d.xi_arcsec)
 
 
 def test_a_deflection_is_given_by_hand_or_by_a_geoid(tmp_path):
@@ -116,6 +117,8 @@ def test_a_deflection_is_given_by_hand_or_by_a_geoid(tmp_path):
     path.write_bytes(struct.pack(">4d2i", 30, 40, 1, 1, *heights.shape) + heights.astype(">f4").tobytes())
     grid = geoid_file(str(path))
     there = vertical_of(values(), grid).at(math.radians(45), math.radians(60))
+    higher = vertical_of(values(altitude=3000.0), grid).at(math.radians(45), math.radians(60))
+    assert higher.xi_arcsec - there.xi_arcsec == pytest.approx(3 * 0.171, abs=0.01)
     assert there.xi_arcsec == pytest.approx(-1 / 111132 / math.radians(1 / 3600), rel=1e-3)
     with pytest.raises(GeoidError, match=r"deflection\.xi"):
         vertical_of(values(deflection__xi=3.0), grid)

@@ -11,6 +11,7 @@ import numpy as np
 from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.cli import common
+from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
@@ -55,7 +56,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="--site is on WGS 84, as a map or a receiver has it: the deflection of the vertical is put on",
     )
-    common.add_vertical(parser)
+    add_vertical(parser)
     common.add_turn(parser)
     parser.add_argument("-o", "--output", metavar="OUT", help="write the instrument file (YAML) with A3")
     parser.add_argument(
@@ -68,7 +69,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def check(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
-    deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid) != (None,) * 4
+    deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
     if args.site is None:
         if (
             deflection
@@ -83,7 +84,8 @@ def check(args: argparse.Namespace) -> None:
         return
     if deflection and not args.geodetic:
         raise InstrumentError(
-            "--xi, --eta, --deflection-stddev and --geoid are of a place on WGS 84: say --geodetic, or leave them out"
+            "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
+            "leave them out"
         )
     if args.fixed:
         if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
@@ -143,7 +145,7 @@ def _site(args: argparse.Namespace) -> tuple[Site, float]:
     if not args.geodetic:
         return Site(*args.site), 0.0
     latitude, longitude = np.radians(args.site).tolist()
-    d = common.vertical_of(args).at(latitude, longitude)
+    d = vertical_of(args).at(latitude, longitude)
     return Site(*np.degrees(astronomic(latitude, longitude, d)).tolist()), d.stddev_arcsec
 
 

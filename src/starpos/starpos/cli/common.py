@@ -12,9 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from starpos.earth import geoid
 from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
@@ -24,9 +22,6 @@ from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
-
-# sigma of a deflection that is given by hand without one
-GIVEN_STDDEV_ARCSEC = 1.0
 
 
 def add_frames(
@@ -213,35 +208,6 @@ def add_air(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_vertical(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `vertical_of` reads."""
-    parser.add_argument("--xi", type=float, metavar="ARCSEC", help="deflection of the vertical, north (0)")
-    parser.add_argument("--eta", type=float, metavar="ARCSEC", help="deflection of the vertical, east (0)")
-    parser.add_argument(
-        "--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)"
-    )
-    parser.add_argument(
-        "--geoid",
-        metavar="FILE",
-        help="take the deflection and its error from a geoid grid, GTX or GeoTIFF, such as egm96_15.gtx of proj-data",
-    )
-
-
-def vertical_of(args: argparse.Namespace) -> Vertical:
-    """The deflection that is given by hand or by a geoid; without either an unknown one.  Raises StarposError."""
-    by_hand = args.xi, args.eta, args.deflection_stddev
-    if args.geoid is not None:
-        if by_hand != (None, None, None):
-            raise InstrumentError(
-                "--geoid tells the deflection and its error: give either it or --xi, --eta and theirs"
-            )
-        return geoid.read(args.geoid)
-    stddev = args.deflection_stddev
-    if stddev is None:
-        stddev = GIVEN_STDDEV_ARCSEC if args.xi or args.eta else UNKNOWN_STDDEV_ARCSEC
-    return Deflection(args.xi or 0.0, args.eta or 0.0, stddev)
-
-
 def number(low: float, high: float, kind: type[int] | type[float] = float) -> Callable[[str], Any]:
     """An argparse type: a number of a kind, from low to high."""
 
@@ -351,15 +317,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.integer):
         return int(value)
     return value
-
-
-def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection) -> None:
-    """Complain if the geoid that was given has no data at the place."""
-    if args.geoid is not None and deflection == Deflection():
-        stddev = deflection.stddev_arcsec
-        complain(
-            command, f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:g} arcsec"
-        )
 
 
 def complain(command: str, error: StarposError | str) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.cli import common
+from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.stars import Stars, no_stars
 from starpos.instrument.instrument import Instrument
@@ -39,7 +40,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
     common.add_instrument(parser)
     common.add_air(parser)
-    common.add_vertical(parser)
+    add_vertical(parser)
     common.add_self_calibration(parser)
     parser.set_defaults(run=run)
 
@@ -83,7 +84,7 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
         instrument_for=_once_a_size(lambda stars: common.instrument_of(args, stars)),
         catalogue=catalogue.load_catalogue(),
         atmosphere=common.atmosphere_of(args),
-        vertical=common.vertical_of(args),
+        vertical=vertical_of(args),
         turn_stddev_deg=common.turn_of(args) if args.self_calibrate else None,
         progress=common.ProgressBar(),
     )

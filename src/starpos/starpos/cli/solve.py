@@ -13,6 +13,7 @@ from starpos.calibration.turning import turn
 from starpos.calibration.unknown import unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
+from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
@@ -50,7 +51,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     common.add_exif(parser)
     common.add_instrument(parser)
     common.add_air(parser)
-    common.add_vertical(parser)
+    add_vertical(parser)
     common.add_self_calibration(parser)
     parser.add_argument(
         "--save", metavar="OUT", help="write the instrument file (YAML) with the A3 of --self-calibrate"
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         return solve_pointings.run(args)
     if args.near is not None:
         raise InstrumentError("--near is for --pointings without a roll: leave it out")
-    vertical, read = common.vertical_of(args), Reader(common.clock_of(args))
+    vertical, read = vertical_of(args), Reader(common.clock_of(args))
     given = nights_of(args.frames, args.tilt, common.has_own_level(args))
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
@@ -177,7 +178,7 @@ def tell(
     together = _combine(night, solved)
     if solved:
         last = solved[-1].fix
-        common.tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
+        tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
         if calibration is not None:
             wide = last if together is None else together
             if unknown := unknown_a3(calibration, wide.covariance):

@@ -9,6 +9,7 @@ import numpy as np
 from starpos.averaging.altitudes import Circle, circle_of, place_of_circles
 from starpos.cli import common
 from starpos.cli.archive import NightFolder
+from starpos.cli.deflection import tell_unknown, vertical_of
 from starpos.cli.frame_work import NO_CAMERA, tilts
 from starpos.cli.solve import NO_FIX, json_of, print_combined, solved_by_turning, tell
 from starpos.earth.vertical import Vertical
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     """Work on the table of --pointings; returns the exit status."""
     if args.near is not None and not (abs(args.near[0]) <= 90 and abs(args.near[1]) <= 360):
         raise InstrumentError("--near {:g} {:g}: give latitude and longitude in deg".format(*args.near))
-    pointings, vertical = read_pointings(args.pointings), common.vertical_of(args)
+    pointings, vertical = read_pointings(args.pointings), vertical_of(args)
     own_level = common.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
@@ -82,7 +83,7 @@ def _from_elevations(
         near = None if args.near is None else tuple(np.radians(args.near).tolist())
         try:
             together = place_of_circles(circles, near)
-            common.tell_unknown("solve", args, vertical.at(together.latitude, together.longitude))
+            tell_unknown("solve", args, vertical.at(together.latitude, together.longitude))
         except FixError as e:
             common.complain("solve", e)
         print_combined(NightFolder((), args.tilt), together, [], set(), args, vertical)

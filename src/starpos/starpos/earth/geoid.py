@@ -41,10 +41,12 @@ class Geoid:
         """The Deflection at a place in rad; the default Deflection, of unknown value, if the grid has no data there.
 
         xi = -dN / (M dphi), eta = -dN / (N' cos(phi) dlambda): Heiskanen & Moritz, Physical Geodesy (1967), section 2-22,
-        with the radii M, N' of WGS 84 and a cubic spline through the nodes. They are deflections at the geoid. At the
-        ground the curvature of the plumb line adds 0.17 arcsec sin(2 phi) for each km of height, and in mountains some
-        arcseconds more. No geoid grid shows these; the stated error includes them. An astronomic place may be given for a
-        geodetic one: 10 arcsec (300 m) make no difference.
+        with the radii M, N' of WGS 84 and a cubic spline through the nodes. Undulations N are heights of the geoid above
+        the ellipsoid, so these are deflections at the geoid, under the ground; `vertical.AtHeight` takes them up to the
+        instrument, by the curvature of normal plumb lines. (Some national grids are of a quasi-geoid. Its undulations are
+        height anomalies, which belong to the ground, but are against normal gravity there: the same curvature is
+        missing.) In mountains real plumb lines curve by some arcseconds more. No geoid grid shows that; the stated error
+        includes it. An astronomic place may be given for a geodetic one: 10 arcsec (300 m) make no difference.
         """
         phi = np.clip(np.degrees(latitude), NEAREST_POLE_DEG - 90, 90 - NEAREST_POLE_DEG)
         lam = np.degrees(longitude)

@@ -31,7 +31,7 @@ SOMIGLIANA_K = 1.931852652e-3
 
 
 class Vertical(Protocol):
-    """A source of the deflection of the vertical: a Deflection, the same everywhere, or a geoid.Geoid."""
+    """A source of the deflection of the vertical: a Deflection, the same everywhere, a geoid.Geoid, or one AtHeight."""
 
     def at(self, latitude: float, longitude: float) -> "Deflection":
         """The Deflection at a place in rad, with its error; never raises."""
@@ -106,7 +106,7 @@ def plumb_curvature_arcsec_per_m(latitude: float) -> float:
     return float(share * np.sin(2 * latitude) / meridian / ARCSEC)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Geodetic:
     """Latitude, longitude and heading (rad) on WGS 84.
 
@@ -153,7 +153,15 @@ def geodetic(
     extra, turned = errors @ errors.T, moved @ covariance @ moved.T
     # an unknown heading, which is NaN, leaves the place as it is
     turned[:2, :2] = moved[:2, :2] @ covariance[:2, :2] @ moved[:2, :2].T
-    return Geodetic(phi, lam, full_turn(heading + turn), turned + extra, d, extra, turn)
+    return Geodetic(
+        latitude=phi,
+        longitude=lam,
+        heading=full_turn(heading + turn),
+        covariance=turned + extra,
+        deflection=d,
+        deflection_covariance=extra,
+        azimuth_turn=turn,
+    )
 
 
 def _leaned(axes: np.ndarray, d: Deflection, sign: int) -> np.ndarray:
