@@ -66,5 +66,6 @@ def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection)
     if args.geoid is not None and not deflection.known:
         stddev = deflection.stddev_arcsec
         common.complain(
-            command, f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:g} arcsec"
+            command,
+            f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec",
         )

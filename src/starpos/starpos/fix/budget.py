@@ -219,10 +219,11 @@ def time_terms(
     latitude: float, earth: EarthState, clock_stddev_s: float, stamp_stddev_s: float
 ) -> tuple[ErrorTerm, ...]:
     """The sources of error of the Earth's rotation, which are the same for all directions."""
-    prime, _ = curvature_radii_m(latitude)
-    east, north = np.eye(6)[:, :1], np.eye(6)[:, 1:2]
-    second_of_time = east * ROTATION_RAD_S * prime * np.cos(latitude)
-    pole = np.hstack([east, north]) * earth.orientation.pole_sigma * prime
+    (prime, meridian), north_turns = curvature_radii_m(latitude), meridian_turn(latitude)
+    # the Earth's turn moves the place along its parallel, and north with it; another pole is another north
+    second_of_time = np.array([[prime * np.cos(latitude), 0, 0, 0, 0, 0]]).T * ROTATION_RAD_S
+    east, north = [prime, 0, north_turns, 0, 0, -north_turns], [0, meridian, 0, 0, 0, 0]
+    pole = np.array([east, north]).T * earth.orientation.pole_sigma
     return (
         ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
         # a constant lag does not average away, and nobody can exclude one

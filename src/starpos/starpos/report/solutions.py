@@ -48,8 +48,8 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
     sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and np.abs([m.xi, m.eta]).max() < 3600
     sane &= bool(np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all())
     if status is Status.OK and sane:
-        ground = geodetic(*angles, covariance, Deflection(m.xi, m.eta, 0.0))
-        heading = angles[2] - ground.azimuth_turn
+        applied = Deflection(m.xi, m.eta, 0.0)
+        heading = angles[2] - geodetic(angles[0], angles[1], 0.0, covariance, applied).azimuth_turn
         terms = tuple(
             ErrorTerm(
                 t.name,
