@@ -41,7 +41,7 @@ def test_the_covariance_of_a_geodetic_place_at_a_pole_is_true(latitude, rng):
     field = SkyField(latitude=latitude)
     xy, places = field.places(STATE, rng)
     tilt = field.tilt(np.eye(2) * sigma**2)
-    nees = []
+    distances2 = []
     for x, y in rng.normal(0, sigma, (draws, 2)):
         fix = field.solve(
             xy, places, STATE, tilt=replace(tilt, theta_x=tilt.theta_x + x, theta_y=tilt.theta_y + y)
@@ -54,9 +54,9 @@ def test_the_covariance_of_a_geodetic_place_at_a_pole_is_true(latitude, rng):
         true = turned @ zenith_of(*np.radians([field.latitude, field.longitude]))
         axes = enu_axes(ground.latitude, ground.longitude)[:2] * np.c_[curvature_radii_m(ground.latitude)].T
         off = axes @ true
-        nees.append(off @ np.linalg.solve(ground.covariance[:2, :2], off))
+        distances2.append(off @ np.linalg.solve(ground.covariance[:2, :2], off))
         assert np.sqrt(np.trace(ground.covariance[:2, :2])) < 3 * sigma * EARTH_RADIUS_M
-    assert np.mean(nees) == pytest.approx(2.0, abs=5 * 2 / np.sqrt(draws))
+    assert np.mean(distances2) == pytest.approx(2.0, abs=5 * 2 / np.sqrt(draws))
 
 
 @pytest.mark.parametrize("latitude", LATITUDES)
