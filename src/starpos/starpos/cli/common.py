@@ -20,6 +20,7 @@ from starpos.fix.fix import Fix
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
+from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
@@ -141,6 +142,15 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL",
         help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
         "(else those of an SCA100T with a good converter, compensated and calibrated)",
+    )
+    parser.add_argument(
+        "--readout",
+        type=number(-MOST_READOUT_S, MOST_READOUT_S),
+        nargs=2,
+        metavar=("S", "STDDEV"),
+        help="rolling shutter: s from the row read first to the last, negative where the bottom row is first, and its "
+        "error; 0 0 is a global shutter (that of the instrument file, else ROLLSHUT of the frames, else not known, "
+        f"{UNKNOWN.readout_s:g} {UNKNOWN.readout_stddev_s:g})",
     )
     parser.add_argument(
         "--clock-stddev",
@@ -279,7 +289,7 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
             raise InstrumentError(
                 "--instrument holds focal length, misalignment and the inclinometer: give either it or the options"
             )
-        return _with_clock(instrument_file.read(path), args)
+        return _with_times(instrument_file.read(path), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
     if args.focal_mm is not None:
@@ -298,13 +308,15 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
         inclinometer=errors,
         inclinometer_model=model,
     )
-    return _with_clock(made, args)
+    return _with_times(made, args)
 
 
-def _with_clock(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:
-    """The instrument with the error of its clock from --clock-stddev, if that is given."""
-    stddev = getattr(args, "clock_stddev", None)
-    return known if stddev is None else replace(known, clock_stddev_s=stddev)
+def _with_times(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:
+    """The instrument with its clock's error from --clock-stddev and its shutter from --readout, as far as given."""
+    stddev, readout = getattr(args, "clock_stddev", None), getattr(args, "readout", None)
+    if stddev is not None:
+        known = replace(known, clock_stddev_s=stddev)
+    return known if readout is None else replace(known, shutter=Shutter(*readout))
 
 
 class HasFocalLength(Protocol):
