@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -15,11 +15,10 @@ import numpy as np
 from starpos.earth import geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, Vertical
-from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
-from starpos.frames.reading import read_frame
 from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file, sensors
@@ -58,6 +57,10 @@ def check_frames(args: argparse.Namespace) -> None:
     """Raise InstrumentError unless there are either frames or --pointings."""
     if bool(args.frames) == (args.pointings is not None):
         raise InstrumentError("give either frames or --pointings CSV" + (", not both" if args.frames else ""))
+    if args.pointings is not None and (args.shutter_delay, args.readout) != (None, None):
+        raise InstrumentError(
+            "--shutter-delay and --readout are for frames: the times in --pointings are those when the sky was seen"
+        )
 
 
 def has_own_level(args: argparse.Namespace) -> bool:
@@ -72,8 +75,8 @@ def has_own_level(args: argparse.Namespace) -> bool:
     return True
 
 
-def add_exif(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `clock_of` reads."""
+def add_stamps(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the frames' times, which `clock_of` and `frame_work.reader_of` read."""
     parser.add_argument(
         "--exif-utc-offset",
         type=_utc_offset,
@@ -86,6 +89,14 @@ def add_exif(parser: argparse.ArgumentParser) -> None:
         type=number(0, 86400),
         metavar="S",
         help=f"how far that clock may be off ({UNTENDED_STDDEV_S:g}; 1 s is 464 m at the equator)",
+    )
+    parser.add_argument(
+        "--shutter-delay",
+        type=number(-10, 60),
+        nargs=2,
+        metavar=("S", "STDDEV"),
+        help="s from the start of an exposure by the frame's header until the shutter opened, and its error "
+        "(0; of raw files and JPEG with an error of 0.06 by themselves)",
     )
 
 
@@ -325,17 +336,6 @@ class HasFocalLength(Protocol):
     @property
     def focal_px(self) -> float | None:
         """Focal length in px that the frame's header states; None if it states none."""
-
-
-def frames_of(
-    paths: list[str], clock: CameraClock | None = None
-) -> Iterator[tuple[str, Frame | Stars | FrameError]]:
-    """(path, Frame or Stars or FrameError) of each path, read one at a time."""
-    for path in paths:
-        try:
-            yield path, read_frame(path, clock)
-        except FrameError as e:
-            yield path, e
 
 
 def stars_of(item: Frame | Stars) -> Stars:
