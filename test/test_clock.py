@@ -65,6 +65,28 @@ def test_a_clocks_error_that_is_none_is_refused(graph, solver, value):
     assert solution.status == Solution.BAD_INPUT and "clock_stddev_s" in solution.status_text
 
 
+def test_what_the_stars_say_of_their_shutter_is_in_the_budget(graph, solver):
+    def claimed_m(**shutter):
+        shot = told()
+        for name, value in shutter.items():
+            setattr(shot.stars, name, value)
+        (term,) = (t for t in answered(graph, shot).budget if t.name == "shutter")
+        assert term.common
+        return math.hypot(term.east, term.north)
+
+    unknown = claimed_m(shutter_known=False)
+    assert claimed_m(shutter_known=True) == 0
+    assert claimed_m(shutter_known=True, readout_stddev=0.06) == pytest.approx(2 * unknown, rel=0.1) != 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e3])
+def test_a_readout_that_is_none_is_refused(graph, solver, value):
+    shot = told()
+    shot.stars.shutter_known, shot.stars.readout = True, value
+    solution, _, _ = graph.answer(shot)
+    assert solution.status == Solution.BAD_INPUT and "readout" in solution.status_text
+
+
 def late(shot, seconds):
     """The shot's stamps moved."""
     for m in (shot.stars, *shot.tilts):

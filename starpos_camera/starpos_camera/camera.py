@@ -20,6 +20,7 @@ from std_msgs.msg import Header
 
 from starpos.errors import InstrumentError, StarposError
 from starpos.frames.frame import Frame
+from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
@@ -31,7 +32,7 @@ from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport, time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
-from starpos_common.messages import camera_to_message, frame_to_message, unix_to_stamp
+from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_common.paths import path_of
 from starpos_common.topics import publisher
@@ -178,6 +179,8 @@ class CameraNode(Node):
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
         frame = replace(exposure.frame, clock_stddev_s=clock.stddev_s) if clock else exposure.frame
+        if not math.isnan(self._values["readout"]):
+            frame = replace(frame, shutter=Shutter(self._values["readout"], self._values["readout_stddev"]))
         header = Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=self._values["frame_id"])
         capture = Capture(
             header=header,
@@ -185,6 +188,7 @@ class CameraNode(Node):
             stamp_stddev=frame.stamp_stddev_s,
             clock_stddev=frame.clock_stddev_s,
             stamp_source=exposure.stamp_source,
+            **shutter_fields(frame.shutter),
         )
         # A message is a copy of the frame, so it is made only for subscribers.
         heard = self._images.get_subscription_count()
@@ -344,9 +348,18 @@ class CameraNode(Node):
                 "exposure (s)": last.exposure,
                 "stamp from": STAMP_SOURCES[last.stamp_source],
                 "stamp error (s)": last.stamp_stddev,
+                "shutter": _shutter(last),
                 "taking one frame (s)": self._last_took_s,
             }
         return Diagnosis(level, sentence, values)
+
+
+def _shutter(capture: Capture) -> str:
+    if not capture.shutter_known:
+        return "not known"
+    if capture.readout == capture.readout_stddev == 0:
+        return "global"
+    return f"rolling, {capture.readout:.3g} +- {capture.readout_stddev:.3g} s from the first row to the last"
 
 
 def _settings(values: Mapping[str, Any]) -> CaptureSettings:

@@ -3,6 +3,7 @@
 
 import math
 
+from starpos.frames.shutter import MOST_READOUT_S
 from starpos_camera.sources.registry import SOURCES
 from starpos_common.parameters import FRAME_NAME, Parameter
 
@@ -79,6 +80,24 @@ COMMON = (
         unit="s",
         minimum=0.0,
         maximum=60.0,
+    ),
+    Parameter(
+        "readout",
+        math.nan,
+        "From the row of a frame that is read first to the last, of a rolling shutter: positive where the top row is "
+        "first, negative where the bottom one is; 0 for a global shutter. Unset: as the source knows it, and where that "
+        "knows nothing, fixes hold 0.03 s. The wrong sign makes a fix wrong by twice what it would be without.",
+        unit="s",
+        minimum=-MOST_READOUT_S,
+        maximum=MOST_READOUT_S,
+    ),
+    Parameter(
+        "readout_stddev",
+        0.0,
+        "How far `readout` may be off, where that is set; 0.03 s is some tens of metres, all frames alike.",
+        unit="s",
+        minimum=0.0,
+        maximum=MOST_READOUT_S,
     ),
     Parameter(
         "calibration_url",

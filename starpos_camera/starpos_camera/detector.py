@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
-from starpos.recording.messages import message_to_frame
+from starpos.recording.messages import message_to_frame, message_to_shutter
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
@@ -181,12 +181,18 @@ class DetectorNode(Node):
         self._sequence = sequence
 
     def _with_capture(self, job: Job) -> Frame:
-        """Add exposure and errors of the Capture to its frame."""
+        """Add exposure, errors and shutter of the Capture to its frame."""
         capture = self._captures.pop(_key(job.header), None) or Capture()
         told = (capture.exposure, capture.stamp_stddev, capture.clock_stddev)
         exposure, stamp, clock = (v if math.isfinite(v) and v > 0 else 0.0 for v in told)
         exposure = exposure or self._values["exposure"] or None
-        return replace(job.frame, exposure_s=exposure, stamp_stddev_s=stamp, clock_stddev_s=clock)
+        return replace(
+            job.frame,
+            exposure_s=exposure,
+            stamp_stddev_s=stamp,
+            clock_stddev_s=clock,
+            shutter=message_to_shutter(capture),
+        )
 
     def _detect(self, job: Job) -> DetectedFrame:
         """Find the stars of a frame, in the worker's thread."""

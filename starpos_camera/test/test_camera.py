@@ -66,6 +66,7 @@ def test_plays_files_and_says_which_one_is_broken(start, listener, folder):
         assert message_to_camera(info) == Camera.from_focal(640, 480, 7812.5)
     state = listener.wait_for_state("camera: Capture", OK, "are played")
     assert (state["frames"], state["failed"], state["stamp from"]) == ("2", "1", "file")
+    assert state["shutter"] == "global"
 
     assert "own exposure" in set_capture(listener, exposure=1.0).message
     assert "own gain" in set_capture(listener, gain=3.0).message
@@ -107,6 +108,7 @@ def test_simulated_sky_is_live_and_its_stars_are_where_starpos_says(start, liste
     now = listener.node.get_clock().now().nanoseconds * 1e-9
     capture = captures[0]
     assert capture.stamp_source == Capture.SIMULATED and capture.exposure == 0.5
+    assert (capture.shutter_known, capture.readout, capture.readout_stddev) == (True, 0.0, 0.0)
     frame = message_to_frame(images[0])
     assert 0 < now - frame.mid_unix_s < 30
     stars = detect(frame).stars
@@ -127,6 +129,9 @@ def test_simulated_sky_is_live_and_its_stars_are_where_starpos_says(start, liste
     assert not listener.set("camera", cadence=0.1).successful
     assert listener.set("camera", **{"simulated.azimuth": 90.0, "exposure": 0.1}).successful
     listener.wait(lambda: captures[-1].exposure == 0.1)
+    assert listener.set("camera", readout=-0.03, readout_stddev=0.001).successful
+    listener.wait(lambda: captures[-1].readout == -0.03)
+    assert captures[-1].readout_stddev == 0.001
     assert not listener.set("camera", source="files").successful
     status, out = node.end(signal.SIGTERM)
     assert status == 0 and "taking frames of 640 x 480 px." in out and len(out.splitlines()) == 1

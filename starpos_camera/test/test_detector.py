@@ -66,7 +66,15 @@ def test_stars_are_those_of_starpos_under_the_header_of_the_image(feed, frame):
         message = feed.message(frame)
         feed.images.publish(message)
         feed.captures.publish(  # two topics keep no order
-            Capture(header=message.header, exposure=0.75, stamp_stddev=0.003, clock_stddev=0.02)
+            Capture(
+                header=message.header,
+                exposure=0.75,
+                stamp_stddev=0.003,
+                clock_stddev=0.02,
+                shutter_known=True,
+                readout=-0.03,
+                readout_stddev=0.001,
+            )
         )
         shown.append(feed.wait_for(message))
 
@@ -75,6 +83,7 @@ def test_stars_are_those_of_starpos_under_the_header_of_the_image(feed, frame):
     got = shown[-1]
     assert (got.width, got.height, got.exposure) == (640, 480, 0.75)
     assert (got.stamp_stddev, got.clock_stddev) == (0.003, 0.02)
+    assert (got.shutter_known, got.readout, got.readout_stddev) == (True, -0.03, 0.001)
     want = detect(frame).stars
     stars = message_to_stars(got)
     assert len(want) >= 10

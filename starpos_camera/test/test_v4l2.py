@@ -64,6 +64,8 @@ def test_the_sensors_pixels_in_every_format(session, letters, kind, pattern):
     assert (shot["size"], shot["type"], shot["pattern"]) == ([64, 48], kind, pattern)
     assert shot["exposure_s"] is None  # it is automatic, and no longer than the period
     assert shot["stddev_s"] == pytest.approx(2 * PERIOD_S / math.sqrt(12))
+    # its rows are read within a period, from either end
+    assert shot["readout_stddev_s"] == pytest.approx(PERIOD_S / math.sqrt(3))
 
 
 def test_frames_are_exposed_after_they_are_asked_for_and_stamped_as_wide_as_is_not_known(session):

@@ -45,6 +45,7 @@ def told(source, settings=SETTINGS):
         "began_s": began_us / 1e6 - asked_s,
         "mid_s": frame.mid_unix_s - asked_unix_s,
         "stddev_s": exposure.frame.stamp_stddev_s,
+        "readout_stddev_s": frame.shutter.readout_stddev_s,
         "stamp": exposure.stamp_source,
         "exposure_s": frame.exposure_s,
         "remark": exposure.remark,

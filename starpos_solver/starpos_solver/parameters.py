@@ -29,7 +29,7 @@ PARAMETERS = (
     Parameter(
         "calibration_url",
         "",
-        "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock; '' uses the next three "
+        "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock, shutter; '' uses the next three "
         "parameters. A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km. One "
         "whose focal length is 5 % from camera_info's is refused.",
     ),

@@ -68,16 +68,33 @@ float64 temperature
 uint32 sequence
 uint8 flags
 """
-ORIGINAL = "starpos_interfaces/msg/Tilt"
+FIRST_CAPTURE = """
+std_msgs/Header header
+float64 exposure
+float64 stamp_stddev
+float64 clock_stddev
+uint8 stamp_source
+"""
+FIRST_STARS = """
+std_msgs/Header header
+uint32 width
+uint32 height
+float64 exposure
+float64 stamp_stddev
+float64 clock_stddev
+starpos_interfaces/Star[] stars
+"""
+FIRST = {"Tilt": FIRST_TILT, "Capture": FIRST_CAPTURE, "StarArray": FIRST_STARS}
 
 
 class FirstReleaseBag(NightBag):
-    """Writes a bag as the first release did, whose Tilt had no third axis."""
+    """Writes a bag as the first release did, whose Tilt had no third axis, and which knew of no shutter."""
 
     def __init__(self, path):
         super().__init__(path)
-        del self.store.fielddefs[ORIGINAL]
-        self.store.register(get_types_from_msg(FIRST_TILT, ORIGINAL))
+        for name, text in FIRST.items():
+            del self.store.fielddefs[f"starpos_interfaces/msg/{name}"]
+            self.store.register(get_types_from_msg(text, f"starpos_interfaces/msg/{name}"))
 
 
 @pytest.mark.parametrize("frame_id", ["", "s", "starpos_inclinometer_frame"])
@@ -106,6 +123,25 @@ def test_tilts_and_solutions_of_the_first_release_are_played_as_those_of_two_axe
         assert math.isnan(got.z) and math.isnan(got.z_variance)
     assert (solved.tilt_samples, solved.ids, solved.xi, solved.fix_seconds) == (3, ids, 4.0, 0.25)
     assert [(t.name, t.east, t.common) for t in solved.budget] == [("tilt", 1.5, True)]
+
+
+def test_stars_of_the_first_release_are_played_as_those_of_an_unknown_shutter(tmp_path):
+    from rclpy.serialization import deserialize_message
+
+    with FirstReleaseBag(tmp_path / "night") as bag:
+        star = bag.message("Star", x=3.0, y=4.0, covariance=np.array([0.01, 0, 0, 0.01]), flags=2)
+        stars = bag.message("StarArray", 1000.5, width=10, height=20, stars=[star], clock_stddev=0.02)
+        capture = bag.message("Capture", 1000.5, exposure=0.5, stamp_stddev=0.01, stamp_source=3)
+        bag.write("stars", stars, 1000.5)
+        bag.write("camera/capture", capture, 1000.5)
+    with Bag(tmp_path / "night") as bag:
+        topics = bag.topics(None, left_out=pytest.fail)
+        said = {t.name: deserialize_message(data, t.kind) for t, _, data in bag.messages(topics)}
+    got, taken = said["/stars"], said["/camera/capture"]
+    assert (got.width, got.height, got.clock_stddev) == (10, 20, 0.02)
+    assert [(s.x, s.y, s.flags) for s in got.stars] == [(3.0, 4.0, 2)]
+    assert (taken.exposure, taken.stamp_stddev, taken.stamp_source) == (0.5, 0.01, 3)
+    assert not got.shutter_known and not taken.shutter_known
 
 
 def test_a_broken_tilt_of_the_first_release_is_left_to_the_player(tmp_path):

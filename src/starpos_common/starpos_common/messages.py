@@ -3,6 +3,7 @@
 
 import array
 import sys
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -11,6 +12,7 @@ from std_msgs.msg import Header
 
 from starpos.errors import TimeError
 from starpos.frames.frame import Frame
+from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
@@ -53,7 +55,19 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
         stamp_stddev=float(stars.stamp_stddev_s),
         clock_stddev=float(stars.clock_stddev_s),
         stars=[msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns],
+        **shutter_fields(stars.shutter),
     )
+
+
+def shutter_fields(shutter: Shutter | None) -> dict[str, Any]:
+    """The fields of a StarArray or a Capture that tell a shutter; none if it is not known."""
+    if shutter is None:
+        return {}
+    return {
+        "shutter_known": True,
+        "readout": float(shutter.readout_s),
+        "readout_stddev": float(shutter.readout_stddev_s),
+    }
 
 
 def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0) -> msg.Tilt:

@@ -3,6 +3,7 @@
 
 import array
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
 from starpos.frames.frame import Frame
+from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
@@ -94,6 +96,20 @@ def test_stars_round_trip(heard):
     assert (got.width, got.height, got.exposure_s) == (200, 100, 0.5)
     assert (got.stamp_stddev_s, got.clock_stddev_s) == (1e-3, 0.02)
     assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
+
+
+@pytest.mark.parametrize("shutter", [None, GLOBAL, Shutter(-0.03, 0.001)])
+def test_the_shutter_of_stars_round_trips(heard, shutter):
+    message = heard(messages.stars_to_message(replace(stars(), shutter=shutter), "c"))
+    assert message_to_stars(message).shutter == shutter
+    assert message.shutter_known == (shutter is not None)
+
+
+def test_a_shutter_that_cannot_be_is_refused(heard):
+    message = messages.stars_to_message(replace(stars(), shutter=GLOBAL), "c")
+    message.readout = math.nan
+    with pytest.raises(FrameError, match="readout"):
+        message_to_stars(heard(message))
 
 
 def test_no_stars_and_no_time_round_trip(heard):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
+from starpos.frames.shutter import MOST_READOUT_S, Shutter
 from starpos_camera.sources.opencv_video import quiet
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
@@ -78,6 +79,7 @@ class V4l2Device:
                 camera = self._capture
                 exposure_s, remark = self._settings(cv2, camera, settings)
                 mid_s, stddev_s, stamp = self._grab(cv2, camera, exposure_s)
+                period_s = _period_s(cv2, camera)
                 came, raw = camera.retrieve()
                 if not came:
                     raise CaptureError("it gave no frame.")
@@ -93,6 +95,8 @@ class V4l2Device:
             exposure_s=exposure_s,
             source=self._path,
             stamp_stddev_s=stddev_s,
+            # from either end, and no longer than from one frame to the next
+            shutter=Shutter(0.0, min(period_s, MOST_READOUT_S) / math.sqrt(3)),
         )
         return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
 

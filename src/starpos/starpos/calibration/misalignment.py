@@ -27,7 +27,7 @@ from starpos.units import ARCSEC
 ROUNDS = 4
 SETTLED_RAD = 0.02 * ARCSEC
 # terms that move the zenith, of all frames about alike
-OF_PLACE = ("refraction", "clock", "time stamp", "ut1", "pole")
+OF_PLACE = ("refraction", "shutter", "clock", "time stamp", "ut1", "pole")
 VALID_DAYS = 365.0
 # the fixes use so many times the sigma of A3's turn that the leans gave, because both come from the same tilts
 TURN_SIGMA = 3.0

@@ -13,7 +13,7 @@ from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.camera_adjustment import PARAMETERS, UNLEVELLED, UNTIMED
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
-from starpos.cli.frame_work import NO_CAMERA
+from starpos.cli.frame_work import NO_CAMERA, reader_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.frames.pointings import read_pointings
@@ -44,7 +44,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", metavar="PNG", help="draw where the stars lie off the given and the fitted camera (--camera)"
     )
-    common.add_exif(parser)
+    common.add_stamps(parser)
     common.add_instrument(parser)
     parser.add_argument(
         "--tilt",
@@ -110,12 +110,13 @@ def _stars_of_all(args: argparse.Namespace) -> tuple[list[Stars], bool]:
     """The stars of the frames that can be read, and whether some cannot."""
     progress, unreadable = common.ProgressBar(), False
     frames: list[Stars] = []
-    for k, (_, item) in enumerate(common.frames_of(args.frames, common.clock_of(args))):
-        if isinstance(item, FrameError):
-            common.complain("calibrate", item)
+    read = reader_of(args)
+    for k, path in enumerate(args.frames):
+        try:
+            frames.append(common.stars_of(read(path)))
+        except FrameError as e:
+            common.complain("calibrate", e)
             unreadable = True
-        else:
-            frames.append(common.stars_of(item))
         progress("frames", (k + 1) / len(args.frames))
     return frames, unreadable
 

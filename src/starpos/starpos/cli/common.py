@@ -6,18 +6,18 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.frame import Frame
-from starpos.frames.reading import read_frame
+from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
@@ -52,6 +52,10 @@ def check_frames(args: argparse.Namespace) -> None:
     """Raise InstrumentError unless there are either frames or --pointings."""
     if bool(args.frames) == (args.pointings is not None):
         raise InstrumentError("give either frames or --pointings CSV" + (", not both" if args.frames else ""))
+    if args.pointings is not None and (args.shutter_delay, args.readout) != (None, None):
+        raise InstrumentError(
+            "--shutter-delay and --readout are for frames: the times in --pointings are those when the sky was seen"
+        )
 
 
 def has_own_level(args: argparse.Namespace) -> bool:
@@ -66,8 +70,8 @@ def has_own_level(args: argparse.Namespace) -> bool:
     return True
 
 
-def add_exif(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `clock_of` reads."""
+def add_stamps(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the frames' times, which `clock_of` and `frame_work.reader_of` read."""
     parser.add_argument(
         "--exif-utc-offset",
         type=_utc_offset,
@@ -80,6 +84,14 @@ def add_exif(parser: argparse.ArgumentParser) -> None:
         type=number(0, 86400),
         metavar="S",
         help=f"how far that clock may be off ({UNTENDED_STDDEV_S:g}; 1 s is 464 m at the equator)",
+    )
+    parser.add_argument(
+        "--shutter-delay",
+        type=number(-10, 60),
+        nargs=2,
+        metavar=("S", "STDDEV"),
+        help="s from the start of an exposure by the frame's header until the shutter opened, and its error "
+        "(0; of raw files and JPEG with an error of 0.06 by themselves)",
     )
 
 
@@ -136,6 +148,15 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL",
         help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
         "(else those of an SCA100T with a good converter, compensated and calibrated)",
+    )
+    parser.add_argument(
+        "--readout",
+        type=number(-MOST_READOUT_S, MOST_READOUT_S),
+        nargs=2,
+        metavar=("S", "STDDEV"),
+        help="rolling shutter: s from the row read first to the last, negative where the bottom row is first, and its "
+        "error; 0 0 is a global shutter (that of the instrument file, else ROLLSHUT of the frames, else not known, "
+        f"{UNKNOWN.readout_s:g} {UNKNOWN.readout_stddev_s:g})",
     )
     parser.add_argument(
         "--clock-stddev",
@@ -245,7 +266,7 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
             raise InstrumentError(
                 "--instrument holds focal length, misalignment and the inclinometer: give either it or the options"
             )
-        return _with_clock(instrument_file.read(path), args)
+        return _with_times(instrument_file.read(path), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
     if args.focal_mm is not None:
@@ -264,13 +285,15 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
         inclinometer=errors,
         inclinometer_model=model,
     )
-    return _with_clock(made, args)
+    return _with_times(made, args)
 
 
-def _with_clock(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:
-    """The instrument with the error of its clock from --clock-stddev, if that is given."""
-    stddev = getattr(args, "clock_stddev", None)
-    return known if stddev is None else replace(known, clock_stddev_s=stddev)
+def _with_times(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:
+    """The instrument with its clock's error from --clock-stddev and its shutter from --readout, as far as given."""
+    stddev, readout = getattr(args, "clock_stddev", None), getattr(args, "readout", None)
+    if stddev is not None:
+        known = replace(known, clock_stddev_s=stddev)
+    return known if readout is None else replace(known, shutter=Shutter(*readout))
 
 
 class HasFocalLength(Protocol):
@@ -279,17 +302,6 @@ class HasFocalLength(Protocol):
     @property
     def focal_px(self) -> float | None:
         """Focal length in px that the frame's header states; None if it states none."""
-
-
-def frames_of(
-    paths: list[str], clock: CameraClock | None = None
-) -> Iterator[tuple[str, Frame | Stars | FrameError]]:
-    """(path, Frame or Stars or FrameError) of each path, read one at a time."""
-    for path in paths:
-        try:
-            yield path, read_frame(path, clock)
-        except FrameError as e:
-            yield path, e
 
 
 def stars_of(item: Frame | Stars) -> Stars:

@@ -4,15 +4,17 @@
 Each is called with the path of a frame and returns its answer; it raises FrameError if the frame is at fault.
 """
 
+import argparse
+import math
 import os
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli.common import stars_of
+from starpos.cli.common import clock_of, stars_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
 from starpos.fix.pointing import IDEAL
@@ -32,21 +34,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Reader:
-    """Reads frames, and keeps one that will be asked for again, in its own process only."""
+    """Reads frames, and keeps one that will be asked for again, in its own process only.
+
+    delay_s: how much later than its header says a frame was exposed, and the standard deviation of that.
+    """
 
     clock: CameraClock | None = None
+    delay_s: tuple[float, float] = (0.0, 0.0)
     _kept: dict = field(default_factory=dict, compare=False)
 
     def __call__(self, path: str) -> Frame | Stars:
-        return self._kept.pop(path) if path in self._kept else read_frame(path, self.clock)
+        if path in self._kept:
+            return self._kept.pop(path)
+        item = read_frame(path, self.clock)
+        if item.mid_unix_s is None:
+            return item
+        late_s, stddev_s = self.delay_s
+        stamp_s = math.hypot(item.stamp_stddev_s, stddev_s)
+        return replace(item, mid_unix_s=item.mid_unix_s + late_s, stamp_stddev_s=stamp_s)
 
     def keep(self, path: str, item: Frame | Stars) -> None:
         """Keep a frame for the next call with its path."""
         self._kept.clear()
         self._kept[path] = item
 
-    def __reduce__(self) -> tuple[type["Reader"], tuple[CameraClock | None]]:
-        return Reader, (self.clock,)
+    def __reduce__(self) -> tuple[type["Reader"], tuple[CameraClock | None, tuple[float, float]]]:
+        return Reader, (self.clock, self.delay_s)
+
+
+def reader_of(args: argparse.Namespace) -> Reader:
+    """The reader of frames with the clock and the delay of their shutter that the options give."""
+    return Reader(clock_of(args), tuple(args.shutter_delay or (0.0, 0.0)))
 
 
 @dataclass(frozen=True)

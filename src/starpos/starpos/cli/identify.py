@@ -6,14 +6,14 @@ import argparse
 import numpy as np
 
 from starpos.cli import common, jobs
-from starpos.cli.frame_work import Identifying, Listing, Look, Reader
+from starpos.cli.frame_work import Identifying, Listing, Look, reader_of
 from starpos.errors import FrameError
 from starpos.fix.solver import Solution, Status
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
-    common.add_exif(parser)
+    common.add_stamps(parser)
     common.add_optics(parser)
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -21,7 +21,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     any_found, unreadable, number = False, False, len(args.frames)
-    read = Reader(common.clock_of(args))
+    read = reader_of(args)
     with jobs.workers_of(args, number) as workers:
         (about,) = workers.map([(Look(read), tuple(args.frames))])
         # without a frame that can be read, each one reports why it cannot

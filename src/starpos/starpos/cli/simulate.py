@@ -6,6 +6,7 @@ import argparse
 import numpy as np
 
 from starpos.cli import common
+from starpos.frames.shutter import MOST_READOUT_S
 from starpos.instrument.instrument import focal_px_of
 from starpos.simulation.night_on_disk import write_night
 from starpos.simulation.scene import scene_of
@@ -64,6 +65,13 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="deg",
     )
     parser.add_argument(
+        "--readout",
+        type=common.number(-MOST_READOUT_S, MOST_READOUT_S),
+        default=0.0,
+        metavar="S",
+        help="rolling shutter: s from the first row to the last, negative: the bottom row is first (0: global)",
+    )
+    parser.add_argument(
         "--stars-only", action="store_true", help="lists of detected stars (CSV) instead of frames"
     )
     parser.add_argument("--seed", type=common.number(0, 2**63, int), default=1)
@@ -82,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
         misalignment_deg=tuple(args.misalignment),
         tilt_noise_deg=args.tilt_noise,
         tilt_zero_deg=tuple(args.tilt_zero),
+        readout_s=args.readout,
     )
     write_night(
         args.out,

@@ -14,7 +14,7 @@ from starpos.calibration.unknown import unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
-from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, tilts
+from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of, tilts
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.fix import Fix
@@ -48,7 +48,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
         "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground",
     )
-    common.add_exif(parser)
+    common.add_stamps(parser)
     common.add_instrument(parser)
     common.add_air(parser)
     add_vertical(parser)
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         return solve_pointings.run(args)
     if args.near is not None:
         raise InstrumentError("--near is for --pointings without a roll: leave it out")
-    vertical, read = vertical_of(args), Reader(common.clock_of(args))
+    vertical, read = vertical_of(args), reader_of(args)
     given = nights_of(args.frames, args.tilt, common.has_own_level(args))
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")

@@ -213,6 +213,13 @@ def _tai_minus_utc(utc_unix_s: float) -> float:
     return float(table.tai_minus_utc[min(max(day, 0), len(table.mjd) - 1)])
 
 
+def later(itrs: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Directions (N, 3) in ITRS as they are so many seconds (N,) later, by the Earth's rotation alone."""
+    angle = ROTATION_RAD_S * seconds
+    c, s, (x, y, z) = np.cos(angle), np.sin(angle), np.moveaxis(itrs, -1, 0)
+    return np.stack([c * x + s * y, c * y - s * x, z], -1)
+
+
 def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
     """Velocity (3,) of the rotating ground in units of c, ITRS, at the place whose zenith is zenith_itrs (3,)."""
     radius = EQUATOR_RADIUS_M / np.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)

@@ -175,12 +175,17 @@ def error_terms(
     tilt: Tilt,
     mounting: Mounting,
     refraction_rotation: np.ndarray,
+    shutter_rotation: np.ndarray,
     latitude: float,
     earth: EarthState,
     clock_stddev_s: float,
     stamp_stddev_s: float,
 ) -> tuple[ErrorTerm, ...]:
-    """All known sources of error.  refraction_rotation (3,): rotation of A4 in rad for 1 sigma of the refraction."""
+    """All known sources of error.
+
+    refraction_rotation (3,), shutter_rotation (3, 2): rotation of A4 in rad for 1 sigma of the refraction, and of the two
+    errors of the rows' times.
+    """
 
     def factor_from_stars(covariance: np.ndarray) -> np.ndarray:
         return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
@@ -192,6 +197,7 @@ def error_terms(
         calibration,
         *readings,
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
+        ErrorTerm("shutter", sensitivity.stars @ shutter_rotation, shared=ALWAYS, posed=True),
         *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s),
     )
 

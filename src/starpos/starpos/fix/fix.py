@@ -5,12 +5,12 @@ The equation is that of the paper's section 4, A2 A3 W = A4 A1 V, with refractio
 site.  The residuals are formed in pixels, because the errors of the stars are known there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.orientation import EarthState, later, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix.budget import (
@@ -24,6 +24,7 @@ from starpos.fix.budget import (
     total_covariance,
 )
 from starpos.fix.outliers import expected_extra, judged
+from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
 from starpos.identification import Identification
 from starpos.instrument.camera import Camera
@@ -116,19 +117,21 @@ def solve_fix(
     earth: EarthState,
     clock_stddev_s: float,
     stamp_stddev_s: float = 0.0,
+    shutter: Shutter = GLOBAL,
 ) -> Fix:
     """The fix of one frame from identified stars.
 
     It starts from a closed solution (singular values) and goes on by Gauss-Newton over the rotation A4 and the plate
     scale.  The derivatives are computed once: they hardly change over the arcseconds that are left.
     clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
+    shutter: when each row was exposed; `earth` is of the row that is read first.
     Raises FixError if the stars are too few or do not agree.
     """
     problem = _Adjustment(
         stars.xy,
         camera,
         level_of(mounting.up(tilt)) @ mounting.a3,
-        earth.to_itrs(stars.places),
+        later(earth.to_itrs(stars.places), shutter.later_s(stars.xy[:, 1], camera.height)),
         atmosphere.refraction(),
     )
     catalogue_px2 = np.eye(2) * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
@@ -172,6 +175,7 @@ def solve_fix(
         earth,
         (clock_stddev_s, stamp_stddev_s),
         sensitivity,
+        shutter,
     )
     axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
     bent = np.linalg.norm(np.cross(axis, problem.refraction.unbend(axis)))
@@ -288,18 +292,24 @@ def _terms(
     earth: EarthState,
     clock_and_stamp_stddev_s: tuple[float, float],
     sensitivity: Sensitivity,
+    shutter: Shutter,
 ) -> tuple[ErrorTerm, ...]:
-    """The budget of the fix: the errors of its stars, of the refraction as it acts on them, and all others."""
+    """The budget of the fix: the errors of its stars, of refraction and shutter as they act on them, and all others."""
     stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
     bending = (
         -np.einsum("ank,nk->a", errors.gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
     )
+    turned = replace(problem, itrs=later(problem.itrs, np.ones(len(problem.itrs)))).predict(state)
+    drift = turned - problem.predict(state)
+    late = shutter.errors_s(problem.xy[:, 1], problem.camera.height)
+    rolling = -np.einsum("ank,nk,nc->ac", errors.gain, drift[keep], late[keep])
     return error_terms(
         sensitivity,
         errors,
         tilt,
         mounting,
         bending,
+        rolling,
         place_of(state.a4).latitude,
         earth,
         *clock_and_stamp_stddev_s,

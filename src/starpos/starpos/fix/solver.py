@@ -18,6 +18,7 @@ from starpos.fix.pointing import IDEAL, pointing_fix
 from starpos.fix.unmoved import check_unmoved
 from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
+from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.frames.stars import SATURATED, Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangle_cache
 from starpos.identification.hint import Hint
@@ -272,6 +273,7 @@ class Solver:
             state,
             self.clock_stddev_s(stars),
             stars.stamp_stddev_s,
+            self.shutter(stars),
         )
         check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
         return replace(fix, used=np.flatnonzero(use)[fix.used])
@@ -279,6 +281,10 @@ class Solver:
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
         """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""
         return max(self.instrument.clock_stddev_s, stars.clock_stddev_s)
+
+    def shutter(self, stars: Stars) -> Shutter:
+        """The shutter as the instrument states it, else as the stars' source does."""
+        return self.instrument.shutter or stars.shutter or UNKNOWN
 
     def _camera(self, width: int, height: int) -> Camera:
         camera = self.instrument.camera_for(width, height)

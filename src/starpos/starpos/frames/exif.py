@@ -16,6 +16,7 @@ from typing import Any
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.header import MAX_EXPOSURE_S
+from starpos.frames.shutter import UNKNOWN_LATENCY_S
 
 # Canon and Nikon allow their clocks an error of a minute a month.
 UNTENDED_STDDEV_S = 60.0
@@ -49,7 +50,8 @@ def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, Any]:
     """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
 
     exposure_s comes from ExposureTime. With a clock also mid_unix_s, stamp_stddev_s and clock_stddev_s: DateTimeOriginal
-    and SubSecTimeOriginal are the start of the exposure, rounded down. FrameError if these exist but are not a time.
+    and SubSecTimeOriginal are the start of the exposure, rounded down; when the shutter opened is known less well.
+    FrameError if these exist but are not a time.
     """
     try:
         import exifread
@@ -71,7 +73,7 @@ def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, Any]:
     start_unix_s, step_s = _start(tags, place, clock)
     return known | {
         "mid_unix_s": start_unix_s + exposure_s / 2,
-        "stamp_stddev_s": step_s / math.sqrt(12),
+        "stamp_stddev_s": math.hypot(step_s / math.sqrt(12), UNKNOWN_LATENCY_S),
         "clock_stddev_s": clock.stddev_s,
     }
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import FrameError
+from starpos.frames.shutter import Shutter
 
 # In a longer exposure the tilts of several poses would be averaged.
 MOST_EXPOSURE_S = 3600.0
@@ -19,12 +20,13 @@ LARGEST_SIDE_PX = 1_000_000
 class Exposure:
     """One exposure of a camera; a `Frame` adds its pixels, `Stars` the stars found on it.
 
-    mid_unix_s      middle of the exposure, UTC as a Unix time; None: unknown
+    mid_unix_s      middle of the exposure (of the row that is read first), UTC as a Unix time; None: unknown
     exposure_s      None: unknown
     source          where it came from, for messages: a path or a topic
     focal_px        focal length by the file's header (FOCALLEN / XPIXSZ), px; only a hint; None: unknown
     stamp_stddev_s  standard deviation of mid_unix_s against the clock it was read from; 0: unknown
     clock_stddev_s  standard deviation of that clock against UTC, an error that all frames share; 0: unknown
+    shutter         times of the rows; None: nobody has said
 
     FrameError if a time, a standard deviation or the focal length is an impossible number.
     """
@@ -35,6 +37,7 @@ class Exposure:
     focal_px: float | None = None
     stamp_stddev_s: float = 0.0
     clock_stddev_s: float = 0.0
+    shutter: Shutter | None = None
 
     def __post_init__(self) -> None:
         place = self.place

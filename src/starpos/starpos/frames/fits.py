@@ -15,7 +15,7 @@ import numpy as np
 from starpos.errors import FrameError, one_line
 from starpos.frames.files import MAX_BYTES, check_pixels
 from starpos.frames.frame import PATTERNS, Frame, to_unsigned
-from starpos.frames.header import KEYS, focal_px, times
+from starpos.frames.header import KEYS, focal_px, shutter, times
 
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 # The image is among so many first parts (HDUs) of a file.
@@ -70,6 +70,7 @@ def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
         source=place,
         focal_px=focal_px(header),
         stamp_stddev_s=rounding,
+        shutter=shutter(header, place),
     )
     return frame, header
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import FrameError
+from starpos.frames.shutter import Shutter
 
 START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
 KEYS = (
@@ -26,6 +27,7 @@ KEYS = (
     "YBAYROFF",
     "FOCALLEN",
     "XPIXSZ",
+    "ROLLSHUT",
 )
 # Time scales of TIMESYS that are read; UT1 would need tables.
 SCALES = ("utc", "tai", "tt", "tdb")
@@ -95,6 +97,21 @@ def _middle(start: Any, exposure_s: float, scale: str, what: str) -> float:
     if not np.isfinite(unix):
         raise FrameError(f"{what} is {start!r}, which is no time; write it like 2026-11-02T18:00:00.000.")
     return unix
+
+
+def shutter(header: Mapping, place: str) -> Shutter | None:
+    """The shutter by ROLLSHUT, s from the row that is read first to the last, negative where the bottom row is first.
+
+    0 is a global shutter; None if the header has no ROLLSHUT. FrameError for a bad one.
+    """
+    if (readout := header.get("ROLLSHUT")) in (None, ""):
+        return None
+    try:
+        return Shutter(float(readout), 0.0)
+    except (TypeError, ValueError, OverflowError, FrameError):
+        raise FrameError(
+            f"{place}: its ROLLSHUT is no time from the first row to the last in s; correct the header."
+        ) from None
 
 
 def focal_px(header: Mapping) -> float | None:

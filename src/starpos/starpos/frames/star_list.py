@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of
-from starpos.frames.header import focal_px, times
+from starpos.frames.header import focal_px, shutter, times
 from starpos.frames.stars import Stars
 
 MAX_CSV_BYTES = 20_000_000
@@ -76,6 +76,7 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         source=place,
         focal_px=focal_px(header),
         stamp_stddev_s=rounding,
+        shutter=shutter(header, place),
     )
 
 
@@ -87,6 +88,8 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str) -> None:
         "NAXIS1": stars.width,
         "NAXIS2": stars.height,
     }
+    if stars.shutter is not None:
+        about["ROLLSHUT"] = stars.shutter.readout_s
     sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
     rows = "".join(
         f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n"

@@ -8,6 +8,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.errors import InstrumentError
+from starpos.frames.shutter import Shutter
 from starpos.instrument.camera import Camera
 from starpos.instrument.camera_vertical import CameraVertical
 from starpos.instrument.inclinometer import InclinometerErrors
@@ -181,6 +182,7 @@ class Instrument:
     inclinometer        its errors
     inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
     clock_stddev_s      standard deviation of the clock against UTC, s
+    shutter             times of the camera's rows; None: as the source of the frames states them
     vertical            of a camera fixed to the ground, which is its own level; None: there is an inclinometer
     """
 
@@ -192,6 +194,7 @@ class Instrument:
     inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
+    shutter: Shutter | None = None
     vertical: CameraVertical | None = None
 
     def __post_init__(self) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from starpos.errors import InstrumentError, TimeError
+from starpos.errors import FrameError, InstrumentError, TimeError
+from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file, sensors, yaml_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
@@ -51,8 +52,10 @@ KEYS = (
     "inclinometer",
     *INCLINOMETER,
     "clock_stddev_s",
+    "shutter",
     "vertical",
 )
+SHUTTER = ("readout_s", "readout_stddev_s")
 VERTICAL = ("camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour")
 
 
@@ -78,6 +81,7 @@ def read(path: Path | str) -> Instrument:
     tilt_pose_arcsec: 0                                  new at each pose: hysteresis, nonlinearity, flexure
     tilt_range_deg: 90
     clock_stddev_s: 0.1
+    shutter: {readout_s: 0.03, readout_stddev_s: 0}      from the row read first to the last; negative: bottom row first
     vertical: {camera_to_itrs, covariance_arcsec2, sag_arcsec_per_sqrt_hour}
                                                          of a camera fixed to the ground, in place of tilt_...
     """
@@ -131,6 +135,8 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
         }
         content["vertical"][VERTICAL[2]] = float(instrument.inclinometer.drift_rad_per_sqrt_hour / ARCSEC)
     content["clock_stddev_s"] = float(instrument.clock_stddev_s)
+    if instrument.shutter is not None:
+        content["shutter"] = {key: float(getattr(instrument.shutter, key)) for key in SHUTTER}
     yaml_file.save(Path(path), content, comment)
 
 
@@ -152,7 +158,19 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
         instrument = _with_vertical(instrument, content["vertical"])
     if "clock_stddev_s" in content:
         instrument = replace(instrument, clock_stddev_s=_number(content, "clock_stddev_s"))
+    if "shutter" in content:
+        instrument = replace(instrument, shutter=_shutter(content["shutter"]))
     return instrument
+
+
+def _shutter(about: object) -> Shutter:
+    if not isinstance(about, dict):
+        raise InstrumentError(f"shutter is {_short(about)}: give {{{', '.join(SHUTTER)}}}")
+    _refuse_others(about, SHUTTER)
+    try:
+        return Shutter(*(_number(about, key) for key in SHUTTER))
+    except FrameError as e:
+        raise InstrumentError(str(e)) from None
 
 
 def _with_vertical(instrument: Instrument, about: object) -> Instrument:

@@ -11,6 +11,7 @@ import numpy as np
 
 from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.frames.frame import Frame
+from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, SQUARE, Tilt
@@ -61,7 +62,16 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
         stamp_stddev_s=message.stamp_stddev,
         # older bags do not have it
         clock_stddev_s=getattr(message, "clock_stddev", 0.0),
+        shutter=message_to_shutter(message),
     )
+
+
+def message_to_shutter(message: Any) -> Shutter | None:
+    """Shutter that a StarArray or a Capture tells, None if it is not known; FrameError if it cannot be."""
+    # older bags do not have it
+    if not getattr(message, "shutter_known", False):
+        return None
+    return Shutter(message.readout, message.readout_stddev)
 
 
 def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:

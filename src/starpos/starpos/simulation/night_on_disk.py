@@ -75,7 +75,7 @@ def _text(unix_s: float) -> str:
 
 
 def write_fits(path: Path | str, frame: Frame, start_utc: str) -> None:
-    """Write a frame as FITS with DATE-OBS (start of exposure, UTC), EXPTIME and, if known, the focal length."""
+    """Write a frame as FITS with DATE-OBS (start of exposure, UTC), EXPTIME and, if known, focal length and shutter."""
     from astropy.io import fits
 
     header = fits.Header()
@@ -84,4 +84,6 @@ def write_fits(path: Path | str, frame: Frame, start_utc: str) -> None:
     if frame.focal_px is not None:
         header["FOCALLEN"] = (frame.focal_px / 1000, "mm, at 1 um pixels")
         header["XPIXSZ"] = (1.0, "um")
+    if frame.shutter is not None:
+        header["ROLLSHUT"] = (frame.shutter.readout_s, "s from the row read first to the last")
     fits.PrimaryHDU(frame.pixels, header).writeto(path, overwrite=True)

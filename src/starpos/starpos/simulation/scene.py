@@ -13,6 +13,7 @@ from scipy.special import erf
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.frame import Frame
+from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
@@ -61,7 +62,7 @@ class TiltErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """An instrument at a site, and its pointing."""
+    """An instrument at a site, its pointing, and the times of its camera's rows."""
 
     camera: Camera
     instrument: Instrument
@@ -71,6 +72,7 @@ class Scene:
     roll_deg: float = 15.0
     optics: Optics = field(default_factory=Optics)
     tilt_errors: TiltErrors = field(default_factory=TiltErrors)
+    shutter: Shutter = GLOBAL
 
     @property
     def attitude(self) -> np.ndarray:
@@ -120,6 +122,9 @@ def expose(
         & (px[1] < [camera.width + 5, camera.height + 5]).all(1)
     )
     electrons = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * catalogue.vmag(index))
+    later_s = scene.shutter.later_s(px[1, :, 1], camera.height)
+    # the trail is as good as straight
+    px = px + (px[2] - px[0]) / exposure_s * later_s[:, None]
     start, middle, end = px[:, on]
     return Exposed(start, middle, end, electrons[on], index[on])
 
@@ -156,6 +161,7 @@ def render(
         exposure_s=exposure_s,
         source=source,
         focal_px=camera.fx,
+        shutter=scene.shutter,
     )
 
 
@@ -201,6 +207,7 @@ def scene_of(
     misalignment_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
     tilt_noise_deg: float = 0.0035,
     tilt_zero_deg: tuple[float, float] = (0.0, 0.0),
+    readout_s: float = 0.0,
 ) -> Scene:
     """The paper's instrument at a place; plain numbers for what is usually varied."""
     azimuth_deg, altitude_deg, roll_deg = pointing_deg
@@ -216,6 +223,7 @@ def scene_of(
             tuple(np.radians(tilt_zero_deg)),
             quantum=np.radians(tilt_noise_deg / 8),
         ),
+        shutter=Shutter(readout_s, 0.0),
     )
 
 
@@ -249,4 +257,5 @@ def detected(
         exposure_s=exposure_s,
         source=source,
         focal_px=camera.fx,
+        shutter=scene.shutter,
     )

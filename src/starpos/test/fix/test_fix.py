@@ -308,6 +308,7 @@ def test_the_budget_says_which_errors_are_common(rng):
         "tilt temperature",
         "tilt response",
         "refraction",
+        "shutter",
         "clock",
         "time stamp",
         "ut1",

@@ -14,6 +14,7 @@ from starpos.errors import FrameError, TimeError
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import decode_frame, read_frame
+from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
@@ -108,7 +109,7 @@ def test_the_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path, n
     assert (unasked.mid_unix_s, unasked.exposure_s, unasked.clock_stddev_s) == (None, 0.5, 0.0)
     frame = read_frame(path, TEHRAN)
     assert frame.mid_unix_s == pytest.approx(SHOWN_S - 3.5 * 3600 + 0.255 + 0.25, abs=1e-6)
-    assert frame.stamp_stddev_s == pytest.approx(0.01 / np.sqrt(12))
+    assert frame.stamp_stddev_s == pytest.approx(np.hypot(0.01 / np.sqrt(12), UNKNOWN_LATENCY_S))
     assert (frame.exposure_s, frame.clock_stddev_s) == (0.5, 2.0)
 
 
@@ -116,7 +117,7 @@ def test_the_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path, n
 @pytest.mark.parametrize("subsec", [None, "", "00", "  ", "x"])
 def test_whole_seconds_are_known_to_a_third_of_a_second(tmp_path, subsec):
     frame = read_frame(write(tmp_path / "a.jpg", jpeg(subsec=subsec)), CameraClock(0.0))
-    assert frame.stamp_stddev_s == pytest.approx(0.2887, abs=1e-4)
+    assert frame.stamp_stddev_s == pytest.approx(np.hypot(0.2887, UNKNOWN_LATENCY_S), abs=1e-4)
     assert frame.mid_unix_s == pytest.approx(SHOWN_S + 0.5 + 0.25)
     assert frame.clock_stddev_s == 60.0
 
@@ -133,7 +134,7 @@ def test_the_error_of_a_clock_that_counts_in_steps_is_as_large_as_it_is_said_to_
         if subsec and not int(subsec):
             continue  # such are taken for no fraction
         away.append(frame.mid_unix_s - frame.exposure_s / 2 - SHOWN_S - true)
-        claimed = frame.stamp_stddev_s
+        claimed = np.sqrt(frame.stamp_stddev_s**2 - UNKNOWN_LATENCY_S**2)
     assert abs(np.mean(away)) < 4 * claimed / np.sqrt(len(away))
     assert np.std(away) == pytest.approx(claimed, rel=0.15)
 
