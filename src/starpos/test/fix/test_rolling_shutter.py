@@ -55,7 +55,7 @@ def off_m(fix, scene):
 
 
 def together(catalogue, readout_s, shutter):
-    """Root mean square of error and claim (m), mean squared error over claim and residual (arcsec) of fixes at random places."""
+    """Root mean square of error and claim (m), mean chi-square, and residual (arcsec), of fixes at random places."""
     rows = []
     for seed in range(PLACES):
         scene, stars, tilt = night(catalogue, readout_s, seed)
