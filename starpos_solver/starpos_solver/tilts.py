@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import BRACKET_S, TOUCH_S, TiltLog
+from starpos.instrument.tilt_log import BRACKET_S, NEIGHBOURS_S, TOUCH_S, TiltLog, noise_excess
 from starpos.recording.messages import (
     OUT_OF_RANGE,
     SATURATED,
@@ -20,6 +20,8 @@ from starpos_interfaces import msg
 from starpos_solver.tilt_publishers import TiltPublishers
 
 CAPACITY = 6000  # ten minutes at 10 Hz
+# The noise is measured from so many samples.
+NOISE_CAPACITY = 2000
 # Between two samples of one exposure at most so many others arrive.
 TOGETHER = 20
 # Samples so near to an exposure may bracket it; a flagged one explains why it has no good one.
@@ -35,6 +37,8 @@ class TiltBuffer:
         self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with the number of its arrival
         self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
+        # of each sample and the one before it: time of the later, how far they differ, and the stated variance
+        self._steps: deque[tuple[float, np.ndarray, float]] = deque(maxlen=NOISE_CAPACITY)
         self._publishers = TiltPublishers()
 
     def __len__(self) -> int:
@@ -43,6 +47,7 @@ class TiltBuffer:
     def clear(self) -> None:
         self._good.clear()
         self._flagged.clear()
+        self._steps.clear()
         self._publishers = TiltPublishers()
 
     def heard(self, message: msg.Tilt, number: int | None, now_s: float) -> None:
@@ -53,6 +58,7 @@ class TiltBuffer:
         self._publishers.heard(message.header.frame_id, number, now_s)
         if several := self._publishers.several:
             self._good.clear()
+            self._steps.clear()
             raise TiltError(several)
 
     def add(self, message: msg.Tilt, unknown_stddev_rad: float) -> None:
@@ -61,6 +67,8 @@ class TiltBuffer:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
             return
         sample = message_to_tilt(message, unknown_stddev_rad)
+        if self._good:
+            self._note_step(self._good[-1][1], sample)
         self._came += 1
         self._good.append((self._came, sample))
         self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
@@ -70,6 +78,7 @@ class TiltBuffer:
         if self._latest_unix_s > unix_s:
             self._latest_unix_s = unix_s
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
+            self._steps = deque((s for s in self._steps if s[0] <= unix_s), maxlen=NOISE_CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether all samples of an exposure have arrived: the last one leaves no time for another."""
@@ -107,7 +116,22 @@ class TiltBuffer:
         else:
             # Later samples must not count, because it is chance how many have arrived by now.
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1]
-        return TiltLog.of_readings(near).average(mid_unix_s, span_s)
+        excess = self._excess(mid_unix_s + span_s / 2)
+        return TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
+
+    def _note_step(self, before: Tilt, sample: Tilt) -> None:
+        apart = sample.utc_unix_s - before.utc_unix_s
+        if 0 < apart < NEIGHBOURS_S and sample.axes == before.axes:
+            variance = float(np.diag(sample.covariance).mean())
+            self._steps.append((sample.utc_unix_s, sample.theta - before.theta, variance))
+
+    def _excess(self, end_unix_s: float) -> float:
+        """Noise over the stated one of the samples until the end of an exposure: later ones are there by chance."""
+        steps = [(step, variance) for t, step, variance in self._steps if t <= end_unix_s]
+        if not steps or len({len(step) for step, _ in steps}) > 1:
+            return 1.0
+        stated = np.sqrt(np.mean([variance for _, variance in steps]))
+        return noise_excess(np.array([step for step, _ in steps]), float(stated))
 
     def _explain(self, mid_unix_s: float, span_s: float, others_near: bool) -> None:
         """Raise the reason why no sample lies in an exposure; return if others that are near it may bracket it."""

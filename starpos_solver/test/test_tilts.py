@@ -52,6 +52,20 @@ def test_a_stated_covariance_is_used():
     assert tilt.covariance == pytest.approx(np.eye(2) * 1e-8 / 5)
 
 
+def test_the_noise_is_measured_from_all_samples_so_far():
+    """Five tell little; what came after the exposure is there by chance and does not count."""
+    rng = np.random.default_rng(3)
+    noisy = [
+        sample(-60 + k / 10, *([1, -2] + 3 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(603)
+    ]
+    found = math.sqrt(buffer_of(noisy).average(T0, 0.5).covariance[0, 0] * 5)
+    assert found == pytest.approx(3 * NOISE, rel=0.15)
+    later = [
+        sample(0.3 + k / 10, *([1, -2] + 9 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(300)
+    ]
+    assert buffer_of(noisy + later).average(T0, 0.5).covariance[0, 0] * 5 == pytest.approx(found**2)
+
+
 def test_samples_from_before_the_clock_was_set_back_are_none_of_the_same_times_now():
     before = [sample(k / 10, 20.0) for k in range(-20, 300)]
     buffer = buffer_of([*before, *(sample(k / 10 + 0.03) for k in range(-3, 4))])

@@ -39,6 +39,19 @@ def white_noise(steps: np.ndarray) -> np.ndarray:
     return np.sqrt((size**2).mean(0) / KEPT_VARIANCE / 2)
 
 
+def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
+    """Noise of readings over the stated one, from their differences (N, axes) from one to the next; 1 or more.
+
+    The readings of a pair are not more than NEIGHBOURS_S apart. Fewer than ENOUGH_NEIGHBOURS pairs tell nothing: 1.
+    """
+    # of an instrument at rest: while it moves, readings differ by more than any noise that is let pass
+    steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * REST * stated_rad).all(1)]
+    if len(steps) < ENOUGH_NEIGHBOURS:
+        return 1.0
+    found = float(white_noise(steps).max() / stated_rad)
+    return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
+
+
 @dataclass(frozen=True)
 class TiltLog:
     """N readings of one sensor.
@@ -47,6 +60,7 @@ class TiltLog:
     covariance (N, 2, 2) in rad2 of each reading's theta_x, theta_y.
     theta_z (N,) in rad; None or NaN of a two-axis sensor.
     variance_z (N,) in rad2; None or NaN: that of the other two.
+    earlier_excess  noise over the stated one that earlier readings showed, which are not in the log
     """
 
     utc_unix_s: np.ndarray
@@ -57,6 +71,7 @@ class TiltLog:
     covariance: np.ndarray
     theta_z: np.ndarray | None = None
     variance_z: np.ndarray | None = None
+    earlier_excess: float = 1.0
 
     @classmethod
     def of(
@@ -80,7 +95,7 @@ class TiltLog:
         )
 
     @classmethod
-    def of_readings(cls, readings: Sequence[Tilt]) -> "TiltLog":
+    def of_readings(cls, readings: Sequence[Tilt], earlier_excess: float = 1.0) -> "TiltLog":
         """Make a log of readings, each with its own covariance."""
         return cls(
             np.array([r.utc_unix_s for r in readings]),
@@ -90,6 +105,7 @@ class TiltLog:
             covariance=np.array([r.covariance for r in readings]),
             theta_z=np.array([r.theta_z for r in readings]),
             variance_z=np.array([r.variance_z for r in readings]),
+            earlier_excess=earlier_excess,
         )
 
     @cached_property
@@ -114,16 +130,8 @@ class TiltLog:
         order = np.argsort(self.utc_unix_s, kind="stable")
         apart = np.diff(self.utc_unix_s[order])
         near = (apart > 0) & (apart < NEIGHBOURS_S)
-        if near.sum() < ENOUGH_NEIGHBOURS:
-            return 1.0
         steps = np.diff(self.theta[order], axis=0)[near]
-        stated = np.sqrt(self.variance.mean())
-        # of an instrument at rest: while it moves, readings differ by more than any noise that is let pass
-        steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * REST * stated).all(1)]
-        if len(steps) < ENOUGH_NEIGHBOURS:
-            return 1.0
-        found = float(white_noise(steps).max() / stated)
-        return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
+        return max(noise_excess(steps, float(np.sqrt(self.variance.mean()))), self.earlier_excess)
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
