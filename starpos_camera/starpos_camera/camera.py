@@ -24,6 +24,7 @@ from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
+from starpos.paths import path_of
 from starpos.recording.messages import message_to_camera
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
@@ -34,7 +35,6 @@ from starpos_common.clock_report import ClockReport, time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp
 from starpos_common.parameters import declare
-from starpos_common.paths import path_of
 from starpos_common.topics import publisher
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture

@@ -8,8 +8,7 @@ from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
 from starpos import rotation
-from starpos.averaging.average import Average
-from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.earth.vertical import Geodetic
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Status
 from starpos_common.messages import tilt_to_message
@@ -30,17 +29,6 @@ DEFLECTION = "deflection"
 # m2; with a NaN consumers would drop the whole matrix.
 UNKNOWN_ALTITUDE_VARIANCE = 1e8
 NAN = math.nan
-
-
-def on_ground(answer: Solution, vertical: Vertical) -> Geodetic | None:
-    """Convert the fix of an answer to a geodetic position; None without a fix."""
-    fix = answer.fix
-    return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical) if fix else None
-
-
-def average_on_ground(place: Average, vertical: Vertical) -> Geodetic:
-    """Convert an average to a geodetic position."""
-    return geodetic(place.latitude, place.longitude, place.heading, place.covariance, vertical)
 
 
 def nav_sat_fix(

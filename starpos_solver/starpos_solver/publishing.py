@@ -6,9 +6,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
-from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic
-from starpos.fix.solver import Solution
+from starpos.session.frames import Answered, Averaged, Output
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
 from starpos_solver import outputs
@@ -25,38 +24,27 @@ class SolutionPublishers:
         self._imu = publisher(node, Imu, "heading/imu", 10)
         self._solution = publisher(node, msg.Solution, "solver/solution", 10)
 
-    def publish(self, stamp: Time, answer: Solution, no_camera: bool) -> None:
-        """Publish the solution of a frame; no_camera: no camera calibration has arrived."""
-        header, ground = self._header(stamp), outputs.on_ground(answer, self._settings.vertical)
-        self._fix.publish(self._nav_sat_fix(header, ground))
-        if answer.fix is not None and ground is not None:
-            self._imu.publish(outputs.imu(header, answer.fix, ground))
-        self._solution.publish(_solution(header, answer, ground, no_camera))
+    def publish(self, output: Output) -> None:
+        """Publish what a session made."""
+        header = self._header(output.stamp)
+        if isinstance(output, Averaged):
+            self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
+            return
+        self._fix.publish(self._nav_sat_fix(header, output.ground))
+        fix = output.solution.fix
+        if fix is not None and output.ground is not None:
+            self._imu.publish(outputs.imu(header, fix, output.ground))
+        self._solution.publish(self.solution(output))
 
-    def solution(self, stamp: Time, answer: Solution, no_camera: bool) -> msg.Solution:
-        """Make the message of a solution, for a service."""
-        ground = outputs.on_ground(answer, self._settings.vertical)
-        return _solution(self._header(stamp), answer, ground, no_camera)
-
-    def average(self, stamp: Time, place: Average) -> NavSatFix:
-        """Make the message of an average."""
-        return self._nav_sat_fix(
-            self._header(stamp), outputs.average_on_ground(place, self._settings.vertical)
-        )
-
-    def publish_average(self, message: NavSatFix) -> None:
-        """Publish a message that `average` made."""
-        self._fix_averaged.publish(message)
+    def solution(self, answered: Answered) -> msg.Solution:
+        """Make the message of a solution."""
+        message = outputs.solution(self._header(answered.stamp), answered.solution, answered.ground)
+        if answered.no_camera:
+            message.status = msg.Solution.NO_CAMERA
+        return message
 
     def _header(self, stamp: Time) -> Header:
         return Header(stamp=stamp, frame_id=self._values["frame_id"])
 
     def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
         return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
-
-
-def _solution(header: Header, answer: Solution, ground: Geodetic | None, no_camera: bool) -> msg.Solution:
-    message = outputs.solution(header, answer, ground)
-    if no_camera:
-        message.status = msg.Solution.NO_CAMERA
-    return message

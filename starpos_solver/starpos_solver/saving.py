@@ -6,7 +6,7 @@ from pathlib import Path
 from starpos.errors import InstrumentError
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
-from starpos_common.paths import path_of
+from starpos.paths import path_of
 
 
 def save(path: str, calibration_url: str, instrument: Instrument) -> Path:

@@ -1,30 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the solver, and the contents of the files that they name."""
+"""The session's parameters as those of a node."""
 
-import math
 from collections.abc import Callable, Mapping
 
 from rclpy.node import Node
 
-from starpos.earth.geoid import Geoid
-from starpos.earth.vertical import Vertical
-from starpos.errors import StarposError
-from starpos.fix.solver import Solver
-from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
-from starpos.instrument.instrument import Calibration, Instrument
-from starpos.sky.catalogue import Catalogue
+from starpos.session.parameters import PARAMETERS
+from starpos.session.settings import Settings
 from starpos_common.parameters import declare
-from starpos_solver import parameters
-
-ANY_CAMERA = Camera.from_focal(100, 100, 1000.0)
 
 
-class SolverSettings:
-    """The parameters as `values` by name, and the objects made from them and from their files.
-
-    A file is read once, when its parameter is validated, so the checked contents are applied. A file that breaks or
-    disappears later does not matter until the parameter is set again.
+class SolverSettings(Settings):
+    """Settings that are declared by a node and may be set while it runs.
 
     camera: returns the camera in use, None before there is one.
     apply: called with the names that were set.
@@ -33,67 +21,14 @@ class SolverSettings:
     def __init__(
         self, node: Node, camera: Callable[[], Camera | None], apply: Callable[[frozenset[str]], None]
     ) -> None:
+        super().__init__({})
         self._camera, self._apply = camera, apply
-        self._known: Instrument | None = None
-        self._geoid: Geoid | None = None
-        self._read: tuple[Instrument | None, Geoid | None] = None, None  # by the last validation
-        self.values = declare(node, parameters.PARAMETERS, apply=self._adopt, check=self._check)
-        self._known, self._geoid = self._read
+        self.values = declare(node, PARAMETERS, apply=self._adopted, check=self._check)
+        self.adopt()
 
     def _check(self, values: Mapping, names: frozenset[str]) -> str | None:
-        """Say in a sentence why values make no instrument together, such as with a broken file; None if they do."""
-        known, grid, camera = self._known, self._geoid, self._camera()
-        try:
-            if "calibration_url" in names:
-                known = parameters.known_instrument(values["calibration_url"])
-                if camera is not None:
-                    parameters.check_camera(known, values["calibration_url"], camera)
-            if "deflection.geoid" in names:
-                grid = parameters.geoid_file(values["deflection.geoid"])
-            parameters.instrument_of(values, ANY_CAMERA, known)
-            parameters.atmosphere_of(values)
-            parameters.vertical_of(values, grid)
-        except StarposError as e:
-            return str(e)
-        self._read = known, grid
-        return None
+        return self.check(values, names, self._camera())
 
-    def _adopt(self, names: frozenset[str]) -> None:
-        self._known, self._geoid = self._read
+    def _adopted(self, names: frozenset[str]) -> None:
+        self.adopt()
         self._apply(names)
-
-    def saved(self, instrument: Instrument) -> None:
-        """Note that the file of calibration_url holds this instrument now."""
-        self._known = instrument
-
-    @property
-    def vertical(self) -> Vertical:
-        return parameters.vertical_of(self.values, self._geoid)
-
-    @property
-    def tilt_stddev_rad(self) -> float:
-        """Standard deviation of a tilt sample that states none."""
-        stated = math.radians(self.values["tilt_stddev"])
-        if not math.isnan(stated):
-            return stated
-        errors = (
-            self._known.inclinometer if self._known else sensors.find(self.values["inclinometer.model"])[1]
-        )
-        return errors.noise_rad
-
-    def calibration(self, found: Calibration | None) -> Calibration:
-        """The calibration in use; `found` is the one from frames, or None."""
-        return parameters.instrument_of(self.values, ANY_CAMERA, self._known, found).calibration
-
-    def solver(self, camera: Camera, found: Calibration | None, catalogue: Catalogue) -> Solver:
-        """Make a Solver for a camera, with the calibration from frames (`found`, or None).
-
-        Raises InstrumentError if the instrument file belongs to another camera.
-        """
-        parameters.check_camera(self._known, self.values["calibration_url"], camera)
-        return Solver(
-            parameters.instrument_of(self.values, camera, self._known, found),
-            catalogue,
-            parameters.atmosphere_of(self.values),
-            self.values["min_stars"],
-        )

@@ -13,6 +13,7 @@ from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ErrorTerm, heading_of
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Status
+from starpos.session.frames import ground_of
 from starpos_interfaces import msg
 from starpos_solver import outputs
 
@@ -69,20 +70,20 @@ def yaw_deg(imu) -> float:
 @pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
 def test_yaw_is_counterclockwise_from_east(azimuth, yaw):
     answer = answer_facing(azimuth)
-    message = outputs.imu(Header(), answer.fix, outputs.on_ground(answer, EXACT))
+    message = outputs.imu(Header(), answer.fix, ground_of(answer.fix, EXACT))
     assert (yaw_deg(message) - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-9)
 
 
 def test_heading_north_is_not_taken_for_none():
     answer = answer_facing(0.0)
-    message = outputs.solution(Header(), answer, outputs.on_ground(answer, EXACT))
+    message = outputs.solution(Header(), answer, ground_of(answer.fix, EXACT))
     assert message.heading == 0.0
     assert message.status == msg.Solution.OK
 
 
 def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
     answer = answer_facing(0.0)
-    message = outputs.solution(Header(), answer, outputs.on_ground(answer, EXACT))
+    message = outputs.solution(Header(), answer, ground_of(answer.fix, EXACT))
     assert (message.stars_detected, message.stars_matched) == (5, 3)
     assert (message.ids, list(message.indices), list(message.magnitudes)) == (
         ["a", "b", "c"],
@@ -93,14 +94,14 @@ def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
 
 def test_rates_and_accelerations_are_declared_unmeasured():
     answer = answer_facing(10.0)
-    message = outputs.imu(Header(), answer.fix, outputs.on_ground(answer, EXACT))
+    message = outputs.imu(Header(), answer.fix, ground_of(answer.fix, EXACT))
     assert message.angular_velocity_covariance[0] == -1.0
     assert message.linear_acceleration_covariance[0] == -1.0
     assert np.all(np.linalg.eigvalsh(np.array(message.orientation_covariance).reshape(3, 3)) > 0)
 
 
 def test_a_fix_has_a_known_covariance_of_east_and_north():
-    ground = outputs.on_ground(answer_facing(10.0), EXACT)
+    ground = ground_of(answer_facing(10.0).fix, EXACT)
     message = outputs.nav_sat_fix(Header(), ground, 250.0, 10.0)
     assert message.status.status == NavSatStatus.STATUS_FIX
     assert message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_KNOWN
@@ -108,7 +109,7 @@ def test_a_fix_has_a_known_covariance_of_east_and_north():
 
 
 def test_an_unset_altitude_stays_nan_and_its_variance_finite():
-    message = outputs.nav_sat_fix(Header(), outputs.on_ground(answer_facing(10.0), EXACT), math.nan, 10.0)
+    message = outputs.nav_sat_fix(Header(), ground_of(answer_facing(10.0).fix, EXACT), math.nan, 10.0)
     assert math.isnan(message.altitude)
     assert np.isfinite(message.position_covariance).all()
 
@@ -122,7 +123,7 @@ def test_no_fix_is_nan_with_an_unknown_covariance():
 
 def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
     answer, deflection = answer_facing(10.0), Deflection(10.0, -20.0, 5.0)
-    ground, plain = outputs.on_ground(answer, deflection), outputs.on_ground(answer, EXACT)
+    ground, plain = ground_of(answer.fix, deflection), ground_of(answer.fix, EXACT)
     arcsec = math.radians(1 / 3600)
     assert ground.latitude - plain.latitude == pytest.approx(-10 * arcsec, rel=1e-3)
     assert ground.longitude - plain.longitude == pytest.approx(
@@ -173,7 +174,7 @@ def test_every_status_has_a_code_of_the_message():
 
 def test_the_budget_adds_up_and_the_deflection_to_the_geodetic_covariance():
     answer = answer_facing(30.0)
-    message = outputs.solution(Header(), answer, outputs.on_ground(answer, Deflection(1.0, 2.0, 3.0)))
+    message = outputs.solution(Header(), answer, ground_of(answer.fix, Deflection(1.0, 2.0, 3.0)))
     *others, deflection = message.budget
     assert deflection.name == "deflection" and deflection.common
     variance = np.sum([[t.east**2, t.north**2, t.heading**2] for t in others], axis=0)

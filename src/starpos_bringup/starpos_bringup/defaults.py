@@ -8,14 +8,14 @@ import starpos_camera.camera_parameters
 import starpos_camera.detector_parameters
 import starpos_dashboard.parameters
 import starpos_inclinometer.parameters
-import starpos_solver.parameters
+from starpos.session.parameters import PARAMETERS
 from starpos_common.parameters import to_yaml
 
 NODES = {
     "camera": starpos_camera.camera_parameters.PARAMETERS,
     "detector": starpos_camera.detector_parameters.PARAMETERS,
     "inclinometer": starpos_inclinometer.parameters.PARAMETERS,
-    "solver": starpos_solver.parameters.PARAMETERS,
+    "solver": PARAMETERS,
     "dashboard": starpos_dashboard.parameters.PARAMETERS,
 }
 

@@ -2,31 +2,18 @@
 """Publishing of /diagnostics once a second, in diagnostic_updater's conventions (which PyPI's ROS does not carry)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from enum import IntEnum
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
+from starpos.diagnosis import Diagnosis, Level
+
+# for the tasks of the nodes
+__all__ = ["Diagnosis", "Diagnostics", "Level"]
+
 PERIOD_S = 1.0
-
-
-class Level(IntEnum):
-    OK = 0
-    WARN = 1
-    ERROR = 2
-    STALE = 3
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Result of a diagnostic task: a level, a sentence, and named values (numbers, strings, booleans)."""
-
-    level: Level
-    message: str
-    values: Mapping[str, object] = field(default_factory=dict)
 
 
 class Diagnostics:

@@ -2,32 +2,25 @@
 """Jobs of several seconds, done in a thread while the node goes on."""
 
 import threading
-import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Future
 
-from starpos.errors import StarposError
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The value that a job returned, or the sentence that says why it failed."""
-
-    value: Any = None
-    trouble: str = ""
+from starpos.job import Outcome, outcome_of
 
 
 class JobRunner:
-    """Runs one job at a time and gives its outcome back in the node's executor."""
+    """Runs one job at a time and gives its outcome back in the node's executor.
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    then: called when all who wait for an outcome have it.
+    """
+
+    def __init__(self, node: Node, then: Callable[[], object] = lambda: None) -> None:
+        self._node, self._then = node, then
         self._ended = node.create_guard_condition(self._on_ended)
         self._future: Future | None = None
         self._outcome: Outcome | None = None
@@ -44,14 +37,7 @@ class JobRunner:
         return self._future
 
     def _work(self, job: Callable[[], Any]) -> None:
-        try:
-            self._outcome = Outcome(job())
-        except StarposError as e:
-            self._outcome = Outcome(trouble=str(e))
-        except Exception as e:
-            # A defect ends this job, not the node.
-            self._node.get_logger().error(traceback.format_exc())
-            self._outcome = Outcome(trouble=f"it failed ({type(e).__name__}: {e})")
+        self._outcome = outcome_of(job, self._node.get_logger().error)
         # The node may have ended meanwhile.
         with suppress(InvalidHandle):
             self._ended.trigger()
@@ -60,3 +46,4 @@ class JobRunner:
         future, self._future = self._future, None
         assert future is not None
         future.set_result(self._outcome)
+        self._then()

@@ -8,10 +8,10 @@ import numpy as np
 
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
+from starpos.diagnosis import Diagnosis, Level
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
 from starpos.fix.fix import Fix
 from starpos.units import ARCSEC
-from starpos_common.diagnostics import Diagnosis, Level
 
 # With a larger error of A3 its square, which a linear filter leaves out, exceeds 2 arcsec.
 WIDE_RAD = 600 * ARCSEC

@@ -2,26 +2,36 @@
 """Tilts matched to exposures by their time stamps, whatever order and state they come in."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from starpos.errors import TiltError, TiltRangeError
-from starpos_common.messages import unix_to_stamp
-from starpos_interfaces.msg import Tilt
-from starpos_solver.tilts import CAPACITY, TiltBuffer
+from starpos.recording.messages import OUT_OF_RANGE, SATURATED, STUCK
+from starpos.session.tilts import CAPACITY, TiltBuffer
 
 NOISE = math.radians(0.0035)
+GAP = 8
 T0 = 1_793_642_400.0
 
 
 def sample(
     seconds: float, x_deg: float = 1.0, y_deg: float = -2.0, flags: int = 0, variance: float = 0.0
-) -> Tilt:
-    message = Tilt(x=math.radians(x_deg), y=math.radians(y_deg), flags=flags, temperature=10.0)
-    message.header.stamp = unix_to_stamp(T0 + seconds)
-    message.covariance = [variance, 0.0, 0.0, variance]
-    return message
+) -> SimpleNamespace:
+    """A message as rclpy or rosbags gives it."""
+    whole, part = divmod(round((T0 + seconds) * 1e6), 1_000_000)
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=whole, nanosec=part * 1000), frame_id="")
+    return SimpleNamespace(
+        header=header,
+        x=math.radians(x_deg),
+        y=math.radians(y_deg),
+        z=0.0,
+        z_variance=0.0,
+        covariance=[variance, 0.0, 0.0, variance],
+        temperature=10.0,
+        flags=flags,
+    )
 
 
 def buffer_of(messages) -> TiltBuffer:
@@ -83,10 +93,10 @@ def test_samples_of_a_clock_that_was_ahead_are_forgotten_when_it_is_right():
 
 
 def test_a_gap_before_a_sample_does_not_spoil_it():
-    assert buffer_of([sample(0.0, flags=Tilt.GAP)]).average(T0, 0.5).samples == 1
+    assert buffer_of([sample(0.0, flags=GAP)]).average(T0, 0.5).samples == 1
 
 
-@pytest.mark.parametrize("flag", [Tilt.OUT_OF_RANGE, Tilt.SATURATED])
+@pytest.mark.parametrize("flag", [OUT_OF_RANGE, SATURATED])
 def test_flagged_samples_explain_a_missing_tilt(flag):
     with pytest.raises(TiltRangeError, match="beyond its range"):
         buffer_of([sample(0.0, flags=flag)]).average(T0, 0.5)
@@ -94,7 +104,7 @@ def test_flagged_samples_explain_a_missing_tilt(flag):
 
 def test_a_stuck_converter_is_named():
     with pytest.raises(TiltError, match="same value"):
-        buffer_of([sample(0.0, flags=Tilt.STUCK)]).average(T0, 0.5)
+        buffer_of([sample(0.0, flags=STUCK)]).average(T0, 0.5)
 
 
 def test_nothing_near_says_how_far_the_nearest_is():
@@ -107,7 +117,7 @@ def test_nothing_near_says_how_far_the_nearest_is():
 def test_broken_samples_are_refused_and_not_kept():
     buffer = TiltBuffer()
     impossible = sample(0.0, 60.0, 60.0)
-    for broken in (sample(0.0, math.nan), sample(0.0, variance=-1.0), Tilt(x=0.1), impossible):
+    for broken in (sample(0.0, math.nan), sample(0.0, variance=-1.0), sample(-T0), impossible):
         with pytest.raises(TiltError):
             buffer.add(broken, NOISE)
     assert len(buffer) == 0

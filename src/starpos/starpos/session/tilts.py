@@ -2,6 +2,7 @@
 """The tilts that have arrived, and their average over an exposure."""
 
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,7 @@ from starpos.recording.messages import (
     message_to_tilt,
     stamp_to_unix,
 )
-from starpos_interfaces import msg
-from starpos_solver.tilt_publishers import TiltPublishers
+from starpos.session.tilt_publishers import TiltPublishers
 
 CAPACITY = 6000  # ten minutes at 10 Hz
 # The noise is measured from so many samples.
@@ -50,7 +50,7 @@ class TiltBuffer:
         self._steps.clear()
         self._publishers = TiltPublishers()
 
-    def heard(self, message: msg.Tilt, number: int | None, now_s: float) -> None:
+    def heard(self, message: Any, number: int | None, now_s: float) -> None:
         """Note who publishes, before `add`; number: that of its publisher's messages, None if there is none.
 
         TiltError while two publish: whose samples are the instrument's own nobody knows, so none is kept.
@@ -61,7 +61,7 @@ class TiltBuffer:
             self._steps.clear()
             raise TiltError(several)
 
-    def add(self, message: msg.Tilt, unknown_stddev_rad: float) -> None:
+    def add(self, message: Any, unknown_stddev_rad: float) -> None:
         """Keep a sample; TiltError if the message is broken."""
         if message.flags & UNUSABLE:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))

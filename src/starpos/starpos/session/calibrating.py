@@ -6,26 +6,22 @@ Both are here because they must forget at the same events: an average holds for 
 
 import math
 from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
-from rclpy.task import Future
 
 from starpos.calibration.misalignment import Calibrated, calibrate_at
+from starpos.diagnosis import Diagnosis, Level
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Calibration
+from starpos.job import Coming, Jobs, Outcome
+from starpos.session.averaging import Averaging, News
+from starpos.session.log import Log
+from starpos.session.memory import PoseMemory, RecentFrames, Seen, tilts_of
+from starpos.session.settings import Settings
+from starpos.session.turned import Turned, turn_on_the_spot
 from starpos.sky.site import Site
-from starpos_common.diagnostics import Diagnosis, Level
-from starpos_common.job import JobRunner, Outcome
-from starpos_interfaces.srv import Calibrate, SelfCalibrate
-from starpos_solver.averaging import Averaging, News
-from starpos_solver.memory import PoseMemory, RecentFrames, Seen, tilts_of
-from starpos_solver.settings import SolverSettings
-from starpos_solver.turned import Turned, turn_on_the_spot
 
 # Fewer headings cannot show that they are of one place. The caller of the service asserts it, so it needs one less.
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
@@ -38,7 +34,6 @@ CALIBRATE_IT = (
 LATE_FRAMES = 3
 # A calibration replaces one that the solver has found itself only if its error is smaller by this factor.
 BETTER = 0.8
-R = TypeVar("R", Calibrate.Response, SelfCalibrate.Response)
 OF_CALIBRATION = {"misalignment", "misalignment_stddev", "calibration_url"}
 OF_AVERAGE = OF_CALIBRATION | {
     "self_calibration",
@@ -59,11 +54,16 @@ class Calibrating:
     """
 
     def __init__(
-        self, node: Node, settings: SolverSettings, solver: Callable[[], Solver], changed: Callable[[], None]
+        self,
+        settings: Settings,
+        jobs: Jobs,
+        solver: Callable[[], Solver],
+        changed: Callable[[], None],
+        log: Log,
     ) -> None:
         self.found: Calibration | None = None
         self.average = Averaging()
-        self._log = node.get_logger()
+        self._log = log
         self._settings, self._solver, self._changed = settings, solver, changed
         self._values = settings.values
         self._recent = RecentFrames(self._values["calibration_frames"])
@@ -75,18 +75,22 @@ class Calibrating:
         self._plumb_arcsec = math.nan
         # Grows when the instrument or the place changes; a job of an older era is out of date.
         self._era = 0
-        self._worker = JobRunner(node)
-        self._running: Future | None = None
+        self._worker = jobs
+        self._running: Coming | None = None
         self._asked = False  # whether a service waits for a job
         self._again = False  # whether to calibrate by itself again when there is time
         self._about = ""  # a sentence about `found`
         self._said = ""  # why the last calibration by itself was not taken
-        # A service that awaits its job must not block the other callbacks.
-        group = ReentrantCallbackGroup()
-        node.create_service(Calibrate, "solver/calibrate", self._on_calibrate, callback_group=group)
-        node.create_service(
-            SelfCalibrate, "solver/self_calibrate", self._on_self_calibrate, callback_group=group
-        )
+
+    @property
+    def busy(self) -> bool:
+        """Whether a calibration is being worked out."""
+        return self._worker.busy
+
+    @property
+    def about(self) -> str:
+        """A sentence about the calibration that was found; '' without one."""
+        return self._about
 
     @property
     def unknown(self) -> bool:
@@ -98,7 +102,7 @@ class Calibrating:
         """Whether A3 and its error come from frames."""
         return not math.isnan(self._plumb_arcsec)
 
-    # events of the node ----------------------------------------------------------------------------------------------
+    # events of the session ----------------------------------------------------------------------------------------------
 
     def learn(self, seen: Seen, fix: Fix | None) -> bool:
         """Take a frame and its fix; return whether the average includes this frame."""
@@ -181,32 +185,27 @@ class Calibrating:
 
     # at a known place ------------------------------------------------------------------------------------------------
 
-    async def _on_calibrate(
-        self, request: Calibrate.Request, response: Calibrate.Response
-    ) -> Calibrate.Response:
-        response.misalignment_deg, response.covariance_deg2 = [math.nan] * 3, [math.nan] * 9
-        outcome = await self._asked_for(lambda: self._at_known_place(request))
-        response.message = outcome.trouble
-        if outcome.trouble:
-            return response
-        self._adopt(outcome.value)
-        response.success, response.message = True, self._about
-        return _with_a3(response, outcome.value)
+    async def at_known_place(self, latitude: float, longitude: float, frames: int) -> Outcome:
+        """Find A3 from so many of the newest frames (0: all) at a place by gravity (deg), and use it: a Calibrated."""
+        outcome = await self._asked_for(lambda: self._at_known_place(latitude, longitude, frames))
+        if not outcome.trouble:
+            self._adopt(outcome.value)
+        return outcome
 
-    def _at_known_place(self, request: Calibrate.Request) -> Callable[[], Calibrated]:
+    def _at_known_place(self, latitude: float, longitude: float, wanted: int) -> Callable[[], Calibrated]:
         """Make the job; StarposError if the request is wrong or the frames here do not suffice."""
-        latitude, longitude, most = request.latitude, request.longitude, self._values["calibration_frames"]
+        most = self._values["calibration_frames"]
         if not (abs(latitude) <= 90 and abs(longitude) <= 360):
             raise InstrumentError(
                 f"latitude {latitude:g}, longitude {longitude:g}: give those of the place, by gravity, in deg"
             )
-        if request.frames > most:
+        if wanted > most:
             raise FixError(
-                f"{request.frames} frames are more than are kept: give up to {most}, or raise calibration_frames"
+                f"{wanted} frames are more than are kept: give up to {most}, or raise calibration_frames"
             )
-        frames = self._recent.newest(request.frames or most)
-        if len(frames) < max(request.frames, 1):
-            asked = f" of {request.frames}" if request.frames else ""
+        frames = self._recent.newest(wanted or most)
+        if len(frames) < max(wanted, 1):
+            asked = f" of {wanted}" if wanted else ""
             raise FixError(
                 f"only {len(frames)}{asked} frames with stars and a tilt have arrived: wait for more, or ask for fewer"
             )
@@ -218,27 +217,15 @@ class Calibrating:
 
     # turning on the spot ---------------------------------------------------------------------------------------------
 
-    async def _on_self_calibrate(
-        self, request: SelfCalibrate.Request, response: SelfCalibrate.Response
-    ) -> SelfCalibrate.Response:
-        response.misalignment_deg, response.covariance_deg2 = [math.nan] * 3, [math.nan] * 9
-        response.latitude = response.longitude = response.plumb_stddev = math.nan
-        response.covariance = [math.nan] * 4
+    async def on_the_spot(self) -> tuple[Turned | None, str]:
+        """Find A3 and the place from the headings here, and use them unless the second says why not."""
         outcome = await self._asked_for(self._on_the_spot)
-        response.message = outcome.trouble
         if outcome.trouble:
-            return response
-        turned = outcome.value
-        response.message = self._why_not(turned, FEWEST_HEADINGS)
-        if not response.message:
-            self._adopt_turned(turned)
-            response.success, response.message = True, self._about
-        place = turned.place
-        response.headings = place.frames
-        response.plumb_stddev = turned.calibrated.plumb_stddev_arcsec / 3600
-        response.latitude, response.longitude = math.degrees(place.latitude), math.degrees(place.longitude)
-        response.covariance = place.covariance[:2, :2].ravel()
-        return _with_a3(response, turned.calibrated)
+            return None, outcome.trouble
+        why_not = self._why_not(outcome.value, FEWEST_HEADINGS)
+        if not why_not:
+            self._adopt_turned(outcome.value)
+        return outcome.value, why_not
 
     def _on_the_spot(self) -> Callable[[], Turned]:
         """Make the job; StarposError if there are too few poses or no solver."""
@@ -335,7 +322,7 @@ class Calibrating:
             return Outcome(trouble=outcome.trouble or changed)
         return outcome
 
-    def _run(self, job: Callable[[], object]) -> Future:
+    def _run(self, job: Callable[[], object]) -> Coming:
         self._running = self._worker.run(job)
         return self._running
 
@@ -366,11 +353,3 @@ def _about(found: Calibrated) -> str:
 
 def _headings(count: int) -> str:
     return f"{count} heading{'s' if count != 1 else ''}"
-
-
-def _with_a3(response: R, found: Calibrated) -> R:
-    """Fill the calibration into the response of a service."""
-    c = found.instrument.calibration
-    response.misalignment_deg = list(c.misalignment_deg)
-    response.covariance_deg2 = c.angle_covariance_deg2.ravel()
-    return response

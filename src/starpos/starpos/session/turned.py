@@ -9,7 +9,7 @@ from starpos.calibration.turning import turn
 from starpos.errors import FixError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
-from starpos_solver.memory import Seen, tilts_of
+from starpos.session.memory import Seen, tilts_of
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix.fix import Fix
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
+from starpos.session.memory import Seen
 from starpos.sky.site import Site, camera_to_enu
-from starpos_solver.memory import Seen
 
 T0 = 1_793_642_400.0
 NOISE = math.radians(0.0035)

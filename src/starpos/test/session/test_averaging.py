@@ -8,8 +8,8 @@ import pytest
 from fixes import fix_at, north_of
 
 from starpos.averaging.average import average
-from starpos_common.diagnostics import Level
-from starpos_solver.averaging import Averaging, News
+from starpos.diagnosis import Level
+from starpos.session.averaging import Averaging, News
 
 
 def averaging_of(fixes) -> Averaging:

@@ -32,7 +32,7 @@ class TiltPublishers:
         """Note a message; number: that of its publisher's messages, None where the middleware tells none."""
         mine = self._voice_of(frame_id, number) or _Voice(frame_id, number, now_s)
         mine.number, mine.heard_s = number, now_s
-        others = [v for v in self._voices if v is not mine and now_s - v.heard_s <= ALONE_S]
+        others = [v for v in self._voices if v is not mine and abs(now_s - v.heard_s) <= ALONE_S]
         self._voices = [*others, mine]
 
     def _voice_of(self, frame_id: str, number: int | None) -> _Voice | None:

@@ -13,8 +13,8 @@ from starpos.errors import GeoidError, InstrumentError
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos_common.parameters import FRAME_NAME, Parameter
-from starpos_common.paths import path_of
+from starpos.parameter import FRAME_NAME, Parameter
+from starpos.paths import path_of
 
 NAN = math.nan
 # Share by which the focal length of one camera may change.

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera in use, and the Solver for it."""
+
+from collections import deque
+from collections.abc import Callable
+
+from starpos.errors import InstrumentError
+from starpos.fix.solver import Solver
+from starpos.instrument.camera import Camera
+from starpos.job import Jobs, Outcome
+
+MOST_CHANGES = 1000
+
+
+class CameraSolver:
+    """Keeps the camera that frames are of, and makes its Solver as a job when it changes.
+
+    make: makes the Solver for a camera with the present parameters and calibration; it may raise a StarposError.
+    changed: called when the camera is another one.  say: takes a sentence about why there is no Solver.
+    topic: full name of the topic of the camera's intrinsics.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[Camera], Solver],
+        changed: Callable[[], None],
+        jobs: Jobs,
+        say: Callable[[str], None],
+        topic: str,
+    ) -> None:
+        self.camera: Camera | None = None
+        self.solver: Solver | None = None
+        # why there is no solver
+        self.trouble = ""
+        self._make, self._changed, self._jobs, self._say, self._topic = make, changed, jobs, say, topic
+        # cameras that hold from a stamp on which no frame has reached yet
+        self._changes: deque[tuple[float | None, Camera]] = deque(maxlen=MOST_CHANGES)
+
+    @property
+    def preparing(self) -> bool:
+        """Whether the triangles of a field are being built."""
+        return self._jobs.busy
+
+    @property
+    def solver_now(self) -> Solver:
+        """The solver; InstrumentError with the reason while there is none."""
+        if self.solver is not None:
+            return self.solver
+        waiting = f"{self._topic}: no camera calibration has arrived: start the camera"
+        if self.preparing:
+            waiting = "the triangles of this field are being built"
+        raise InstrumentError(self.trouble or waiting)
+
+    def take(self, camera: Camera, since_s: float | None, at_once: bool) -> None:
+        """Take a camera for the frames from a time on, or at once; the first one counts at once anyway."""
+        if camera == (self._changes[-1][1] if self._changes else self.camera):
+            return
+        if at_once or self.camera is None:
+            self._use(camera)
+        else:
+            self._changes.append((since_s, camera))
+
+    def go_on_to(self, mid_unix_s: float | None) -> None:
+        """Take the cameras into use that hold for a frame of that time."""
+        while self._changes and not self.preparing:
+            since_s, camera = self._changes[0]
+            if since_s is not None and mid_unix_s is not None and since_s > mid_unix_s:
+                return
+            self._changes.popleft()
+            self._use(camera)
+
+    def remake(self) -> None:
+        """Make the solver again with the present parameters and calibration."""
+        if self.camera is None or self.preparing:
+            return
+        if self.solver is None:
+            self._prepare(self.camera)
+        else:
+            self.solver = self._make(self.camera)
+
+    def _use(self, camera: Camera) -> None:
+        self.camera, self.solver, self.trouble = camera, None, ""
+        self._changed()
+        if not self.preparing:
+            self._prepare(camera)
+
+    def _prepare(self, camera: Camera) -> None:
+        """Prepare the triangles of this field as a job, because building them takes seconds."""
+
+        def work() -> Solver:
+            solver = self._make(camera)
+            solver.prepare(camera.width, camera.height)
+            return solver
+
+        self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
+
+    def _prepared(self, camera: Camera, made: Outcome) -> None:
+        if self.camera is not None and camera != self.camera:
+            # Another camera_info has come meanwhile.
+            self._prepare(self.camera)
+            return
+        self.solver, self.trouble = made.value, made.trouble
+        if self.trouble:
+            self._say(self.trouble)
+        else:
+            # The parameters may have changed meanwhile.
+            self.remake()

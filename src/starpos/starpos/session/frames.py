@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame in a session: while it waits, and what becomes of it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from starpos.averaging.average import Average
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution
+from starpos.frames.stars import Stars
+
+
+@dataclass(frozen=True)
+class Answered:
+    """What became of a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
+
+    no_camera: no camera calibration has arrived.
+    """
+
+    stamp: Any
+    solution: Solution
+    ground: Geodetic | None
+    no_camera: bool
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """The average that a frame is part of, with the stamp of its message."""
+
+    stamp: Any
+    place: Average
+    ground: Geodetic
+
+
+Output = Answered | Averaged
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame that waits: its message, and its stars with the error of their time.
+
+    since_s: when it came, by the clock in which waiting is counted.
+    ahead_s: how far the middle of its exposure was ahead of the session's clock then.
+    doubted: whether its stars contradict its time.
+    """
+
+    message: Any
+    stars: Stars
+    since_s: float
+    ahead_s: float
+    doubted: bool = False
+
+
+def ground_of(place: Fix | Average, vertical: Vertical) -> Geodetic:
+    """Convert a fix or an average to a geodetic position."""
+    return geodetic(place.latitude, place.longitude, place.heading, place.covariance, vertical)

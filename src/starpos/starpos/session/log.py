@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whom a session tells what it says and what it hears."""
+
+from typing import Protocol
+
+
+class Log(Protocol):
+    """Takes sentences, as rclpy's logger does; of an error, which is a defect, the traceback."""
+
+    def info(self, message: str) -> object: ...
+
+    def warning(self, message: str) -> object: ...
+
+    def error(self, message: str) -> object: ...
+
+
+class Heard(Protocol):
+    """Keeps account of the messages, by the relative name of their topic."""
+
+    def came(self, name: str) -> object: ...
+
+    def refuse(self, name: str, sentence: str) -> object: ...

@@ -1,0 +1,362 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solver's decisions: which camera and which tilts belong to a frame, how long it waits, what is made of it.
+
+A state machine without a clock or a thread of its own: it is told each message with the time it came at, or the time
+alone, and returns what to publish.  The node `solver` drives it with what ROS brings, replay.py with what a bag holds:
+the same messages at the same times give the same answers.
+"""
+
+import math
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+from starpos.earth.orientation import earth_state
+from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
+from starpos.fix.fix import Fix
+from starpos.fix.solver import Solution, Solver, Status
+from starpos.frames.stars import Stars
+from starpos.identification.hint import Hint
+from starpos.instrument.camera import Camera
+from starpos.job import Jobs
+from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
+from starpos.session import reports
+from starpos.session.calibrating import Calibrating
+from starpos.session.camera_solver import CameraSolver
+from starpos.session.clock_doubt import ClockDoubt
+from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
+from starpos.session.log import Heard, Log
+from starpos.session.memory import Seen
+from starpos.session.now import Now
+from starpos.session.settings import Settings
+from starpos.session.tilts import TiltBuffer
+from starpos.sky import catalogue
+
+# Most frames that wait for their tilts or for the triangles; older ones are dropped. Of recorded ones none should be.
+WAITING, WAITING_PLAYED = 4, 1000
+MOST_EARLY = 1000
+J2000_UNIX_S = 946_728_000.0
+# A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
+CLOCK_SIGMAS = 6.0
+# A clock that goes back by so much was set.
+STEP_S = 0.05
+CAMERA_TOPIC = "camera/camera_info"
+
+
+class SolverSession:
+    """An instrument's messages to its solutions.
+
+    jobs: makes who runs what takes long; when an Outcome has come, call `at`.
+    arrived: gives the tilts, with their numbers (see TiltPublishers), that have come but are not taken yet.
+    topic: full name of the topic of the camera's intrinsics, for sentences.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        jobs: Callable[[], Jobs],
+        heard: Heard,
+        log: Log,
+        *,
+        arrived: Callable[[], Iterable[tuple[Any, int | None]]] = tuple,
+        topic: str = CAMERA_TOPIC,
+    ) -> None:
+        self.latest: Waiting | None = None
+        self.answer: Solution | None = None
+        self.counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
+        self.tilts = TiltBuffer()
+        self.doubt = ClockDoubt()
+        self._settings, self._values = settings, settings.values
+        self._catalogue = catalogue.load_catalogue()
+        # This reads the tables of the Earth's rotation, so that the first frame is not slow.
+        earth_state(J2000_UNIX_S)
+        self._heard, self._log, self._arrived = heard, log, arrived
+        self._waiting: deque[Waiting] = deque()
+        # tilts ahead of a clock that may have been heard only after them
+        self._early: deque[Any] = deque(maxlen=MOST_EARLY)
+        self._was_s: float | None = None
+        self._ended = False
+        # from the last fix
+        self._hint: Hint | None = None
+        self._logged: object = None
+        self.instrument = CameraSolver(
+            self._make_solver,
+            self._other_camera,
+            jobs(),
+            lambda why: self._log_change(why, good=False),
+            topic,
+        )
+        self.calibrating = Calibrating(
+            settings, jobs(), lambda: self.instrument.solver_now, self.instrument.remake, log
+        )
+
+    def _make_solver(self, camera: Camera) -> Solver:
+        return self._settings.solver(camera, self.calibrating.found, self._catalogue)
+
+    def _other_camera(self) -> None:
+        self._hint = None
+        self.calibrating.camera_changed()
+
+    @property
+    def waits(self) -> bool:
+        """Whether a frame or a tilt waits for its time."""
+        return bool(self._waiting or self._early)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
+        return self.instrument.preparing or self.calibrating.busy
+
+    # parameters ------------------------------------------------------------------------------------------------------
+
+    def parameters_set(self, names: frozenset[str]) -> None:
+        """Apply a change of these parameters."""
+        if "clock_stddev" in names:
+            self.doubt.clear()
+        self.calibrating.parameters_set(names)
+        self.instrument.remake()
+
+    # inputs ----------------------------------------------------------------------------------------------------------
+
+    def take_camera(self, message: Any, now: Now) -> list[Output]:
+        """Take a CameraInfo.
+
+        Another camera's counts from now on; in recorded data from its stamp on, since it may be read before frames that
+        were taken before it.
+        """
+        made = self.at(now)
+        try:
+            camera = message_to_camera(message)
+        except StarposError as e:
+            if self.instrument.camera is None:
+                self.instrument.trouble = str(e)
+            self._heard.refuse("camera_info", str(e))
+            return made
+        self._heard.came("camera_info")
+        self.instrument.take(camera, stamp_to_unix(message.header.stamp), at_once=not now.played)
+        return made + self._work(now)
+
+    def take_tilt(self, message: Any, number: int | None, now: Now) -> list[Output]:
+        """Take a Tilt; number: that of its publisher's messages, None if there is none."""
+        made = self.at(now)
+        self._take_tilt(message, number, now)
+        return made + self._work(now)
+
+    def _take_tilt(self, message: Any, number: int | None, now: Now) -> None:
+        try:
+            self.tilts.heard(message, number, now.waiting_s)
+            ahead_s = now.ahead_s(stamp_to_unix(message.header.stamp))
+        except StarposError as e:
+            self._heard.refuse("tilt", str(e))
+            return
+        if now.played and ahead_s > reports.AHEAD_S:
+            self._early.append(message)
+        else:
+            self._add_tilt(message, now)
+
+    def _add_tilt(self, message: Any, now: Now) -> None:
+        """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
+        try:
+            if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
+                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
+            self.tilts.add(message, self._settings.tilt_stddev_rad)
+            self._heard.came("tilt")
+        except StarposError as e:
+            self._heard.refuse("tilt", str(e))
+
+    def take_stars(self, message: Any, now: Now) -> list[Output]:
+        """Take a StarArray."""
+        made = self.at(now)
+        self._heard.came("stars")
+        try:
+            stars = message_to_stars(message)
+            # If the user sets clock_stddev, it replaces the error that the camera's host states.
+            if not math.isnan(self._values["clock_stddev"]):
+                stars = replace(stars, clock_stddev_s=0.0)
+        except StarposError as e:
+            bad = Solution(
+                Status.BAD_INPUT,
+                str(e),
+                source="stars",
+                utc_unix_s=None,
+                stars_detected=len(message.stars),
+            )
+            return [*made, self._answered(message.header.stamp, bad, now)]
+        self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
+            self._waiting.popleft()
+            self.counts["dropped frames"] += 1
+        return made + self._work(now)
+
+    # time ------------------------------------------------------------------------------------------------------------
+
+    def at(self, now: Now) -> list[Output]:
+        """Go on to a time."""
+        self._ended = False
+        return self._on(now)
+
+    def end(self, now: Now) -> list[Output]:
+        """Answer the frames that wait, because nothing comes any more; again after a job."""
+        self._ended = True
+        return self._on(now)
+
+    def _on(self, now: Now) -> list[Output]:
+        was_s, self._was_s = self._was_s, now.unix_s
+        if was_s is not None and now.unix_s is not None:
+            if now.unix_s < was_s - STEP_S:
+                # The clock was set back: no tilt may be from the future.
+                self.tilts.forget_after(now.unix_s)
+            if now.unix_s > was_s:
+                early, self._early = self._early, deque(maxlen=MOST_EARLY)
+                for message in early:
+                    self._add_tilt(message, now)
+        return self._work(now)
+
+    # work ------------------------------------------------------------------------------------------------------------
+
+    def _work(self, now: Now) -> list[Output]:
+        """Solve the frames that have everything they need."""
+        made: list[Output] = []
+        while self._waiting:
+            self.instrument.go_on_to(self._waiting[0].stars.mid_unix_s)
+            if not self._ready(self._waiting[0], now):
+                break
+            # After a stall those are of the frame.
+            for message, number in self._arrived():
+                self._take_tilt(message, number, now)
+            made += self._solve(self._dated(self._waiting.popleft(), now), now)
+        return made
+
+    def _dated(self, frame: Waiting, now: Now) -> Waiting:
+        """The frame with how far it is ahead of a clock that is played, which may have been heard only after it."""
+        if not now.played:
+            return frame
+        return replace(frame, ahead_s=min(now.ahead_s(frame.stars.mid_unix_s), frame.ahead_s))
+
+    def _ready(self, frame: Waiting, now: Now) -> bool:
+        if self.instrument.preparing:
+            return False
+        if math.isnan(frame.since_s):
+            frame = self._waiting[0] = replace(frame, since_s=now.waiting_s)
+        mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
+        # less than none: the clock has begun anew
+        if mid is None or self._ended or waited_s > self._values["tilt_timeout"] or waited_s < 0:
+            return True
+        if self.instrument.solver is None:
+            return bool(self.instrument.trouble)
+        return self.tilts.complete(mid, self._span(frame.stars))
+
+    def _span(self, stars: Stars) -> float:
+        return stars.exposure_s or self._values["tilt_window"]
+
+    def _solve(self, frame: Waiting, now: Now) -> list[Output]:
+        answer = self._answer_to(frame, self._hint)
+        if answer.ok and answer.fix is not None:
+            frame, answer = self._with_doubt(frame, answer, answer.fix)
+        self.latest = frame
+        made: list[Output] = [self._answered(frame.message.header.stamp, answer, now)]
+        if self.instrument.solver is not None:
+            made += self._learn(frame, answer)
+        return made
+
+    def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
+        """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
+        stated_s = math.hypot(
+            self.instrument.solver_now.clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s
+        )
+        self.doubt.add(fix, stated_s)
+        if self.doubt.seconds <= stated_s:
+            return frame, answer
+        frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self.doubt.seconds), doubted=True)
+        if self.doubt.leans_otherwise:
+            return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
+        return frame, self._answer_to(frame, answer.hint)
+
+    def _answer_to(self, frame: Waiting, hint: Hint | None) -> Solution:
+        stars = frame.stars
+        try:
+            solver = self.instrument.solver_now
+            if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
+                raise TimeError(
+                    f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
+                )
+            return solver.solve(stars, lambda mid, *_: self.tilts.average(mid, self._span(stars)), hint)
+        except (InstrumentError, TimeError) as e:
+            return Solution.failed(stars, Status.BAD_INPUT, str(e))
+        except Exception as e:
+            # A defect costs this frame only; the session goes on.
+            self._log.error(traceback.format_exc())
+            return Solution.failed(
+                stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
+            )
+
+    def _learn(self, frame: Waiting, answer: Solution) -> list[Output]:
+        """Give a frame to the calibration and the average, even one that a stale calibration refuses.
+
+        A frame whose time is in doubt is left out.  Returns the average if it includes the frame.
+        """
+        stars = frame.stars
+        if stars.mid_unix_s is None or frame.doubted:
+            return []
+        if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
+            return []
+        try:
+            tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
+        except StarposError:
+            return []
+        try:
+            used = self.calibrating.learn(Seen(stars, tilt), answer.fix)
+            place = self.calibrating.average.place if used else None
+            if place is None:
+                return []
+            return [Averaged(frame.message.header.stamp, place, ground_of(place, self._settings.vertical))]
+        except Exception:
+            # Fix and heading go on without the average; data that cause a defect must not stay.
+            self._log.error(traceback.format_exc())
+            self.calibrating.forget()
+            return []
+
+    # outputs ---------------------------------------------------------------------------------------------------------
+
+    def _answered(self, stamp: Any, answer: Solution, now: Now) -> Answered:
+        if now.played:
+            # by the clock of recorded data no time passes
+            answer = replace(answer, identify_s=0.0, fix_s=0.0)
+        self.answer = answer
+        self.counts["frames"] += 1
+        self.counts["fixes"] += answer.ok
+        self._hint = answer.hint or self._hint
+        self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
+        return self._output(stamp, answer)
+
+    def _output(self, stamp: Any, answer: Solution) -> Answered:
+        no_camera = self.instrument.solver is None and self.instrument.camera is None
+        ground = None if answer.fix is None else ground_of(answer.fix, self._settings.vertical)
+        return Answered(stamp, answer, ground, no_camera)
+
+    def _log_change(self, sentence: str, good: bool, state: object = None) -> None:
+        state = state or sentence
+        if state == self._logged:
+            return
+        self._logged = state
+        if good:
+            self._log.info(sentence)
+        else:
+            self._log.warning(sentence)
+
+    def solve_again(self) -> Answered | None:
+        """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""
+        if self.latest is None:
+            return None
+        return self._output(self.latest.message.header.stamp, self._answer_to(self.latest, None))
+
+    def reset(self) -> None:
+        """Forget tilts, frames and the place, but no calibration that was found."""
+        self.tilts.clear()
+        self._waiting.clear()
+        self._early.clear()
+        self.latest = self.answer = self._hint = None
+        self.doubt.clear()
+        self.calibrating.forget()
