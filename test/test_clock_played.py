@@ -12,7 +12,7 @@ from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Solution
 from starpos_testing.graph.shots import EXPOSURE_S, SOLVER, START_S, scene_at, shot_of
 
-LATENCY_S = 0.5
+LATENCY_S, TICK_S = 0.5, 0.1
 
 
 class Played:
@@ -30,7 +30,7 @@ class Played:
         self.graph.stars.publish(stars)
 
         def answered():
-            now_s = START_S + at_s + EXPOSURE_S + LATENCY_S + 1e-3 * next(ticks)
+            now_s = START_S + at_s + EXPOSURE_S + LATENCY_S + TICK_S * next(ticks)
             self._clock.publish(Clock(clock=unix_to_stamp(now_s)))
             return stamp in self.graph.solutions
 

@@ -17,6 +17,7 @@ COMMANDS = {
     "solve": "position and heading of frames with their tilts",
     "detect": "the stars of frames",
     "identify": "where frames look, lost in space",
+    "replay": "recorded nights (rosbag2) by the solver's own code: the same fixes as in the running graph",
     "calibrate": "A3 at a known place, or the camera, from identified stars",
     "report": "nights on one page: stability, scatter, residuals, sky, error budget",
     "simulate": "write a night of frames and tilts from a place you choose",

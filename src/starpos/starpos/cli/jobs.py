@@ -23,6 +23,7 @@ AUTO = "auto"
 def add_jobs(parser: argparse.ArgumentParser) -> None:
     """Add the options that `workers_of` reads."""
     parser.add_argument(
+        "-j",
         "--jobs",
         type=_jobs,
         metavar="N|auto",

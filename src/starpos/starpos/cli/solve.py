@@ -171,9 +171,9 @@ def tell(
         else:
             common.complain("solve", answer.message)
         if args.json:
-            common.print_json({"file": path} | json_of(answer.fix, vertical) | _json_about(answer))
+            common.print_json({"file": path} | json_of(answer.fix, vertical) | json_about(answer))
         else:
-            print(_line(path, answer, args.self_calibrate), flush=True)
+            print(line_of(path, answer, args.self_calibrate), flush=True)
     common.tell_extrapolation("solve", solved)
     together = _combine(night, solved)
     if solved:
@@ -289,7 +289,8 @@ def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
     return terms
 
 
-def _json_about(s: Solution) -> dict:
+def json_about(s: Solution) -> dict:
+    """The keys of --json about the stars of a frame."""
     a = s.attitude
     return {
         "stars_detected": s.stars_detected,
@@ -301,7 +302,8 @@ def _json_about(s: Solution) -> dict:
     }
 
 
-def _line(path: str, s: Solution, turning: bool) -> str:
+def line_of(path: str, s: Solution, turning: bool) -> str:
+    """The line of a frame; turning: its place waits for the other headings."""
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     # one frame of a turn does not tell A3, so its own place would be 1100 km wide

@@ -17,10 +17,11 @@ def load(path: Path, what: str) -> Any:
         text = files.read_regular(path, MOST_BYTES)
     except OSError as e:
         raise InstrumentError(f"{path}: not a readable {what} ({e.strerror})") from None
-    return _parsed(text, f"{path}: not a readable {what}")
+    return parse(text, f"{path}: not a readable {what}")
 
 
-def _parsed(text: bytes, complaint: str) -> Any:
+def parse(text: bytes | str, complaint: str) -> Any:
+    """Read YAML without aliases; InstrumentError that begins with the complaint if it is none."""
     import yaml
 
     class Loader(yaml.SafeLoader):

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starpos.earth.vertical import Deflection
-from starpos.errors import FrameError, InstrumentError, TiltError
+from starpos.errors import InstrumentError, TiltError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog
 from starpos.progress import Progress
-from starpos.recording.bag import PACKAGE, BagReader
+from starpos.recording.bag import BagReader
+from starpos.recording.instruments import INPUTS, SOLUTION, STARS, TILT, instrument_in
 from starpos.recording.messages import UNUSABLE, message_to_camera, message_to_tilt
 from starpos.report.folder import truth_in
 from starpos.report.night import Shot, Truth
@@ -22,9 +23,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 SUFFIXES = (".mcap", ".db3")
-STARS, TILT, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Tilt", "Solution"))
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-TOPICS = {"stars": STARS, "tilt": TILT, "solver/solution": SOLUTION, "camera/camera_info": CAMERA_INFO}
+TOPICS = INPUTS | {"solver/solution": SOLUTION}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,22 +95,7 @@ def star_lists(r: Recorded) -> Iterator[Any]:
 
 def _instrument(bag: BagReader, path: Path, namespace: str | None) -> "tuple[str, Sequence[Connection]]":
     """Namespace and connections of the instrument; raises FrameError if it is not there or one of several."""
-    found: dict[str, list[Connection]] = {}
-    for c in bag.connections:
-        for suffix, kind in TOPICS.items():
-            if c.msgtype == kind and c.topic.endswith(f"/{suffix}"):
-                found.setdefault(c.topic.removesuffix(suffix).rstrip("/") or "/", []).append(c)
-    able = sorted(
-        n for n, cs in found.items() if any(c.msgtype in (STARS, SOLUTION) and c.msgcount for c in cs)
-    )
-    if not able:
-        raise FrameError(
-            f"{path}: neither stars nor solver/solution are in it: record stars, tilt and camera/camera_info"
-        )
-    wanted = "/" + namespace.strip("/") if namespace is not None else able[0]
-    if wanted not in able or (namespace is None and len(able) > 1):
-        raise FrameError(f"{path}: the instruments in it are {', '.join(able)}: choose one with --namespace")
-    return wanted, found[wanted]
+    return instrument_in(bag, path, namespace, TOPICS, (STARS, SOLUTION))
 
 
 class _Reading:

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos replay`: what the node `solver` makes of recorded nights, by the node's own code, without ROS."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from starpos.averaging.average import Average
+from starpos.calibration.unknown import unknown_a3
+from starpos.cli import common, jobs
+from starpos.cli.archive import NightFolder
+from starpos.cli.solve import NO_FIX, Solved, json_about, json_of, line_of, print_combined
+from starpos.earth.vertical import Vertical
+from starpos.errors import StarposError
+from starpos.fix.solver import Solution
+from starpos.instrument.instrument import Calibration
+from starpos.session.frames import Answered, Averaged
+from starpos.session.parameter_file import settings_of
+from starpos.session.replay import Replay
+from starpos.utc import utc_text
+
+
+def define(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "bags",
+        nargs="+",
+        metavar="BAG",
+        help="a rosbag2 with stars, tilts and camera_info: a folder or a file",
+    )
+    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
+    parser.add_argument(
+        "--params-file",
+        type=Path,
+        metavar="YAML",
+        help="parameters of the node solver, as ROS's files have them",
+    )
+    parser.add_argument(
+        "-p",
+        "--param",
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help="a parameter of the node solver, such as misalignment_stddev:=5.0; it counts more than the file's",
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object a frame instead of a table")
+    jobs.add_jobs(parser)
+    parser.set_defaults(run=run)
+
+
+@dataclass
+class Night:
+    """What came of a bag: its solutions, the average of its place, what was said; trouble: why it broke off."""
+
+    solutions: list[Solution] = field(default_factory=list)
+    average: Average | None = None
+    said: list[str] = field(default_factory=list)
+    trouble: str = ""
+
+    @property
+    def summary(self) -> str:
+        """How many frames there were, and what came of them."""
+        fixes = sum(s.fix is not None for s in self.solutions)
+        return f"{len(self.solutions)} frames, {len(self.solutions)} answers, {fixes} fixes"
+
+
+class _Said:
+    """Keeps each sentence of a session once."""
+
+    def __init__(self, night: Night) -> None:
+        self._said = night.said
+
+    def came(self, name: str) -> None:
+        """Nothing is said of a sound message."""
+
+    def refuse(self, name: str, sentence: str) -> None:
+        self.error(sentence)
+
+    def info(self, message: str) -> None:
+        """Fixes speak for themselves."""
+
+    def warning(self, message: str) -> None:
+        """The frame's own line tells it."""
+
+    def error(self, message: str) -> None:
+        if message not in self._said:
+            self._said.append(message)
+
+
+@dataclass(frozen=True)
+class Playing:
+    """The work on one bag, for any process."""
+
+    params_file: Path | None
+    given: Sequence[str]
+    namespace: str | None
+
+    def __call__(self, bag: str) -> Night:
+        night = Night()
+        said = _Said(night)
+        replay = Replay(settings_of(self.params_file, self.given), said, said)
+        try:
+            for output in replay.play(Path(bag), self.namespace):
+                if isinstance(output, Answered):
+                    night.solutions.append(_light(output.solution))
+                elif isinstance(output, Averaged):
+                    night.average = output.place
+        except StarposError as error:
+            night.trouble = str(error)
+        return night
+
+
+def _light(solution: Solution) -> Solution:
+    """A solution without what only its solver needs."""
+    return replace(solution, hint=None)
+
+
+def run(args: argparse.Namespace) -> int:
+    settings = settings_of(args.params_file, args.param)
+    work = Playing(args.params_file, tuple(args.param), args.namespace)
+    with jobs.workers_of(args, len(args.bags)) as workers:
+        answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags))
+        return max(
+            tell(args, bag, night, settings.vertical, settings.calibration(None))
+            for bag, night in zip(args.bags, answers, strict=True)
+        )
+
+
+def tell(
+    args: argparse.Namespace, bag: str, night: Night, vertical: Vertical, calibration: Calibration
+) -> int:
+    """Print the solutions of a bag and the average of its place; returns the exit status."""
+    for sentence in night.said:
+        common.complain("replay", f"{bag}: {sentence}")
+    solved: list[Solved] = []
+    for solution in night.solutions:
+        if solution.fix:
+            solved.append(Solved.of(solution, solution.fix))
+        else:
+            common.complain("replay", f"{bag}: {solution.message}")
+        time = "a frame" if solution.utc_unix_s is None else utc_text(solution.utc_unix_s)
+        if args.json:
+            about = {"file": bag} | json_of(solution.fix, vertical) | json_about(solution)
+            common.print_json(about)
+        else:
+            print(line_of(f"{bag} {time}", solution, turning=False), flush=True)
+    common.tell_extrapolation("replay", solved)
+    if solved:
+        if night.average and (unknown := unknown_a3(calibration, night.average.covariance)):
+            common.complain("replay", f"{bag}: {unknown}")
+        warnings = {warning for s in night.solutions for warning in s.warnings}
+        whole = NightFolder((), None, bag if len(args.bags) > 1 else None)
+        print_combined(whole, night.average, solved, warnings, args, vertical)
+    common.complain("replay", f"{bag}: {night.trouble or night.summary}")
+    return common.UNREADABLE if night.trouble else 0 if solved else NO_FIX

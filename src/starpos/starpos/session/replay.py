@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded night through a session, as the node `solver` works it when `replay` plays the bag to it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from starpos.errors import BagError
+from starpos.job import JobsInTurn
+from starpos.recording.bag import BagReader
+from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
+from starpos.session.frames import Output
+from starpos.session.log import Heard, Log
+from starpos.session.now import Now
+from starpos.session.session import SolverSession
+from starpos.session.settings import Settings
+
+# The latest time that ROS can hold.
+LAST_NS = (2**31 - 1) * 10**9
+
+
+class Replay:
+    """A session whose messages come from a bag, each at the time it was recorded at."""
+
+    def __init__(self, settings: Settings, heard: Heard, log: Log) -> None:
+        self._jobs: list[JobsInTurn] = []
+        self._log = log
+        self.session = SolverSession(settings, self._new_jobs, heard, log)
+
+    def _new_jobs(self) -> JobsInTurn:
+        self._jobs.append(JobsInTurn(self._log.error))
+        return self._jobs[-1]
+
+    def play(self, path: Path, namespace: str | None = None) -> Iterator[Output]:
+        """Yield what the solver publishes of a bag; namespace: the instrument's, None where there is only one.
+
+        Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
+        """
+        session, tilts, now_ns = self.session, 0, 0
+        with BagReader(path, typed=True) as bag:
+            _, connections = instrument_in(bag, path, namespace, INPUTS, (STARS,))
+            for connection, log_ns, message in bag.decoded(connections):
+                check_log_time(path, connection.topic, log_ns)
+                # Time never goes back, even if the times of a bag's messages do.
+                now_ns = max(now_ns, log_ns)
+                now = Now.in_data(now_ns * 1e-9)
+                if connection.msgtype == TILT:
+                    tilts += 1
+                    yield from session.take_tilt(message, tilts, now)
+                elif connection.msgtype == STARS:
+                    yield from session.take_stars(message, now)
+                else:
+                    yield from session.take_camera(message, now)
+                yield from self._settled(now)
+        now = Now.in_data(now_ns * 1e-9)
+        yield from session.end(now)
+        while session.busy:
+            yield from self._settled(now)
+            yield from session.end(now)
+
+    def _settled(self, now: Now) -> Iterator[Output]:
+        while self.session.busy:
+            for jobs in self._jobs:
+                jobs.work()
+            yield from self.session.at(now)
+
+
+def check_log_time(path: Any, topic: str, log_ns: int) -> None:
+    """Raise BagError if a message was recorded at no time that ROS can hold."""
+    if not 0 <= log_ns <= LAST_NS:
+        raise BagError(f"{path}: a message of {topic} was logged at {log_ns} ns, no time until 2038")
