@@ -3,6 +3,7 @@
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -19,9 +21,11 @@ from starpos.frames.frame import Frame
 from starpos.recording.messages import message_to_frame, message_to_shutter
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
+from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
+from starpos_common.replayed import Replayed, Take
 from starpos_common.topics import publisher, subscription
 from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
@@ -68,6 +72,7 @@ class DetectorNode(Node):
         self._frames = self._bad = self._dropped = 0
         # Sequence number of the last image; None: the middleware gives none.
         self._sequence: int | None = None
+        self._replayed: Replayed | None = None
         self._troubles = Troubles(self)
         self._complaint = ""  # about a frame since the last report
         self._last: DetectedFrame | None = None
@@ -85,11 +90,22 @@ class DetectorNode(Node):
 
     def listen(self) -> None:
         """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
-        self._captures_come = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=steady, autostart=False)
-        images = subscription(self, Image, "camera/image_raw", self._on_image, IMAGE_DEPTH)
+        takes: dict[str, Take] = {"camera/capture": self._on_capture, "camera/image_raw": self._on_image}
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        if time_is_simulated(self):
+            clock = self.get_clock()
+            self._replayed = Replayed(self, takes, "stars", busy=lambda: not self._worker.idle)
+        self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=clock, autostart=False)
+        self._captures_come = self._subscribe(Capture, "camera/capture", takes, CAPTURES_KEPT)
+        images = self._subscribe(Image, "camera/image_raw", takes, IMAGE_DEPTH)
         self._where = f" on {images.topic_name}"
+
+    def _subscribe(self, kind: type, name: str, takes: Mapping[str, Take], depth: int) -> Subscription:
+        def on_message(message: Any, info: Mapping[str, Any]) -> None:
+            if self._replayed is None or not self._replayed.holds(name, message, info):
+                takes[name](message, info)
+
+        return subscription(self, kind, name, on_message, depth)
 
     def destroy_node(self) -> None:
         self._worker.stop()
@@ -133,14 +149,14 @@ class DetectorNode(Node):
     def _apply(self, names: frozenset[str]) -> None:
         self._settings = self._detection_settings()
 
-    def _on_capture(self, message: Capture) -> None:
+    def _on_capture(self, message: Capture, info: Mapping[str, Any]) -> None:
         if len(self._captures) >= CAPTURES_KEPT:
             del self._captures[next(iter(self._captures))]
         self._captures[_key(message.header)] = message
         if self._held is not None and _key(self._held.header) == _key(message.header):
             self._go_on()
 
-    def _on_image(self, message: Image, info: dict[str, Any]) -> None:
+    def _on_image(self, message: Image, info: Mapping[str, Any]) -> None:
         self._count_overwritten(info["publication_sequence_number"])
         try:
             _check_stamp(message.header)
@@ -154,6 +170,9 @@ class DetectorNode(Node):
         self._held = Job(frame, message.header)
         # At the first image the sender's Captures may not have been discovered yet.
         expected = self._last_frame_s is None or self._captures_come.get_publisher_count()
+        if self._replayed is not None and self._replayed.playing:
+            # It was played before its image, or is not in the bag.
+            expected = False
         if expected and _key(message.header) not in self._captures:
             self._late.reset()
         else:
@@ -210,6 +229,8 @@ class DetectorNode(Node):
             if isinstance(result, DetectedFrame):
                 self._publisher.publish(result.message)
                 self._frames += 1
+                if self._replayed is not None:
+                    self._replayed.made += 1
                 self._troubles.right("frames")
                 if result.frame is not None:
                     self._annotator.take(result.frame, result.detection.stars, result.message.header)
@@ -220,6 +241,8 @@ class DetectorNode(Node):
                 # A defect costs this frame only; the node goes on.
                 kind = type(result).__name__
                 self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
+        if self._replayed is not None:
+            self._replayed.go_on()
 
     def _complain(self, sentence: str) -> None:
         self._bad += 1

@@ -2,6 +2,7 @@
 """Inputs of the solver: when messages came, and which were refused."""
 
 import time
+from collections.abc import Mapping
 
 from rclpy.node import Node
 
@@ -31,13 +32,14 @@ class Inputs:
         self.refused += 1
         self._troubles.wrong(name, sentence)
 
-    def report(self, tilts_kept: int) -> Diagnosis:
-        """Make the diagnostic `Inputs`."""
+    def report(self, tilts_kept: int, dropped: Mapping[str, int]) -> Diagnosis:
+        """Make the diagnostic `Inputs`; dropped: messages that were lost on the way, by topic."""
         now = time.monotonic()
         ages_s = {name: now - came for name, came in self._came_s.items()}
         missing = [name for name in NAMES if ages_s.get(name, STALE_S) >= STALE_S]
         values: dict[str, object] = {f"{name} age (s)": age for name, age in ages_s.items()}
         values |= {"tilts kept": tilts_kept, "refused": self.refused}
+        values |= {f"{name} dropped": count for name, count in dropped.items()}
         refusals = self._troubles.lately(STALE_S)
         if missing:
             return Diagnosis(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)

@@ -10,17 +10,20 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
 from starpos.session import reports
-from starpos.session.frames import Output
+from starpos.session.frames import Answered, Output
 from starpos.session.now import Now
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
+from starpos_common.dropped import Dropped
 from starpos_common.job import JobRunner
+from starpos_common.replayed import Replayed, Take
 from starpos_common.topics import subscription
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
@@ -31,6 +34,7 @@ from starpos_solver.settings import SolverSettings
 
 POLL_S = 0.02
 TILT_QUEUE = 1000
+PLAY_SLOWER = "their frames have other fixes, or none. Play it slower, or by `ros2 run starpos_bringup replay`, which drops none"
 TICK = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1))
 
 
@@ -43,6 +47,8 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._inputs = Inputs(self)
+        self._dropped = Dropped(self, PLAY_SLOWER)
+        self._replayed: Replayed | None = None
         self._session = SolverSession(
             self._settings,
             lambda: JobRunner(self, self._go_on),
@@ -60,9 +66,23 @@ class SolverNode(Node):
 
     def _connect(self) -> None:
         self._outputs = SolutionPublishers(self, self._settings)
-        subscription(self, CameraInfo, CAMERA_TOPIC, self._on_camera, 10)
-        self._tilt_subscription = subscription(self, msg.Tilt, "tilt", self._on_tilt, TILT_QUEUE)
-        subscription(self, msg.StarArray, "stars", self._on_stars, 10)
+        session = self._session
+        takes: dict[str, Take] = {
+            CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
+            "tilt": lambda m, info: self._publish(session.take_tilt(m, _number(info), self._now())),
+            "stars": lambda m, _: self._publish(session.take_stars(m, self._now())),
+        }
+        if time_is_simulated(self):
+            self._replayed = Replayed(
+                self,
+                takes,
+                "solver/solution",
+                busy=lambda: session.busy,
+                end=lambda: self._publish(session.end(self._now())),
+            )
+        self._subscribe(CameraInfo, CAMERA_TOPIC, takes, 10)
+        self._tilts = self._subscribe(msg.Tilt, "tilt", takes, TILT_QUEUE)
+        self._subscribe(msg.StarArray, "stars", takes, 10)
         self.create_service(Solve, "solver/solve", self._on_solve)
         self.create_service(Trigger, "solver/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -71,10 +91,9 @@ class SolverNode(Node):
             POLL_S, self._go_on, callback_group=group, clock=self._steady, autostart=False
         )
         self._tick = self.get_clock().create_jump_callback(TICK, post_callback=lambda _: self._go_on())
-        session = self._session
         tasks = {
             "Solution": self._report_solution,
-            "Inputs": lambda: self._inputs.report(len(session.tilts)),
+            "Inputs": lambda: self._inputs.report(len(session.tilts), self._dropped.counts),
             "Clock": self._report_clock,
             "Conditions": self._report_conditions,
             "Calibration": session.calibrating.report,
@@ -89,38 +108,51 @@ class SolverNode(Node):
     # inputs ----------------------------------------------------------------------------------------------------------
 
     def _now(self) -> Now:
+        if self._replayed is not None and self._replayed.playing:
+            return Now.in_data(self._replayed.unix_s)
         now_ns = self.get_clock().now().nanoseconds
         unix_s = now_ns * 1e-9 if now_ns else None
         if time_is_simulated(self):
             return Now.in_data(unix_s)
         return Now(unix_s, self._steady.now().nanoseconds * 1e-9)
 
-    def _on_camera(self, message: CameraInfo) -> None:
-        self._publish(self._session.take_camera(message, self._now()))
+    def _subscribe(self, kind: type, name: str, takes: Mapping[str, Take], depth: int) -> Subscription:
+        def on_message(message: Any, info: Mapping[str, Any]) -> None:
+            if self._replayed is None or not self._replayed.holds(name, message, info):
+                self._note_dropped(name, info)
+                takes[name](message, info)
 
-    def _on_tilt(self, message: msg.Tilt, info: Mapping[str, Any]) -> None:
-        self._publish(self._session.take_tilt(message, _number(info), self._now()))
+        return subscription(self, kind, name, on_message, depth)
 
-    def _on_stars(self, message: msg.StarArray) -> None:
-        self._publish(self._session.take_stars(message, self._now()))
+    def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
+        if time_is_simulated(self):
+            self._dropped.came(name, info)
 
     def _arrived_tilts(self) -> Iterator[tuple[msg.Tilt, int | None]]:
-        """Read the tilts that have arrived but wait for the executor."""
-        handle = self._tilt_subscription.handle
+        """Read the tilts that have arrived but wait for the executor; in a replay they wait for their turn."""
+        if self._replayed is not None and self._replayed.playing:
+            return
+        handle = self._tilts.handle
         with handle:
             for _ in range(TILT_QUEUE):
                 taken = handle.take_message(msg.Tilt, False)
                 if taken is None:
                     return
+                self._note_dropped("tilt", taken[1])
                 yield taken[0], _number(taken[1])
 
     def _go_on(self) -> None:
         """Go on with the frames that wait, because time has passed or a job is done."""
         self._publish(self._session.at(self._now()))
+        if self._replayed is not None:
+            self._replayed.go_on()
 
     def _publish(self, outputs: list[Output]) -> None:
         for output in outputs:
             self._outputs.publish(output)
+            if self._replayed is not None and isinstance(output, Answered):
+                self._replayed.made += 1
+                self._replayed.fixes += output.solution.ok
         # poll only while a frame waits; where the clock is played, its ticks do
         waits = self._session.waits and not time_is_simulated(self)
         if waits and self._poll.is_canceled():

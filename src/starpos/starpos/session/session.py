@@ -188,6 +188,10 @@ class SolverSession:
         while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
             self._waiting.popleft()
             self.counts["dropped frames"] += 1
+            if now.played:
+                self._heard.refuse(
+                    "stars", f"a frame was dropped: over {WAITING_PLAYED} wait for their tilts"
+                )
         return made + self._work(now)
 
     # time ------------------------------------------------------------------------------------------------------------

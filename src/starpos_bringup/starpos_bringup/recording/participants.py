@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes that take part in a replay, as the player sees them (starpos_common/replayed.py is their side)."""
+
+import random
+import time
+from collections.abc import Callable
+
+from builtin_interfaces.msg import Time
+from rclpy.node import Node
+
+from starpos_common.replayed import DEPTH, LATCHED, PLAYED, TAKEN
+from starpos_interfaces.msg import Played, Taken
+
+# A node that says nothing for so long has ended, or hangs; they speak once a second.
+SILENCE_S = 30.0
+# A node that waits for so long for a message that was published has lost it.
+LOST_S = 30.0
+
+
+class _Participant:
+    """A node: its last words, when they came, since when it has taken nothing new, and what it had made before."""
+
+    def __init__(self, words: Taken) -> None:
+        self.before = words
+        self.gone = False
+        self.hear(words)
+        self.stands_since_s = time.monotonic()
+
+    def hear(self, words: Taken) -> None:
+        self.heard_s = time.monotonic()
+        known: Taken | None = getattr(self, "words", None)
+        if known is None or words.busy or (words.replay, words.index) != (known.replay, known.index):
+            self.stands_since_s = self.heard_s
+        self.words = words
+
+
+class Participants:
+    """Tells them what is played, and knows what each has taken.
+
+    say: takes a sentence for the person at the terminal.
+    """
+
+    def __init__(self, node: Node, say: Callable[[str], None]) -> None:
+        self._node, self._say = node, say
+        self._heard: dict[str, _Participant] = {}
+        self._replay = self._index = 0
+        # whether one was lost on the way
+        self.lost = False
+        self._publisher = node.create_publisher(Played, PLAYED, DEPTH)
+        node.create_subscription(Taken, TAKEN, self._on_taken, LATCHED)
+
+    def _on_taken(self, words: Taken) -> None:
+        if words.node in self._heard:
+            self._heard[words.node].hear(words)
+        else:
+            self._heard[words.node] = _Participant(words)
+
+    @property
+    def _present(self) -> list[_Participant]:
+        return [p for p in self._heard.values() if not p.gone]
+
+    def all_here(self) -> bool:
+        """Whether each node that is known to take part has been heard, and hears us."""
+        known = self._node.count_publishers(TAKEN)
+        return 0 < known <= len(self._present) <= self._publisher.get_subscription_count()
+
+    def taking(self, topic: str) -> list[_Participant]:
+        """Those that take a topic."""
+        return [p for p in self._present if topic in p.words.takes]
+
+    def made_of(self, topic: str) -> list[tuple[str, int]]:
+        """The topics on which others publish what they make of this one's messages, and how many so far."""
+        return [(p.words.makes, p.words.made) for p in self.taking(topic)]
+
+    def answers(self, topic: str) -> tuple[int, int]:
+        """How many answers and fixes have come of the messages of a topic since the player began."""
+        theirs = [p for p in self._heard.values() if topic in p.words.takes]
+        made = sum(p.words.made - p.before.made for p in theirs)
+        return made, sum(p.words.fixes - p.before.fixes for p in theirs)
+
+    def begin(self) -> None:
+        """Begin a replay: those that are here now are waited for."""
+        self._replay, self._index = random.getrandbits(63), -1
+        self.tell(Played.BEGIN, 0, answer=True)
+
+    def tell(
+        self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool = False
+    ) -> None:
+        """Say what is played."""
+        self._index += 1
+        sec, nanosec = divmod(now_ns, 10**9)
+        self._publisher.publish(
+            Played(
+                replay=self._replay,
+                index=self._index,
+                kind=kind,
+                time=Time(sec=sec, nanosec=nanosec),
+                topic=topic,
+                stamp=stamp or Time(),
+                answer=answer,
+            )
+        )
+
+    def have_taken_all(self) -> bool:
+        """Whether all that was told is taken by all who are still there."""
+        for p in self._present:
+            if (p.words.replay, p.words.index) == (self._replay, self._index):
+                continue
+            now_s, name = time.monotonic(), p.words.node
+            if now_s - p.heard_s > SILENCE_S:
+                p.gone = self.lost = True
+                self._say(f"{name} has not been heard for {SILENCE_S:.0f} s: it goes on without it")
+            elif now_s - p.stands_since_s > LOST_S:
+                p.gone = self.lost = True
+                self._say(f"a message was lost on its way to {name}: it goes on without it")
+            else:
+                return False
+        return True

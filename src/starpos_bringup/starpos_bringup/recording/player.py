@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishes the messages of a bag at the wanted pace, each frame when the one before is worked off."""
+
+import sys
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+
+from starpos_bringup.recording.bag import Topic
+from starpos_bringup.recording.participants import Participants
+from starpos_interfaces.msg import Played
+
+STARS, IMAGE = "starpos_interfaces/msg/StarArray", "sensor_msgs/msg/Image"
+CLOCK_PERIOD_S = 0.025
+ACKNOWLEDGED_S = 3.0
+# So many messages are on their way at most: queues hold some hundred.
+BURST = 50
+# Where nobody takes part nobody says what is taken: at rate 0 listeners get so long to empty their queues.
+BURST_REST_S = 0.05
+BEGIN_S = 30.0
+
+
+class Player:
+    """Publishes the topics of a bag, and has the nodes that take part take them one after another.
+
+    frames: of those that were published, or made of others, how many a solver could answer.
+    """
+
+    def __init__(
+        self,
+        topics: Iterable[Topic],
+        rate: float,
+        stopped: list[int],
+        contexts: tuple[Context, Context],
+        say: Callable[[str], None],
+    ) -> None:
+        self.count = self.broken = self.frames = 0
+        self._rate, self._stopped, self._say = rate, stopped, say
+        self._node, self._frame_node = (
+            Node(name, context=context, start_parameter_services=False, enable_rosout=False)
+            for name, context in zip(("replay", "replay_frames"), contexts, strict=True)
+        )
+        self._executor = SingleThreadedExecutor(context=contexts[0])
+        self._executor.add_node(self._node)
+        self._clock = self._node.create_publisher(Clock, "/clock", 10)
+        topics = list(topics)
+        self._publishers = {t.name: self._publisher(t) for t in topics}
+        self._frame_topics = [t.name for t in topics if t.type_name in (STARS, IMAGE)]
+        # those of star lists, which a solver answers
+        self._star_topics = {t.name for t in topics if t.type_name == STARS}
+        self._participants = Participants(self._node, say)
+        self._now_ns: int | None = None
+        self._show = sys.stderr.isatty()
+        self._shown_s = 0.0
+
+    def _publisher(self, topic: Topic) -> Publisher:
+        # An image may have 42 MB.
+        large = topic.type_name.endswith("Image")
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
+        profile = QoSProfile(depth=2 if large else 1000, durability=durability)
+        return (self._frame_node if large else self._node).create_publisher(topic.kind, topic.name, profile)
+
+    @property
+    def answers(self) -> tuple[int, int]:
+        """How many answers and fixes the solvers have given."""
+        told = [self._participants.answers(topic) for topic in sorted(self._star_topics)]
+        return max((a for a, _ in told), default=0), max((f for _, f in told), default=0)
+
+    @property
+    def lost(self) -> bool:
+        """Whether a node that took part did not take all."""
+        return self._participants.lost
+
+    def wait(self, at_most_s: float, *, for_solver: bool) -> None:
+        """Wait until all who listen are found, or the time is over; then report missing ones and other publishers.
+
+        for_solver: wait for nodes that take part, too, from the frames to the solver.
+        """
+        self._spin(at_most_s, lambda: self._all_listen() and (not for_solver or self._chain()))
+        # who takes part may not be heard yet, and who listens not be found
+        self._spin(at_most_s, self._all_found)
+        heard = [n for n in self._frame_topics if self._publishers[n].get_subscription_count()]
+        if self._frame_topics and not heard and not self._stopped:
+            self._say(
+                f"nobody subscribes to {', '.join(self._frame_topics)}: start detector or solver in its namespace, with "
+                "use_sim_time, or remap (--ros-args -r)"
+            )
+        elif self._frame_topics and not any(map(self._participants.taking, heard)):
+            self._say(
+                f"those who subscribe to {', '.join(heard)} do not say what they take: start detector and solver with "
+                "use_sim_time"
+            )
+        doubled = [n for n in self._publishers if self._node.count_publishers(n) > 1 and not self._is_made(n)]
+        if doubled:
+            self._say(
+                f"{', '.join(doubled)} is published by another node too: both are heard; --topics leaves it out"
+            )
+
+    def _all_listen(self) -> bool:
+        every = [*self._publishers.values(), self._clock]
+        return all(p.get_subscription_count() for p in every)
+
+    def _chain(self) -> bool:
+        """Whether somebody takes the frames, and somebody the star lists that are made of them."""
+        makers = {makes for n in self._frame_topics for makes, _ in self._participants.made_of(n)}
+        solvers = [*self._star_topics, *makers]
+        return bool(makers) and any(map(self._participants.taking, solvers))
+
+    def _all_found(self) -> bool:
+        """Whether all whom the graph knows to listen do."""
+        if self._node.count_publishers("/replay/taken") and not self._participants.all_here():
+            return False
+        return all(
+            p.get_subscription_count() >= self._node.count_subscribers(name)
+            for name, p in self._publishers.items()
+        )
+
+    def _is_made(self, name: str) -> bool:
+        return any(name == makes for n in self._frame_topics for makes, _ in self._participants.made_of(n))
+
+    def start_round(self) -> None:
+        """Begin a replay with those who take part."""
+        self._now_ns: int | None = None
+        self._first_ns: int | None = None
+        self._participants.begin()
+        self._taken(BEGIN_S)
+        self._begin_s = time.monotonic()
+
+    def end_round(self) -> None:
+        """End it, and let the last messages arrive before the publishers go."""
+        self._participants.tell(Played.END, self._now_ns or 0, answer=True)
+        if self._stopped:
+            return
+        self._taken()
+        for publisher in (*self._publishers.values(), self._clock):
+            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
+
+    def play(self, topic: Topic, log_ns: int, data: bytes) -> None:
+        """Publish one message when its time has come; a broken one is counted and left out."""
+        try:
+            message = deserialize_message(data, topic.kind)
+        except Exception:
+            # Besides RMWError, hostile bytes may cause any error of a conversion.
+            self.broken += 1
+            if self.broken == 1:
+                self._say(f"a message of {topic.name} is broken and left out, as are others like it")
+            return
+        self._pace(log_ns)
+        if self._stopped:
+            return
+        before = self._participants.made_of(topic.name) if topic.type_name == IMAGE else []
+        self._publishers[topic.name].publish(data)
+        self.count += 1
+        made = False
+        if self._participants.taking(topic.name):
+            made = self._agree(topic, message.header.stamp, before)
+        elif self._rate == 0 and self.count % BURST == 0:
+            self._spin(BURST_REST_S)
+        self.frames += topic.type_name in (STARS, IMAGE) and not made
+        self._progress()
+
+    def _agree(self, topic: Topic, stamp: Any, before: list[tuple[str, int]]) -> bool:
+        """Have those who take part take a message, and what they make of it; return whether they made something."""
+        frame = topic.type_name in (STARS, IMAGE)
+        answer = frame or self.count % BURST == 0
+        self._tell(topic.name, stamp, answer)
+        if not answer:
+            return False
+        self._taken()
+        made_any = False
+        after = dict(self._participants.made_of(topic.name))
+        for makes, made in before:
+            for _ in range(after.get(makes, made) - made):
+                made_any = True
+                self._star_topics.add(makes)
+                self.frames += 1
+                self._tell(makes, stamp, answer=True)
+                self._taken()
+        return made_any
+
+    def _tell(self, topic: str, stamp: Any, answer: bool) -> None:
+        assert self._now_ns is not None
+        self._participants.tell(Played.MESSAGE, self._now_ns, topic, stamp, answer=answer)
+
+    def _taken(self, at_most_s: float | None = None) -> None:
+        """Wait until all is taken that was told; whoever hangs is given up by then."""
+        while not self._participants.have_taken_all() and not self._stopped:
+            if not self._spin(at_most_s or 1.0, self._participants.have_taken_all) and at_most_s:
+                return
+
+    def _pace(self, log_ns: int) -> None:
+        if self._first_ns is None:
+            self._first_ns = log_ns
+        while self._rate and not self._stopped:
+            # Time never goes back within a round, even if the times of a bag's messages do.
+            elapsed_ns = max(log_ns - self._first_ns, 0)
+            left_s = self._begin_s + elapsed_ns * 1e-9 / self._rate - time.monotonic()
+            if left_s <= 0:
+                break
+            self._spin(min(left_s, CLOCK_PERIOD_S))
+            passed_ns = int((time.monotonic() - self._begin_s) * self._rate * 1e9)
+            self._tick(min(self._first_ns + passed_ns, log_ns))
+        self._tick(log_ns)
+
+    def _tick(self, now_ns: int) -> None:
+        if self._now_ns is not None and now_ns <= self._now_ns:
+            return
+        self._now_ns = now_ns
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+        self._clock.publish(message)
+
+    def _spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        end = time.monotonic() + seconds
+        while not self._stopped and not until():
+            left_s = end - time.monotonic()
+            if left_s <= 0:
+                return False
+            self._executor.spin_once(timeout_sec=min(left_s, 0.05))
+        return True
+
+    def _progress(self) -> None:
+        if self._now_ns is None or self._first_ns is None:
+            return
+        if self._show and time.monotonic() - self._shown_s >= 1.0:
+            self._shown_s = time.monotonic()
+            self._say(f"{(self._now_ns - self._first_ns) * 1e-9:.0f} s of the bag, {self.count} messages")
+
+    def close(self) -> None:
+        """End the nodes."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._frame_node.destroy_node()

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node's part in a replay: it takes the messages in the order in which they were played, and says so.
+
+No order holds between the topics of ROS, and a clock that is played is a topic of its own.  So the player
+(starpos_bringup's `replay`) says on /replay/played what it has published and when that was recorded; a node whose time
+is simulated holds each message back until its turn, and answers on /replay/taken.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from starpos_interfaces.msg import Played, Taken
+
+PLAYED, TAKEN = "/replay/played", "/replay/taken"
+# Many more than a player publishes before it waits for an answer.
+DEPTH = 5000
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+HEARTBEAT_S = 1.0
+
+# A message, and what the middleware tells of it.
+Take = Callable[[Any, Mapping[str, Any]], object]
+
+
+class Replayed:
+    """Holds back the messages of a replay until it is their turn.
+
+    takes: what takes the messages of a topic, by its relative name.  makes: relative name of the topic of what comes of
+    a frame; count it in `made` and `fixes`.  end: called when no more messages come.  busy: whether the node still works
+    on what it has taken; call `go_on` when it does no more.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        takes: Mapping[str, Take],
+        makes: str,
+        busy: Callable[[], bool],
+        end: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.made = self.fixes = 0
+        self.unix_s: float | None = None
+        self._node, self._busy, self._end = node, busy, end
+        self._names = {name: node.resolve_topic_name(name) for name in takes}
+        self._takes = {self._names[name]: take for name, take in takes.items()}
+        self._makes = node.resolve_topic_name(makes)
+        self._replay = self._index = 0
+        self._playing = False
+        self._turns: deque[Played] = deque()
+        self._taking: Played | None = None
+        self._held: dict[str, deque[tuple[Any, Mapping[str, Any]]]] = {}
+        node.create_subscription(Played, PLAYED, self._on_played, DEPTH)
+        self._publisher = node.create_publisher(Taken, TAKEN, LATCHED)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._heartbeat = node.create_timer(HEARTBEAT_S, self._beat, clock=steady)
+        self._say()
+
+    @property
+    def playing(self) -> bool:
+        """Whether a replay is under way: `unix_s` is its time, None before its first message."""
+        return self._playing
+
+    def holds(self, name: str, message: Any, info: Mapping[str, Any]) -> bool:
+        """Keep a message of a topic until its turn; False if no replay is under way."""
+        if not self._playing:
+            return False
+        self._held.setdefault(self._names[name], deque(maxlen=DEPTH)).append((message, info))
+        self.go_on()
+        return True
+
+    def go_on(self) -> None:
+        """Take all messages whose turn it is."""
+        while not self._busy():
+            if self._taking is not None:
+                self._done(self._taking)
+            if not self._turns or not self._take(self._turns[0]):
+                return
+
+    def _on_played(self, turn: Played) -> None:
+        if turn.kind == Played.BEGIN:
+            self._leave()
+            self._replay, self._playing = turn.replay, True
+        if turn.replay == self._replay and self._playing:
+            self._turns.append(turn)
+            self.go_on()
+
+    def _take(self, turn: Played) -> bool:
+        """Take a turn; False if its message has not come yet, or if it goes on after a job."""
+        take = self._takes.get(turn.topic)
+        held = self._of(turn) if take else None
+        if take and held is None:
+            return False
+        if turn.kind != Played.BEGIN:
+            self.unix_s = (turn.time.sec * 10**9 + turn.time.nanosec) * 1e-9
+        if take and held is not None:
+            self._turns.popleft()
+            self._taking = turn
+            take(*held)
+            return True
+        if turn.kind == Played.END:
+            self._end()
+            if self._busy():
+                return False
+        self._turns.popleft()
+        self._taking = turn
+        return True
+
+    def _of(self, turn: Played) -> tuple[Any, Mapping[str, Any]] | None:
+        """The message of a turn, if it has come."""
+        held = self._held.get(turn.topic, ())
+        for k, (message, _) in enumerate(held):
+            if message.header.stamp == turn.stamp:
+                found = held[k]
+                del held[k]
+                return found
+        return None
+
+    def _done(self, turn: Played) -> None:
+        self._taking, self._index = None, turn.index
+        if turn.kind == Played.END:
+            self._leave()
+        if turn.answer:
+            self._say()
+
+    def _leave(self) -> None:
+        self._playing, self._taking, self.unix_s = False, None, None
+        self._turns.clear()
+        self._held.clear()
+
+    def _beat(self) -> None:
+        # A player that was killed will not end it.
+        if self._playing and not self._node.count_publishers(PLAYED):
+            self._leave()
+        self._say()
+
+    def _say(self) -> None:
+        self._publisher.publish(
+            Taken(
+                node=self._node.get_fully_qualified_name(),
+                replay=self._replay,
+                index=self._index,
+                busy=self._busy(),
+                takes=sorted(self._takes),
+                makes=self._makes,
+                made=self.made,
+                fixes=self.fixes,
+            )
+        )
