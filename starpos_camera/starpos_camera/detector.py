@@ -94,7 +94,7 @@ class DetectorNode(Node):
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         if time_is_simulated(self):
             clock = self.get_clock()
-            self._replayed = Replayed(self, takes, "stars", busy=lambda: not self._worker.idle)
+            self._replayed = Replayed(self, takes, [self._publisher], busy=lambda: not self._worker.idle)
         self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=clock, autostart=False)
         self._captures_come = self._subscribe(Capture, "camera/capture", takes, CAPTURES_KEPT)
         images = self._subscribe(Image, "camera/image_raw", takes, IMAGE_DEPTH)

@@ -34,7 +34,9 @@ from starpos_solver.settings import SolverSettings
 
 POLL_S = 0.02
 TILT_QUEUE = 1000
-PLAY_SLOWER = "their frames have other fixes, or none. Play it slower, or by `ros2 run starpos_bringup replay`, which drops none"
+PLAY_SLOWER = (
+    "play it slower, or by `ros2 run starpos_bringup replay`; frames without them have other fixes, or none"
+)
 TICK = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1))
 
 
@@ -76,7 +78,7 @@ class SolverNode(Node):
             self._replayed = Replayed(
                 self,
                 takes,
-                "solver/solution",
+                self._outputs.publishers,
                 busy=lambda: session.busy,
                 end=lambda: self._publish(session.end(self._now())),
             )

@@ -3,6 +3,7 @@
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
@@ -23,6 +24,11 @@ class SolutionPublishers:
         self._fix_averaged = publisher(node, NavSatFix, "fix_averaged", 10)
         self._imu = publisher(node, Imu, "heading/imu", 10)
         self._solution = publisher(node, msg.Solution, "solver/solution", 10)
+
+    @property
+    def publishers(self) -> tuple[Publisher, ...]:
+        """Those of all topics, the solution's first."""
+        return self._solution, self._fix, self._fix_averaged, self._imu
 
     def publish(self, output: Output) -> None:
         """Publish what a session made."""

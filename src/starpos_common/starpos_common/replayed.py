@@ -6,13 +6,15 @@ No order holds between the topics of ROS, and a clock that is played is a topic 
 is simulated holds each message back until its turn, and answers on /replay/taken.
 """
 
+import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from starpos_interfaces.msg import Played, Taken
@@ -21,7 +23,8 @@ PLAYED, TAKEN = "/replay/played", "/replay/taken"
 # Many more than a player publishes before it waits for an answer.
 DEPTH = 5000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-HEARTBEAT_S = 1.0
+# How often it is looked at whether there is something new to say.
+HEARTBEAT_S, LOOK_S = 1.0, 0.1
 
 # A message, and what the middleware tells of it.
 Take = Callable[[Any, Mapping[str, Any]], object]
@@ -30,16 +33,17 @@ Take = Callable[[Any, Mapping[str, Any]], object]
 class Replayed:
     """Holds back the messages of a replay until it is their turn.
 
-    takes: what takes the messages of a topic, by its relative name.  makes: relative name of the topic of what comes of
-    a frame; count it in `made` and `fixes`.  end: called when no more messages come.  busy: whether the node still works
-    on what it has taken; call `go_on` when it does no more.
+    takes: what takes the messages of a topic, by its relative name.
+    makes: the publishers, the first that of what comes of a frame; count it in `made` and `fixes`.
+    busy: whether the node still works on what it has taken; call `go_on` when it does no more.
+    end: called when no more messages come.
     """
 
     def __init__(
         self,
         node: Node,
         takes: Mapping[str, Take],
-        makes: str,
+        makes: Sequence[Publisher],
         busy: Callable[[], bool],
         end: Callable[[], object] = lambda: None,
     ) -> None:
@@ -48,7 +52,7 @@ class Replayed:
         self._node, self._busy, self._end = node, busy, end
         self._names = {name: node.resolve_topic_name(name) for name in takes}
         self._takes = {self._names[name]: take for name, take in takes.items()}
-        self._makes = node.resolve_topic_name(makes)
+        self._makes = makes
         self._replay = self._index = 0
         self._playing = False
         self._turns: deque[Played] = deque()
@@ -57,7 +61,9 @@ class Replayed:
         node.create_subscription(Played, PLAYED, self._on_played, DEPTH)
         self._publisher = node.create_publisher(Taken, TAKEN, LATCHED)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._heartbeat = node.create_timer(HEARTBEAT_S, self._beat, clock=steady)
+        self._heartbeat = node.create_timer(LOOK_S, self._beat, clock=steady)
+        self._said_s = 0.0
+        self._listeners = 0
         self._say()
 
     @property
@@ -112,7 +118,7 @@ class Replayed:
 
     def _of(self, turn: Played) -> tuple[Any, Mapping[str, Any]] | None:
         """The message of a turn, if it has come."""
-        held = self._held.get(turn.topic, ())
+        held = self._held.get(turn.topic, deque())
         for k, (message, _) in enumerate(held):
             if message.header.stamp == turn.stamp:
                 found = held[k]
@@ -136,9 +142,13 @@ class Replayed:
         # A player that was killed will not end it.
         if self._playing and not self._node.count_publishers(PLAYED):
             self._leave()
-        self._say()
+        listeners = sum(p.get_subscription_count() for p in self._makes)
+        if listeners != self._listeners or time.monotonic() - self._said_s > HEARTBEAT_S:
+            self._listeners = listeners
+            self._say()
 
     def _say(self) -> None:
+        self._said_s = time.monotonic()
         self._publisher.publish(
             Taken(
                 node=self._node.get_fully_qualified_name(),
@@ -146,7 +156,8 @@ class Replayed:
                 index=self._index,
                 busy=self._busy(),
                 takes=sorted(self._takes),
-                makes=self._makes,
+                makes=[p.topic_name for p in self._makes],
+                listeners=self._listeners,
                 made=self.made,
                 fixes=self.fixes,
             )

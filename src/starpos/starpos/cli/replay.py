@@ -49,7 +49,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 @dataclass
-class Night:
+class PlayedNight:
     """What came of a bag: its solutions, the average of its place, what was said; trouble: why it broke off."""
 
     solutions: list[Solution] = field(default_factory=list)
@@ -67,7 +67,7 @@ class Night:
 class _Said:
     """Keeps each sentence of a session once."""
 
-    def __init__(self, night: Night) -> None:
+    def __init__(self, night: PlayedNight) -> None:
         self._said = night.said
 
     def came(self, name: str) -> None:
@@ -95,8 +95,8 @@ class Playing:
     given: Sequence[str]
     namespace: str | None
 
-    def __call__(self, bag: str) -> Night:
-        night = Night()
+    def __call__(self, bag: str) -> PlayedNight:
+        night = PlayedNight()
         said = _Said(night)
         replay = Replay(settings_of(self.params_file, self.given), said, said)
         try:
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def tell(
-    args: argparse.Namespace, bag: str, night: Night, vertical: Vertical, calibration: Calibration
+    args: argparse.Namespace, bag: str, night: PlayedNight, vertical: Vertical, calibration: Calibration
 ) -> int:
     """Print the solutions of a bag and the average of its place; returns the exit status."""
     for sentence in night.said:

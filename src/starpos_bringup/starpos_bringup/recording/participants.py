@@ -60,9 +60,12 @@ class Participants:
         return [p for p in self._heard.values() if not p.gone]
 
     def all_here(self) -> bool:
-        """Whether each node that is known to take part has been heard, and hears us."""
-        known = self._node.count_publishers(TAKEN)
-        return 0 < known <= len(self._present) <= self._publisher.get_subscription_count()
+        """Whether each node that is known to take part has been heard, hears us, and has found who listens to it."""
+        known, here = self._node.count_publishers(TAKEN), self._present
+        listeners = (sum(map(self._node.count_subscribers, p.words.makes)) for p in here)
+        return known <= len(here) <= self._publisher.get_subscription_count() and all(
+            p.words.listeners >= number for p, number in zip(here, listeners, strict=True)
+        )
 
     def taking(self, topic: str) -> list[_Participant]:
         """Those that take a topic."""
@@ -70,7 +73,7 @@ class Participants:
 
     def made_of(self, topic: str) -> list[tuple[str, int]]:
         """The topics on which others publish what they make of this one's messages, and how many so far."""
-        return [(p.words.makes, p.words.made) for p in self.taking(topic)]
+        return [(p.words.makes[0], p.words.made) for p in self.taking(topic)]
 
     def answers(self, topic: str) -> tuple[int, int]:
         """How many answers and fixes have come of the messages of a topic since the player began."""

@@ -27,6 +27,8 @@ BURST = 50
 # Where nobody takes part nobody says what is taken: at rate 0 listeners get so long to empty their queues.
 BURST_REST_S = 0.05
 BEGIN_S = 30.0
+# Those who never will hear, because they want another quality of service, must not stop it.
+FOUND_S = 10.0
 
 
 class Player:
@@ -87,7 +89,7 @@ class Player:
         """
         self._spin(at_most_s, lambda: self._all_listen() and (not for_solver or self._chain()))
         # who takes part may not be heard yet, and who listens not be found
-        self._spin(at_most_s, self._all_found)
+        self._spin(min(at_most_s, FOUND_S), self._all_found)
         heard = [n for n in self._frame_topics if self._publishers[n].get_subscription_count()]
         if self._frame_topics and not heard and not self._stopped:
             self._say(
@@ -117,9 +119,7 @@ class Player:
 
     def _all_found(self) -> bool:
         """Whether all whom the graph knows to listen do."""
-        if self._node.count_publishers("/replay/taken") and not self._participants.all_here():
-            return False
-        return all(
+        return self._participants.all_here() and all(
             p.get_subscription_count() >= self._node.count_subscribers(name)
             for name, p in self._publishers.items()
         )
@@ -129,7 +129,7 @@ class Player:
 
     def start_round(self) -> None:
         """Begin a replay with those who take part."""
-        self._now_ns: int | None = None
+        self._now_ns = None
         self._first_ns: int | None = None
         self._participants.begin()
         self._taken(BEGIN_S)

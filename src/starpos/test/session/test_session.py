@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A session told the messages of a recorded night: what waits for what, and that only the data count."""
+
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rosbags")
+
+from starpos.fix.solver import Status
+from starpos.job import JobsInTurn
+from starpos.recording.bag import BagReader
+from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
+from starpos.session.frames import Answered
+from starpos.session.now import Now
+from starpos.session.parameter_file import settings_of
+from starpos.session.replay import Replay
+from starpos.session.session import SolverSession
+
+NIGHT = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
+if not NIGHT.is_dir():
+    pytest.skip("the recorded night is not beside this package", allow_module_level=True)
+KNOWN = ("misalignment:=[0.31,-0.22,0.53]", "misalignment_stddev:=0.1", "refraction.pressure:=66000.0",
+         "refraction.temperature:=-4.0", "refraction.humidity:=0.4")  # fmt: skip
+
+
+class Said:
+    """Keeps what a session says."""
+
+    def __init__(self):
+        self.refused, self.errors = [], []
+
+    def came(self, name):
+        pass
+
+    def refuse(self, name, sentence):
+        self.refused.append((name, sentence))
+
+    def info(self, message):
+        pass
+
+    warning = info
+
+    def error(self, message):
+        self.errors.append(message)
+
+
+class Told:
+    """A session that is told messages, and its jobs, which are done when a test says so."""
+
+    def __init__(self, *parameters):
+        self.said, self.jobs = Said(), []
+        self.session = SolverSession(
+            settings_of(None, (*KNOWN, *parameters)), self._new, self.said, self.said
+        )
+
+    def _new(self):
+        self.jobs.append(JobsInTurn(self.said.error))
+        return self.jobs[-1]
+
+    def tell(self, kind, message, at_s, played=True):
+        now = Now.in_data(at_s) if played else Now(at_s, at_s)
+        if kind == TILT:
+            return self.session.take_tilt(message, None, now)
+        return (self.session.take_stars if kind == STARS else self.session.take_camera)(message, now)
+
+    def at(self, at_s):
+        return self.session.at(Now.in_data(at_s))
+
+    def work(self, at_s):
+        for jobs in self.jobs:
+            jobs.work()
+        return self.at(at_s)
+
+
+@pytest.fixture(scope="module")
+def messages():
+    """(type, message, time it was recorded at) of the night."""
+    with BagReader(NIGHT, typed=True) as bag:
+        _, connections = instrument_in(bag, NIGHT, None, INPUTS, (STARS,))
+        return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in bag.decoded(connections)]
+
+
+@pytest.fixture(scope="module")
+def begin_s(messages):
+    return messages[0][2]
+
+
+def first(messages, kind):
+    return next((message, at_s) for k, message, at_s in messages if k == kind)
+
+
+@pytest.fixture
+def told(messages, begin_s):
+    """A session with its camera and its triangles."""
+    told = Told()
+    told.tell(CAMERA_INFO, first(messages, CAMERA_INFO)[0], begin_s)
+    told.work(begin_s)
+    return told
+
+
+def tilts_of(messages, end_s):
+    return [(message, at_s) for kind, message, at_s in messages if kind == TILT and at_s < end_s]
+
+
+def test_a_frame_without_tilts_waits_by_the_clock_of_the_data(told, messages):
+    stars, came_s = first(messages, STARS)
+    assert told.tell(STARS, stars, came_s) == []
+    assert told.at(came_s + 0.49) == []
+    [answer] = told.at(came_s + 0.51)
+    assert answer.solution.status is Status.NO_TILT
+
+
+def test_a_frame_is_answered_with_its_last_tilt(told, messages):
+    stars, came_s = first(messages, STARS)
+    tilts = tilts_of(messages, came_s)
+    assert told.tell(STARS, stars, came_s) == []
+    made = []
+    for tilt, _ in tilts:
+        assert not made
+        made = told.tell(TILT, tilt, came_s + 0.1)
+        if made:
+            break
+    assert made[0].solution.ok and made[0].solution.tilt.samples == 5
+
+
+def test_the_end_answers_what_waits(told, messages):
+    stars, came_s = first(messages, STARS)
+    told.tell(STARS, stars, came_s)
+    [answer] = told.session.end(Now.in_data(came_s))
+    assert answer.solution.status is Status.NO_TILT and not told.session.waits
+
+
+def test_a_clock_that_begins_anew_keeps_no_frame(told, messages):
+    stars, came_s = first(messages, STARS)
+    told.tell(STARS, stars, came_s)
+    assert [type(made) for made in told.at(came_s - 100.0)] == [Answered]
+
+
+def test_another_camera_counts_from_its_stamp_on_though_it_is_read_before(told, messages):
+    stars, came_s = first(messages, STARS)
+    info = deepcopy(first(messages, CAMERA_INFO)[0])
+    info.header.stamp.sec += 5
+    info.width, info.height = 1000, 700
+    told.tell(CAMERA_INFO, info, came_s)
+    for tilt, _ in tilts_of(messages, came_s):
+        told.tell(TILT, tilt, came_s)
+    made = told.tell(STARS, stars, came_s)
+    assert made[0].solution.ok
+    later = deepcopy(stars)
+    later.header.stamp.sec += 5
+    assert told.tell(STARS, later, came_s + 5.0) == []
+    # its triangles are a job
+    assert told.session.busy and told.session.instrument.camera.width == 1000
+
+
+def test_live_another_camera_counts_at_once(told, messages, begin_s):
+    info = deepcopy(first(messages, CAMERA_INFO)[0])
+    info.width = 1000
+    told.tell(CAMERA_INFO, info, begin_s, played=False)
+    assert told.session.instrument.camera.width == 1000
+
+
+def test_tilts_ahead_of_a_played_clock_wait_for_its_next_tick(told, messages, begin_s):
+    tilt = deepcopy(tilts_of(messages, begin_s + 60.0)[0][0])
+    tilt.header.stamp.sec += 5
+    told.tell(TILT, tilt, begin_s)
+    assert not told.said.refused and not len(told.session.tilts)
+    told.at(begin_s + 5.0)
+    assert len(told.session.tilts) == 1
+    tilt.header.stamp.sec += 50
+    told.tell(TILT, tilt, begin_s + 6.0)
+    told.at(begin_s + 7.0)
+    assert "before its time" in told.said.refused[0][1]
+
+
+def answers_of(messages, delay):
+    """The solutions of a night that turns, with jobs that are done so many messages after they were begun."""
+    told, made, left = Told("self_calibration:=true"), [], 0
+    for kind, message, at_s in messages:
+        made += told.tell(kind, message, at_s)
+        if told.session.busy:
+            left = left or delay
+            left -= 1
+            if not left:
+                made += told.work(at_s)
+    end = Now.in_data(messages[-1][2])
+    made += told.session.end(end)
+    while told.session.busy:
+        made += told.work(end.unix_s)
+        made += told.session.end(end)
+    assert not told.said.errors
+    return [m.solution for m in made if isinstance(m, Answered)], told.session.calibrating.found
+
+
+def test_how_long_a_job_takes_does_not_matter_to_recorded_frames(messages):
+    (quick, found), (slow, found_slowly) = answers_of(messages, 1), answers_of(messages, 120)
+    assert found is not None and found == found_slowly
+    assert len(quick) == len(slow) == 10
+    for a, b in zip(quick, slow, strict=True):
+        assert (a.status, a.fix and a.fix.latitude, a.fix and a.fix.longitude) == (
+            b.status,
+            b.fix and b.fix.latitude,
+            b.fix and b.fix.longitude,
+        )
+
+
+def test_a_replay_twice_is_the_same():
+    def played():
+        said = Said()
+        return [
+            repr(replace(m, stamp=None)) for m in Replay(settings_of(None, KNOWN), said, said).play(NIGHT)
+        ]
+
+    assert played() == played() and len(played()) == 20
