@@ -43,6 +43,8 @@ class Participants:
     def __init__(self, node: Node, say: Callable[[str], None]) -> None:
         self._node, self._say = node, say
         self._heard: dict[str, _Participant] = {}
+        # those of this replay; None before it begins. Who comes later takes part in the next.
+        self._members: list[_Participant] | None = None
         self._replay = self._index = 0
         # whether one was lost on the way
         self.lost = False
@@ -57,7 +59,8 @@ class Participants:
 
     @property
     def _present(self) -> list[_Participant]:
-        return [p for p in self._heard.values() if not p.gone]
+        known = self._heard.values() if self._members is None else self._members
+        return [p for p in known if not p.gone]
 
     def all_here(self) -> bool:
         """Whether each node that is known to take part has been heard, hears us, and has found who listens to it."""
@@ -82,7 +85,8 @@ class Participants:
         return made, sum(p.words.fixes - p.before.fixes for p in theirs)
 
     def begin(self) -> None:
-        """Begin a replay: those that are here now are waited for."""
+        """Begin a replay with those that are here now."""
+        self._members = list(self._heard.values())
         self._replay, self._index = random.getrandbits(63), -1
         self.tell(Played.BEGIN, 0, answer=True)
 
