@@ -23,11 +23,9 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
-
 from starpos_testing.domain import own_domain
 from starpos_testing.patience import WAIT_S
+from starpos_testing.skies.bags import part_of
 
 NIGHT = Path(__file__).resolve().parents[2] / "test" / "data" / "night"
 SECONDS = 10
@@ -48,18 +46,6 @@ class Outcome:
     messages: tuple[int, ...] = ()
     digest: str = ""
     trouble: str = ""
-
-
-def part_of_night(folder: Path, begin_s: float) -> Path:
-    """Write so many seconds of the night as a bag of its own."""
-    with AnyReader([NIGHT]) as reader, Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        begin_ns = reader.start_time + round(begin_s * 1e9)
-        made = {}
-        for c, log_ns, data in reader.messages(start=begin_ns, stop=begin_ns + SECONDS * 10**9):
-            if c.topic not in made:
-                made[c.topic] = writer.add_connection(c.topic, c.msgtype, typestore=reader.typestore)
-            writer.write(made[c.topic], log_ns, data)
-    return folder
 
 
 def parameters() -> list[str]:
@@ -169,7 +155,7 @@ def main() -> int:
         other.start()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            bag = part_of_night(Path(folder) / "bag", BEGIN_S[options.inputs])
+            bag = part_of(NIGHT, Path(folder) / "bag", BEGIN_S[options.inputs], SECONDS)
             return compare(bag, options, context)
     finally:
         for other in others:

@@ -54,7 +54,7 @@ class Replayed:
         self._takes = {self._names[name]: take for name, take in takes.items()}
         self._makes = makes
         self._replay = self._index = 0
-        self._playing = False
+        self._playing = self._player_there = False
         self._turns: deque[Played] = deque()
         self._taking: Played | None = None
         self._held: dict[str, deque[tuple[Any, Mapping[str, Any]]]] = {}
@@ -139,8 +139,9 @@ class Replayed:
         self._held.clear()
 
     def _beat(self) -> None:
-        # A player that was killed will not end it.
-        if self._playing and not self._node.count_publishers(PLAYED):
+        # A player that was killed will not end it. It may be heard before the graph knows it.
+        before, self._player_there = self._player_there, bool(self._node.count_publishers(PLAYED))
+        if self._playing and before and not self._player_there:
             self._leave()
         listeners = sum(p.get_subscription_count() for p in self._makes)
         if listeners != self._listeners or time.monotonic() - self._said_s > HEARTBEAT_S:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -21,6 +22,17 @@ def typestore():
     for text in MESSAGES.glob("*.msg"):
         store.register(get_types_from_msg(text.read_text(), f"starpos_interfaces/msg/{text.stem}"))
     return store
+
+
+def part_of(bag: Path, folder: Path, begin_s: float, seconds: float) -> Path:
+    """Write a part of a bag, from so many seconds after its beginning, as a bag of its own."""
+    with AnyReader([bag]) as reader, Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        begin_ns, made = reader.start_time + round(begin_s * 1e9), {}
+        for c, log_ns, data in reader.messages(start=begin_ns, stop=begin_ns + round(seconds * 1e9)):
+            if c.topic not in made:
+                made[c.topic] = writer.add_connection(c.topic, c.msgtype, typestore=reader.typestore)
+            writer.write(made[c.topic], log_ns, data)
+    return folder
 
 
 class NightBag:

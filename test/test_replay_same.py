@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same bag gives the same answers: by our player, by another's, and by the command line without ROS."""
+
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import NavSatFix
+from std_srvs.srv import Trigger
+
+from starpos.session.frames import Answered
+from starpos.session.parameter_file import settings_of
+from starpos.session.replay import Replay
+from starpos_bringup.recording.bag import Bag
+from starpos_common.messages import unix_to_stamp
+from starpos_interfaces.msg import Tilt
+from starpos_testing.patience import WAIT_S
+from starpos_testing.skies.bags import part_of
+
+NIGHT = Path(__file__).parent / "data" / "night"
+SOAK = Path(__file__).parent.parent / "tools" / "soaks" / "soak_replay.py"
+KNOWN = ("refraction.pressure:=66000.0", "refraction.temperature:=-4.0", "refraction.humidity:=0.4",
+         "misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=0.1")  # fmt: skip
+CLOCK_S = 0.025  # between ticks, as `ros2 bag play --clock` does
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return part_of(NIGHT, tmp_path_factory.mktemp("bag") / "bag", 0.0, 10.0)
+
+
+class Quiet:
+    """Whom a session may tell anything."""
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
+@pytest.fixture(scope="module")
+def expected(bag):
+    """(fixes, averages) of the bag without ROS, by stamp; angles in deg."""
+    fixes, averages = {}, {}
+    for made in Replay(settings_of(None, KNOWN), Quiet(), Quiet()).play(bag):
+        kept = fixes if isinstance(made, Answered) else averages
+        ground = made.ground
+        kept[made.stamp.sec, made.stamp.nanosec] = (
+            math.degrees(ground.latitude),
+            math.degrees(ground.longitude),
+            *ground.covariance[:2, :2].ravel().tolist(),
+        )
+    assert len(fixes) == len(averages) == 2
+    return fixes, averages
+
+
+def told(message: NavSatFix):
+    c = message.position_covariance
+    return message.latitude, message.longitude, c[0], c[1], c[3], c[4]
+
+
+@pytest.fixture(scope="module")
+def averages(graph, tmp_path_factory):
+    """A solver whose time is simulated; the averages that it publishes."""
+    heard = graph.hear(NavSatFix, "fix_averaged")
+    log = tmp_path_factory.mktemp("solver") / "log"
+    graph.start(log, "starpos_solver", "solver", "use_sim_time:=true", *KNOWN)
+    graph.wait_for_solver()
+    return heard
+
+
+@pytest.fixture
+def nothing_known(graph, averages):
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    graph.solutions.clear(), graph.fixes.clear(), averages.clear()
+
+
+def check(graph, averages, expected):
+    fixes, means = expected
+    graph.wait(lambda: len(graph.fixes) == len(fixes) and len(averages) == len(means), "for all fixes")
+    assert {stamp: told(messages[0]) for stamp, messages in graph.fixes.items()} == fixes
+    stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for m in averages]
+    assert dict(zip(stamps, map(told, averages), strict=True)) == means
+
+
+@pytest.mark.usefixtures("nothing_known")
+@pytest.mark.parametrize("rate", ["0", "10"])
+def test_the_player_and_the_command_line_agree_to_the_last_bit(graph, run, bag, averages, expected, rate):
+    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--rate", rate, "--inputs", "stars"))
+    assert replay.wait() == 0, replay.output
+    assert "2 frames, 2 answers, 2 fixes" in replay.output
+    check(graph, averages, expected)
+
+
+def play_as_others_do(graph, bag, rate):
+    """Publish a bag and /clock and ask nobody, as `ros2 bag play --clock`."""
+    clock = graph.node.create_publisher(Clock, "/clock", QoSProfile(depth=1))
+    with Bag(bag) as opened:
+        topics = opened.topics(None, print)
+        publishers = {
+            t.name: graph.node.create_publisher(t.kind, t.name, QoSProfile(depth=1000))
+            for t in topics.values()
+        }
+        every = (*publishers.values(), clock)
+        graph.wait(lambda: all(p.get_subscription_count() for p in every), "for who listens")
+        begin_s, first_ns = time.monotonic(), None
+        for topic, log_ns, data in opened.messages(topics):
+            first_ns = log_ns if first_ns is None else first_ns
+            due_s = begin_s + (log_ns - first_ns) * 1e-9 / rate
+            while time.monotonic() < due_s:
+                graph.comes(lambda: False, min(CLOCK_S, max(due_s - time.monotonic(), 0.0)))
+                passed_s = (time.monotonic() - begin_s) * rate
+                clock.publish(Clock(clock=unix_to_stamp(first_ns * 1e-9 + passed_s)))
+            publishers[topic.name].publish(data)
+    # theirs, too, stay until all has arrived
+    graph.wait(lambda: len(graph.fixes) == 2, "for the fixes")
+    for publisher in every:
+        graph.node.destroy_publisher(publisher)
+
+
+@pytest.mark.usefixtures("nothing_known")
+def test_a_player_who_asks_nobody_gives_the_same_where_nothing_is_dropped(graph, bag, averages, expected):
+    play_as_others_do(graph, bag, 10.0)
+    check(graph, averages, expected)
+
+
+def test_what_such_a_player_loses_is_named(graph, run):
+    graph.node.destroy_publisher(graph.tilt)
+    solver = run(
+        "starpos_solver", "solver", "use_sim_time:=true", "qos_overrides./tilt.subscription.depth:=1"
+    )
+    graph.tilt = graph._publisher(Tilt, "tilt", 1000)
+    graph.wait(lambda: graph.tilt.get_subscription_count() == 2)
+
+    def lost():
+        for _ in range(200):
+            graph.tilt.publish(Tilt())
+        return graph.comes(lambda: "/tilt: " in solver.output, 0.2)
+
+    graph.wait(lost, "for the warning")
+    assert "messages were dropped on the way: play it slower" in solver.output
+
+
+@pytest.mark.timeout(5 * WAIT_S)
+@pytest.mark.parametrize("inputs", ["stars", "images"])
+def test_three_busy_runs_are_the_same_to_the_last_byte(inputs):
+    command = [sys.executable, str(SOAK), "--runs", "3", "--busy", "3", "--rates", "0", "10", "--processes", "4",
+               "--lanes", "3", "--inputs", inputs]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=5 * WAIT_S, check=False)
+    assert done.returncode == 0 and "6 runs, 1 different outcomes" in done.stdout, done.stdout + done.stderr
