@@ -8,14 +8,14 @@ import starpos_camera.camera_parameters
 import starpos_camera.detector_parameters
 import starpos_dashboard.parameters
 import starpos_inclinometer.parameters
-from starpos.session.parameters import PARAMETERS
+import starpos_solver.settings
 from starpos_common.parameters import to_yaml
 
 NODES = {
     "camera": starpos_camera.camera_parameters.PARAMETERS,
     "detector": starpos_camera.detector_parameters.PARAMETERS,
     "inclinometer": starpos_inclinometer.parameters.PARAMETERS,
-    "solver": PARAMETERS,
+    "solver": starpos_solver.settings.PARAMETERS,
     "dashboard": starpos_dashboard.parameters.PARAMETERS,
 }
 
