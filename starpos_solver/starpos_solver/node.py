@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from starpos.instrument.camera import Camera
 from starpos.session import reports
 from starpos.session.frames import Answered, Output
-from starpos.session.now import Now
+from starpos.session.now import Now, Sent
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
@@ -71,7 +71,7 @@ class SolverNode(Node):
         session = self._session
         takes: dict[str, Take] = {
             CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
-            "tilt": lambda m, info: self._publish(session.take_tilt(m, _number(info), self._now())),
+            "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
             "stars": lambda m, _: self._publish(session.take_stars(m, self._now())),
         }
         if time_is_simulated(self):
@@ -130,7 +130,7 @@ class SolverNode(Node):
         if time_is_simulated(self):
             self._dropped.came(name, info)
 
-    def _arrived_tilts(self) -> Iterator[tuple[msg.Tilt, int | None]]:
+    def _arrived_tilts(self) -> Iterator[tuple[msg.Tilt, Sent]]:
         """Read the tilts that have arrived but wait for the executor; in a replay they wait for their turn."""
         if self._replayed is not None and self._replayed.playing:
             return
@@ -141,7 +141,7 @@ class SolverNode(Node):
                 if taken is None:
                     return
                 self._note_dropped("tilt", taken[1])
-                yield taken[0], _number(taken[1])
+                yield taken[0], _sent(taken[1])
 
     def _go_on(self) -> None:
         """Go on with the frames that wait, because time has passed or a job is done."""
@@ -222,6 +222,7 @@ class NodeLog:
         self._logger.error(message, throttle_duration_sec=60.0)
 
 
-def _number(info: Mapping[str, Any]) -> int | None:
-    """The number that the publisher has given its message; None where the middleware tells none."""
-    return info.get("publication_sequence_number")
+def _sent(info: Mapping[str, Any]) -> Sent:
+    """What the middleware tells of a message."""
+    written_ns = info.get("source_timestamp")
+    return Sent(info.get("publication_sequence_number"), written_ns * 1e-9 if written_ns else None)

@@ -182,6 +182,12 @@ class World:
         successful, reason = self.graph.set("solver", **self._parameters)
         assert successful, reason
 
+    def until_read(self):
+        """Wait until the solver has read what was sent: its executor takes a call when it has taken what came before."""
+        for _ in range(2):
+            self.spin(0.15)
+            self.restore_parameters()
+
     def spin(self, seconds: float):
         """Spin for a while, for things that nobody waits for."""
         self.graph.comes(lambda: False, seconds)

@@ -52,8 +52,8 @@ def tilts_from_the_future(w: World):
         w.now_s -= 0.8
         shift(early.tilts, 0.8 * ahead)
         w.tilts(early)
-    # The tilts arrive before their time comes, also here, where a second takes 50 ms.
-    w.spin(0.3)
+    # The solver reads the tilts before their time comes, also here, where a second takes 50 ms.
+    w.until_read()
     w.turn()
 
 

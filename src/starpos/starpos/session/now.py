@@ -9,6 +9,18 @@ ANOTHER_TIME_S = 3600.0
 
 
 @dataclass(frozen=True)
+class Sent:
+    """What the middleware tells of a message.
+
+    number: its place among those of its publisher; None where that is not told.
+    unix_s: when it was written, by the clock of its publisher's host; None where that is not told.
+    """
+
+    number: int | None = None
+    unix_s: float | None = None
+
+
+@dataclass(frozen=True)
 class Now:
     """A moment.
 

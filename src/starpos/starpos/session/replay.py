@@ -11,7 +11,7 @@ from starpos.recording.bag import BagReader
 from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
 from starpos.session.frames import Output
 from starpos.session.log import Heard, Log
-from starpos.session.now import Now
+from starpos.session.now import Now, Sent
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -46,7 +46,7 @@ class Replay:
                 now = Now.in_data(now_ns * 1e-9)
                 if connection.msgtype == TILT:
                     tilts += 1
-                    yield from session.take_tilt(message, tilts, now)
+                    yield from session.take_tilt(message, Sent(tilts), now)
                 elif connection.msgtype == STARS:
                     yield from session.take_stars(message, now)
                 else:

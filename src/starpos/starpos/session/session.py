@@ -29,7 +29,7 @@ from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
-from starpos.session.now import Now
+from starpos.session.now import Now, Sent
 from starpos.session.settings import Settings
 from starpos.session.tilts import TiltBuffer
 from starpos.sky import catalogue
@@ -49,7 +49,7 @@ class SolverSession:
     """An instrument's messages to its solutions.
 
     jobs: makes who runs what takes long; when an Outcome has come, call `at`.
-    arrived: gives the tilts, with their numbers (see TiltPublishers), that have come but are not taken yet.
+    arrived: gives the tilts that have come but are not taken yet.
     topic: full name of the topic of the camera's intrinsics, for sentences.
     """
 
@@ -60,7 +60,7 @@ class SolverSession:
         heard: Heard,
         log: Log,
         *,
-        arrived: Callable[[], Iterable[tuple[Any, int | None]]] = tuple,
+        arrived: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
         topic: str = CAMERA_TOPIC,
     ) -> None:
         self.latest: Waiting | None = None
@@ -138,16 +138,20 @@ class SolverSession:
         self.instrument.take(camera, stamp_to_unix(message.header.stamp), at_once=not now.played)
         return made + self._work(now)
 
-    def take_tilt(self, message: Any, number: int | None, now: Now) -> list[Output]:
-        """Take a Tilt; number: that of its publisher's messages, None if there is none."""
+    def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
+        """Take a Tilt."""
         made = self.at(now)
-        self._take_tilt(message, number, now)
+        self._take_tilt(message, sent, now)
         return made + self._work(now)
 
-    def _take_tilt(self, message: Any, number: int | None, now: Now) -> None:
+    def _take_tilt(self, message: Any, sent: Sent, now: Now) -> None:
+        stamp_s = stamp_to_unix(message.header.stamp)
+        if sent.unix_s is not None and not now.played:
+            # A process that stood still may read it only when its time has come.
+            now = replace(now, unix_s=min(sent.unix_s, sent.unix_s if now.unix_s is None else now.unix_s))
         try:
-            self.tilts.heard(message, number, now.waiting_s)
-            ahead_s = now.ahead_s(stamp_to_unix(message.header.stamp))
+            self.tilts.heard(message, sent.number, now.waiting_s)
+            ahead_s = now.ahead_s(stamp_s)
         except StarposError as e:
             self._heard.refuse("tilt", str(e))
             return
@@ -229,8 +233,8 @@ class SolverSession:
             if not self._ready(self._waiting[0], now):
                 break
             # After a stall those are of the frame.
-            for message, number in self._arrived():
-                self._take_tilt(message, number, now)
+            for message, sent in self._arrived():
+                self._take_tilt(message, sent, now)
             made += self._solve(self._dated(self._waiting.popleft(), now), now)
         return made
 

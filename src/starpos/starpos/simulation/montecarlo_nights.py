@@ -270,9 +270,13 @@ def calibrated_night(
     stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)
     lower = replace(world, scene=replace(world.scene, altitude_deg=world.scene.altitude_deg - 5))
     more, readings, _ = photograph(lower, zero, begin + 3600, [0.0], frames, rng)
-    columns = ("utc_unix_s", "theta_x", "theta_y", "temperature_c", "covariance")
     tilts = TiltLog(
-        **{name: np.concatenate([getattr(tilts, name), getattr(readings, name)]) for name in columns}
+        *(
+            np.concatenate([getattr(log, n) for log in (tilts, readings)])
+            for n in ("utc_unix_s", "theta_x", "theta_y")
+        ),
+        temperature_c=np.concatenate([tilts.temperature_c, readings.temperature_c]),
+        covariance=np.concatenate([tilts.covariance, readings.covariance]),
     )
     solver = Solver(world.told, catalogue, world.air)
     later = begin + DAY_S * rng.uniform(0.1, 20)

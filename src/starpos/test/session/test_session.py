@@ -13,8 +13,9 @@ from starpos.fix.solver import Status
 from starpos.job import JobsInTurn
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
+from starpos.recording.messages import stamp_to_unix
 from starpos.session.frames import Answered
-from starpos.session.now import Now
+from starpos.session.now import Now, Sent
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
 from starpos.session.session import SolverSession
@@ -47,6 +48,9 @@ class Said:
         self.errors.append(message)
 
 
+NOTHING_TOLD = Sent()
+
+
 class Told:
     """A session that is told messages, and its jobs, which are done when a test says so."""
 
@@ -60,10 +64,10 @@ class Told:
         self.jobs.append(JobsInTurn(self.said.error))
         return self.jobs[-1]
 
-    def tell(self, kind, message, at_s, played=True):
+    def tell(self, kind, message, at_s, played=True, sent=NOTHING_TOLD):
         now = Now.in_data(at_s) if played else Now(at_s, at_s)
         if kind == TILT:
-            return self.session.take_tilt(message, None, now)
+            return self.session.take_tilt(message, sent, now)
         return (self.session.take_stars if kind == STARS else self.session.take_camera)(message, now)
 
     def at(self, at_s):
@@ -215,3 +219,16 @@ def test_a_replay_twice_is_the_same():
         ]
 
     assert played() == played() and len(played()) == 20
+
+
+def test_tilts_stamped_before_their_time_are_refused_though_they_are_read_when_it_has_come(messages):
+    """The solver's process stood still: by its own clock they are no longer of the future."""
+    told, count = Told(), 0
+    for kind, message, at_s in messages:
+        if kind == TILT:
+            stamp_s = stamp_to_unix(message.header.stamp)
+            told.tell(
+                kind, message, at_s, played=False, sent=Sent(unix_s=stamp_s - (3.0 if count % 2 else -0.1))
+            )
+            count += 1
+    assert len(told.session.tilts) == (count + 1) // 2 > 0
