@@ -15,9 +15,6 @@ from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, tr
 from starpos_testing.graph.shots import SMALL
 from starpos_testing.patience import WAIT_S
 
-# A replay waits for solutions, not for tilts that were taken: on a busy machine a fix may lack readings. To go with that.
-pytestmark = pytest.mark.flaky(reruns=2)
-
 NIGHT = Path(__file__).parent / "data" / "night"
 LOSSY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "config" / "lossy_link.xml"
 PATIENCE_S = 2 * WAIT_S
