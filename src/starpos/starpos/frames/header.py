@@ -76,8 +76,8 @@ def times(header: Mapping, place: str) -> tuple[float | None, float | None, floa
 def _rounding(start: Any) -> float:
     """Standard deviation (s) from the last digit of a text or an MJD, rounded or cut off; 0 of an MJD with many."""
     if not isinstance(start, str):
-        decimals = repr(float(start)).partition(".")[2].rstrip("0")
-        sigma_s = DAY_S * 10.0 ** -len(decimals) / math.sqrt(3)
+        digits = repr(float(start)).partition(".")[2].rstrip("0")
+        sigma_s = DAY_S * 10.0 ** -len(digits) / math.sqrt(3)
         return sigma_s if sigma_s > LEAST_MJD_STEP_S else 0.0
     decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
     # a time without seconds
