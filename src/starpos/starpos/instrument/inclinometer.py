@@ -16,8 +16,10 @@ SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
-# sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors change it by less than this
-SQUARE = 0.1
+# sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors of any sensor change it by
+# less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose) by less than LEAST_SQUARE
+SQUARE, LEAST_SQUARE = 0.1, 0.01
+SQUARE_SIGMA = 5.0
 # one vertical axis: L's X, which lies below S's X', is taken below Y' instead
 STEEP = 0.999
 
@@ -140,6 +142,31 @@ class InclinometerErrors:
             raise TiltRangeError(
                 f"tilt ({x:.3f}, {y:.3f}) deg is beyond +-{np.degrees(self.range_rad):.3g} deg, "
                 "the inclinometer's range: set the instrument more upright"
+            )
+
+    def check_axes(self, tilt: Tilt) -> None:
+        """Raise TiltError if three axes contradict each other by more than the sensor's errors make possible."""
+        if tilt.axes == 2:
+            return
+        sines = np.sin(tilt.theta)
+        squares = sines**2
+        # each axis shows a share of the other two
+        cross = (squares.sum() - squares) @ squares
+        variance = (
+            sines @ tilt.noise @ sines
+            + self.quantum_rad**2 / 12
+            + self.pose_rad**2
+            + self.scale**2 * (squares @ squares)
+            + self.cross**2 * cross
+        )
+        most = min(SQUARE, LEAST_SQUARE + 2 * SQUARE_SIGMA * float(np.sqrt(variance)))
+        off = float(squares.sum()) - 1
+        if abs(off) > most:
+            angles = ", ".join(f"{angle:.3f}" for angle in np.degrees(tilt.theta))
+            raise TiltError(
+                f"tilts of {angles} deg contradict each other: the squares of their sines add up to {1 + off:.4f}, not "
+                f"to 1 within the {most:.4f} that the inclinometer's stated errors make possible: check it, or name its "
+                "model"
             )
 
     def undithered_rad(self, tilt: Tilt) -> float:
