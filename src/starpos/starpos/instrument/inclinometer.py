@@ -20,6 +20,8 @@ SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the pape
 # less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose) by less than LEAST_SQUARE
 SQUARE, LEAST_SQUARE = 0.1, 0.01
 SQUARE_SIGMA = 5.0
+# no inclinometer measures at a higher temperature
+MOST_CELSIUS = 300.0
 # one vertical axis: L's X, which lies below S's X', is taken below Y' instead
 STEEP = 0.999
 
