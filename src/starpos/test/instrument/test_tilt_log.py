@@ -164,6 +164,32 @@ def test_an_instrument_that_moves_during_the_exposure():
         log(np.linspace(0, 5, 11)).average(1000.5, 1.0)
 
 
+def froze(rng, step_deg, readings, noise_deg=SCA100T_NOISE_RAD / DEG):
+    """A log of 60 readings in steps, of which so many from the 30th on are equal."""
+    x, y = np.round(rng.normal(0, noise_deg, (2, 60)) / step_deg) * step_deg * DEG
+    x[30 : 30 + readings], y[30 : 30 + readings] = x[30], y[30]
+    return TiltLog.of(1000 + 0.1 * np.arange(60), x, y, np.full(60, 15.0))
+
+
+@pytest.mark.parametrize("step_deg", [1e-6, 0.0005, 0.001])
+def test_a_sensor_that_is_stuck_gives_no_tilt(rng, step_deg):
+    log = froze(rng, step_deg, 12)
+    for mid in (1003.5, 1003.0, 1004.3):
+        with pytest.raises(TiltError, match="repeats the same value"):
+            log.average(mid, 0.5)
+    assert log.average(1002.0, 0.5).samples == log.average(1005.0, 0.5).samples == 5
+    assert not froze(rng, step_deg, 9).stuck.any()
+
+
+def test_a_table_that_is_coarse_or_quiet_is_not_stuck(rng):
+    """Steps larger than the noise, of a sensor that is quieter than stated too, and in many poses."""
+    for noise, step in ((0.0035, 0.01), (0.0003, 0.001), (0.0001, 0.0005), (0.0, 1e-4)):
+        assert not froze(rng, step, 12, noise).stuck.any()
+        poses = np.repeat(rng.uniform(-20, 20, 40), 20)
+        read = np.round((poses + rng.normal(0, noise, 800)) / step) * step
+        assert not log(read).stuck.any()
+
+
 def test_csv(tmp_path):
     path = tmp_path / "tilt.csv"
     path.write_text(
