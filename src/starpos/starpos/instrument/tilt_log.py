@@ -210,9 +210,12 @@ class TiltLog:
         from_middle = np.abs(theta - np.median(theta, axis=0))
         spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
         if spread.max() > REST * noise:
+            # angles that cannot be, as in another unit, scatter as well
+            _check_possible(theta[from_middle.max(1).argmin()])
             raise TiltError(
                 f"the tilt moved by {np.degrees(np.ptp(theta, axis=0).max()):.3f} deg during the exposure: "
-                "the instrument was not at rest"
+                "the instrument was not at rest, or its inclinometer has more noise than the "
+                f"{np.degrees(noise):.2g} deg that are stated"
             )
         sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)
         theta, use = theta[sane], use[sane]
@@ -256,7 +259,7 @@ class TiltLog:
                 return pair
             raise TiltError(
                 "the tilt differs before and after the exposure, and no reading lies in it: the instrument was not at "
-                "rest, or readings were lost"
+                "rest, readings were lost, or their noise is larger than stated"
             )
         first, end = np.searchsorted(t, [mid_unix_s - half - spread_s / 2, mid_unix_s + half + spread_s / 2])
         if spread_s > exposure_s and first < end:
@@ -265,7 +268,7 @@ class TiltLog:
                 return index[first:end]
             raise TiltError(
                 f"the tilt changes within the {spread_s:g} s in which the exposure may lie: the instrument was not at "
-                "rest"
+                "rest, or its inclinometer's noise is larger than stated"
             )
         nearest = np.abs(t - mid_unix_s).min() if len(t) and np.isfinite(mid_unix_s) else np.inf
         raise TiltError(
@@ -306,3 +309,9 @@ class TiltLog:
         """Whether two readings are of one lean, as far as their noise tells."""
         variance = (self.variance[a] + self.variance[b]) * self.excess**2
         return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())
+
+
+def _check_possible(theta: np.ndarray) -> None:
+    """TiltError if elevations (axes,) in rad are none of any lean."""
+    theta_x, theta_y, *third = theta.tolist()
+    Tilt(theta_x, theta_y, np.zeros((2, 2)), utc_unix_s=0.0, theta_z=third[0] if third else np.nan)

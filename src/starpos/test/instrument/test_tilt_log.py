@@ -164,6 +164,17 @@ def test_an_instrument_that_moves_during_the_exposure():
         log(np.linspace(0, 5, 11)).average(1000.5, 1.0)
 
 
+def test_noise_beyond_the_stated_and_angles_that_cannot_be_are_named_as_such(rng):
+    noisy = log(3 + rng.normal(0, 1, 60))
+    with pytest.raises(
+        TiltError, match=r"not at rest, or its inclinometer has more noise than the 0.0035 deg"
+    ):
+        noisy.average(1003.0, 2.0)
+    for middle in (170.0, 60.0):
+        with pytest.raises(TiltError, match="cannot hold together: check the inclinometer and its units"):
+            log(middle + rng.normal(0, 1, 60)).average(1003.0, 2.0)
+
+
 def froze(rng, step_deg, readings, noise_deg=SCA100T_NOISE_RAD / DEG):
     """A log of 60 readings in steps, of which so many from the 30th on are equal."""
     x, y = np.round(rng.normal(0, noise_deg, (2, 60)) / step_deg) * step_deg * DEG
