@@ -195,13 +195,14 @@ EXACT = InclinometerErrors(
 
 
 def elevations(angles: np.ndarray) -> np.ndarray:
-    """Elevations (..., axes) in rad from angles (..., axes) in rad that a sensor may count from 0 to 360 deg.
+    """Elevations (..., axes) in rad from angles (..., axes) in rad that a sensor may count from 0 to 360 deg; NaN of inf.
 
     A third axis tells which way is up, so of three axes an angle beyond 90 deg has the elevation of its supplement.
     Of two it stays, and `Tilt` refuses it: the sensor is upside down.
     """
     angles = np.asarray(angles, float)
-    unwrapped = np.where(np.abs(angles) > np.pi, (angles + np.pi) % (2 * np.pi) - np.pi, angles)
+    with np.errstate(invalid="ignore"):
+        unwrapped = np.where(np.abs(angles) > np.pi, (angles + np.pi) % (2 * np.pi) - np.pi, angles)
     if angles.shape[-1] == 2:
         return unwrapped
     return np.where(np.abs(unwrapped) > np.pi / 2, np.sign(unwrapped) * np.pi - unwrapped, unwrapped)

@@ -239,6 +239,21 @@ def test_a_third_axis_and_the_error_of_each_row(tmp_path):
     assert np.sqrt(np.diag(other.noise)) == pytest.approx([SCA100T_NOISE_RAD] * 3)
 
 
+@pytest.mark.parametrize("name", ["utc_unix_s", "theta_x_deg", "theta_z_deg", "temperature_c"])
+@pytest.mark.parametrize("wild", ["inf", "-inf"])
+def test_what_is_infinite_in_a_table_warns_nobody(tmp_path, name, wild):
+    path = tmp_path / "tilt.csv"
+    names = ["utc_unix_s", "theta_x_deg", "theta_y_deg", "theta_z_deg", "temperature_c"]
+    rows = [[str(v) for v in (1000 + 0.1 * k, 1, 2, 87.7635, 15)] for k in range(30)]
+    for row in rows[12:14]:
+        row[names.index(name)] = wild
+    path.write_text("\n".join(",".join(row) for row in [names, *rows]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tilt = read_tilt_csv(path).average(1001.2, 1.0)
+    assert tilt.theta_x == pytest.approx(DEG) and tilt.samples >= 8
+
+
 @pytest.mark.parametrize("sigma", ["0", "-0.01", "inf", "90"])
 def test_an_error_that_cannot_be_is_refused_in_a_sentence(tmp_path, sigma):
     path = tmp_path / "tilt.csv"
