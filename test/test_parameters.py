@@ -24,6 +24,7 @@ def test_solve_says_why_there_is_nothing_to_solve(graph, solver):
     [
         ({"refraction__pressure": -5.0}, "refraction.pressure must be a number from 0 to 120000 Pa"),
         ({"refraction__pressure": math.inf}, "refraction.pressure must be a number from 0 to 120000 Pa"),
+        ({"refraction__pressure": 880.0}, "pressure 880 Pa (8.8 hPa) between 30000 and 120000 Pa"),
         ({"misalignment": [1.0, 2.0]}, "misalignment must be 3 values"),
         ({"calibration_url": "/nowhere/instrument.yaml"}, "/nowhere/instrument.yaml"),
         ({"deflection__geoid": "/nowhere/egm.gtx"}, "/nowhere/egm.gtx GTX GeoTIFF"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
+from starpos.errors import InstrumentError
 from starpos.instrument.instrument import focal_px_of
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource
 from starpos_common.parameters import Parameter
@@ -65,7 +66,8 @@ PARAMETERS = (
     Parameter(
         "simulated.pressure",
         101325.0,
-        "Air pressure of the simulated place; the solver's refraction.pressure has to agree.",
+        "Air pressure of the simulated place, 30000 Pa or more, or 0 for a vacuum; the solver's refraction.pressure has "
+        "to agree.",
         unit="Pa",
         minimum=0.0,
         maximum=120000.0,
@@ -123,6 +125,10 @@ class Simulated(FrameSource):
             )
         if settings.gain:
             return "the simulated sky has no gain: leave `gain` unset."
+        try:
+            air_from(values)
+        except InstrumentError as error:
+            return f"simulated.{error}."
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
@@ -152,6 +158,15 @@ class Simulated(FrameSource):
         """Do nothing, because nothing is held open."""
 
 
+def air_from(values: Mapping) -> Atmosphere:
+    """Make the air of the node's parameters; InstrumentError for values that cannot be."""
+    return Atmosphere(
+        pressure_pa=values["simulated.pressure"],
+        temperature_c=values["simulated.temperature"],
+        humidity=values["simulated.humidity"],
+    )
+
+
 def scene_from(values: Mapping) -> "Scene":
     """Make the scene of the node's parameters."""
     from starpos.simulation.scene import scene_of
@@ -161,10 +176,6 @@ def scene_from(values: Mapping) -> "Scene":
         focal_px=focal_px_of(values["focal_mm"], values["pixel_um"]),
         latitude_deg=values["simulated.latitude"],
         longitude_deg=values["simulated.longitude"],
-        atmosphere=Atmosphere(
-            pressure_pa=values["simulated.pressure"],
-            temperature_c=values["simulated.temperature"],
-            humidity=values["simulated.humidity"],
-        ),
+        atmosphere=air_from(values),
         pointing_deg=(values["simulated.azimuth"], values["simulated.altitude"], values["simulated.roll"]),
     )

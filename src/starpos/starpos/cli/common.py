@@ -220,7 +220,10 @@ def camera_of(args: argparse.Namespace) -> Camera:
 def add_air(parser: argparse.ArgumentParser) -> None:
     """Add the options that `atmosphere_of` reads."""
     parser.add_argument(
-        "--pressure-hpa", type=float, metavar="HPA", help="air pressure at the instrument, not reduced"
+        "--pressure-hpa",
+        type=float,
+        metavar="HPA",
+        help="air pressure at the instrument, not reduced: 300 to 1200, or 0 for a vacuum",
     )
     parser.add_argument("--temperature-c", type=float, metavar="C", help="air temperature")
     parser.add_argument("--humidity", type=float, metavar="0..1", help="relative humidity")

@@ -13,6 +13,8 @@ from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
 STANDARD_TEMPERATURE_C = 15.0
+# from the highest mountain to the lowest shore; hPa given as Pa, or Pa as hPa, lie outside
+LEAST_PRESSURE_PA, MOST_PRESSURE_PA = 30_000.0, 120_000.0
 # ERFA's own limit: below 3 deg of altitude the two-constant model has no meaning.
 MIN_COS_ZENITH = 0.05
 
@@ -21,7 +23,7 @@ MIN_COS_ZENITH = 0.05
 class Atmosphere:
     """The air at the instrument and how well it is known (1 sigma); InstrumentError for impossible values."""
 
-    pressure_pa: float = STANDARD_PRESSURE_PA
+    pressure_pa: float = STANDARD_PRESSURE_PA  # not reduced to sea level; 0: a vacuum
     temperature_c: float = STANDARD_TEMPERATURE_C
     humidity: float = 0.5  # 0..1
     wavelength_um: float = 0.55
@@ -31,8 +33,13 @@ class Atmosphere:
     wavelength_stddev_um: float = 0.08
 
     def __post_init__(self) -> None:
+        if self.pressure_pa != 0 and not LEAST_PRESSURE_PA <= self.pressure_pa <= MOST_PRESSURE_PA:
+            raise InstrumentError(
+                f"pressure {self.pressure_pa:g} Pa ({self.pressure_pa / 100:g} hPa): must lie between "
+                f"{LEAST_PRESSURE_PA:.0f} and {MOST_PRESSURE_PA:.0f} Pa ({LEAST_PRESSURE_PA / 100:.0f} and "
+                f"{MOST_PRESSURE_PA / 100:.0f} hPa), or be 0 for a vacuum"
+            )
         checks = (
-            ("pressure", self.pressure_pa, 0.0, 1.2e5, "Pa"),
             ("temperature", self.temperature_c, -100.0, 80.0, "deg C"),
             ("humidity", self.humidity, 0.0, 1.0, ""),
             ("wavelength", self.wavelength_um, 0.2, 10.0, "um"),

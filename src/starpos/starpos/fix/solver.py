@@ -223,6 +223,7 @@ class Solver:
             raise TiltError(f"{frame.place}: no tilt: give the inclinometer's")
         self.instrument.calibration.check_age(frame.mid_unix_s)
         self.instrument.inclinometer.check_range(tilt)
+        self.instrument.inclinometer.check_axes(tilt)
         return state, tilt
 
     def _solve_pointing(self, pointing: Pointing, tilt: Tilt | Tilts | None) -> Solution:

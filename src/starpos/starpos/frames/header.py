@@ -14,6 +14,7 @@ import numpy as np
 
 from starpos.errors import FrameError
 from starpos.frames.shutter import Shutter
+from starpos.units import DAY_S
 
 START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
 KEYS = (
@@ -32,6 +33,8 @@ KEYS = (
 # Time scales of TIMESYS that are read; UT1 would need tables.
 SCALES = ("utc", "tai", "tt", "tdb")
 MAX_EXPOSURE_S = 86400.0
+# an MJD's last digit counts from here: below it lie the last bits of a double
+LEAST_MJD_STEP_S = 1e-3
 
 
 def times(header: Mapping, place: str) -> tuple[float | None, float | None, float]:
@@ -62,13 +65,20 @@ def times(header: Mapping, place: str) -> tuple[float | None, float | None, floa
     scale = str(header.get("TIMESYS", "UTC")).strip().lower()
     if scale not in SCALES:
         raise FrameError(f"{place}: its TIMESYS is {scale!r}; it must be one of {', '.join(SCALES)}.")
+    # a number of another keyword (a Julian date, Unix time) would pass for an MJD
+    if not isinstance(start, str) and not key.startswith("MJD"):
+        raise FrameError(
+            f"{place}: its {key} is {start!r}, which is no text; write it like 2026-11-02T18:00:00.000."
+        )
     return _middle(start, exposure, scale, f"{place}: its {key}"), exposure, _rounding(start)
 
 
-def _rounding(start: object) -> float:
-    """Standard deviation (s) from a text's last digit, rounded or cut off; 0 for an MJD, which has digits enough."""
+def _rounding(start: Any) -> float:
+    """Standard deviation (s) from the last digit of a text or an MJD, rounded or cut off; 0 of an MJD with many."""
     if not isinstance(start, str):
-        return 0.0
+        digits = repr(float(start)).partition(".")[2].rstrip("0")
+        sigma_s = DAY_S * 10.0 ** -len(digits) / math.sqrt(3)
+        return sigma_s if sigma_s > LEAST_MJD_STEP_S else 0.0
     decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
     # a time without seconds
     if decimals is None:

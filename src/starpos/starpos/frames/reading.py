@@ -28,10 +28,11 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     clock is that of the camera which wrote the file, if it may be trusted.
 
     FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
-    TIMESYS), EXPTIME or EXPOSURE its length in s; BAYERPAT (XBAYROFF, YBAYROFF) is the mosaic; FOCALLEN (mm) and XPIXSZ
-    (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits are only rounded. Others are shifted
-    to begin at 0, and scaled to fill 16 bits if their range is wider than that or, for floats, narrower than 4096. A few
-    NaN or infinite pixels become the median. Values farther from it than any light (frame.LOUDEST) are clipped.
+    TIMESYS), whose last digit is its error, EXPTIME or EXPOSURE its length in s; BAYERPAT (XBAYROFF, YBAYROFF) is the
+    mosaic; FOCALLEN (mm) and XPIXSZ (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits
+    are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range is wider than that
+    or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
+    light (frame.LOUDEST) are clipped.
     TIFF, PNG, JPEG: 8 or 16 bits, grey or colour. 16-bit colour is scaled down to bgr8.
     Camera raw: the mosaic as the sensor gave it, through rawpy.
     The exposure of pictures and raw files comes from EXIF if exifread is installed; their time too, but only with a

@@ -16,8 +16,12 @@ SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution
 
 
-# sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors change it by less than this
-SQUARE = 0.1
+# sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors of any sensor change it by
+# less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose) by less than LEAST_SQUARE
+SQUARE, LEAST_SQUARE = 0.1, 0.01
+SQUARE_SIGMA = 5.0
+# no inclinometer measures at a higher temperature
+MOST_CELSIUS = 300.0
 # one vertical axis: L's X, which lies below S's X', is taken below Y' instead
 STEEP = 0.999
 
@@ -142,6 +146,31 @@ class InclinometerErrors:
                 "the inclinometer's range: set the instrument more upright"
             )
 
+    def check_axes(self, tilt: Tilt) -> None:
+        """Raise TiltError if three axes contradict each other by more than the sensor's errors make possible."""
+        if tilt.axes == 2:
+            return
+        sines = np.sin(tilt.theta)
+        squares = sines**2
+        # each axis shows a share of the other two
+        cross = (squares.sum() - squares) @ squares
+        variance = (
+            sines @ tilt.noise @ sines
+            + self.quantum_rad**2 / 12
+            + self.pose_rad**2
+            + self.scale**2 * (squares @ squares)
+            + self.cross**2 * cross
+        )
+        most = min(SQUARE, LEAST_SQUARE + 2 * SQUARE_SIGMA * float(np.sqrt(variance)))
+        off = float(squares.sum()) - 1
+        if abs(off) > most:
+            angles = ", ".join(f"{angle:.3f}" for angle in np.degrees(tilt.theta))
+            raise TiltError(
+                f"tilts of {angles} deg contradict each other: the squares of their sines add up to {1 + off:.4f}, not "
+                f"to 1 within the {most:.4f} that the inclinometer's stated errors make possible: check it, or name its "
+                "model"
+            )
+
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.
 
@@ -166,13 +195,14 @@ EXACT = InclinometerErrors(
 
 
 def elevations(angles: np.ndarray) -> np.ndarray:
-    """Elevations (..., axes) in rad from angles (..., axes) in rad that a sensor may count from 0 to 360 deg.
+    """Elevations (..., axes) in rad from angles (..., axes) in rad that a sensor may count from 0 to 360 deg; NaN of inf.
 
     A third axis tells which way is up, so of three axes an angle beyond 90 deg has the elevation of its supplement.
     Of two it stays, and `Tilt` refuses it: the sensor is upside down.
     """
     angles = np.asarray(angles, float)
-    unwrapped = np.where(np.abs(angles) > np.pi, (angles + np.pi) % (2 * np.pi) - np.pi, angles)
+    with np.errstate(invalid="ignore"):
+        unwrapped = np.where(np.abs(angles) > np.pi, (angles + np.pi) % (2 * np.pi) - np.pi, angles)
     if angles.shape[-1] == 2:
         return unwrapped
     return np.where(np.abs(unwrapped) > np.pi / 2, np.sign(unwrapped) * np.pi - unwrapped, unwrapped)

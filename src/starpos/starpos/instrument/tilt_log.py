@@ -27,6 +27,11 @@ BRACKET_S = 1.5
 AGREE_SIGMA = 5.0
 # readings that come at their usual rate may leave out one of them
 USUAL_GAPS = 2.5
+# So many equal readings in a row are a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at 0.1
+# chance makes one such row in 10^9 readings.
+STUCK_READINGS, RARE = 10, 0.1
+# a sensor that stands still more often than it moves is coarse, or quiet
+MOSTLY_STUCK = 2.0
 
 
 def white_noise(steps: np.ndarray) -> np.ndarray:
@@ -137,13 +142,19 @@ class TiltLog:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
 
         Two readings of the same time count once. A reading far from the others is left out. If they scatter more than
-        stated (wind, footsteps), the covariance is larger. TiltError if the readings do not cover the exposure, or the
-        instrument moved.
+        stated (wind, footsteps), the covariance is larger. TiltError if the readings do not cover the exposure, the
+        instrument moved, or the sensor was stuck.
 
         spread_s: the whole width in which the middle may lie, where a clock counts in whole seconds; then readings within
         it stand for the exposure, if all of them agree.
         """
-        return self._mean(self._of_exposure(mid_unix_s, exposure_s, spread_s))
+        use = self._of_exposure(mid_unix_s, exposure_s, spread_s)
+        if self.stuck[use].any():
+            raise TiltError(
+                f"the inclinometer repeats the same value in {STUCK_READINGS} readings or more, though its noise is "
+                "larger than its steps: check its converter's wiring"
+            )
+        return self._mean(use)
 
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
@@ -156,6 +167,42 @@ class TiltLog:
         """Mask (N,) of the readings whose time and angles are all there."""
         return np.isfinite(self.utc_unix_s) & np.isfinite(self.theta).all(1)
 
+    @cached_property
+    def _once(self) -> np.ndarray:
+        """Indices of the finite readings in order of time, one for each time."""
+        index = np.flatnonzero(self._finite)
+        return index[np.unique(self.utc_unix_s[index], return_index=True)[1]]
+
+    @cached_property
+    def stuck(self) -> np.ndarray:
+        """Mask (N,) of the readings that stand in a row of STUCK_READINGS or more that are equal to the last digit.
+
+        None does where noise does not clearly exceed the steps of the readings, by the stated noise and by how rarely
+        other neighbours are equal.
+        """
+        stuck = np.zeros(len(self.utc_unix_s), bool)
+        order = self._once
+        steps = np.diff(self.theta[order], axis=0)
+        equal = (steps == 0).all(1)
+        # rows of equal steps [begin, end)
+        begin, end = np.flatnonzero(np.diff(np.concatenate([[0], equal, [0]]))).reshape(-1, 2).T
+        rows = end - begin >= STUCK_READINGS - 1
+        begin, end = begin[rows], end[rows]
+        # all but these, of an instrument at rest
+        free = np.diff(self.utc_unix_s[order]) < NEIGHBOURS_S
+        noise = self.excess * float(np.sqrt(self.variance.mean()))
+        free &= (np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * noise).all(1)
+        for first, last in zip(begin, end, strict=True):
+            free[first:last] = False
+        if free.sum() < max(ENOUGH_NEIGHBOURS, (end - begin).sum() / MOSTLY_STUCK):
+            return stuck
+        moved = np.abs(steps[free])
+        coarse = np.where(moved > 0, moved, np.inf).min() > noise
+        if not coarse and equal[free].mean() < RARE:
+            for first, last in zip(begin, end, strict=True):
+                stuck[order[first : last + 1]] = True
+        return stuck
+
     def _mean(self, use: np.ndarray) -> Tilt:
         """The mean tilt of the readings `use` (indices)."""
         theta = self.theta[use]
@@ -163,9 +210,12 @@ class TiltLog:
         from_middle = np.abs(theta - np.median(theta, axis=0))
         spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
         if spread.max() > REST * noise:
+            # angles that cannot be, as in another unit, scatter as well
+            _check_possible(theta[from_middle.max(1).argmin()])
             raise TiltError(
                 f"the tilt moved by {np.degrees(np.ptp(theta, axis=0).max()):.3f} deg during the exposure: "
-                "the instrument was not at rest"
+                "the instrument was not at rest, or its inclinometer has more noise than the "
+                f"{np.degrees(noise):.2g} deg that are stated"
             )
         sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)
         theta, use = theta[sane], use[sane]
@@ -197,8 +247,7 @@ class TiltLog:
         They are those inside the exposure, which must cover it. If none is inside, two do that bracket it closely and
         agree: what happened between two readings that differ nobody knows.
         """
-        index = np.flatnonzero(self._finite)
-        index = index[np.unique(self.utc_unix_s[index], return_index=True)[1]]
+        index = self._once
         t, half = self.utc_unix_s[index], max(exposure_s, 0.0) / 2 + TOUCH_S
         first, end = np.searchsorted(t, [mid_unix_s - half, mid_unix_s + half])
         if first < end:
@@ -210,7 +259,7 @@ class TiltLog:
                 return pair
             raise TiltError(
                 "the tilt differs before and after the exposure, and no reading lies in it: the instrument was not at "
-                "rest, or readings were lost"
+                "rest, readings were lost, or their noise is larger than stated"
             )
         first, end = np.searchsorted(t, [mid_unix_s - half - spread_s / 2, mid_unix_s + half + spread_s / 2])
         if spread_s > exposure_s and first < end:
@@ -219,7 +268,7 @@ class TiltLog:
                 return index[first:end]
             raise TiltError(
                 f"the tilt changes within the {spread_s:g} s in which the exposure may lie: the instrument was not at "
-                "rest"
+                "rest, or its inclinometer's noise is larger than stated"
             )
         nearest = np.abs(t - mid_unix_s).min() if len(t) and np.isfinite(mid_unix_s) else np.inf
         raise TiltError(
@@ -260,3 +309,9 @@ class TiltLog:
         """Whether two readings are of one lean, as far as their noise tells."""
         variance = (self.variance[a] + self.variance[b]) * self.excess**2
         return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())
+
+
+def _check_possible(theta: np.ndarray) -> None:
+    """TiltError if elevations (axes,) in rad are none of any lean."""
+    theta_x, theta_y, *third = theta.tolist()
+    Tilt(theta_x, theta_y, np.zeros((2, 2)), utc_unix_s=0.0, theta_z=third[0] if third else np.nan)

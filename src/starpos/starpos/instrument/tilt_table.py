@@ -5,6 +5,7 @@ import io
 import itertools
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
 
@@ -12,12 +13,13 @@ import numpy as np
 
 from starpos.errors import TiltError
 from starpos.files import open_regular
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, elevations
-from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, elevations
+from starpos.instrument.tilt_log import BRACKET_S, TiltLog
 
 # A week at 10 Hz.
 MAX_CSV_BYTES = 300_000_000
 NEEDED = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
+ANGLES = ("theta_x_deg", "theta_y_deg", "theta_z_deg")
 OPTIONAL = ("theta_z_deg", "temperature_c", "sigma_deg")
 CURE = (
     f"give a CSV with a line of names, {','.join(NEEDED)}[,{','.join(OPTIONAL)}], and readings: the elevations of "
@@ -25,13 +27,17 @@ CURE = (
 )
 # no angle is less certain, and still one
 MOST_SIGMA_DEG = 45.0
+# Readings alternate where, of three in a row, the outer two are nearer to each other than two neighbours in so large a
+# share. Of white noise it is a half, and so many sigma above it less than once in 10^7 tables.
+ALTERNATING, ALTERNATING_SIGMA = 0.75, 6.0
 
 
 def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
     """Read a TiltLog from a CSV, one reading of a sensor a line; TiltError if it cannot be one.
 
-    Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c; sigma_deg, 1 sigma
-    of the white noise of that line's angles. Where no sigma is stated (no column, or NaN) it is noise_rad.
+    Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
+    it is beyond MOST_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
+    column, or NaN) it is noise_rad.
     """
     path = Path(path)
     try:
@@ -50,7 +56,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
             f"{path}: a tilt table needs the columns {', '.join(NEEDED)} and at least one row: {CURE}"
         )
     column = dict(zip(names, rows.T, strict=True))
-    _check_one_sensor(path, column["utc_unix_s"], rows)
+    _check_one_sensor(path, column, rows)
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]
     unknown = np.full(len(rows), np.nan)
@@ -58,11 +64,12 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     axes = ["theta_x_deg", "theta_y_deg"] + ([] if np.isnan(z).all() else ["theta_z_deg"])
     theta = elevations(np.radians([column[axis][order] for axis in axes]).T).T
     sigma = np.radians(_sigma_deg(path, column.get("sigma_deg", unknown)))[order]
+    celsius = column.get("temperature_c", unknown)[order]
     return TiltLog.of(
         column["utc_unix_s"][order],
         theta[0],
         theta[1],
-        column.get("temperature_c", unknown)[order],
+        np.where(np.abs(celsius) <= MOST_CELSIUS, celsius, np.nan),
         np.where(np.isnan(sigma), noise_rad, sigma),
         theta_z=theta[2] if len(theta) == 3 else None,
     )
@@ -88,21 +95,42 @@ def _opened(path: Path) -> TextIO:
     return io.TextIOWrapper(file, "utf-8-sig")
 
 
-def _check_one_sensor(path: Path, utc_unix_s: np.ndarray, rows: np.ndarray) -> None:
-    """TiltError if the times go back into those that the table already holds: readings of two sensors, it seems.
+def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray], rows: np.ndarray) -> None:
+    """TiltError if the rows seem to be readings of two sensors, one after the other or alternating.
 
-    A table may hold nights in any order, and a part of itself once more.
+    One after the other, their times go back into those that the table already holds. A table may hold nights in any
+    order, and a part of itself once more.
     """
-    finite = np.isfinite(utc_unix_s)
+    finite = np.flatnonzero(np.isfinite(column["utc_unix_s"]))
     _, first = np.unique(rows[finite], axis=0, return_index=True)
-    t = utc_unix_s[finite][np.sort(first)]
+    once = finite[np.sort(first)]
+    t = column["utc_unix_s"][once]
     runs = np.split(t, np.flatnonzero(np.diff(t) < 0) + 1)
     ranges = sorted((run[0], run[-1]) for run in runs if len(run))
+    in_time = once[np.argsort(t, kind="stable")]
+    angles = np.stack([column[name] for name in ANGLES if name in column], -1)[in_time]
     if any(later < end for (_, end), (later, _) in itertools.pairwise(ranges)):
-        raise TiltError(
-            f"{path}: its times go back into those that it already holds, as if it had the readings of two "
-            "inclinometers: give the table of one"
-        )
+        seen = "its times go back into those that it already holds"
+    elif _alternate(column["utc_unix_s"][in_time], angles):
+        seen = "its readings alternate between two tilts"
+    else:
+        return
+    raise TiltError(f"{path}: {seen}, as if it had the readings of two inclinometers: give the table of one")
+
+
+def _alternate(t: np.ndarray, angles: np.ndarray) -> bool:
+    """Whether readings (N, axes), in the order of their times t (N,), alternate beyond chance on an axis."""
+    # threes that share no reading are independent
+    start = np.arange(0, len(t) - 2, 3)
+    # an instrument may be turned to and fro between readings that are further apart
+    start = start[(t[start + 2] - t[start + 1] <= BRACKET_S) & (t[start + 1] - t[start] <= BRACKET_S)]
+    with np.errstate(invalid="ignore"):
+        near = np.abs(angles[start + 1] - angles[start])
+        outer = np.abs(angles[start + 2] - angles[start])
+    more, less = (outer < near).sum(0), (outer > near).sum(0)
+    told = more + less
+    beyond_chance = more - less > ALTERNATING_SIGMA * np.sqrt(told)
+    return bool((beyond_chance & (more > ALTERNATING * told)).any())
 
 
 def _first_line(error: Exception) -> str:

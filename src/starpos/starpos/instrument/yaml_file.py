@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from starpos import files
-from starpos.errors import InstrumentError
+from starpos.errors import InstrumentError, one_line
 
 # Ten times what a calibration needs. A parser of YAML reads about 100 kB in a second.
 MOST_BYTES = 64_000
@@ -21,11 +21,11 @@ def load(path: Path, what: str) -> Any:
 
 
 def parse(text: bytes | str, complaint: str) -> Any:
-    """Read YAML without aliases; InstrumentError that begins with the complaint if it is none."""
+    """Read YAML without aliases or keys given twice; InstrumentError that begins with the complaint if it is none."""
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Reads YAML without aliases: a few lines of them unpack to gigabytes."""
+        """Reads YAML without aliases, a few lines of which unpack to gigabytes, and without keys that are given twice."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -34,6 +34,19 @@ def parse(text: bytes | str, complaint: str) -> Any:
                     f"{complaint} (line {line} has an alias, *name: write what it stands for)"
                 )
             return super().compose_node(parent, index)
+
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node = super().compose_mapping_node(anchor)
+            known = set()
+            # a list or a mapping for a key is refused when it is read
+            for key in (key for key, _ in node.value if isinstance(key.value, str)):
+                if (key.tag, key.value) in known:
+                    line = key.start_mark.line + 1
+                    raise InstrumentError(
+                        f"{complaint} (line {line} gives {one_line(key.value)} again: keep one of the two)"
+                    )
+                known.add((key.tag, key.value))
+            return node
 
     try:
         return yaml.load(text, Loader)

@@ -14,7 +14,7 @@ from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, SQUARE, Tilt
+from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16
@@ -29,8 +29,6 @@ ENCODINGS = {
 }
 # rad2; a larger variance says nothing, and might overflow
 MOST_TILT_VARIANCE = 1.0
-# no inclinometer measures at a higher temperature
-MOST_CELSIUS = 300.0
 # a detector publishes no more
 MAX_STARS = 100_000
 

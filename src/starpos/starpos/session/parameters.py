@@ -92,7 +92,8 @@ PARAMETERS = (
     Parameter(
         "refraction.pressure",
         NAN,
-        "Air pressure at the instrument, not reduced to sea level; unset widens the fix.",
+        "Air pressure at the instrument, not reduced to sea level, 30000 Pa or more, or 0 for a vacuum; unset widens "
+        "the fix.",
         unit="Pa",
         minimum=0.0,
         maximum=120000.0,

@@ -264,6 +264,7 @@ BAD_CALLS = {
     "a word for a number": ("identify", "STARS", "--focal-mm", "long", "--pixel-um", "6"),
     "a missing tilt file": ("solve", "STARS", "--tilt", "none.csv", *WIDE),
     "pressure in Pa": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--pressure-hpa", "101325"),
+    "a hundredth of the pressure": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--pressure-hpa", "8.8"),
     "humidity in percent": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--humidity", "30"),
     "a deflection of nan": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--xi", "nan"),
     "a missing geoid": ("solve", "STARS", "--tilt", "TILT", *WIDE, "--geoid", "none.gtx"),

@@ -115,9 +115,18 @@ def test_a_factor_scales_the_bending():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("pressure_pa", -1.0), ("pressure_pa", 1013.25e3), ("temperature_c", 283.15), ("humidity", 30.0),
+    [("pressure_pa", -1.0), ("pressure_pa", 1013.25e3), ("pressure_pa", 880.0), ("pressure_pa", float("inf")),
+     ("temperature_c", -274.0), ("temperature_c", 283.15), ("humidity", 30.0),
      ("wavelength_um", 550.0), ("pressure_pa", float("nan")), ("temperature_c", float("inf"))],
 )  # fmt: skip
 def test_impossible_air_is_refused_with_its_limits(name, value):
     with pytest.raises(InstrumentError, match=r"must lie between .* and"):
         Atmosphere(**{name: value})
+
+
+def test_a_pressure_in_the_wrong_unit_is_named_in_both():
+    with pytest.raises(
+        InstrumentError, match=r"pressure 880 Pa \(8.8 hPa\): .* 30000 and 120000 Pa \(300 and 1200 hPa"
+    ):
+        Atmosphere(pressure_pa=880.0)
+    assert Atmosphere(pressure_pa=30_000.0).relative_sigma > 0

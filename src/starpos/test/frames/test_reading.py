@@ -75,6 +75,22 @@ def test_the_ways_a_header_can_tell_the_time_or_not(tmp_path, cards, middle):
 
 
 @pytest.mark.parametrize(
+    ("mjd", "sigma_s"),
+    [(61346.75, 864 / np.sqrt(3)), (61346.75017, 0.864 / np.sqrt(3)), (61346.750173611, 0.0),
+     (61346, 86400 / np.sqrt(3))],
+)  # fmt: skip
+def test_an_mjd_of_few_decimals_has_the_error_of_its_last(tmp_path, mjd, sigma_s):
+    frame = read_frame(write_fits(tmp_path / "a.fits", **{"MJD-OBS": mjd, "EXPTIME": 1}))
+    assert frame.stamp_stddev_s == pytest.approx(sigma_s, rel=1e-6)
+
+
+@pytest.mark.parametrize("key", ["DATE-OBS", "DATE-BEG"])
+def test_a_date_that_is_a_number_is_refused(tmp_path, key):
+    with pytest.raises(FrameError, match=rf"{key} is 61346.75.*no text"):
+        read_frame(write_fits(tmp_path / "a.fits", **{key: 61346.75, "EXPTIME": 1}))
+
+
+@pytest.mark.parametrize(
     ("values", "expected"),
     [
         (np.array([[0, 200]], np.uint8), [[0, 200]]),

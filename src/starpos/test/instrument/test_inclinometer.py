@@ -6,6 +6,7 @@ import pytest
 
 from starpos import rotation
 from starpos.errors import TiltError, TiltRangeError
+from starpos.instrument import sensors
 from starpos.instrument.inclinometer import (
     InclinometerErrors,
     Tilt,
@@ -77,6 +78,37 @@ def test_a_tilt_beyond_the_sensors_range_is_refused():
     InclinometerErrors().check_range(tilt)
     with pytest.raises(TiltRangeError, match=r"beyond \+-30 deg"):
         InclinometerErrors(range_rad=30 * DEG).check_range(tilt)
+
+
+def three_axes(angles_deg):
+    x, y, z = np.radians(angles_deg)
+    return Tilt(x, y, np.eye(2) * 1e-9, utc_unix_s=0.0, theta_z=z)
+
+
+@pytest.mark.parametrize(
+    ("errors", "most"), [(InclinometerErrors(), 0.011), (sensors.SCL3300, 0.05), (sensors.SCA100T, 0.1)]
+)
+def test_three_axes_that_contradict_each_other_are_refused(errors, most, rng):
+    """The sines of (30, 40, 35.69) deg have squares that add up to 1; a step of the third axis makes them contradict."""
+    for third in np.linspace(35.69, 38.5, 30):
+        tilt = three_axes((30.0, 40.0, third))
+        off = float(np.sum(np.sin(tilt.theta) ** 2)) - 1
+        if off < 0.009:
+            errors.check_axes(tilt)
+        elif off > most:
+            with pytest.raises(
+                TiltError, match=rf"contradict each other: .* add up to {1 + off:.4f}, not to 1"
+            ):
+                errors.check_axes(tilt)
+    errors.check_axes(Tilt(0.1, 0.2, NO_ERROR, utc_unix_s=0.0))
+
+
+def test_axes_with_the_errors_of_their_sheet_do_not_contradict_each_other(rng):
+    errors = sensors.SCL3300
+    for up in rotation.normalised(rng.normal(size=(2000, 3))):
+        skew = np.eye(3) + errors.cross * rng.normal(size=(3, 3)) * (1 - np.eye(3))
+        read = skew @ up * (1 + errors.scale * rng.normal(size=3)) + errors.pose_rad * rng.normal(size=3)
+        errors.check_axes(three_axes(np.degrees(np.arcsin(np.clip(read, -1, 1)))))
 
 
 @pytest.mark.parametrize(

@@ -170,6 +170,15 @@ REFUSED = {
         ),
         "alias",
     ),
+    "a key twice": (
+        SIMPLE + "tilt_noise_deg: 0.002\ntilt_noise_deg: 0.2\n",
+        "not a readable instrument file (line 4 gives tilt_noise_deg again: keep one of the two)",
+    ),
+    "a key twice inside": (
+        "starpos_instrument: 1\ncamera: {focal_mm: 600, 'focal_mm': 60, pixel_um: 6}\n",
+        "(line 2 gives focal_mm again",
+    ),
+    "a mapping for a key": ("? {a: 1}\n: 2\n? {a: 1}\n: 3\n", "not a readable instrument file"),
     "broken yaml": ("starpos_instrument: 1\ncamera: {focal_mm: [\n", "not a readable"),
     "an empty file of tags": ("!!binary 5\n", "instrument file"),
     "tabs": ("starpos_instrument: 1\n\tcamera: 1\n", "not a readable"),

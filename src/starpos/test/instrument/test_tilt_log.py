@@ -164,6 +164,43 @@ def test_an_instrument_that_moves_during_the_exposure():
         log(np.linspace(0, 5, 11)).average(1000.5, 1.0)
 
 
+def test_noise_beyond_the_stated_and_angles_that_cannot_be_are_named_as_such(rng):
+    noisy = log(3 + rng.normal(0, 1, 60))
+    with pytest.raises(
+        TiltError, match=r"not at rest, or its inclinometer has more noise than the 0.0035 deg"
+    ):
+        noisy.average(1003.0, 2.0)
+    for middle in (170.0, 60.0):
+        with pytest.raises(TiltError, match="cannot hold together: check the inclinometer and its units"):
+            log(middle + rng.normal(0, 1, 60)).average(1003.0, 2.0)
+
+
+def froze(rng, step_deg, readings, noise_deg=SCA100T_NOISE_RAD / DEG):
+    """A log of 60 readings in steps, of which so many from the 30th on are equal."""
+    x, y = np.round(rng.normal(0, noise_deg, (2, 60)) / step_deg) * step_deg * DEG
+    x[30 : 30 + readings], y[30 : 30 + readings] = x[30], y[30]
+    return TiltLog.of(1000 + 0.1 * np.arange(60), x, y, np.full(60, 15.0))
+
+
+@pytest.mark.parametrize("step_deg", [1e-6, 0.0005, 0.001])
+def test_a_sensor_that_is_stuck_gives_no_tilt(rng, step_deg):
+    log = froze(rng, step_deg, 12)
+    for mid in (1003.5, 1003.0, 1004.3):
+        with pytest.raises(TiltError, match="repeats the same value"):
+            log.average(mid, 0.5)
+    assert log.average(1002.0, 0.5).samples == log.average(1005.0, 0.5).samples == 5
+    assert not froze(rng, step_deg, 9).stuck.any()
+
+
+def test_a_table_that_is_coarse_or_quiet_is_not_stuck(rng):
+    """Steps larger than the noise, of a sensor that is quieter than stated too, and in many poses."""
+    for noise, step in ((0.0035, 0.01), (0.0003, 0.001), (0.0001, 0.0005), (0.0, 1e-4)):
+        assert not froze(rng, step, 12, noise).stuck.any()
+        poses = np.repeat(rng.uniform(-20, 20, 40), 20)
+        read = np.round((poses + rng.normal(0, noise, 800)) / step) * step
+        assert not log(read).stuck.any()
+
+
 def test_csv(tmp_path):
     path = tmp_path / "tilt.csv"
     path.write_text(
@@ -200,6 +237,21 @@ def test_a_third_axis_and_the_error_of_each_row(tmp_path):
     # of three axes an angle over the zenith is the elevation of its supplement
     assert other.theta / DEG == pytest.approx([30, 0, 60])
     assert np.sqrt(np.diag(other.noise)) == pytest.approx([SCA100T_NOISE_RAD] * 3)
+
+
+@pytest.mark.parametrize("name", ["utc_unix_s", "theta_x_deg", "theta_z_deg", "temperature_c"])
+@pytest.mark.parametrize("wild", ["inf", "-inf"])
+def test_what_is_infinite_in_a_table_warns_nobody(tmp_path, name, wild):
+    path = tmp_path / "tilt.csv"
+    names = ["utc_unix_s", "theta_x_deg", "theta_y_deg", "theta_z_deg", "temperature_c"]
+    rows = [[str(v) for v in (1000 + 0.1 * k, 1, 2, 87.7635, 15)] for k in range(30)]
+    for row in rows[12:14]:
+        row[names.index(name)] = wild
+    path.write_text("\n".join(",".join(row) for row in [names, *rows]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tilt = read_tilt_csv(path).average(1001.2, 1.0)
+    assert tilt.theta_x == pytest.approx(DEG) and tilt.samples >= 8
 
 
 @pytest.mark.parametrize("sigma", ["0", "-0.01", "inf", "90"])
@@ -302,6 +354,31 @@ def test_two_inclinometers_in_one_table_are_refused(tmp_path):
     for offset in (0.0, 0.05, 5.0):
         with pytest.raises(TiltError, match="two inclinometers"):
             read_tilt_csv(table(tmp_path / "tilt.csv", mine, other + np.array([offset, 0, 0])))
+
+
+@pytest.mark.parametrize("noise_deg", [0.0, 0.0035])
+def test_two_inclinometers_whose_readings_alternate_are_refused(tmp_path, rng, noise_deg):
+    t = 1000 + 0.1 * np.arange(300)
+    x, y = rng.normal(0, noise_deg, (2, 300))
+    merged = np.stack([t, 1 + x + 0.02 * (np.arange(300) % 2), 2 + y], 1)
+    with pytest.raises(TiltError, match=r"alternate between two tilts, as if .* two inclinometers"):
+        read_tilt_csv(table(tmp_path / "tilt.csv", merged))
+
+
+def test_one_inclinometer_does_not_alternate(tmp_path, rng):
+    """White noise, coarse or not, with a turn, and an instrument that is read once in each of two poses."""
+    t = 1000 + 0.1 * np.arange(600)
+    for step in (1e-6, 0.003, 0.02):
+        x, y = np.round(rng.normal(0, 0.0035, (2, 600)) / step) * step
+        read_tilt_csv(table(tmp_path / "tilt.csv", np.stack([t, 1 + x + 3 * (t > 1030), 2 + y], 1)))
+    to_and_fro = np.stack([1000 + 60.0 * np.arange(300), 1 + np.arange(300) % 2, np.zeros(300)], 1)
+    read_tilt_csv(table(tmp_path / "tilt.csv", to_and_fro))
+
+
+def test_a_temperature_that_no_sensor_has_is_unknown(tmp_path):
+    path = tmp_path / "tilt.csv"
+    path.write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n1,1,1,20\n2,1,1,1e9\n3,1,1,-inf\n")
+    np.testing.assert_array_equal(read_tilt_csv(path).temperature_c, [20, np.nan, np.nan])
 
 
 def test_nights_in_any_order_and_a_part_twice_are_one_table(tmp_path):
