@@ -63,7 +63,7 @@ def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarr
     for _ in range(rounds):
         _, step, seen = moments(stamps, x, y, window)
         with np.errstate(invalid="ignore"):
-            usable = (np.abs(step).max(1) < 1.5) & (np.linalg.det(seen) > 0.01)
+            usable = (np.abs(step).max(1) < 1.5) & (_narrow_side(seen) > 0.1)
         if not usable.any():
             break
         seen = np.median(seen[usable], axis=0)
@@ -81,6 +81,12 @@ def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarr
         if change < 1e-3:
             break
     return None if shape is None else at_least(shape - blur * np.eye(2), NARROWEST)
+
+
+def _narrow_side(seen: np.ndarray) -> np.ndarray:
+    """The smaller eigenvalues (N,) of moments (N, 2, 2): not the determinants, which two negative widths make positive."""
+    xx, xy, yy = seen[:, 0, 0], seen[:, 0, 1], seen[:, 1, 1]
+    return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
 
 
 def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.identification.evidence import TEST_STARS, Prior, log_evidence
+from starpos.identification.evidence import Prior, log_evidence
 from starpos.identification.pairs import close_pairs, mutual_nearest
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.sky import Sky
@@ -96,19 +96,20 @@ def identified(
     None unless the evidence is beyond doubt (ENOUGH).
     """
     xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
-    stars = OnFrame.of(field, sky, near_pose, TEST_STARS)
-    pair = mutual_nearest(xy[:TEST_STARS], near_pose.project(stars.directions), radius_px[:TEST_STARS])
-    match = _settled(field, xy[:TEST_STARS], sigma, stars, near_pose, pair)
+    tested = xy[: field.tested]
+    stars = OnFrame.of(field, sky, near_pose, field.tested)
+    pair = mutual_nearest(tested, near_pose.project(stars.directions), radius_px[: field.tested])
+    match = _settled(field, tested, sigma, stars, near_pose, pair)
     if match is None:
         return None
     pose, (star, near), residual = match
     log_odds = log_evidence(
-        xy[:TEST_STARS], sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
+        tested, sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
     )
     # true for NaN too
     if not log_odds >= ENOUGH:
         return None
-    if len(xy) > TEST_STARS:
+    if len(xy) > len(tested):
         stars = OnFrame.of(field, sky, pose, FAINTEST_FIT)
         pair = mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
         match = _settled(field, xy, sigma, stars, pose, pair)
