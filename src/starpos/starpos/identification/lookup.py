@@ -16,9 +16,8 @@ LOOSE_PX = 1.0
 TRIANGLE_SIGMA = 3.0
 # A look-up is limited to triangles for which so many candidates are expected.
 MOST_CANDIDATES = 25_000
-# In a crowd of false stars triangles are looked up for which fewer candidates are expected, so many at a time, and so
-# many candidates, those best supported, are looked at.
-RARE, CROWD_BLOCK, MOST_SUPPORTED = 2.0, 50_000, 40
+# The same limit in a crowd of false stars; so many candidates, those best supported, are looked at there.
+MOST_IN_CROWD, MOST_SUPPORTED = 60_000, 40
 
 
 @dataclass(frozen=True)
@@ -74,28 +73,22 @@ class Lookup:
     def supported(self, stars: int, error_px: float) -> Candidates:
         """The candidates, at most MOST_SUPPORTED, that most others support, of all triangles of the `stars` brightest.
 
-        Where most of the brightest are false, nearly all of so many candidates are chance, but chance supports few: three
-        true stars more give three candidates that share sides. Only triangles that chance seldom matches are looked up.
+        Where most of these stars are false, nearly all candidates are chance, but chance supports few. Only the triangles
+        that chance matches least are looked up.
         """
         triples = _triples(stars)
-        found = [
-            self._of_crowd(triples[k : k + CROWD_BLOCK], error_px) for k in range(0, len(triples), CROWD_BLOCK)
-        ]
-        star, corner, mirrored = (np.concatenate(column) for column in zip(*found, strict=True))
+        error = np.hypot(error_px, self.field.sigma[triples].max(1)) / self.field.focal_px
+        star, shape, tolerance = _shapes(self.v, triples, error)
+        expected = self.table.expected(tolerance)
+        rarest = np.argsort(expected)
+        rarest = rarest[expected[rarest].cumsum() < MOST_IN_CROWD]
+        query, found = self.table.near(shape[rarest], tolerance[rarest])
+        star, corner = star[rarest[query]], self.table.corners[found]
+        mirrored = self.table.counter_clockwise[found] != counter_clockwise(self.v[star])
         support = _shared_sides(star, corner, mirrored)
         order = np.argsort(-support, kind="stable")[:MOST_SUPPORTED]
         order = order[support[order] > 1]
         return Candidates(star[order], corner[order], mirrored[order])
-
-    def _of_crowd(self, triples: np.ndarray, error_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Columns of the Candidates for triangles (T, 3) that chance seldom matches."""
-        error = np.hypot(error_px, self.field.sigma[triples].max(1)) / self.field.focal_px
-        star, shape, tolerance = _shapes(self.v, triples, error)
-        rare = self.table.expected(tolerance) < RARE
-        star = star[rare]
-        query, found = self.table.near(shape[rare], tolerance[rare])
-        star, corner = star[query], self.table.corners[found]
-        return star, corner, self.table.counter_clockwise[found] != counter_clockwise(self.v[star])
 
 
 @lru_cache(maxsize=32)
