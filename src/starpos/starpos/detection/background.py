@@ -11,6 +11,10 @@ from scipy import ndimage
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
 QUANTISATION = 12**-0.5
+# A JPEG has smoothed the sky where this share of blocks is flat; a block of the smallest step is then a peak of 4 sigma.
+FLAT, FAINTEST, BLOCK_NOISE = 0.1, 0.1, 2.0
+# Rows and columns of blocks that are looked at.
+MOST_BLOCKS = 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,9 +102,30 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     level, noise = (
         np.stack([_smooth(m, e) for m, e in zip(mesh, error, strict=True)]) for mesh in (level, noise)
     )
-    noise = np.maximum(noise, QUANTISATION)
+    noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
+
+
+def _lost_noise(plane: np.ndarray) -> float:
+    """Noise (DN) that a JPEG may have smoothed away: BLOCK_NOISE times the light of its faintest blocks; 0 without such.
+
+    A JPEG stores the waves in each block of 8 x 8 px in coarse steps. Noise of less than half a step leaves most blocks
+    flat, and a few with a bump of one step that looks like a star.
+    """
+    height, width = (n // 8 for n in plane.shape)
+    if not (height and width):
+        return 0.0
+    rows, columns = (np.unique(np.linspace(0, n - 1, MOST_BLOCKS).astype(int)) for n in (height, width))
+    blocks = plane[: 8 * height, : 8 * width].reshape(height, 8, width, 8)[rows[:, None], :, columns]
+    blocks = blocks.reshape(-1, 64)
+    low, high = blocks.min(1), blocks.max(1)
+    # a sky cut off at 0 and a lamp are flat in any file
+    grey = (low > 0) & (high < high.max())
+    flat, bumpy = grey & (low == high), grey & (low < high)
+    if not bumpy.any() or flat.sum() < FLAT * grey.sum():
+        return 0.0
+    return BLOCK_NOISE * float(np.quantile(blocks[bumpy].astype(np.float32).std(1), FAINTEST))
 
 
 def _sample(length: int, cell_px: int) -> np.ndarray:

@@ -24,6 +24,8 @@ from starpos.detection.stamps import Stamps, are_dots, cut
 DEFAULT_SIGMA = 1.1
 # Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
 BRIGHT, TEACHERS = 20, 250
+# the brightest of them show the shape (in a JPEG fainter ones may be its blocks),
+SHAPERS = 30
 # and of wide stars fewer: together they have so many pixels.
 TEACHING_PIXELS = 12000
 # A star does not teach if the residual's share of its squared light exceeds this, plus noise, plus three times that of
@@ -118,10 +120,11 @@ def _teachers(
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
+    leaders = stamps.take(slice(0, SHAPERS))
     # the shapes of fainter stars are noise
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
-        stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
-    shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
+        leaders = leaders.take(_most_alike(grey(leaders, background)[0]))
+    shape = frame_shape(*grey(leaders, background)) if len(stamps.x) else None
     if shape is None:
         return gaussian(np.eye(2) * DEFAULT_SIGMA**2), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
     psf = gaussian(shape, stamps.x, stamps.y)
