@@ -113,10 +113,10 @@ def _teachers(
     clear = np.ones(len(x), bool)
     for streak in background.streaks:
         clear &= streak.at(y, x)[0] == 0
-    bright = np.flatnonzero(clear & (height > BRIGHT))
-    if len(bright) == 0:
-        bright = np.flatnonzero(clear)[:TEACHERS]
-    bright = bright[_isolated(x, y, height, bright)]
+    alone, high = _isolated(x, y, height)
+    # where no bright star is isolated, fainter ones may be; where none is, stars are wider than their distances
+    choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
+    bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
@@ -198,14 +198,14 @@ def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.nda
     return x, y
 
 
-def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Whether the peaks `index` have no neighbour within 12 px that is higher than a fiftieth of their height."""
-    points = np.stack([x, y], 1)
-    pairs = spatial.cKDTree(points).query_pairs(12, output_type="ndarray")
-    crowded = np.zeros(len(x), bool)
+def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which peaks (N,) have no neighbour within 12 px above a fiftieth of their height, and which have no higher one."""
+    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(12, output_type="ndarray")
+    alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):
-        crowded[a[height[b] > 0.02 * height[a]]] = True
-    return ~crowded[index]
+        alone[a[height[b] > 0.02 * height[a]]] = False
+        high[a[height[b] > height[a]]] = False
+    return alone, high
 
 
 def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
