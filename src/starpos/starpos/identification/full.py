@@ -24,6 +24,8 @@ LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 FAINTEST_FIT = 2000
 # Errors of catalogue and lens, which a centroid's own error does not include.
 FLOOR_PX = 0.05
+# Where the residuals spread more, the lens bends: then all stars count alike, or the brightest few would decide.
+BENT_PX = 0.3
 # Closer stars make one image.
 BLEND_PX = 2.5
 
@@ -116,6 +118,11 @@ def identified(
         if match is None:
             return None
         pose, (star, near), residual = match
+    spread = _spread(residual)
+    if spread > BENT_PX:
+        w, error = stars.directions[near], np.hypot(sigma[star], spread)
+        pose = _fitted_alone(field.focal_px, pose.mirrored, xy[star], w, error)
+        residual = xy[star] - pose.project(w)
     return Identification(
         star=star,
         catalogue=stars.index[near],
@@ -156,9 +163,13 @@ def _settled(
 
 def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
+    return GATE_SIGMA * np.hypot(max(_spread(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
+
+
+def _spread(residual: np.ndarray) -> float:
+    """Standard deviation (px) that the median of residuals (M, 2) shows."""
     # np.median, without its overhead
-    middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]
-    return GATE_SIGMA * np.hypot(max(1.4826 * float(middling), LEAST_SPREAD_PX), sigma) + GATE_PX
+    return 1.4826 * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
 
 
 def _rms(residual: np.ndarray, sigma_px: np.ndarray) -> float:
