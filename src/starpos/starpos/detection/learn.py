@@ -20,12 +20,10 @@ from starpos.detection.shape import (
 )
 from starpos.detection.stamps import Stamps, are_dots, cut
 
-# Width of the PSF, px, for a frame without a star to learn from.
-DEFAULT_SIGMA = 1.1
+# Widths of the PSF, px, for a frame with fewer than ALIKE stars to learn from: so many of its highest peaks decide.
+USUAL_SIGMAS, FEW = (1.1, 0.55, 2.2, 4.4), 10
 # Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
 BRIGHT, TEACHERS = 20, 250
-# the brightest of them show the shape (in a JPEG fainter ones may be its blocks),
-SHAPERS = 30
 # and of wide stars fewer: together they have so many pixels.
 TEACHING_PIXELS = 12000
 # A star does not teach if the residual's share of its squared light exceeds this, plus noise, plus three times that of
@@ -120,13 +118,16 @@ def _teachers(
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
-    leaders = stamps.take(slice(0, SHAPERS))
     # the shapes of fainter stars are noise
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
-        leaders = leaders.take(_most_alike(grey(leaders, background)[0]))
-    shape = frame_shape(*grey(leaders, background)) if len(stamps.x) else None
-    if shape is None:
-        return gaussian(np.eye(2) * DEFAULT_SIGMA**2), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
+        stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
+    shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
+    if shape is None or len(stamps.x) < ALIKE:
+        seen = np.flatnonzero(clear)[:FEW]
+        seen = cut(plane, background, x[seen], y[seen], 12, saturation)
+        shape, learnt = _likeliest(seen, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
+        if not learnt:
+            return gaussian(shape), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
     psf = gaussian(shape, stamps.x, stamps.y)
     stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
     smooth, blur = grey(stamps, background)
@@ -142,6 +143,22 @@ def _teachers(
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
+
+
+def _likeliest(
+    stamps: Stamps, shape: np.ndarray | None, response: Response
+) -> tuple[np.ndarray, bool]:
+    """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one."""
+    choices = [np.eye(2) * sigma**2 for sigma in USUAL_SIGMAS]
+    # what is much wider than the learnt shape is not a star
+    choices = choices if shape is None else [shape, *choices[:2]]
+    found = []
+    for choice in choices:
+        psf = gaussian(choice)
+        fit = fit_stars(stamps, psf, stamps.x.astype(float), stamps.y.astype(float), response, rounds=3)
+        found.append(np.median(np.nan_to_num(fit.flux / fit.flux_sigma)) if len(stamps.x) else 0.0)
+    best = int(np.argmax(found))
+    return choices[best], shape is not None and best == 0
 
 
 def _most_alike(stamps: Stamps) -> np.ndarray:
