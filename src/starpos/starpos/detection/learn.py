@@ -22,6 +22,8 @@ from starpos.detection.stamps import Stamps, are_dots, cut
 
 # Widths of the PSF, px, for a frame with fewer than ALIKE stars to learn from: so many of its highest peaks decide.
 USUAL_SIGMAS, FEW = (1.1, 0.55, 2.2, 4.4), 10
+# A usual width replaces a learnt one if it finds so many times its light.
+CLEARLY = 1.1
 # Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
 BRIGHT, TEACHERS = 20, 250
 # and of wide stars fewer: together they have so many pixels.
@@ -148,7 +150,7 @@ def _teachers(
 def _likeliest(
     stamps: Stamps, shape: np.ndarray | None, response: Response
 ) -> tuple[np.ndarray, bool]:
-    """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one."""
+    """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one, if any."""
     choices = [np.eye(2) * sigma**2 for sigma in USUAL_SIGMAS]
     # what is much wider than the learnt shape is not a star
     choices = choices if shape is None else [shape, *choices[:2]]
@@ -158,7 +160,8 @@ def _likeliest(
         fit = fit_stars(stamps, psf, stamps.x.astype(float), stamps.y.astype(float), response, rounds=3)
         found.append(np.median(np.nan_to_num(fit.flux / fit.flux_sigma)) if len(stamps.x) else 0.0)
     best = int(np.argmax(found))
-    return choices[best], shape is not None and best == 0
+    learnt = shape is not None and found[best] < CLEARLY * found[0]
+    return choices[0 if learnt else best], learnt
 
 
 def _most_alike(stamps: Stamps) -> np.ndarray:

@@ -100,15 +100,12 @@ def crowded_attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[At
     for prior in priors:
         yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
     lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
-    lookup, done = Lookup(field, sky.triangles), 0
-    for stars, error_px in CROWD_STAGES:
-        stars = min(stars, len(field))
-        if stars > done:
-            candidates = lookup.supported(stars, error_px)
-            poses, radius_px = _of_triangles(field, sky, candidates, error_px)
-            for k in range(len(poses)):
-                yield poses[k], radius_px[k], lost
-        done = stars
+    lookup, stages = Lookup(field, sky.triangles), [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
+    for stars, error_px in dict.fromkeys(stages):
+        candidates = lookup.supported(stars, error_px)
+        poses, radius_px = _of_triangles(field, sky, candidates, error_px)
+        for k in range(len(poses)):
+            yield poses[k], radius_px[k], lost
 
 
 def attempts(
