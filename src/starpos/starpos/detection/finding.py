@@ -72,7 +72,9 @@ def find_peaks(plane: np.ndarray, background: Background, threshold: float, limi
     if not _crowded(bright):
         return sharp
     wide = _peaks_of(plane, background, WIDE, threshold, limit)
-    return wide if _are_rings(plane.shape, bright, _no_dots(plane, background, wide)) else sharp
+    if not _are_rings(plane.shape, bright, _no_dots(plane, background, wide)):
+        return sharp
+    return _with_others(wide, bright, limit)
 
 
 def _no_dots(plane: np.ndarray, background: Background, peaks: Peaks) -> Peaks:
@@ -112,6 +114,22 @@ def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
     at_edge = np.minimum(centres, np.array(size[::-1]) - 1 - centres).min(1) < 2 * CROWD
     rings = ring[~on_line & ~at_edge][:LEADERS]
     return bool(np.count_nonzero(rings) > 0.5 * len(rings))
+
+
+def _with_others(wide: Peaks, sharp: Peaks, limit: int) -> Peaks:
+    """The wide peaks, and the highest sharp one of each group that is far from them: of rings that the noise hides."""
+    points, centres = (np.stack([peaks.x, peaks.y], 1) for peaks in (sharp, wide))
+    far = spatial.cKDTree(centres).query(points)[0] > CROWD
+    pairs = spatial.cKDTree(points).query_pairs(CROWD, output_type="ndarray")
+    # the peaks are sorted: the second of a pair is the lower one
+    far[pairs.max(1)] = False
+    columns = [
+        np.concatenate([own, others[far]])
+        for own, others in ((wide.x, sharp.x), (wide.y, sharp.y), (wide.height, sharp.height))
+    ]
+    order = np.argsort(-columns[2], kind="stable")
+    x, y, height = (column[order[:limit]] for column in columns)
+    return replace(wide, x=x, y=y, height=height)
 
 
 def _peaks_of(

@@ -124,6 +124,9 @@ def _teachers(
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
+    # a shape as wide as the stamps is the sky's
+    if shape is not None and np.linalg.eigvalsh(shape)[0] > 0.9 * (stamps.reach / 2) ** 2:
+        shape = None
     if shape is None or len(stamps.x) < ALIKE:
         seen = np.flatnonzero(clear)[:FEW]
         seen = cut(plane, background, x[seen], y[seen], 12, saturation)
