@@ -11,6 +11,8 @@ from scipy import ndimage
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
 QUANTISATION = 12**-0.5
+# A cell is partly white where this share of its pixels has the frame's largest value.
+WHITE = 0.03
 # A JPEG has smoothed the sky where this share of blocks is flat; a block of the smallest step is then a peak of 4 sigma.
 FLAT, FAINTEST, BLOCK_NOISE = 0.1, 0.1, 2.0
 # Rows and columns of blocks that are looked at.
@@ -93,7 +95,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     (ny, sy), (nx, sx) = rows.shape, columns.shape
     # (cell row, block row, 2, cell column, block column, 2) -> (phase, cell row, cell column, samples)
     sample = sample.reshape(ny, sy // 2, 2, nx, sx // 2, 2).transpose(2, 5, 0, 3, 1, 4).reshape(4, ny, nx, -1)
-    level, noise = _clipped(sample)
+    level, noise = _beside_lamps(sample, *_clipped(sample))
     if mosaic is None:
         mosaic = _phases_differ(level, noise, sample.shape[-1])
     if not mosaic:
@@ -105,6 +107,20 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
+
+
+def _beside_lamps(
+    sample: np.ndarray, level: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Level and noise (P, rows, columns) with those of the nearest dark cell in cells that are partly white.
+
+    sample (P, rows, columns, samples). Else the sky beside a white wall would be too bright, and its stars lost.
+    """
+    white = (sample == sample.max()).mean((0, 3))
+    if white.mean() < WHITE or not (white < WHITE).any():
+        return level, noise
+    row, column = ndimage.distance_transform_edt(white >= WHITE, return_distances=False, return_indices=True)
+    return level[:, row, column], noise[:, row, column]
 
 
 def _lost_noise(plane: np.ndarray) -> float:

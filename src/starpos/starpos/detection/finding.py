@@ -220,7 +220,8 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     score = (value - level.mean(1).reshape(x.shape)) / np.sqrt((noise**2).mean(1)).reshape(x.shape)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them. A roof or a tree that
     # covers a part of the frame must not raise the threshold elsewhere: the typical part counts
-    parts = [part for row in np.split(score, 8) for part in np.array_split(row, PARTS, axis=1)]
+    columns = min(PARTS, score.shape[1])
+    parts = [part for row in np.split(score, len(tops)) for part in np.array_split(row, columns, axis=1)]
     low, sigma_below, median = np.array([np.quantile(part, (0.0228, 0.1587, 0.5)) for part in parts]).T
     whole = tied = np.median(np.minimum(median - sigma_below, sigma_below - low)) / kernel.norm
     # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone

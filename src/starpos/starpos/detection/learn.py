@@ -155,13 +155,15 @@ def _likeliest(
 ) -> tuple[np.ndarray, bool]:
     """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one, if any."""
     choices = [np.eye(2) * sigma**2 for sigma in USUAL_SIGMAS]
+    if not len(stamps.x):
+        return choices[0], False
     # what is much wider than the learnt shape is not a star
     choices = choices if shape is None else [shape, *choices[:2]]
     found = []
     for choice in choices:
         psf = gaussian(choice)
         fit = fit_stars(stamps, psf, stamps.x.astype(float), stamps.y.astype(float), response, rounds=3)
-        found.append(np.median(np.nan_to_num(fit.flux / fit.flux_sigma)) if len(stamps.x) else 0.0)
+        found.append(np.median(np.nan_to_num(fit.flux / fit.flux_sigma)))
     best = int(np.argmax(found))
     learnt = shape is not None and found[best] < CLEARLY * found[0]
     return choices[0 if learnt else best], learnt
