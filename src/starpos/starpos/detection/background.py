@@ -109,9 +109,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
 
 
-def _beside_lamps(
-    sample: np.ndarray, level: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _beside_lamps(sample: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and noise (P, rows, columns) with those of the nearest dark cell in cells that are partly white.
 
     sample (P, rows, columns, samples). Else the sky beside a white wall would be too bright, and its stars lost.

@@ -97,7 +97,7 @@ def _crowded(peaks: Peaks) -> bool:
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
-    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one would be in white noise.
+    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one in white noise.
 
     Peaks on a line do not count. Nor do those at the edge of the frame, size (height, width) px, where a line ends.
     """
@@ -108,7 +108,9 @@ def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
     highest = height.max(1, where=inside, initial=0)
     alike = height > 0.25 * highest[:, None]
     # in units of the same noise: correlated noise lowers the wide peaks more
-    ring = (highest * sharp.correlation < wide.height * wide.correlation) & (np.count_nonzero(inside & alike, axis=1) > 1)
+    ring = (highest * sharp.correlation < wide.height * wide.correlation) & (
+        np.count_nonzero(inside & alike, axis=1) > 1
+    )
     beyond = alike & ~inside & np.isfinite(apart)
     way = (np.append(points, [[0, 0]], 0)[near] - centres[:, None]) / np.maximum(apart, 1)[..., None]
     way *= beyond[..., None]

@@ -150,9 +150,7 @@ def _teachers(
     return psf, stamps.take(alike), x[alike], y[alike]
 
 
-def _likeliest(
-    stamps: Stamps, shape: np.ndarray | None, response: Response
-) -> tuple[np.ndarray, bool]:
+def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> tuple[np.ndarray, bool]:
     """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one, if any."""
     choices = [np.eye(2) * sigma**2 for sigma in USUAL_SIGMAS]
     if not len(stamps.x):

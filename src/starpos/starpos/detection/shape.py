@@ -93,7 +93,7 @@ def _settled_shape(stamps: Stamps, window: np.ndarray, rounds: int) -> np.ndarra
 
 
 def _narrow_side(seen: np.ndarray) -> np.ndarray:
-    """The smaller eigenvalues (N,) of moments (N, 2, 2): not the determinants, which two negative widths make positive."""
+    """The smaller eigenvalues (N,) of moments (N, 2, 2); two negative ones would have a positive determinant."""
     xx, xy, yy = seen[:, 0, 0], seen[:, 0, 1], seen[:, 1, 1]
     return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
 

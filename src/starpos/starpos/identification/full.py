@@ -105,9 +105,7 @@ def identified(
     if match is None:
         return None
     pose, (star, near), residual = match
-    log_odds = log_evidence(
-        tested, sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
-    )
+    log_odds = log_evidence(tested, sigma, field.area_px2, pose, prior, star, near, stars.directions[near])
     # true for NaN too
     if not log_odds >= ENOUGH:
         return None

@@ -25,7 +25,7 @@ MOST_LOOKED_AT = 25
 EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
 # Triangles of the brightest stars, and the error in px, where a crowd of them is false.
-CROWD_STAGES = (60, 0.3), (140, 0.3)
+CROWD_STAGES = (60, 0.3), (140, 0.1)
 
 Priors = Sequence[PointingPrior | PlumbPrior]
 
@@ -100,7 +100,10 @@ def crowded_attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[At
     for prior in priors:
         yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
     lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
-    lookup, stages = Lookup(field, sky.triangles), [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
+    lookup, stages = (
+        Lookup(field, sky.triangles),
+        [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES],
+    )
     for stars, error_px in dict.fromkeys(stages):
         candidates = lookup.supported(stars, error_px)
         poses, radius_px = _of_triangles(field, sky, candidates, error_px)

@@ -87,7 +87,9 @@ def test_rings_are_found_whose_noise_went_through_the_same_lens_filter(rng):
     frame = noisy(field(SIZE, stars), rng).astype(float)
     blurred = cv2.filter2D(frame, -1, disc / disc.sum(), borderType=cv2.BORDER_REFLECT)
     found = detect(Frame(np.rint(blurred).astype(np.uint16))).stars
-    inner = (stars[:, 0] > 20) & (stars[:, 0] < SIZE[1] - 20) & (stars[:, 1] > 20) & (stars[:, 1] < SIZE[0] - 20)
+    inner = (
+        (stars[:, 0] > 20) & (stars[:, 0] < SIZE[1] - 20) & (stars[:, 1] > 20) & (stars[:, 1] < SIZE[0] - 20)
+    )
     there, true = share_found(found, stars[inner], 2.0)
     assert there > 0.9
     assert true > 0.9
