@@ -11,6 +11,12 @@ from scipy import ndimage
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
 QUANTISATION = 12**-0.5
+# A cell is partly white where this share of its pixels has the frame's largest value.
+WHITE = 0.03
+# A JPEG has smoothed the sky where this share of blocks is flat; a block of the smallest step is then a peak of 4 sigma.
+FLAT, FAINTEST, BLOCK_NOISE = 0.1, 0.1, 2.0
+# Rows and columns of blocks that are looked at.
+MOST_BLOCKS = 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -89,7 +95,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     (ny, sy), (nx, sx) = rows.shape, columns.shape
     # (cell row, block row, 2, cell column, block column, 2) -> (phase, cell row, cell column, samples)
     sample = sample.reshape(ny, sy // 2, 2, nx, sx // 2, 2).transpose(2, 5, 0, 3, 1, 4).reshape(4, ny, nx, -1)
-    level, noise = _clipped(sample)
+    level, noise = _beside_lamps(sample, *_clipped(sample))
     if mosaic is None:
         mosaic = _phases_differ(level, noise, sample.shape[-1])
     if not mosaic:
@@ -98,9 +104,42 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     level, noise = (
         np.stack([_smooth(m, e) for m, e in zip(mesh, error, strict=True)]) for mesh in (level, noise)
     )
-    noise = np.maximum(noise, QUANTISATION)
+    noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
+
+
+def _beside_lamps(sample: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Level and noise (P, rows, columns) with those of the nearest dark cell in cells that are partly white.
+
+    sample (P, rows, columns, samples). Else the sky beside a white wall would be too bright, and its stars lost.
+    """
+    white = (sample == sample.max()).mean((0, 3))
+    if white.mean() < WHITE or not (white < WHITE).any():
+        return level, noise
+    row, column = ndimage.distance_transform_edt(white >= WHITE, return_distances=False, return_indices=True)
+    return level[:, row, column], noise[:, row, column]
+
+
+def _lost_noise(plane: np.ndarray) -> float:
+    """Noise (DN) that a JPEG may have smoothed away: BLOCK_NOISE times the light of its faintest blocks; 0 without such.
+
+    A JPEG stores the waves in each block of 8 x 8 px in coarse steps. Noise of less than half a step leaves most blocks
+    flat, and a few with a bump of one step that looks like a star.
+    """
+    height, width = (n // 8 for n in plane.shape)
+    if not (height and width):
+        return 0.0
+    rows, columns = (np.unique(np.linspace(0, n - 1, MOST_BLOCKS).astype(int)) for n in (height, width))
+    blocks = plane[: 8 * height, : 8 * width].reshape(height, 8, width, 8)[rows[:, None], :, columns]
+    blocks = blocks.reshape(-1, 64)
+    low, high = blocks.min(1), blocks.max(1)
+    # a sky cut off at 0 and a lamp are flat in any file
+    grey = (low > 0) & (high < high.max())
+    flat, bumpy = grey & (low == high), grey & (low < high)
+    if not bumpy.any() or flat.sum() < FLAT * grey.sum():
+        return 0.0
+    return BLOCK_NOISE * float(np.quantile(blocks[bumpy].astype(np.float32).std(1), FAINTEST))
 
 
 def _sample(length: int, cell_px: int) -> np.ndarray:

@@ -14,6 +14,8 @@ from starpos.detection.stamps import are_alone, are_dots, surroundings
 STRIP = 64
 # Peaks whose surroundings are looked at together.
 CHUNK = 4096
+# Parts of a strip in which the sky's unevenness is measured.
+PARTS = 4
 # Diameter of the widest defocused star, px.
 CROWD = 14
 # So many of the brightest peaks decide whether the frame's stars are rings,
@@ -72,7 +74,9 @@ def find_peaks(plane: np.ndarray, background: Background, threshold: float, limi
     if not _crowded(bright):
         return sharp
     wide = _peaks_of(plane, background, WIDE, threshold, limit)
-    return wide if _are_rings(plane.shape, bright, _no_dots(plane, background, wide)) else sharp
+    if not _are_rings(plane.shape, bright, _no_dots(plane, background, wide)):
+        return sharp
+    return _with_others(wide, bright, limit)
 
 
 def _no_dots(plane: np.ndarray, background: Background, peaks: Peaks) -> Peaks:
@@ -93,7 +97,7 @@ def _crowded(peaks: Peaks) -> bool:
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
-    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one.
+    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one in white noise.
 
     Peaks on a line do not count. Nor do those at the edge of the frame, size (height, width) px, where a line ends.
     """
@@ -103,7 +107,10 @@ def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
     inside = apart < 0.7 * CROWD
     highest = height.max(1, where=inside, initial=0)
     alike = height > 0.25 * highest[:, None]
-    ring = (highest < wide.height) & (np.count_nonzero(inside & alike, axis=1) > 1)
+    # in units of the same noise: correlated noise lowers the wide peaks more
+    ring = (highest * sharp.correlation < wide.height * wide.correlation) & (
+        np.count_nonzero(inside & alike, axis=1) > 1
+    )
     beyond = alike & ~inside & np.isfinite(apart)
     way = (np.append(points, [[0, 0]], 0)[near] - centres[:, None]) / np.maximum(apart, 1)[..., None]
     way *= beyond[..., None]
@@ -111,6 +118,22 @@ def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
     at_edge = np.minimum(centres, np.array(size[::-1]) - 1 - centres).min(1) < 2 * CROWD
     rings = ring[~on_line & ~at_edge][:LEADERS]
     return bool(np.count_nonzero(rings) > 0.5 * len(rings))
+
+
+def _with_others(wide: Peaks, sharp: Peaks, limit: int) -> Peaks:
+    """The wide peaks, and the highest sharp one of each group that is far from them: of rings that the noise hides."""
+    points, centres = (np.stack([peaks.x, peaks.y], 1) for peaks in (sharp, wide))
+    far = spatial.cKDTree(centres).query(points)[0] > CROWD
+    pairs = spatial.cKDTree(points).query_pairs(CROWD, output_type="ndarray")
+    # the peaks are sorted: the second of a pair is the lower one
+    far[pairs.max(1)] = False
+    columns = [
+        np.concatenate([own, others[far]])
+        for own, others in ((wide.x, sharp.x), (wide.y, sharp.y), (wide.height, sharp.height))
+    ]
+    order = np.argsort(-columns[2], kind="stable")
+    x, y, height = (column[order[:limit]] for column in columns)
+    return replace(wide, x=x, y=y, height=height)
 
 
 def _peaks_of(
@@ -197,9 +220,12 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
     level, noise = background.at(x.ravel(), y.ravel())
     score = (value - level.mean(1).reshape(x.shape)) / np.sqrt((noise**2).mean(1)).reshape(x.shape)
-    # stars widen the scatter upwards; where they are many, only the lowest values are free of them
-    low, sigma_below, median = np.quantile(score, (0.0228, 0.1587, 0.5))
-    whole = tied = min(median - sigma_below, sigma_below - low) / kernel.norm
+    # stars widen the scatter upwards; where they are many, only the lowest values are free of them. A roof or a tree that
+    # covers a part of the frame must not raise the threshold elsewhere: the typical part counts
+    columns = min(PARTS, score.shape[1])
+    parts = [part for row in np.split(score, len(tops)) for part in np.array_split(row, columns, axis=1)]
+    low, sigma_below, median = np.array([np.quantile(part, (0.0228, 0.1587, 0.5)) for part in parts]).T
+    whole = tied = np.median(np.minimum(median - sigma_below, sigma_below - low)) / kernel.norm
     # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone
     lag = round(1.7 * kernel.sigma)
     if score.shape[1] > 2 * lag:

@@ -20,8 +20,10 @@ from starpos.detection.shape import (
 )
 from starpos.detection.stamps import Stamps, are_dots, cut
 
-# Width of the PSF, px, for a frame without a star to learn from.
-DEFAULT_SIGMA = 1.1
+# Widths of the PSF, px, for a frame with fewer than ALIKE stars to learn from: so many of its highest peaks decide.
+USUAL_SIGMAS, FEW = (1.1, 0.55, 2.2, 4.4), 10
+# A usual width replaces a learnt one if it finds so many times its light.
+CLEARLY = 1.1
 # Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
 BRIGHT, TEACHERS = 20, 250
 # and of wide stars fewer: together they have so many pixels.
@@ -111,10 +113,10 @@ def _teachers(
     clear = np.ones(len(x), bool)
     for streak in background.streaks:
         clear &= streak.at(y, x)[0] == 0
-    bright = np.flatnonzero(clear & (height > BRIGHT))
-    if len(bright) == 0:
-        bright = np.flatnonzero(clear)[:TEACHERS]
-    bright = bright[_isolated(x, y, height, bright)]
+    alone, high = _isolated(x, y, height)
+    # where no bright star is isolated, fainter ones may be; where none is, stars are wider than their distances
+    choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
+    bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
     stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
@@ -122,8 +124,15 @@ def _teachers(
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
-    if shape is None:
-        return gaussian(np.eye(2) * DEFAULT_SIGMA**2), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
+    # a shape as wide as the stamps is the sky's
+    if shape is not None and np.linalg.eigvalsh(shape)[0] > 0.9 * (stamps.reach / 2) ** 2:
+        shape = None
+    if shape is None or len(stamps.x) < ALIKE:
+        seen = np.flatnonzero(clear)[:FEW]
+        seen = cut(plane, background, x[seen], y[seen], 12, saturation)
+        shape, learnt = _likeliest(seen, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
+        if not learnt:
+            return gaussian(shape), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
     psf = gaussian(shape, stamps.x, stamps.y)
     stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
     smooth, blur = grey(stamps, background)
@@ -139,6 +148,23 @@ def _teachers(
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
+
+
+def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> tuple[np.ndarray, bool]:
+    """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one, if any."""
+    choices = [np.eye(2) * sigma**2 for sigma in USUAL_SIGMAS]
+    if not len(stamps.x):
+        return choices[0], False
+    # what is much wider than the learnt shape is not a star
+    choices = choices if shape is None else [shape, *choices[:2]]
+    found = []
+    for choice in choices:
+        psf = gaussian(choice)
+        fit = fit_stars(stamps, psf, stamps.x.astype(float), stamps.y.astype(float), response, rounds=3)
+        found.append(np.median(np.nan_to_num(fit.flux / fit.flux_sigma)))
+    best = int(np.argmax(found))
+    learnt = shape is not None and found[best] < CLEARLY * found[0]
+    return choices[0 if learnt else best], learnt
 
 
 def _most_alike(stamps: Stamps) -> np.ndarray:
@@ -195,14 +221,14 @@ def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.nda
     return x, y
 
 
-def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Whether the peaks `index` have no neighbour within 12 px that is higher than a fiftieth of their height."""
-    points = np.stack([x, y], 1)
-    pairs = spatial.cKDTree(points).query_pairs(12, output_type="ndarray")
-    crowded = np.zeros(len(x), bool)
+def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which peaks (N,) have no neighbour within 12 px above a fiftieth of their height, and which have no higher one."""
+    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(12, output_type="ndarray")
+    alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):
-        crowded[a[height[b] > 0.02 * height[a]]] = True
-    return ~crowded[index]
+        alone[a[height[b] > 0.02 * height[a]]] = False
+        high[a[height[b] > height[a]]] = False
+    return alone, high
 
 
 def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:

@@ -57,13 +57,22 @@ def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarr
 
     blur, px2, is what smoothing added to their covariance. None if no star can be measured.
     """
-    window = np.eye(2) * max(1.5, stamps.reach / 4) ** 2
+    # a wide window suits all stars, but in the noise of a wide window faint sharp ones are lost
+    for width in (max(1.5, stamps.reach / 4), 1.5):
+        shape = _settled_shape(stamps, np.eye(2) * width**2, rounds)
+        if shape is not None:
+            return at_least(shape - blur * np.eye(2), NARROWEST)
+    return None
+
+
+def _settled_shape(stamps: Stamps, window: np.ndarray, rounds: int) -> np.ndarray | None:
+    """The typical covariance (2, 2) px2 of the stars in stamps, from a first window (2, 2) px2; None if all fail."""
     x, y = stamps.x.astype(float), stamps.y.astype(float)
     shape = None
     for _ in range(rounds):
         _, step, seen = moments(stamps, x, y, window)
         with np.errstate(invalid="ignore"):
-            usable = (np.abs(step).max(1) < 1.5) & (np.linalg.det(seen) > 0.01)
+            usable = (np.abs(step).max(1) < 1.5) & (_narrow_side(seen) > 0.1)
         if not usable.any():
             break
         seen = np.median(seen[usable], axis=0)
@@ -80,7 +89,13 @@ def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarr
         window = window_for(own)
         if change < 1e-3:
             break
-    return None if shape is None else at_least(shape - blur * np.eye(2), NARROWEST)
+    return shape
+
+
+def _narrow_side(seen: np.ndarray) -> np.ndarray:
+    """The smaller eigenvalues (N,) of moments (N, 2, 2); two negative ones would have a positive determinant."""
+    xx, xy, yy = seen[:, 0, 0], seen[:, 0, 1], seen[:, 1, 1]
+    return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
 
 
 def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:

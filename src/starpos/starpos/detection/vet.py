@@ -74,9 +74,11 @@ def measure(
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
         slack = 3 / matched
+        # through a window wider than the star, noise changes the width more
+        loose = slack * np.sqrt(np.linalg.det(window) / np.linalg.det(shape))
         full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
-        wide = (widths[:, 1] > WIDE) & ~full
-        sound &= full | (widths[:, 0] > 0.45 - slack)
+        wide = (widths[:, 1] > WIDE + loose - slack) & ~full
+        sound &= full | (widths[:, 0] > 0.45 - loose)
         sound &= ~wide | ((widths[:, 0] < NARROW) & (matched > CERTAIN))
         edge = (~stamps.good & ~stamps.full & ~spike & _core(stamps, fit, psf, 3)).any((1, 2))
         foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.identification.pairs import close_pairs
-from starpos.identification.pose import Pose, slopes
+from starpos.identification.pose import CROWD_STARS, Pose, slopes
 
 # Errors of the centroids beside their own (px) and their probabilities: none, errors of the catalogue, unknown lenses.
 ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0.1])
@@ -32,9 +32,7 @@ SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)
 MIRRORED = 0.1
 # Width of all rotations about each axis, and of the likeliest focal lengths.
 WIDTH = np.append(np.full(3, np.cbrt(8 * np.pi**2)), 2 * SCALES[0][0])
-# So many of a frame's brightest stars decide.
-TEST_STARS = 50
-EARLIER = np.tri(TEST_STARS, k=-1, dtype=bool)
+EARLIER = np.tri(CROWD_STARS, k=-1, dtype=bool)
 # Closer detections may be the same star, so the second says nothing new.
 DOUBLE_PX = 3.0
 

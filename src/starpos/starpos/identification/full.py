@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.identification.evidence import TEST_STARS, Prior, log_evidence
+from starpos.identification.evidence import Prior, log_evidence
 from starpos.identification.pairs import close_pairs, mutual_nearest
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.sky import Sky
@@ -24,6 +24,8 @@ LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 FAINTEST_FIT = 2000
 # Errors of catalogue and lens, which a centroid's own error does not include.
 FLOOR_PX = 0.05
+# Where the residuals spread more, the lens bends: then all stars count alike, or the brightest few would decide.
+BENT_PX = 0.3
 # Closer stars make one image.
 BLEND_PX = 2.5
 
@@ -96,25 +98,29 @@ def identified(
     None unless the evidence is beyond doubt (ENOUGH).
     """
     xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
-    stars = OnFrame.of(field, sky, near_pose, TEST_STARS)
-    pair = mutual_nearest(xy[:TEST_STARS], near_pose.project(stars.directions), radius_px[:TEST_STARS])
-    match = _settled(field, xy[:TEST_STARS], sigma, stars, near_pose, pair)
+    tested = xy[: field.tested]
+    stars = OnFrame.of(field, sky, near_pose, field.tested)
+    pair = mutual_nearest(tested, near_pose.project(stars.directions), radius_px[: field.tested])
+    match = _settled(field, tested, sigma, stars, near_pose, pair)
     if match is None:
         return None
     pose, (star, near), residual = match
-    log_odds = log_evidence(
-        xy[:TEST_STARS], sigma, field.area_px2, pose, prior, star, near, stars.directions[near]
-    )
+    log_odds = log_evidence(tested, sigma, field.area_px2, pose, prior, star, near, stars.directions[near])
     # true for NaN too
     if not log_odds >= ENOUGH:
         return None
-    if len(xy) > TEST_STARS:
+    if len(xy) > len(tested):
         stars = OnFrame.of(field, sky, pose, FAINTEST_FIT)
         pair = mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
         match = _settled(field, xy, sigma, stars, pose, pair)
         if match is None:
             return None
         pose, (star, near), residual = match
+    spread = _spread(residual)
+    if spread > BENT_PX:
+        w, error = stars.directions[near], np.hypot(sigma[star], spread)
+        pose = _fitted_alone(field.focal_px, pose.mirrored, xy[star], w, error)
+        residual = xy[star] - pose.project(w)
     return Identification(
         star=star,
         catalogue=stars.index[near],
@@ -155,9 +161,13 @@ def _settled(
 
 def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
+    return GATE_SIGMA * np.hypot(max(_spread(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
+
+
+def _spread(residual: np.ndarray) -> float:
+    """Standard deviation (px) that the median of residuals (M, 2) shows."""
     # np.median, without its overhead
-    middling = np.sort(np.abs(residual), axis=None)[residual.size // 2]
-    return GATE_SIGMA * np.hypot(max(1.4826 * float(middling), LEAST_SPREAD_PX), sigma) + GATE_PX
+    return 1.4826 * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
 
 
 def _rms(residual: np.ndarray, sigma_px: np.ndarray) -> float:

@@ -10,6 +10,8 @@ from starpos.instrument.camera import Camera
 
 # Most steps of a fit; a step below this (rad) is the last one.
 STEPS, SMALL_STEP = 2, 3e-5
+# So many of a frame's brightest stars decide, and so many where most of the brightest may be false.
+TEST_STARS, CROWD_STARS = 50, 200
 # No centroid is better than this.
 LEAST_SIGMA_PX = 1e-3
 
@@ -24,6 +26,7 @@ class FrameStars:
     half      (2,) px, half its size
     focal_px  approximate focal length
     area_px2  area over which false detections are spread; never more than the true one
+    tested    so many of the brightest decide whether a pose is right
     """
 
     xy: np.ndarray
@@ -32,6 +35,7 @@ class FrameStars:
     half: np.ndarray
     focal_px: float
     area_px2: float
+    tested: int = TEST_STARS
 
     @classmethod
     def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera, margin_px: int = 0) -> "FrameStars":

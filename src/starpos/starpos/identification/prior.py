@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.identification.evidence import SCALE_TOLERANCE, TEST_STARS, Prior
+from starpos.identification.evidence import SCALE_TOLERANCE, Prior
 from starpos.identification.full import OnFrame
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.screen import MATCH_SIGMA
@@ -63,7 +63,7 @@ class PointingPrior:
         reach_px = 2 * REACH * field.half[0]
         prior = self._known(field, reach_px + STILL_PX, log_share + WAS_MOVED)
         xy = field.xy[0, :BRIGHTEST]
-        shift = xy[:, None] - pose.project(OnFrame.of(field, sky, pose, TEST_STARS).directions)
+        shift = xy[:, None] - pose.project(OnFrame.of(field, sky, pose, field.tested).directions)
         shift = shift[np.square(shift).sum(-1) < reach_px**2]
         for k in _most_voted(np.square(shift[:, None] - shift).sum(-1) < AGREE_PX**2):
             # a shift along x is a turn about the camera's y axis, one along y about its x axis

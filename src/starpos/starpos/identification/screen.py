@@ -23,7 +23,7 @@ def promising(field: FrameStars, sky: Sky, poses: Poses, star: np.ndarray, sigma
     """Rows of those of the K poses that are worth a fit, best first.
 
     star      (K, 3): the field's stars from which each pose was made
-    sigma_px  (K, n): how well each pose places the n = min(N, TEST_STARS) brightest stars
+    sigma_px  (K, n): how well each pose places the n = min(N, field.tested) brightest stars
     """
     predicted, count = _expected(field, sky, poses)
     xy = field.xy[poses.mirrored.astype(int), : sigma_px.shape[1]]

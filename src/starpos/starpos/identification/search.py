@@ -3,13 +3,14 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from starpos.identification.evidence import TEST_STARS, anywhere
+from starpos.identification.evidence import anywhere
 from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
-from starpos.identification.pose import FrameStars, Pose, Poses
+from starpos.identification.pose import CROWD_STARS, FrameStars, Pose, Poses
 from starpos.identification.prior import Attempt, PlumbPrior, PointingPrior
 from starpos.identification.screen import MATCH_SIGMA, promising
 from starpos.identification.sky import Sky
@@ -22,6 +23,9 @@ LOG_HALF = math.log(0.5)
 MOST_LOOKED_AT = 25
 # Stars so far beyond the frame (px) need no margin; a margin is at most this share of the frame.
 EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
+
+# Triangles of the brightest stars, and the error in px, where a crowd of them is false.
+CROWD_STAGES = (60, 0.3), (140, 0.1)
 
 Priors = Sequence[PointingPrior | PlumbPrior]
 
@@ -84,7 +88,27 @@ def _identify(field: FrameStars, sky: Sky, priors: Priors) -> Identification | N
     for pose, radius_px, prior in attempts(field, sky, priors, STAGES):
         if found := identified(field, sky, pose, radius_px, prior):
             return found
+    field = replace(field, tested=CROWD_STARS)
+    for pose, radius_px, prior in crowded_attempts(field, sky, priors):
+        if found := identified(field, sky, pose, radius_px, prior):
+            return found
     return None
+
+
+def crowded_attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[Attempt]:
+    """Yield the attempts for a frame whose brightest stars may nearly all be false, or in any order of brightness."""
+    for prior in priors:
+        yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
+    lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
+    lookup, stages = (
+        Lookup(field, sky.triangles),
+        [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES],
+    )
+    for stars, error_px in dict.fromkeys(stages):
+        candidates = lookup.supported(stars, error_px)
+        poses, radius_px = _of_triangles(field, sky, candidates, error_px)
+        for k in range(len(poses)):
+            yield poses[k], radius_px[k], lost
 
 
 def attempts(
@@ -121,7 +145,7 @@ def _lost_in_space(
 
 def _of_triangles(field: FrameStars, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
     """The poses of K candidates, and the distance (K, n) px by which the field's brightest stars may be off."""
-    xy = field.xy[c.mirrored.astype(int), : min(len(field), TEST_STARS)]
+    xy = field.xy[c.mirrored.astype(int), : field.tested]
     each = np.arange(len(c))[:, None]
     corners = xy[each, c.star]
     w = sky.bright(c.corner.ravel()).reshape(-1, 3, 3)

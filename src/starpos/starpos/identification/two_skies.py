@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from starpos.identification.evidence import DOUBLE_PX, TEST_STARS
+from starpos.identification.evidence import DOUBLE_PX
 from starpos.identification.full import ENOUGH, Identification, identified
 from starpos.identification.pairs import close_pairs
-from starpos.identification.pose import FrameStars, Pose
+from starpos.identification.pose import TEST_STARS, FrameStars, Pose
 from starpos.identification.prior import PointingPrior
 from starpos.identification.search import STAGES, attempts, frame_stars
 from starpos.identification.sky import Sky
