@@ -97,7 +97,7 @@ def _crowded(peaks: Peaks) -> bool:
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
-    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one in white noise.
+    """Whether most of the brightest wide peaks are rings: several sharp peaks, lower in white noise than the wide one.
 
     Peaks on a line do not count. Nor do those at the edge of the frame, size (height, width) px, where a line ends.
     """
