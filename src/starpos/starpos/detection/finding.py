@@ -14,8 +14,10 @@ from starpos.detection.stamps import are_alone, are_dots, surroundings
 STRIP = 64
 # Peaks whose surroundings are looked at together.
 CHUNK = 4096
-# Parts of a strip in which the sky's unevenness is measured.
-PARTS = 4
+# Parts of a strip in which the sky is compared; the whole frame is at most so many times less even than the typical one.
+PARTS, UNEVENEST = 4, 1.4
+# With fewer values in a part its quantiles are chance.
+SAMPLES = 32
 # Diameter of the widest defocused star, px.
 CROWD = 14
 # So many of the brightest peaks decide whether the frame's stars are rings,
@@ -97,7 +99,7 @@ def _crowded(peaks: Peaks) -> bool:
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
-    """Whether most of the brightest wide peaks are rings: several sharp peaks, all lower than the wide one in white noise.
+    """Whether most of the brightest wide peaks are rings: several sharp peaks, lower in white noise than the wide one.
 
     Peaks on a line do not count. Nor do those at the edge of the frame, size (height, width) px, where a line ends.
     """
@@ -220,12 +222,17 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
     level, noise = background.at(x.ravel(), y.ravel())
     score = (value - level.mean(1).reshape(x.shape)) / np.sqrt((noise**2).mean(1)).reshape(x.shape)
-    # stars widen the scatter upwards; where they are many, only the lowest values are free of them. A roof or a tree that
-    # covers a part of the frame must not raise the threshold elsewhere: the typical part counts
+    # stars widen the scatter upwards; where they are many, only the lowest values are free of them
+    low, sigma_below, median = np.quantile(score, (0.0228, 0.1587, 0.5))
+    # a roof or a tree that covers a part of the frame must not raise the threshold elsewhere
     columns = min(PARTS, score.shape[1])
     parts = [part for row in np.split(score, len(tops)) for part in np.array_split(row, columns, axis=1)]
-    low, sigma_below, median = np.array([np.quantile(part, (0.0228, 0.1587, 0.5)) for part in parts]).T
-    whole = tied = np.median(np.minimum(median - sigma_below, sigma_below - low)) / kernel.norm
+    part_low, part_below, part_median = np.array(
+        [np.quantile(part, (0.0228, 0.1587, 0.5)) for part in parts]
+    ).T
+    typical = np.median(np.minimum(part_median - part_below, part_below - part_low))
+    typical = typical if score.size > SAMPLES * len(parts) else np.inf
+    whole = tied = min(median - sigma_below, sigma_below - low, UNEVENEST * typical) / kernel.norm
     # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone
     lag = round(1.7 * kernel.sigma)
     if score.shape[1] > 2 * lag:
