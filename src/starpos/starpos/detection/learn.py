@@ -128,9 +128,9 @@ def _teachers(
     if shape is not None and np.linalg.eigvalsh(shape)[0] > 0.9 * (stamps.reach / 2) ** 2:
         shape = None
     if shape is None or len(stamps.x) < ALIKE:
-        seen = np.flatnonzero(clear)[:FEW]
-        seen = cut(plane, background, x[seen], y[seen], 12, saturation)
-        shape, learnt = _likeliest(seen, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
+        few = np.flatnonzero(clear)[:FEW]
+        around = cut(plane, background, x[few], y[few], 12, saturation)
+        shape, learnt = _likeliest(around, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
         if not learnt:
             return gaussian(shape), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
     psf = gaussian(shape, stamps.x, stamps.y)

@@ -122,7 +122,7 @@ def _alternate(t: np.ndarray, angles: np.ndarray) -> bool:
     """Whether readings (N, axes), in the order of their times t (N,), alternate beyond chance on an axis."""
     # threes that share no reading are independent
     start = np.arange(0, len(t) - 2, 3)
-    # an instrument may be turned to and fro between readings that are further apart
+    # an instrument may be turned back and forth between readings that are further apart
     start = start[(t[start + 2] - t[start + 1] <= BRACKET_S) & (t[start + 1] - t[start] <= BRACKET_S)]
     with np.errstate(invalid="ignore"):
         near = np.abs(angles[start + 1] - angles[start])
