@@ -40,7 +40,7 @@ def fresh(graph, solver):
 
 @pytest.fixture
 def rng():
-    """The same noise whatever was sent before: of five readings one in twenty scatters by more than it says."""
+    """Noise that is the same whatever was sent before: of five readings one in twenty scatters by more than it says."""
     return np.random.default_rng(4)
 
 

@@ -61,7 +61,7 @@ def allowed() -> dict[str, set]:
 
 
 def done(graph) -> dict[str, set]:
-    """The same of the nodes that are there, those without an enclave left out; no service is called by any of them."""
+    """What the nodes that are there use, those without an enclave left out; none of them calls a service."""
     found, ask = {}, graph.node
     for node, namespace, enclave in ask.get_node_names_and_namespaces_with_enclaves():
         if enclave == "/":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same bag gives the same answers: by our player, by another's, and by the command line without ROS."""
+"""A bag gives the same answers each time: by our player, by another's, and by the command line without ROS."""
 
 import math
 import subprocess

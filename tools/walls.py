@@ -74,6 +74,13 @@ def modules() -> list[Module]:
     return found
 
 
+def tests() -> list[Module]:
+    """All tests, and what they share."""
+    folders = (*ROOT.glob("*/test"), *ROOT.glob("src/*/test"), ROOT / "test")
+    paths = sorted({p for folder in folders for p in folder.rglob("*.py")})
+    return [Module(path.stem, path, path.read_text()) for path in paths]
+
+
 def rows(heading: str) -> list[list[str]]:
     """The cells of the table under a heading of the plan."""
     section = PLAN.read_text().split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
@@ -186,7 +193,7 @@ def keywords(house: list[Module]) -> Iterator[str]:
 
 
 def words(house: list[Module]) -> Iterator[str]:
-    """Docstrings that make a reader stop, and files of two topics."""
+    """Docstrings that make a reader stop, and files of two topics, of the product and of its tests."""
     for module in house:
         for node in ast.walk(module.tree):
             said = ast.get_docstring(node) if isinstance(node, DOCUMENTED) else None
@@ -200,7 +207,9 @@ def words(house: list[Module]) -> Iterator[str]:
 def breaches() -> list[str]:
     """All that is against the rules."""
     house = modules()
-    return [line for rule in (layers, aliases, twins, keywords, words) for line in rule(house)]
+    return [line for rule in (layers, aliases, twins, keywords) for line in rule(house)] + [
+        *words(house + tests())
+    ]
 
 
 if __name__ == "__main__":

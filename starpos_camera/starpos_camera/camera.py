@@ -19,12 +19,12 @@ from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
 from starpos.errors import InstrumentError, StarposError
+from starpos.files import path_of
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
-from starpos.paths import path_of
 from starpos.recording.messages import message_to_camera
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES

@@ -54,7 +54,7 @@ def told(source, settings=SETTINGS):
 
 
 def frames(source, settings=((None, None),)):
-    """Of each pair of exposure and gain, one after the other."""
+    """Frames of each pair of exposure and gain, one after the other."""
     out = []
     for exposure_s, gain in settings:
         out.append(told(source, CaptureSettings(exposure_s, gain, 5.0)))

@@ -36,7 +36,7 @@ def measured(samples):
 
 
 def pull_of_means(tilts, sigmas, n):
-    """Of means of n samples, as who uses tilts makes them."""
+    """Scatter, over claim, of means of n samples, as who uses tilts makes them."""
     whole = len(tilts) // n * n
     means = tilts[:whole].reshape(-1, n, 2).mean(1)
     claims = np.sqrt((sigmas[:whole] ** 2).reshape(-1, n, 2).mean(1) / n)

@@ -9,7 +9,7 @@ from rclpy.node import Node
 
 from starpos.calibration.misalignment import Calibrated
 from starpos.errors import InstrumentError, StarposError
-from starpos.paths import path_of
+from starpos.files import path_of
 from starpos.session.session import SolverSession
 from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate
 from starpos_solver import saving

@@ -4,9 +4,9 @@
 from pathlib import Path
 
 from starpos.errors import InstrumentError
+from starpos.files import path_of
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
-from starpos.paths import path_of
 
 
 def save(path: str, calibration_url: str, instrument: Instrument) -> Path:

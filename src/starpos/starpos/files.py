@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that others wrote, read so that none of them can hang the program; and files written whole or not at all."""
+"""Files of others, read so that none of them can hang the program; files written whole or not at all; their URLs."""
 
 import errno
 import os
@@ -8,6 +8,12 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
+from urllib.parse import unquote, urlsplit
+
+from starpos.errors import InstrumentError
+
+# Linux opens no longer path.
+LONGEST_PATH = 4096
 
 
 def open_regular(path: Path | str) -> BinaryIO:
@@ -76,6 +82,24 @@ def write_whole(path: Path | str, content: bytes) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def path_of(url: str) -> Path:
+    """Convert file:///a/b.yaml, ROS's way, or a path that may begin with ~, to a Path; InstrumentError for anything else."""
+    if len(url) > LONGEST_PATH:
+        raise InstrumentError(
+            f"a text of {len(url)} characters names no file: give file:///path/to/file.yaml, or a path"
+        )
+    try:
+        parts = urlsplit(url)
+        if not parts.scheme:
+            return Path(url).expanduser()
+        if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
+            return Path(unquote(parts.path))
+    except (ValueError, RuntimeError):
+        # It is no URL, or ~ names a user who does not exist.
+        pass
+    raise InstrumentError(f"{url!r} names no file: give file:///path/to/file.yaml, or a path")
 
 
 def _open_at_once(path: str, flags: int) -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.paths import path_of
+from starpos.files import path_of
 
 
 def test_a_file_url_and_a_path_name_a_file():

@@ -8,7 +8,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from starpos.diagnosis import Diagnosis, Level
+from starpos.session.diagnosis import Diagnosis, Level
 
 # for the tasks of the nodes
 __all__ = ["Diagnosis", "Diagnostics", "Level"]

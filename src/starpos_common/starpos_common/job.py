@@ -10,7 +10,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Future
 
-from starpos.job import Outcome, outcome_of
+from starpos.session.job import Outcome, outcome_of
 
 
 class JobRunner:

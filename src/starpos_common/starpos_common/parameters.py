@@ -9,7 +9,7 @@ import rclpy.parameter
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 
-from starpos.parameter import FRAME_NAME, Form, Parameter, ParameterError
+from starpos.session.parameter import FRAME_NAME, Form, Parameter, ParameterError
 
 # for the tables of the nodes
 __all__ = [

@@ -396,7 +396,7 @@ class AsciiSource(TiltSource):
         flags = GAP if line.lost or line.broken else 0
         if 0 < self._stuck_samples <= self._equal:
             flags |= STUCK
-        # Of a sensor without z, beyond 90 deg is upside down.
+        # For a sensor without z, beyond 90 deg is upside down.
         if max(abs(line.x), abs(line.y)) > self._range:
             flags |= OUT_OF_RANGE
         return flags

@@ -45,7 +45,7 @@ LEAST_LINKED = 3
 QUICK_STAGES = STAGES[:2]
 # The other pose has the same focal length to this share, and residuals of so many times those of the first plus so much.
 SAME_FOCAL, WORSE, WORSE_PX = 0.01, 2.0, 0.5
-# Of those left over that are as bright, this share belongs to the second sky.
+# This share of those left over that are as bright belongs to the second sky.
 LEAST_SHARE_SECOND = 0.5
 # From a star of the first sky to its neighbour, what a lens bends changes by at most this share of their distance.
 STEEPEST_BEND = 0.2

@@ -8,9 +8,9 @@ import numpy as np
 
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
-from starpos.diagnosis import Diagnosis, Level
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
 from starpos.fix.fix import Fix
+from starpos.session.diagnosis import Diagnosis, Level
 from starpos.units import ARCSEC
 
 # With a larger error of A3 its square, which a linear filter leaves out, exceeds 2 arcsec.

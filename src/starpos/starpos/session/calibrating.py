@@ -10,13 +10,13 @@ from collections.abc import Callable
 import numpy as np
 
 from starpos.calibration.misalignment import Calibrated, calibrate_at
-from starpos.diagnosis import Diagnosis, Level
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Calibration
-from starpos.job import Coming, Jobs, Outcome
 from starpos.session.averaging import Averaging, News
+from starpos.session.diagnosis import Diagnosis, Level
+from starpos.session.job import Coming, Jobs, Outcome
 from starpos.session.log import Log
 from starpos.session.memory import PoseMemory, RecentFrames, Seen, tilts_of
 from starpos.session.settings import Settings

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
-from starpos.job import Jobs, Outcome
+from starpos.session.job import Jobs, Outcome
 
 MOST_CHANGES = 1000
 

@@ -10,11 +10,11 @@ from starpos.earth.geoid import Geoid
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError
+from starpos.files import path_of
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.parameter import FRAME_NAME, Parameter
-from starpos.paths import path_of
+from starpos.session.parameter import FRAME_NAME, Parameter
 
 NAN = math.nan
 # Share by which the focal length of one camera may change.

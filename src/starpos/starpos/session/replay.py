@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from starpos.errors import BagError
-from starpos.job import JobsInTurn
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
 from starpos.session.frames import Output
+from starpos.session.job import JobsInTurn
 from starpos.session.log import Heard, Log
 from starpos.session.now import Now, Sent
 from starpos.session.session import SolverSession

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from starpos.diagnosis import Diagnosis, Level
 from starpos.fix.solver import Solution
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
+from starpos.session.diagnosis import Diagnosis, Level
 
 WIDE_CLOCK_S = 0.1
 EQUATOR_M_PER_S = 465.1

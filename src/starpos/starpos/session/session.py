@@ -20,13 +20,13 @@ from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
-from starpos.job import Jobs
 from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.session import reports
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
+from starpos.session.job import Jobs
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent

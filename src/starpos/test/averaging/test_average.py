@@ -39,7 +39,7 @@ def fixes(field, rng, headings, tilt=12.6, calibration=0.0, slip=None):
 
 
 def in_order(made, apart_s=10.0):
-    """The same fixes one after the other."""
+    """Fixes given one after the other."""
     return [replace(f, utc_unix_s=UTC + apart_s * k) for k, f in enumerate(made)]
 
 

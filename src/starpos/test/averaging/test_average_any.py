@@ -79,7 +79,7 @@ def spoiled(f, rng):
 
 
 def sigmas_off(a, place) -> float:
-    """Of an average from a true place (deg), in ENU there."""
+    """How far an average is from a true place (deg), in sigmas of ENU there."""
     phi, lam = np.radians(place)
     prime, meridian = curvature_radii_m(phi)
     away = np.array(
@@ -142,7 +142,7 @@ def test_sound_fixes_are_not_left_out(rng):
 
 
 def test_it_is_true_of_the_place_that_it_claims(rng):
-    """Of one place, one fix in ten wrong, whatever is wrong with it: within five sigma, once there were a few."""
+    """One place, one fix in ten wrong, whatever is wrong with it: within five sigma, once there were a few."""
     off = []
     for _ in range(8):
         made = walk(rng, 40, spoil=0.1, turn=0.2)

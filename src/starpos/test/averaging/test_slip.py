@@ -24,7 +24,7 @@ def fix(rng):
 
 
 def turned(fix, vector):
-    """The same after a turn (rad) about the Earth's axes."""
+    """Fix after a turn (rad) about the Earth's axes."""
     return replace(fix, camera_to_itrs=rotation.from_vector(vector) @ fix.camera_to_itrs)
 
 

@@ -125,7 +125,7 @@ def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, off_deg, which):
 
 @pytest.mark.parametrize("bad", [[0], [0, 1], [1, 2, 3]])
 def test_frames_that_do_not_agree(catalogue, rng, bad):
-    """Of two or four frames it cannot be told which are right, or only if all but one are."""
+    """Which of two or four frames are right cannot be told, or only if all but one are."""
     shot = shots(catalogue, rng, [0.0] * max(2, 2 * len(bad)))
     for k in bad:
         shot.spoil(k, 0.2 * (k + 1))

@@ -29,9 +29,9 @@ def upright(rng) -> np.ndarray:
 
 
 def readings(rng, headings, noise=SCA100T, lean=0.0, wander=0.0, leans=None) -> tuple[Readings, Truth]:
-    """Of an instrument turned to these headings (deg) about an axis that is `lean` deg off the zenith.
+    """Readings of an instrument turned to these headings (deg) about an axis that is `lean` deg off the zenith.
 
-    wander: 1 sigma of what the inclinometer's zero follows, like a temperature.  leans: of each frame
+    wander: 1 sigma of what the inclinometer's zero follows, like a temperature.  leans: each frame's
     (deg), by a tilted foot instead of a turn.
     """
     a3 = rotation.from_vector(rng.normal(size=3) * [0.05, 0.05, 2.0])
@@ -75,7 +75,7 @@ def readings(rng, headings, noise=SCA100T, lean=0.0, wander=0.0, leans=None) -> 
 
 
 def plumb_error(found, truth, at: np.ndarray) -> np.ndarray:
-    """Of the direction in C that A3 takes to `at` (3,), as small rotations across it, rad (2,)."""
+    """Error of the direction in C that A3 takes to `at` (3,), as small rotations across it, rad (2,)."""
     off = rotation.shortest_turn(found.a3.T @ at, truth.a3.T @ at)
     w = found.a3 @ rotation.to_small_vector(off)
     return np.linalg.svd(at[None])[2][1:] @ w

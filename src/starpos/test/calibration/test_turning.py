@@ -40,7 +40,7 @@ def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(
 
 
 def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
-    """The same of an instrument that is turned about one axis, which leans; A3's turn given to turn_stddev_deg."""
+    """Shots of an instrument that is turned about one axis, which leans; A3's turn given to turn_stddev_deg."""
     toward = rng.uniform(0, 2 * np.pi)
     flat = np.sin(np.radians(lean_deg)) * np.array([np.cos(toward), np.sin(toward)])
     axis, misalignment = (

@@ -2,84 +2,14 @@
 """The command line: what it prints, what it returns, on a small night made by itself."""
 
 import json
-import os
 import shutil
 import struct
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, run, solve
 
-from starpos.cli import COMMANDS, main
-from starpos_testing.patience import WAIT_S
-
-WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
-# the same, with an A3 that is known
-KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
-PLACE = {"latitude": 47.3, "longitude": -122.8}
-AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
-SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",
-              "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched",
-              "residual_arcsec", "log_odds", "status", "warnings"}  # fmt: skip
-IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-                 "log_odds", "status", "warnings", "cpu_ms"}  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def night(tmp_path_factory):
-    """Two frames (FITS) with their tilts and truth."""
-    folder = tmp_path_factory.mktemp("night")
-    place = [f"--{k}={v}" for k, v in PLACE.items()]
-    assert main(["simulate", str(folder), "-n", "2", "--size", "1000", "700", *WIDE, *place, *AIR]) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
-def lists(tmp_path_factory):
-    """Three lists of stars (CSV) without tilt noise, turning by 40 deg from one to the next."""
-    folder = tmp_path_factory.mktemp("lists")
-    place = [f"--{k}={v}" for k, v in PLACE.items()]
-    command = [
-        "simulate",
-        str(folder),
-        "-n",
-        "3",
-        "--turn",
-        "40",
-        "--stars-only",
-        "--size",
-        "1000",
-        "700",
-        *WIDE,
-        *place,
-        *AIR,
-    ]
-    assert main([*command, "--tilt-noise", "0"]) == 0
-    return folder
-
-
-def run(capsys, *args):
-    """Exit status, standard output, lines of standard error."""
-    capsys.readouterr()
-    try:
-        status = main([str(a) for a in args])
-    except SystemExit as e:
-        status = e.code
-    said = capsys.readouterr()
-    return status, said.out, said.err.splitlines()
-
-
-def objects(out):
-    def no_constants(name):
-        pytest.fail(f"{name} is no JSON")
-
-    return [json.loads(line, parse_constant=no_constants) for line in out.splitlines()]
-
-
-def solve(capsys, folder, *more, frames="frame_*.fits"):
-    paths = sorted(folder.glob(frames))
-    return run(capsys, "solve", *paths, "--tilt", folder / "tilt.csv", *AIR, *more)
+from starpos.cli import main
 
 
 def test_solve_a_night_of_frames(night, capsys):
@@ -374,106 +304,6 @@ def test_simulate_is_the_same_for_the_same_seed(tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
-def test_catalogue_info(capsys):
-    status, out, _ = run(capsys, "catalogue", "info")
-    assert status == 0
-    assert "stars of Tycho-2" in out
-    assert "Hog et al. 2000" in out
-
-
-def test_a_catalogue_that_cannot_be_written(capsys, monkeypatch, catalogue, tmp_path):
-    from starpos.sky import tycho2
-
-    monkeypatch.setattr(tycho2, "build", lambda *_: catalogue)  # the real one reads 500 MB
-    status, _, errors = run(
-        capsys, "catalogue", "build", "x", "--out", tmp_path / "no" / "such" / "folder.npz"
-    )
-    assert (status, len(errors)) == (2, 1)
-    assert "folder.npz" in errors[0]
-
-
-def test_help_and_version(capsys):
-    status, out, errors = run(capsys, "--help")
-    assert (status, errors) == (0, [])
-    assert all(name in out for name in COMMANDS)
-    for name in COMMANDS:
-        status, out, _ = run(capsys, name, "--help")
-        assert status == 0
-        assert f"starpos {name}" in out
-    assert run(capsys, "--version")[:2] == (0, "starpos 0.1.0\n")
-
-
-def test_help_imports_nothing_slow():
-    """Start-up: neither astropy nor OpenCV nor scipy is loaded to print a help text."""
-    program = (
-        "import sys\nfrom starpos.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-        "print([m for m in ('astropy', 'cv2', 'scipy', 'numpy', 'yaml') if m in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
-def test_solves_help_does_not_import_astropy():
-    program = (
-        "import sys\nfrom starpos.cli import main\ntry: main(['solve', '--help'])\nexcept SystemExit: pass\n"
-        "print('astropy' in sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
-    )
-    assert done.stdout.splitlines()[-1] == "False"
-
-
-def test_python_m_starpos(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "starpos", "detect", str(tmp_path / "none.fits")],
-        capture_output=True,
-        text=True,
-        timeout=WAIT_S,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "none.fits" in done.stderr
-
-
-def starpos(*args, **environment):
-    """A whole process: its exit status and its lines of standard error."""
-    done = subprocess.run(
-        [sys.executable, "-m", "starpos", *map(str, args)],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    return done.returncode, done.stderr.splitlines()
-
-
-def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_path):
-    rows = (lists / "stars_0001.csv").read_text()
-    other = tmp_path / "other.csv"  # of another size, so that two catalogues of triangles are wanted
-    other.write_text(rows.replace('"NAXIS1": 1000', '"NAXIS1": 1010'))
-    assert other.read_text() != rows
-    (tmp_path / "file").touch()
-    frames = (lists / "stars_0000.csv", other, lists / "stars_0002.csv")
-    status, errors = starpos("identify", *frames, *WIDE, XDG_CACHE_HOME=str(tmp_path / "file"))
-    assert (status, len(errors)) == (0, 1), errors
-    assert errors[0].startswith("starpos identify: ")
-    assert "XDG_CACHE_HOME" in errors[0]
-
-
-@pytest.mark.parametrize("command", ["solve", "identify"])
-def test_a_missing_catalogue_is_one_line(command, lists, tmp_path):
-    tilt = ("--tilt", lists / "tilt.csv") if command == "solve" else ()
-    none = str(tmp_path / "none.npz")
-    status, errors = starpos(command, lists / "stars_0000.csv", *tilt, *WIDE, STARPOS_CATALOGUE=none)
-    assert (status, len(errors)) == (2, 1), errors
-    assert errors[0].startswith(f"starpos {command}: {none}: no catalogue there")
-
-
 def test_identify_frames_of_any_year(lists, tmp_path, capsys):
     """No Earth rotation is needed for where a camera looks."""
     head, rows = (lists / "stars_0000.csv").read_text().split("\n", 1)
@@ -485,12 +315,3 @@ def test_identify_frames_of_any_year(lists, tmp_path, capsys):
         status, _, errors = run(capsys, "identify", path, *WIDE, "--json")
         assert (status, len(errors)) == (expected, expected), errors
     assert "between 1900 and 2100" in errors[0]
-
-
-def test_a_reader_that_goes_away_is_no_error(lists):
-    """`starpos ... | head` ends quietly."""
-    command = [sys.executable, "-m", "starpos", "catalogue", "info"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    process.stdout.close()
-    _, errors = process.communicate(timeout=WAIT_S)
-    assert errors == b""

@@ -4,7 +4,7 @@
 import json
 
 import pytest
-from test_cli import AIR, PLACE, WIDE, objects, run
+from cli_calls import AIR, PLACE, WIDE, objects, run
 
 from starpos.cli import main
 from starpos.instrument.instrument_file import read

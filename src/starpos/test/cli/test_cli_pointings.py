@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_cli import SOLVE_KEYS, objects, run
+from cli_calls import SOLVE_KEYS, objects, run
 
 from starpos.instrument.instrument_file import read
 from starpos_testing.skies.pointings import pointed_night

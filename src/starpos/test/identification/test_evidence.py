@@ -149,7 +149,7 @@ def test_a_pose_that_the_prior_excludes_is_worth_nothing(rng):
 
 
 def integral(prior, made, zenith, reach_rad, rng):
-    """Of a prior over the poses that have zenith (3,) within reach_rad of where `made` has it, in any roll about it."""
+    """Integral of a prior over the poses whose zenith (3,) is within reach_rad of where `made` has it, in any roll."""
     total, poses = 0.0, 6000
     across = np.cross(zenith, made.attitude[np.argmin(np.abs(made.attitude @ zenith))])
     across /= np.linalg.norm(across)

@@ -17,7 +17,7 @@ YEAR = {"openstartracker": 2017.4, "tetra3": 2019.6, "panoptes": 2016.7}
 
 @pytest.fixture(scope="module", params=["openstartracker", "tetra3", "panoptes"])
 def answers(request, shared, catalogue):
-    """Of one camera: rows of the truth, the stars of each frame and what became of them, arcsec a pixel."""
+    """What one camera saw: rows of the truth, the stars of each frame and what became of them, arcsec a pixel."""
     with (shared / "real" / "truth.csv").open() as f:
         rows = [row for row in csv.DictReader(f) if row["set"] == request.param]
     scale = float(np.mean([float(row["scale_x"]) for row in rows if row["solved"] == "1"]))

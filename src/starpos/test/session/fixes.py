@@ -47,7 +47,7 @@ def seen_at(seconds: float, stars=3, **tilt) -> Seen:
 
 
 def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, calibration_m=10.0) -> Fix:
-    """Of an instrument at longitude 10 deg that stands exactly as it says."""
+    """Fix of an instrument at longitude 10 deg that stands exactly as it says."""
     site = Site(latitude_deg, 10.0)
     attitude = camera_to_enu(azimuth_deg, 80.0, 0.0)
     link = attitude @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -81,5 +81,5 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
 
 
 def north_of(fix: Fix, metres: float) -> Fix:
-    """The same, if the inclinometer errs by so much."""
+    """Fix as it is if the inclinometer errs by so much."""
     return replace(fix, latitude=fix.latitude + metres / 6.371e6)

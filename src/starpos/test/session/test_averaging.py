@@ -8,8 +8,8 @@ import pytest
 from fixes import fix_at, north_of
 
 from starpos.averaging.average import average
-from starpos.diagnosis import Level
 from starpos.session.averaging import Averaging, News
+from starpos.session.diagnosis import Level
 
 
 def averaging_of(fixes) -> Averaging:

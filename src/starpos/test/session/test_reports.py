@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from starpos.diagnosis import Level
 from starpos.instrument.instrument import Calibration
 from starpos.session import reports
+from starpos.session.diagnosis import Level
 from starpos_testing.skies.fields import SkyField
 
 TOLD = {"refraction.pressure": 95000.0, "refraction.temperature": 8.0}

@@ -10,11 +10,11 @@ import pytest
 pytest.importorskip("rosbags")
 
 from starpos.fix.solver import Status
-from starpos.job import JobsInTurn
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
 from starpos.recording.messages import stamp_to_unix
 from starpos.session.frames import Answered
+from starpos.session.job import JobsInTurn
 from starpos.session.now import Now, Sent
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay

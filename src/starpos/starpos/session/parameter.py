@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from starpos.errors import StarposError
-from starpos.paths import LONGEST_PATH
+from starpos.files import LONGEST_PATH
 
 # Characters of a text, as of a path. Nothing else limits what a caller may send.
 LONGEST = LONGEST_PATH

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls of the command line, and what tests of it share."""
+
+import json
+
+import pytest
+
+from starpos.cli import main
+
+WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# the same, with an A3 that is known
+KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+PLACE = {"latitude": 47.3, "longitude": -122.8}
+AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
+SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",
+              "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched",
+              "residual_arcsec", "log_odds", "status", "warnings"}  # fmt: skip
+IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
+                 "log_odds", "status", "warnings", "cpu_ms"}  # fmt: skip
+
+
+def run(capsys, *args):
+    """Exit status, standard output, lines of standard error."""
+    capsys.readouterr()
+    try:
+        status = main([str(a) for a in args])
+    except SystemExit as e:
+        status = e.code
+    said = capsys.readouterr()
+    return status, said.out, said.err.splitlines()
+
+
+def objects(out):
+    def no_constants(name):
+        pytest.fail(f"{name} is no JSON")
+
+    return [json.loads(line, parse_constant=no_constants) for line in out.splitlines()]
+
+
+def solve(capsys, folder, *more, frames="frame_*.fits"):
+    paths = sorted(folder.glob(frames))
+    return run(capsys, "solve", *paths, "--tilt", folder / "tilt.csv", *AIR, *more)

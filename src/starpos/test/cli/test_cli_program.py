@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program around its commands: help, start-up, what it says where a file or its reader is missing."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from cli_calls import WIDE, run
+
+from starpos.cli import COMMANDS
+from starpos_testing.patience import WAIT_S
+
+
+def test_catalogue_info(capsys):
+    status, out, _ = run(capsys, "catalogue", "info")
+    assert status == 0
+    assert "stars of Tycho-2" in out
+    assert "Hog et al. 2000" in out
+
+
+def test_a_catalogue_that_cannot_be_written(capsys, monkeypatch, catalogue, tmp_path):
+    from starpos.sky import tycho2
+
+    monkeypatch.setattr(tycho2, "build", lambda *_: catalogue)  # the real one reads 500 MB
+    status, _, errors = run(
+        capsys, "catalogue", "build", "x", "--out", tmp_path / "no" / "such" / "folder.npz"
+    )
+    assert (status, len(errors)) == (2, 1)
+    assert "folder.npz" in errors[0]
+
+
+def test_help_and_version(capsys):
+    status, out, errors = run(capsys, "--help")
+    assert (status, errors) == (0, [])
+    assert all(name in out for name in COMMANDS)
+    for name in COMMANDS:
+        status, out, _ = run(capsys, name, "--help")
+        assert status == 0
+        assert f"starpos {name}" in out
+    assert run(capsys, "--version")[:2] == (0, "starpos 0.1.0\n")
+
+
+def test_help_imports_nothing_slow():
+    """Start-up: neither astropy nor OpenCV nor scipy is loaded to print a help text."""
+    program = (
+        "import sys\nfrom starpos.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+        "print([m for m in ('astropy', 'cv2', 'scipy', 'numpy', 'yaml') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_solves_help_does_not_import_astropy():
+    program = (
+        "import sys\nfrom starpos.cli import main\ntry: main(['solve', '--help'])\nexcept SystemExit: pass\n"
+        "print('astropy' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
+    )
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+def test_python_m_starpos(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "starpos", "detect", str(tmp_path / "none.fits")],
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "none.fits" in done.stderr
+
+
+def starpos(*args, **environment):
+    """A whole process: its exit status and its lines of standard error."""
+    done = subprocess.run(
+        [sys.executable, "-m", "starpos", *map(str, args)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    return done.returncode, done.stderr.splitlines()
+
+
+def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_path):
+    rows = (lists / "stars_0001.csv").read_text()
+    other = tmp_path / "other.csv"  # of another size, so that two catalogues of triangles are wanted
+    other.write_text(rows.replace('"NAXIS1": 1000', '"NAXIS1": 1010'))
+    assert other.read_text() != rows
+    (tmp_path / "file").touch()
+    frames = (lists / "stars_0000.csv", other, lists / "stars_0002.csv")
+    status, errors = starpos("identify", *frames, *WIDE, XDG_CACHE_HOME=str(tmp_path / "file"))
+    assert (status, len(errors)) == (0, 1), errors
+    assert errors[0].startswith("starpos identify: ")
+    assert "XDG_CACHE_HOME" in errors[0]
+
+
+@pytest.mark.parametrize("command", ["solve", "identify"])
+def test_a_missing_catalogue_is_one_line(command, lists, tmp_path):
+    tilt = ("--tilt", lists / "tilt.csv") if command == "solve" else ()
+    none = str(tmp_path / "none.npz")
+    status, errors = starpos(command, lists / "stars_0000.csv", *tilt, *WIDE, STARPOS_CATALOGUE=none)
+    assert (status, len(errors)) == (2, 1), errors
+    assert errors[0].startswith(f"starpos {command}: {none}: no catalogue there")
+
+
+def test_a_reader_that_goes_away_is_no_error(lists):
+    """`starpos ... | head` ends quietly."""
+    command = [sys.executable, "-m", "starpos", "catalogue", "info"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    _, errors = process.communicate(timeout=WAIT_S)
+    assert errors == b""
