@@ -85,7 +85,7 @@ def write_whole(path: Path | str, content: bytes) -> None:
 
 
 def path_of(url: str) -> Path:
-    """Convert file:///a/b.yaml, ROS's way, or a path that may begin with ~, to a Path; InstrumentError for anything else."""
+    """The file that file:///a/b.yaml, or a path that may begin with ~, names; InstrumentError for anything else."""
     if len(url) > LONGEST_PATH:
         raise InstrumentError(
             f"a text of {len(url)} characters names no file: give file:///path/to/file.yaml, or a path"

@@ -8,9 +8,9 @@ import math
 from dataclasses import dataclass
 
 from starpos.instrument.inclinometer import (
-    LIMIT_RAD,
     SCA100T_NOISE_RAD,
     SCA100T_OFFSET_V,
+    SCA100T_RANGE_RAD,
     SCA100T_SENSITIVITY_V_PER_G,
 )
 from starpos_inclinometer.noise import NoiseTracker
@@ -137,7 +137,7 @@ class Sensor:
         c, at = self.calibration, self.temperature.celsius(self.calibration.temperature_reference_c)
         g = c.axis_g(0, sample.x, at), c.axis_g(1, sample.y, at)
         x, y = c.angles(*g)
-        if max(abs(x), abs(y)) > LIMIT_RAD:
+        if max(abs(x), abs(y)) > SCA100T_RANGE_RAD:
             flags |= OUT_OF_RANGE
         if flags & GAP:
             self.noise.interrupt()

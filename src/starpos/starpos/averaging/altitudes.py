@@ -24,6 +24,7 @@ from starpos.frames.pointings import Pointing
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.mounting import Mounting
+from starpos.normal import SIGMA_PER_MAD
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
 
@@ -43,7 +44,6 @@ ALIKE = 1e-7
 EXCLUDED_SIGMA = 6.0
 # directions further off are left out, of so many or more, up to this share; and so often are they judged
 OUTLIER_SIGMA, FEWEST_JUDGED, MOST_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
-SIGMA_PER_MEDIAN = 1.4826
 WITHIN = 0.95
 
 
@@ -246,7 +246,7 @@ def _sound(whole: _Directions) -> np.ndarray:
         if zenith is None:
             return every
         off = size(zenith)
-        usual = SIGMA_PER_MEDIAN * (1 + 5 / (number - 2)) * float(np.median(off))
+        usual = SIGMA_PER_MAD * (1 + 5 / (number - 2)) * float(np.median(off))
         agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual, 1.0))
         if len(agree) < (1 - MOST_OUTLIERS) * number:
             return every

@@ -15,6 +15,7 @@ from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.calibration.readings import KNOWN, Readings
 from starpos.errors import FixError
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
+from starpos.normal import MEDIAN_OF_CHI2
 from starpos.units import ARCSEC
 
 # a frame further off than this pulls no harder
@@ -39,7 +40,6 @@ NARROW_TURN = np.radians(20)
 AS_GOOD = 8.0
 # share of the axis' weight below which the headings do not tell the axis
 SAME_AXIS = 1e-9
-MEDIAN_OF_CHI2 = 2 * np.log(2)  # for two degrees of freedom
 MOST_STEPS, LONGEST_STEP, SETTLED_RAD = 60, 0.5, 1e-11
 
 

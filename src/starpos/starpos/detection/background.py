@@ -7,6 +7,8 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
+from starpos.normal import SIGMA_PER_MAD
+
 # Neighbouring cells that differ by more than so many times their error lie at an edge, a roof's for example.
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
@@ -160,7 +162,7 @@ def _clipped(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     count = sample.shape[-1]
     median = np.partition(sample, count // 2, axis=-1)[..., count // 2, None]
     deviation = sample - median
-    spread = 1.4826 * np.partition(np.abs(deviation), count // 2, axis=-1)[..., count // 2, None]
+    spread = SIGMA_PER_MAD * np.partition(np.abs(deviation), count // 2, axis=-1)[..., count // 2, None]
     if np.any(spread == 0):
         upper, high = np.quantile(sample, (0.75, 0.9), axis=-1)[..., None]
         spread = np.where(spread > 0, spread, (high - upper) / 0.607)

@@ -9,6 +9,7 @@ from scipy import ndimage, sparse, spatial
 
 from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
+from starpos.normal import SIGMA_PER_MAD
 
 # Rows of a strip: few enough that it stays in the processor's cache.
 STRIP = 64
@@ -237,7 +238,7 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     lag = round(1.7 * kernel.sigma)
     if score.shape[1] > 2 * lag:
         steps = (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])) / 1.5**0.5
-        tied = min(whole, 1.4826 * np.median(np.abs(steps)) / kernel.norm)
+        tied = min(whole, SIGMA_PER_MAD * np.median(np.abs(steps)) / kernel.norm)
     tied = float(tied) if tied > 1.1 else 1.0
     return tied, max(1.0, float(whole) / tied)
 

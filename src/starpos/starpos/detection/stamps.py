@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from starpos.detection.background import Background, phase_of
+from starpos.normal import SIGMA_PER_MAD
 
 # Around a star the sky counts as brighter or less even than the mesh says where about 50 pixels lie so far above it, or
 # scatter so much, in units of a pixel's noise: both are four times their errors.
@@ -101,5 +102,5 @@ def uneven(signal: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     score = signal / noise
     level = np.median(score, axis=1)
-    scatter = 1.4826 * np.median(np.abs(score - level[:, None]), axis=1)
+    scatter = SIGMA_PER_MAD * np.median(np.abs(score - level[:, None]), axis=1)
     return np.where(level > RAISED, level, 0), np.where(scatter > UNEVEN, scatter, 1)

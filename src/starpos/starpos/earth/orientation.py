@@ -25,6 +25,7 @@ TT_MINUS_TAI_S = 32.184
 TT_MINUS_UTC_S = 69.184
 SPEED_OF_LIGHT = erfa.CMPS
 ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
+EQUATOR_M_PER_S = ROTATION_RAD_S * EQUATOR_RADIUS_M
 FIRST_MJD = 41684.0  # 1973-01-02: the first day of the IERS table
 # Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
 # holding the pole (test_orientation.py computes both).

@@ -5,13 +5,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from starpos.normal import MEDIAN_OF_CHI2
+
 OUTLIER_SIGMA = 5.0
 # the grid of variances that `expected_extra` integrates over: points, least in units of the stated variance, most in
 # units of the sum of the squared residuals
 GRID, GRID_LEAST, GRID_MOST = 128, 1e-3, 1e2
 # the search of `_extra_variance`: least as a share of the most, points of a grid, grids; good to 1e-3
 LEAST_EXTRA, COARSE, ROUNDS = 1e-12, 24, 4
-MEDIAN_OF_CHI2 = 2 * np.log(2)  # for two degrees of freedom
 
 
 def judged(

@@ -10,6 +10,7 @@ from starpos.identification.evidence import Prior, log_evidence
 from starpos.identification.pairs import close_pairs, mutual_nearest
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.identification.sky import Sky
+from starpos.normal import SIGMA_PER_MAD
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import rows_near
 
@@ -167,7 +168,7 @@ def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 def _spread(residual: np.ndarray) -> float:
     """Standard deviation (px) that the median of residuals (M, 2) shows."""
     # np.median, without its overhead
-    return 1.4826 * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
+    return SIGMA_PER_MAD * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
 
 
 def _rms(residual: np.ndarray, sigma_px: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from starpos import rotation
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
 from starpos.units import ARCSEC
 
-LIMIT_RAD = np.radians(30.0)  # range of the SCA100T-D01
+SCA100T_RANGE_RAD = np.radians(30.0)  # the -D01 variant
 SCA100T_OFFSET_V = 2.5  # output at zero tilt with a 5 V supply (paper, section 3.1)
 SCA100T_SENSITIVITY_V_PER_G = 4.0  # the -D01 variant
 SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the paper's resolution

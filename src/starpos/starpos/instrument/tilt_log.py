@@ -9,13 +9,13 @@ import numpy as np
 
 from starpos.errors import TiltError
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
+from starpos.normal import SIGMA_PER_MAD
 
 # The noise is measured from readings that are so close in time, if there are so many.
 NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20
 # Readings more than so many sigma away are left out; an instrument whose readings scatter so much more than their noise
 # is not at rest.
 OUTLIER_SIGMA, REST = 6.0, 6.0
-SIGMA_PER_MAD = 1.4826
 # The noise comes from the smallest 80 % of a Gaussian's deviations, which have this variance.
 KEPT, KEPT_VARIANCE = 0.8, 0.4377
 # Over sqrt(steps) it is three times the relative error of `white_noise`.

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith, zenith_of
+from starpos.normal import SIGMA_PER_MAD
 from starpos.report.night import Night, ReportedPlace, Truth
 from starpos.units import ARCSEC
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
 FEWEST_FOR_OUTLIERS = 5
-SIGMA_PER_MAD = 1.4826
 SAME_TIME_S = 0.01
 # if headings are further from their mean, the instrument was turned
 TURNED_RAD, TURNED_SIGMA = np.radians(0.1), 10.0

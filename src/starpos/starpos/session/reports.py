@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from starpos.earth.orientation import EQUATOR_M_PER_S
 from starpos.fix.solver import Solution
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.session.diagnosis import Diagnosis, Level
 
 WIDE_CLOCK_S = 0.1
-EQUATOR_M_PER_S = 465.1
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
