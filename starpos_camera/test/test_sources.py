@@ -7,6 +7,7 @@ import pytest
 
 from starpos.detection import detect
 from starpos.errors import FrameError
+from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
 from starpos_camera.camera_parameters import PARAMETERS
@@ -157,7 +158,7 @@ def test_a_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path):
     (taken,) = play(make(files__path=path, files__exif=True), 1)
     assert taken.stamp_source == Capture.EXIF
     assert taken.frame.mid_unix_s == pytest.approx(NOW_S - 3600 + 0.255 + 0.25)
-    assert taken.frame.stamp_stddev_s == pytest.approx(0.01 / np.sqrt(12))
+    assert taken.frame.stamp_stddev_s == pytest.approx(np.hypot(0.01 / np.sqrt(12), UNKNOWN_LATENCY_S))
     assert taken.frame.clock_stddev_s == 60.0
     own = {"files__exif_utc_offset": -2.5, "files__exif_clock_stddev": 2.0}
     (taken,) = play(make(files__path=path, files__exif=True, **own), 1)

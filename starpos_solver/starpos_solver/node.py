@@ -203,7 +203,9 @@ class SolverNode(Node):
     def _report_conditions(self) -> Diagnosis:
         calibration = self._settings.calibration(self._session.calibrating.found)
         tilt = self._session.answer.tilt if self._session.answer else None
-        return reports.of_conditions(self._values, calibration, tilt)
+        latest, solver = self._session.latest, self._session.instrument.solver
+        shutter = solver.shutter(latest.stars) if latest and solver else None
+        return reports.of_conditions(self._values, calibration, tilt, shutter)
 
 
 class NodeLog:

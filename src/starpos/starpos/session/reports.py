@@ -8,6 +8,7 @@ import numpy as np
 
 from starpos.earth.orientation import EQUATOR_M_PER_S
 from starpos.fix.solver import Solution
+from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.session.diagnosis import Diagnosis, Level
@@ -74,10 +75,12 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
     return Diagnosis(Level.OK, f"the time is known to {wide:.2g} s", values)
 
 
-def of_conditions(values: Mapping, calibration: Calibration, tilt: Tilt | None) -> Diagnosis:
-    """Report which of the air's pressure and temperature, and of the inclinometer's temperatures, nobody knows.
+def of_conditions(
+    values: Mapping, calibration: Calibration, tilt: Tilt | None, shutter: Shutter | None
+) -> Diagnosis:
+    """Report what nobody knows of the air, of the inclinometer's temperatures and of the shutter.
 
-    values: the parameters.  tilt: of the newest frame, None without one.
+    values: the parameters.  tilt, shutter: those of the newest frame, None without one.
     """
     now_c = math.nan if tilt is None else tilt.temperature_c
     pressure_pa, air_c = values["refraction.pressure"], values["refraction.temperature"]
@@ -94,6 +97,11 @@ def of_conditions(values: Mapping, calibration: Calibration, tilt: Tilt | None) 
         unknown.append(
             "the inclinometer's temperature at its calibration is not known, which widens the fix: calibrate again"
         )
+    if shutter == UNKNOWN:
+        unknown.append(
+            "the time from the shutter's first row to its last is not known, which widens the fix: give the instrument "
+            "file's shutter, readout_s: 0 for a global one"
+        )
     shown = {
         "pressure (Pa)": pressure_pa,
         "temperature (deg C)": air_c,
@@ -102,4 +110,4 @@ def of_conditions(values: Mapping, calibration: Calibration, tilt: Tilt | None) 
     }
     if unknown:
         return Diagnosis(Level.WARN, "; ".join(unknown), shown)
-    return Diagnosis(Level.OK, "air and temperatures are known", shown)
+    return Diagnosis(Level.OK, "air, temperatures and shutter are known", shown)

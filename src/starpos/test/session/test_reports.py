@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from starpos.frames.shutter import GLOBAL, UNKNOWN, Shutter
 from starpos.instrument.instrument import Calibration
 from starpos.session import reports
 from starpos.session.diagnosis import Level
@@ -20,28 +21,29 @@ def tilt(temperature_c):
     return replace(SkyField().tilt(), temperature_c=temperature_c)
 
 
-def test_air_and_temperatures_that_are_known_are_right():
-    said = reports.of_conditions(TOLD, NOBODYS, tilt(12.0))
+def test_conditions_that_are_known_are_right():
+    said = reports.of_conditions(TOLD, NOBODYS, tilt(12.0), GLOBAL)
     assert said.level == Level.OK and said.values["inclinometer (deg C)"] == 12.0
     # before the first frame nobody can know what the tilts carry
-    assert reports.of_conditions(TOLD, NOBODYS, None).level == Level.OK
+    assert reports.of_conditions(TOLD, NOBODYS, None, None).level == Level.OK
 
 
 @pytest.mark.parametrize(
-    ("values", "calibration", "temperature_c", "words"),
+    ("values", "calibration", "temperature_c", "shutter", "words"),
     [
-        ({"refraction.pressure": math.nan}, NOBODYS, 12.0, "the air's pressure is not known"),
-        ({"refraction.temperature": math.nan}, NOBODYS, 12.0, "the air's temperature is not known"),
-        ({}, NOBODYS, math.nan, "the inclinometer's temperature is not known"),
-        ({}, DATED, 12.0, "at its calibration is not known"),
+        ({"refraction.pressure": math.nan}, NOBODYS, 12.0, GLOBAL, "the air's pressure is not known"),
+        ({"refraction.temperature": math.nan}, NOBODYS, 12.0, GLOBAL, "the air's temperature is not known"),
+        ({}, NOBODYS, math.nan, GLOBAL, "the inclinometer's temperature is not known"),
+        ({}, DATED, 12.0, Shutter(0.02, 0.001), "at its calibration is not known"),
+        ({}, NOBODYS, 12.0, UNKNOWN, "the shutter's first row to its last is not known"),
     ],
 )
-def test_what_nobody_told_is_a_warning(values, calibration, temperature_c, words):
-    said = reports.of_conditions(TOLD | values, calibration, tilt(temperature_c))
+def test_what_nobody_told_is_a_warning(values, calibration, temperature_c, shutter, words):
+    said = reports.of_conditions(TOLD | values, calibration, tilt(temperature_c), shutter)
     assert said.level == Level.WARN and words in said.message and ";" not in said.message
 
 
 def test_each_lack_has_a_sentence():
     nothing = dict.fromkeys(TOLD, math.nan)
-    said = reports.of_conditions(nothing, DATED, tilt(math.nan))
-    assert said.level == Level.WARN and said.message.count("is not known") == 3
+    said = reports.of_conditions(nothing, DATED, tilt(math.nan), UNKNOWN)
+    assert said.level == Level.WARN and said.message.count("is not known") == 4
