@@ -268,7 +268,7 @@ def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_ma
         replay = run(
             "starpos_bringup",
             "replay",
-            arguments=(str(bag), "--rate", "0", "--inputs", inputs, "--wait", "3"),
+            arguments=(str(bag), "--rate", "0", "--inputs", inputs, "--wait", "10"),
         )
         assert replay.wait() == 0, replay.output
         graph.wait(lambda names=played: all(heard[name] for name in names))

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of tilt readings on disk, a CSV."""
 
+import difflib
 import io
 import itertools
 import os
+import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +27,10 @@ CURE = (
     f"give a CSV with a line of names, {','.join(NEEDED)}[,{','.join(OPTIONAL)}], and readings: the elevations of "
     "the sensor's axes"
 )
+# a cell, but a line's first, that holds nothing
+EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
+# a column's name so much like one that is read may be meant for it
+ALIKE = 0.7
 # no angle is less certain, and still one
 MOST_SIGMA_DEG = 45.0
 # Readings alternate where, of three in a row, the outer two are nearer to each other than two neighbours in so large a
@@ -37,7 +43,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
 
     Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
     it is beyond MOST_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
-    column, or NaN) it is noise_rad.
+    column, an empty cell, or NaN) it is noise_rad. Columns of other names are left alone.
     """
     path = Path(path)
     try:
@@ -45,7 +51,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
             # our own error says that a file is empty
             warnings.simplefilter("ignore")
             names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
-            rows = np.loadtxt(f, delimiter=",", ndmin=2)
+            rows = np.loadtxt(io.StringIO(EMPTY.sub(",nan", f.read())), delimiter=",", ndmin=2)
     except FileNotFoundError:
         raise TiltError(f"{path}: there is no such file: {CURE}") from None
     except (OSError, ValueError, UnicodeDecodeError) as e:
@@ -55,6 +61,9 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         raise TiltError(
             f"{path}: a tilt table needs the columns {', '.join(NEEDED)} and at least one row: {CURE}"
         )
+    for name in set(names) - {*NEEDED, *OPTIONAL}:
+        for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE):
+            raise TiltError(f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise")
     column = dict(zip(names, rows.T, strict=True))
     _check_one_sensor(path, column, rows)
     order = np.argsort(column["utc_unix_s"], kind="stable")
