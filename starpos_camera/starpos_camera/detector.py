@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `detector`: finds the stars of frames and publishes `stars`."""
 
+import itertools
 import math
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,8 +36,14 @@ from starpos_interfaces.msg import Capture, StarArray
 # Only the newest frame is kept; each more would take another 42 MB.
 IMAGE_DEPTH = 1
 CAPTURES_KEPT = 16
-# An image waits so long for its Capture, which comes on another topic and may come later.
-CAPTURE_PATIENCE_S = 0.5
+# An image waits so long for its Capture, which comes on another topic: where a busy machine lost it, the middleware
+# repeats it when the next one is sent, or after 3 s.
+CAPTURE_PATIENCE_S = 3.5
+# So long where no publisher of Captures is known yet: there may be none.
+DISCOVERY_S = 0.5
+# Frames that wait at most, of 42 MB each.
+MOST_HELD = 3
+LOOK_S = 0.1
 # Silence is reported after so long, and after three times the interval between the last two frames.
 MIN_SILENCE_S = 5.0
 
@@ -68,7 +76,10 @@ class DetectorNode(Node):
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = self._detection_settings()
         self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
-        self._held: Job | None = None  # the newest frame, until its Capture comes
+        # what holds for a frame whose Capture is lost
+        self._usual = Capture()
+        # frames until their Captures come, oldest first, and how long they wait for them, s of the clock below
+        self._held: deque[tuple[Job, float]] = deque()
         self._frames = self._bad = self._dropped = 0
         # Sequence number of the last image; None: the middleware gives none.
         self._sequence: int | None = None
@@ -91,11 +102,11 @@ class DetectorNode(Node):
     def listen(self) -> None:
         """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
         takes: dict[str, Take] = {"camera/capture": self._on_capture, "camera/image_raw": self._on_image}
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._patience_clock = Clock(clock_type=ClockType.STEADY_TIME)
         if time_is_simulated(self):
-            clock = self.get_clock()
+            self._patience_clock = self.get_clock()
             self._replayed = Replayed(self, takes, [self._publisher], busy=lambda: not self._worker.idle)
-        self._late = self.create_timer(CAPTURE_PATIENCE_S, self._go_on, clock=clock, autostart=False)
+        self._look = self.create_timer(LOOK_S, self._go_on, clock=self._patience_clock, autostart=False)
         self._captures_come = self._subscribe(Capture, "camera/capture", takes, CAPTURES_KEPT)
         images = self._subscribe(Image, "camera/image_raw", takes, IMAGE_DEPTH)
         self._where = f" on {images.topic_name}"
@@ -153,8 +164,7 @@ class DetectorNode(Node):
         if len(self._captures) >= CAPTURES_KEPT:
             del self._captures[next(iter(self._captures))]
         self._captures[_key(message.header)] = message
-        if self._held is not None and _key(self._held.header) == _key(message.header):
-            self._go_on()
+        self._go_on()
 
     def _on_image(self, message: Image, info: Mapping[str, Any]) -> None:
         self._count_overwritten(info["publication_sequence_number"])
@@ -165,25 +175,46 @@ class DetectorNode(Node):
             self._arrived()
             self._complain(str(error))
             return
-        if self._held is not None:
-            self._go_on()
-        self._held = Job(frame, message.header)
+        patience_s = CAPTURE_PATIENCE_S if self._captures_come.get_publisher_count() else 0.0
         # At the first image the sender's Captures may not have been discovered yet.
-        expected = self._last_frame_s is None or self._captures_come.get_publisher_count()
+        if self._last_frame_s is None:
+            patience_s = max(patience_s, DISCOVERY_S)
         if self._replayed is not None and self._replayed.playing:
             # It was played before its image, or is not in the bag.
-            expected = False
-        if expected and _key(message.header) not in self._captures:
-            self._late.reset()
-        else:
-            self._go_on()
+            patience_s = 0.0
+        self._held.append((Job(frame, message.header), self._now_s() + patience_s))
+        self._go_on()
+
+    def _now_s(self) -> float:
+        return self._patience_clock.now().nanoseconds * 1e-9
 
     def _go_on(self) -> None:
-        """Submit the frame that is held, with its Capture if that has come."""
-        self._late.cancel()
-        job, self._held = self._held, None
-        if job is None:
+        """Submit the oldest frame if its Capture has come, or will not come; a newer one that is ready replaces it."""
+        if not self._held:
             return
+        while self._ready(0):
+            if self._worker.idle:
+                self._submit_with_capture(self._held.popleft()[0])
+            elif self._ready(1):
+                self._held.popleft()
+                self._dropped += 1
+            else:
+                break
+        if not self._held:
+            self._look.cancel()
+        elif self._look.is_canceled():
+            self._look.reset()
+
+    def _ready(self, k: int) -> bool:
+        """Whether the k-th frame that is held need not wait for its Capture any more."""
+        if k >= len(self._held):
+            return False
+        # of one sender they come in order: if that of a later frame is here, its own is lost
+        come = any(_key(job.header) in self._captures for job, _ in itertools.islice(self._held, k, None))
+        return come or len(self._held) > MOST_HELD or self._now_s() >= self._held[k][1]
+
+    def _submit_with_capture(self, job: Job) -> None:
+        """Submit a frame, with its Capture if that has come."""
         try:
             frame = self._with_capture(job)
         except StarposError as error:
@@ -200,18 +231,27 @@ class DetectorNode(Node):
         self._sequence = sequence
 
     def _with_capture(self, job: Job) -> Frame:
-        """Add exposure, errors and shutter of the Capture to its frame."""
-        capture = self._captures.pop(_key(job.header), None) or Capture()
+        """Add exposure, errors and shutter of the Capture to its frame; of a lost one those of the last, no exposure."""
+        capture = self._captures.pop(_key(job.header), None) or self._usual
         told = (capture.exposure, capture.stamp_stddev, capture.clock_stddev)
         exposure, stamp, clock = (v if math.isfinite(v) and v > 0 else 0.0 for v in told)
         exposure = exposure or self._values["exposure"] or None
-        return replace(
+        frame = replace(
             job.frame,
             exposure_s=exposure,
             stamp_stddev_s=stamp,
             clock_stddev_s=clock,
             shutter=message_to_shutter(capture),
         )
+        # the errors of a camera's times and its shutter are those of its other frames; its exposure may not be
+        self._usual = Capture(
+            stamp_stddev=capture.stamp_stddev,
+            clock_stddev=capture.clock_stddev,
+            shutter_known=capture.shutter_known,
+            readout=capture.readout,
+            readout_stddev=capture.readout_stddev,
+        )
+        return frame
 
     def _detect(self, job: Job) -> DetectedFrame:
         """Find the stars of a frame, in the worker's thread."""
@@ -241,6 +281,7 @@ class DetectorNode(Node):
                 # A defect costs this frame only; the node goes on.
                 kind = type(result).__name__
                 self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
+        self._go_on()
         if self._replayed is not None:
             self._replayed.go_on()
 
