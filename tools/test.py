@@ -32,6 +32,8 @@ LINTERS = [
 NO_TESTS = 5  # pytest's exit status where a -k left none
 SHOWN = 20  # of the slowest tests
 LANES = 3  # at once: on two cores, because tests of nodes mostly wait
+# for so many at once: a thread that has no processor of its own makes the others wait for it
+ONE_THREAD = {"OPENCV_FOR_THREADS_NUM": "1"}
 LONGEST_FIRST = ("graph", "starpos", "starpos_camera", "starpos, Ubuntu's", "starpos_inclinometer")
 VERSIONS = "tools/setup/ubuntu-24.04.txt"
 UNDERLAY = ROOT / ".underlay"
@@ -106,11 +108,17 @@ def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
 
 
 def pytest(
-    folder: str, report: str, pytest_args: list[str], out, python=sys.executable, **options
+    folder: str,
+    report: str,
+    pytest_args: list[str],
+    out,
+    python=sys.executable,
+    environment: dict[str, str] | None = None,
 ) -> Outcome:
-    """A folder's tests; options: those of `run`."""
+    """A folder's tests."""
     since, path = time.time(), ROOT / "log" / f"{report}.xml"
-    status = run([python, "-m", "pytest", folder, f"--junit-xml={path}", *pytest_args], out, **options)
+    command = [python, "-m", "pytest", folder, f"--junit-xml={path}", *pytest_args]
+    status = run(command, out, (environment or dict(os.environ)) | ONE_THREAD)
     return outcome_of(path, since, status, out)
 
 

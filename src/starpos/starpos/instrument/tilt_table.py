@@ -63,7 +63,9 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         )
     for name in set(names) - {*NEEDED, *OPTIONAL}:
         for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE):
-            raise TiltError(f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise")
+            raise TiltError(
+                f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise"
+            )
     column = dict(zip(names, rows.T, strict=True))
     _check_one_sensor(path, column, rows)
     order = np.argsort(column["utc_unix_s"], kind="stable")

@@ -63,6 +63,7 @@ def test_place_and_heading_need_no_tilt(solver, site, rng):
     assert sigma == pytest.approx(SAG_ARCSEC * np.sqrt(24), rel=0.05)
 
 
+@pytest.mark.montecarlo
 def test_claims_are_true_of_cameras_that_sag_as_stated(solver):
     place, heading = [], []
     for seed in range(80):

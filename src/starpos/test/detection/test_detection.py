@@ -68,6 +68,7 @@ def rings(diameter, electrons, rng, size=(500, 500)):
     return light, stars
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize(
     ("diameter", "electrons"), [(8, 8000), (8, 30000), (11, 30000), (14, 8000), (14, 30000)]
 )
@@ -83,6 +84,7 @@ def test_defocused_stars_with_a_hole_are_one_star_each(diameter, electrons, rng)
     assert 0.5 < rms((error / np.sqrt(np.einsum("nii->ni", found.covariance[index]))).ravel()) < 1.2
 
 
+@pytest.mark.montecarlo
 def test_hot_pixels_do_not_hide_that_stars_are_rings(rng):
     light, stars = rings(14, 30000, rng)
     pixels = noisy(light + 20, rng)
@@ -109,6 +111,7 @@ def test_error_does_not_depend_on_where_in_a_pixel_a_star_falls(fwhm):
         assert np.all(np.abs(amplitude) < (0.004 if fwhm < 1.3 else 0.002))
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("pattern", ["rggb", ""])
 def test_a_mosaic_declared_or_not_shifts_no_star_whatever_its_colour(pattern):
     error, pull, missed, invented = errors(
@@ -120,6 +123,7 @@ def test_a_mosaic_declared_or_not_shifts_no_star_whatever_its_colour(pattern):
     assert np.all(np.abs(error.mean(0)) < 0.004)
 
 
+@pytest.mark.montecarlo
 @pytest.mark.parametrize("fwhm", [1.2, 1.4, 1.6])
 def test_colours_of_undersampled_stars_are_told_from_their_shape(fwhm):
     error, pull, missed, invented = errors(

@@ -93,6 +93,9 @@ def is_answered(pixels, rng):
     return len(found) > 0
 
 
+FRAMES = 250
+
+
 @pytest.mark.montecarlo
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
@@ -104,11 +107,11 @@ def is_answered(pixels, rng):
         (floats_with_holes, 0.1, 0.6),
     ],
 )
-def test_five_hundred_frames_raise_nothing_but_that_they_are_none(make, least, most):
+def test_many_frames_raise_nothing_but_that_they_are_none(make, least, most):
     rng = np.random.default_rng(14)
-    answers = [is_answered(make(rng), rng) for _ in range(500)]
-    assert least <= answers.count(None) / 500 <= most
-    assert (answers.count(True) > 20) == (make in (stars_and_faults, floats_with_holes))
+    answers = [is_answered(make(rng), rng) for _ in range(FRAMES)]
+    assert least <= answers.count(None) / FRAMES <= most
+    assert (answers.count(True) > FRAMES / 25) == (make in (stars_and_faults, floats_with_holes))
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 5), (5, 0), (0, 0, 3), (0,), ()])

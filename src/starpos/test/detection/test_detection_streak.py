@@ -57,6 +57,7 @@ def test_a_trail_is_no_ring_however_few_the_stars(count, electrons, rng):
     assert len(found) == count
 
 
+@pytest.mark.montecarlo
 def test_a_long_trail_on_a_large_frame_hides_no_star(rng):
     size, start, end = (3744, 5616), (-20, 750), (5636, 3000)
     stars = grid(size, 700, 9000, rng)

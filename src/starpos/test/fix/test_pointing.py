@@ -74,6 +74,7 @@ def test_the_errors_are_exactly_those_stated(catalogue, rng):
     assert most == pytest.approx(10 * sine, rel=0.02) and least < 0.01
 
 
+@pytest.mark.montecarlo
 def test_claims_are_true_over_many_nights(catalogue):
     place, heading = [], []
     for seed in range(60):

@@ -249,6 +249,7 @@ def test_every_status_is_tested_here():
     assert all(f"Status.{s.name}" in text for s in Status)
 
 
+@pytest.mark.montecarlo
 def test_no_content_of_a_frame_raises(night, rng):
     """Hostile lists: coincident, collinear, far away, tiny or huge sigmas, negative flux, tiny and huge frames."""
     _, stars, tilt, solver = night

@@ -199,6 +199,7 @@ def answers_of(messages, delay):
     return [m.solution for m in made if isinstance(m, Answered)], told.session.calibrating.found
 
 
+@pytest.mark.montecarlo
 def test_how_long_a_job_takes_does_not_matter_to_recorded_frames(messages):
     (quick, found), (slow, found_slowly) = answers_of(messages, 1), answers_of(messages, 120)
     assert found is not None and found == found_slowly
