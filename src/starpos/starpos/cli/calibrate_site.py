@@ -19,7 +19,8 @@ from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, SAG_ARCSEC_PER_SQRT_HOUR
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.inclinometer import up_of
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.sky.site import Site
@@ -133,6 +134,8 @@ def run(
         calibration = replace(calibration, valid_days=args.valid_days)
     found = replace(found, instrument=replace(found.instrument, calibration=calibration))
     about = _about(found, site)
+    if args.misalignment is not None:
+        about += _against(instrument.calibration, calibration)
     instrument_file.write(Path(args.output), found.instrument, about)
     if args.json:
         common.print_json(_json_of(found, args.output))
@@ -168,6 +171,13 @@ def _about(found: Calibrated, site: Site) -> str:
     if turns[-1] > 1:
         lines.append("to tell that turn as well, lean the instrument by some degrees between the frames")
     return "\n".join(lines) + "\n"
+
+
+def _against(given: Calibration, found: Calibration) -> str:
+    """A line on how far apart two A3 have the plumb line in the camera, at the lean of the calibration."""
+    up = up_of(np.radians(found.tilt_deg))
+    apart = np.degrees(np.arccos(np.clip(up @ found.a3 @ given.a3.T @ up, -1, 1)))
+    return f"the --misalignment given has the plumb line {apart:.2g} deg from there: if that cannot be, check the site\n"
 
 
 def _json_of(found: Calibrated, path: str) -> dict:
