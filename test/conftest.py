@@ -5,6 +5,7 @@ import pytest
 
 from starpos_testing.graph.graph import Graph
 from starpos_testing.graph.shots import SOLVER
+from starpos_testing.graph.tf2_messages import built
 from starpos_testing.nodes import take_domain
 
 
@@ -43,3 +44,15 @@ def solver(graph, tmp_path_factory):
     process = graph.start(tmp_path_factory.mktemp("solver") / "log", "starpos_solver", "solver", *SOLVER)
     graph.wait_for_solver()
     return process
+
+
+@pytest.fixture(scope="session")
+def variables_of_tf2(tmp_path_factory):
+    return built(tmp_path_factory.mktemp("tf2_msgs"))
+
+
+@pytest.fixture
+def tf2(variables_of_tf2, monkeypatch):
+    """Nodes that are started have the package tf2_msgs, as on a robot."""
+    for name, value in variables_of_tf2.items():
+        monkeypatch.setenv(name, value)

@@ -114,6 +114,7 @@ def hold(graph, *enclaves: str):
     assert not forbidden, f"the policy forbids what is done: {forbidden}"
 
 
+@pytest.mark.usefixtures("tf2")
 def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
     secured("starpos_solver", "solver", sim)

@@ -107,7 +107,7 @@ class CameraNode(Node):
         self._said_s = -math.inf
         self._logged = ""
         self._images = publisher(self, Image, "~/image_raw", IMAGE_DEPTH)
-        self._infos = publisher(self, CameraInfo, "~/camera_info", 10)
+        self._infos = publisher(self, CameraInfo, "~/camera_info", 10, latched=True)
         self._captures = publisher(self, Capture, "~/capture", 10)
         self.create_service(SetCameraInfo, "~/set_camera_info", self._on_set_camera_info)
         self.create_service(SetCapture, "~/set_capture", self._on_set_capture)

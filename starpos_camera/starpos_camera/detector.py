@@ -27,8 +27,8 @@ from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
-from starpos_common.replayed import Replayed, Take
-from starpos_common.topics import publisher, subscription
+from starpos_common.replayed import Replayed
+from starpos_common.topics import Take, publisher, subscription
 from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray

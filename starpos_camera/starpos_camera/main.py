@@ -17,7 +17,9 @@ def camera() -> int:
 
         yield CameraNode()
 
-    return run(make_nodes)
+    return run(
+        make_nodes, help_text=lambda: _help("camera", "The frames of a camera, until Ctrl-C.", "camera")
+    )
 
 
 def detector() -> int:
@@ -31,7 +33,8 @@ def detector() -> int:
         node.listen()
         yield node
 
-    return run(make_nodes)
+    about = "The stars of the frames on camera/image_raw, until Ctrl-C."
+    return run(make_nodes, help_text=lambda: _help("detector", about, "detector"))
 
 
 def camera_detector() -> int:
@@ -48,4 +51,13 @@ def camera_detector() -> int:
         camera.hand_to(detector)
         yield camera
 
-    return run(make_nodes)
+    about = "The frames of a camera and their stars, two nodes in one process, until Ctrl-C."
+    return run(make_nodes, help_text=lambda: _help("camera_detector", about, "camera", "detector"))
+
+
+def _help(executable: str, about: str, *nodes: str) -> str:
+    from starpos_camera import camera_parameters, detector_parameters
+    from starpos_common.node_help import node_help
+
+    tables = {"camera": camera_parameters.PARAMETERS, "detector": detector_parameters.PARAMETERS}
+    return node_help("starpos_camera", executable, about, {node: tables[node] for node in nodes})

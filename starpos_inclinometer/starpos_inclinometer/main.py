@@ -19,7 +19,14 @@ def inclinometer() -> int:
 
         yield InclinometerNode()
 
-    return run(make_nodes)
+    def help_text() -> str:
+        from starpos_common.node_help import node_help
+        from starpos_inclinometer.parameters import PARAMETERS
+
+        about = "The readings of an inclinometer, or of an IMU, on `tilt`, until Ctrl-C."
+        return node_help("starpos_inclinometer", "inclinometer", about, {"inclinometer": PARAMETERS})
+
+    return run(make_nodes, help_text=help_text)
 
 
 def emulator() -> int:

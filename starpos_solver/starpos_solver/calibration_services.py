@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services `solver/calibrate`, `solver/self_calibrate` and `solver/save_calibration`."""
+"""The services `~/calibrate`, `~/self_calibrate` and `~/save_calibration`."""
 
 import math
 from typing import TypeVar
@@ -25,11 +25,9 @@ class CalibrationServices:
         self._session, self._calibrating, self._settings = session, session.calibrating, settings
         # A service that awaits its job must not block the other callbacks.
         group = ReentrantCallbackGroup()
-        node.create_service(Calibrate, "solver/calibrate", self._on_calibrate, callback_group=group)
-        node.create_service(
-            SelfCalibrate, "solver/self_calibrate", self._on_self_calibrate, callback_group=group
-        )
-        node.create_service(SaveCalibration, "solver/save_calibration", self._on_save_calibration)
+        node.create_service(Calibrate, "~/calibrate", self._on_calibrate, callback_group=group)
+        node.create_service(SelfCalibrate, "~/self_calibrate", self._on_self_calibrate, callback_group=group)
+        node.create_service(SaveCalibration, "~/save_calibration", self._on_save_calibration)
 
     async def _on_calibrate(
         self, request: Calibrate.Request, response: Calibrate.Response

@@ -17,5 +17,12 @@ def solver() -> int:
 
         yield SolverNode()
 
+    def help_text() -> str:
+        from starpos.session.parameters import PARAMETERS
+        from starpos_common.node_help import node_help
+
+        about = "Stars and tilts in, position and heading out, until Ctrl-C."
+        return node_help("starpos_solver", "solver", about, {"solver": PARAMETERS})
+
     # A thread may still build triangles.
-    return leave(run(make_nodes))
+    return leave(run(make_nodes, help_text=help_text))

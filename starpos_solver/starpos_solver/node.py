@@ -10,7 +10,6 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
@@ -23,14 +22,15 @@ from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.dropped import Dropped
 from starpos_common.job import JobRunner
-from starpos_common.replayed import Replayed, Take
-from starpos_common.topics import subscription
+from starpos_common.replayed import Replayed
+from starpos_common.topics import Take, subscription, subscription_from_any
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
 from starpos_solver.inputs import Inputs
 from starpos_solver.publishing import SolutionPublishers
 from starpos_solver.settings import SolverSettings
+from starpos_solver.transforms import StaticTransforms
 
 POLL_S = 0.02
 TILT_QUEUE = 1000
@@ -68,6 +68,7 @@ class SolverNode(Node):
 
     def _connect(self) -> None:
         self._outputs = SolutionPublishers(self, self._settings)
+        self._transforms = StaticTransforms(self)
         session = self._session
         takes: dict[str, Take] = {
             CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
@@ -82,11 +83,11 @@ class SolverNode(Node):
                 busy=lambda: session.busy,
                 end=lambda: self._publish(session.end(self._now())),
             )
-        self._subscribe(CameraInfo, CAMERA_TOPIC, takes, 10)
-        self._tilts = self._subscribe(msg.Tilt, "tilt", takes, TILT_QUEUE)
-        self._subscribe(msg.StarArray, "stars", takes, 10)
-        self.create_service(Solve, "solver/solve", self._on_solve)
-        self.create_service(Trigger, "solver/reset", self._on_reset)
+        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
+        self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
+        subscription(self, msg.StarArray, "stars", self._taker("stars", takes), 10)
+        self.create_service(Solve, "~/solve", self._on_solve)
+        self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
         group = MutuallyExclusiveCallbackGroup()
         self._poll = self.create_timer(
@@ -102,10 +103,12 @@ class SolverNode(Node):
             "Average": session.calibrating.average.report,
         }
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
+        self._update_transforms()
 
     def _apply(self, names: frozenset[str]) -> None:
         self._diagnostics.hardware_id = self._values["frame_id"]
         self._session.parameters_set(names)
+        self._update_transforms()
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
@@ -118,13 +121,17 @@ class SolverNode(Node):
             return Now.in_data(unix_s)
         return Now(unix_s, self._steady.now().nanoseconds * 1e-9)
 
-    def _subscribe(self, kind: type, name: str, takes: Mapping[str, Take], depth: int) -> Subscription:
+    def _taker(self, name: str, takes: Mapping[str, Take]) -> Take:
         def on_message(message: Any, info: Mapping[str, Any]) -> None:
+            if name == "tilt":
+                self._transforms.inclinometer = message.header.frame_id
+            elif name == CAMERA_TOPIC:
+                self._transforms.camera = message.header.frame_id
             if self._replayed is None or not self._replayed.holds(name, message, info):
                 self._note_dropped(name, info)
                 takes[name](message, info)
 
-        return subscription(self, kind, name, on_message, depth)
+        return on_message
 
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):
@@ -148,6 +155,13 @@ class SolverNode(Node):
         self._publish(self._session.at(self._now()))
         if self._replayed is not None:
             self._replayed.go_on()
+        self._update_transforms()
+
+    def _update_transforms(self) -> None:
+        solver = self._session.instrument.solver
+        self._transforms.update(
+            self._values["publish_tf"], self._values["frame_id"], solver.instrument if solver else None
+        )
 
     def _publish(self, outputs: list[Output]) -> None:
         for output in outputs:
@@ -155,6 +169,8 @@ class SolverNode(Node):
             if self._replayed is not None and isinstance(output, Answered):
                 self._replayed.made += 1
                 self._replayed.fixes += output.solution.ok
+        if outputs:
+            self._update_transforms()
         # poll only while a frame waits; where the clock is played, its ticks do
         waits = self._session.waits and not time_is_simulated(self)
         if waits and self._poll.is_canceled():

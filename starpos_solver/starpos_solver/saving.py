@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing of the instrument file for solver/save_calibration."""
+"""Writing of the instrument file for ~/save_calibration."""
 
 from pathlib import Path
 

@@ -20,7 +20,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 from launch_ros.substitutions import ExecutableInPackage
 
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
+from starpos_bringup.launch_arguments import is_true, number
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
@@ -31,7 +32,9 @@ ARGUMENTS = (
     ("cadence", "3", "from frame to frame, s"),
     ("dashboard", "true", "the web page, at http://127.0.0.1:8042"),
 )
-POINTING = ("latitude", "longitude", "azimuth", "altitude")
+# deg
+POINTING = {"latitude": (-90, 90), "longitude": (-180, 360), "azimuth": (-360, 360), "altitude": (5, 90)}
+CADENCE_S = 0.01, 86400
 MISALIGNMENT_DEG = (0.4, -0.3, 12.0)
 AIR = {"pressure": 95000.0, "temperature": 8.0, "humidity": 0.4}
 
@@ -55,7 +58,7 @@ def tilt_deg(place: dict[str, float], roll_deg: float):
 
 def nodes(context):
     told = given(context, ARGUMENTS)
-    place = {name: float(told[name]) for name in POINTING}
+    place = {name: number(told, name, *bounds) for name, bounds in POINTING.items()}
     roll_deg = 15.0
     theta_x, theta_y = tilt_deg(place, roll_deg)
     folder = tempfile.mkdtemp(prefix="starpos_")
@@ -65,7 +68,7 @@ def nodes(context):
     simulated = {f"simulated.{name}": value for name, value in (place | AIR).items()} | {
         "simulated.roll": roll_deg
     }
-    camera = {"source": "simulated", "cadence": float(told["cadence"]), **simulated}
+    camera = {"source": "simulated", "cadence": number(told, "cadence", *CADENCE_S), **simulated}
     solver = {f"refraction.{name}": value for name, value in AIR.items()} | {
         "misalignment": list(MISALIGNMENT_DEG),
         "misalignment_stddev": 5.0,

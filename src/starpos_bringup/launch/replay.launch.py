@@ -11,7 +11,8 @@ from launch.actions import OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, is_true, process
+from starpos_bringup.launch_arguments import is_true
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,

@@ -15,6 +15,8 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from starpos_bringup.launch_arguments import LaunchError, is_true
+
 if TYPE_CHECKING:
     from launch.launch_context import LaunchContext
 
@@ -40,10 +42,6 @@ PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "quick_start.xml"])
 
 
-class LaunchError(Exception):
-    """An argument is wrong; the text is one sentence."""
-
-
 @dataclass(frozen=True)
 class Common:
     """Settings that all processes of a launch share."""
@@ -62,15 +60,6 @@ class Common:
             raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
         respawn = is_true(told, "respawn") if "respawn" in told else False
         return cls(str(path), told["log_level"], told["enclaves"].rstrip("/"), respawn)
-
-
-def is_true(told: Mapping[str, str], name: str) -> bool:
-    """Read an argument; LaunchError if it is neither true nor false."""
-    words = {"true": True, "1": True, "false": False, "0": False}
-    try:
-        return words[told[name].lower()]
-    except KeyError:
-        raise LaunchError(f"{name}:={told[name]}: give true or false") from None
 
 
 def declared(arguments: Arguments) -> list[DeclareLaunchArgument]:

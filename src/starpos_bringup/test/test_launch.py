@@ -24,7 +24,7 @@ pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here"
 import launch
 import launch_ros
 
-from starpos_bringup.launching import LaunchError
+from starpos_bringup.launch_arguments import LaunchError
 
 FOLDER = Path(__file__).parent.parent / "launch"
 NIGHT = Path(__file__).parents[2] / "test" / "data" / "night"
@@ -112,6 +112,8 @@ def test_each_process_is_in_its_enclave_of_the_policy():
         ("starpos", {"use_sim_time": "perhaps"}, "use_sim_time:=perhaps: give true or false"),
         ("starpos", {"respawn": "yes"}, "respawn:=yes: give true or false"),
         ("replay", {"bag": "night", "detector": "on"}, "detector:=on: give true or false"),
+        ("demo", {"latitude": "abc"}, "latitude:=abc: give a number from -90 to 90"),
+        ("demo", {"cadence": ""}, "cadence:=: give a number"),
     ],
 )
 def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, given, words):

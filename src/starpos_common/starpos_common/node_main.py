@@ -22,12 +22,17 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 NOTICE_S = 0.5
 
 
-def run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None = None) -> int:
+def run(
+    make_nodes: Callable[[], "Iterator[Node]"],
+    args: list[str] | None = None,
+    help_text: Callable[[], str] | None = None,
+) -> int:
     """Run the nodes that `make_nodes()` yields until they are told to stop; return the process's exit status.
 
     make_nodes: a generator, started after rclpy.init; it may raise StarposError or one of rclpy's parameter errors to
     refuse to start.
     args: the command line, by default sys.argv.
+    help_text: makes what is printed instead where `--help` or `-h` is given; None: they mean nothing here.
 
     The status is 0 after SIGINT (once or twice) or SIGTERM, and 1 with one line on standard error when the start is
     refused. Any other exception of a callback is a defect: it ends the process with its traceback.
@@ -36,11 +41,19 @@ def run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None = Non
     for number in SIGNALS:
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     try:
+        if help_text is not None and _asks_for_help(sys.argv[1:] if args is None else args):
+            print(help_text(), flush=True)
+            return 0
         return _run(make_nodes, args, stopped)
     finally:
         # launch sends a second SIGINT: the default handler must not get it while the interpreter ends.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
+
+
+def _asks_for_help(args: list[str]) -> bool:
+    ours = args[: args.index("--ros-args")] if "--ros-args" in args else args
+    return not {"--help", "-h"}.isdisjoint(ours)
 
 
 def leave(status: int) -> int:

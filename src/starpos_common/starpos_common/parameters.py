@@ -21,6 +21,7 @@ __all__ = [
     "declare",
     "to_yaml",
     "warn_of_unknown",
+    "yaml_value",
 ]
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
@@ -169,19 +170,20 @@ def _prepared(
         return _Refused(node.get_parameter(change.name), str(error))
 
 
-def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
+def toyaml_value(node_name: str, parameters: Sequence[Parameter]) -> str:
     """Write a parameter file with every default, each below a comment with its meaning, unit and constraint."""
     lines = ["# SPDX-License-Identifier: Apache-2.0", f"/**/{node_name}:", "  ros__parameters:"]
     for p in parameters:
         fixed = "; fixed while the node runs" if p.read_only else ""
         lines += [f"    # {p.description}", f"    # {p.name} must be {p.constraint}{fixed}."]
-        lines.append(f"    {p.name}: {_yaml(p.default)}")
+        lines.append(f"    {p.name}: {yaml_value(p.default)}")
     return "\n".join(lines) + "\n"
 
 
-def _yaml(value: Any) -> str:
+def yaml_value(value: Any) -> str:
+    """Write the value of a parameter as YAML that rcl reads."""
     if isinstance(value, tuple):
-        return "[" + ", ".join(map(_yaml, value)) + "]"
+        return "[" + ", ".join(map(yaml_value, value)) + "]"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):

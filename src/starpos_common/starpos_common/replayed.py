@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from starpos_common.topics import Take
 from starpos_interfaces.msg import Played, Taken
 
 PLAYED, TAKEN = "/replay/played", "/replay/taken"
@@ -25,9 +26,6 @@ DEPTH = 5000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # How often it is looked at whether there is something new to say.
 HEARTBEAT_S, LOOK_S = 1.0, 0.1
-
-# A message, and what the middleware tells of it.
-Take = Callable[[Any, Mapping[str, Any]], object]
 
 
 class Replayed:

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishers and subscriptions whose QoS the user may override for each topic (parameters `qos_overrides.TOPIC...`)."""
 
-from collections.abc import Callable
-from typing import TypeVar
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QosCallbackResult, QoSOverridingOptions
 from rclpy.subscription import Subscription
 
@@ -15,13 +17,20 @@ from starpos_common.parameters import ParameterError
 
 MOST_DEPTH = 100_000
 T = TypeVar("T")
+# A message, and what the middleware tells of it.
+Take = Callable[[Any, Mapping[str, Any]], object]
 
 
-def publisher(node: Node, kind: type, topic: str, depth: int) -> Publisher:
-    """Make a RELIABLE publisher that keeps the newest `depth` messages; ParameterError if an override is not allowed."""
+def publisher(node: Node, kind: type, topic: str, depth: int, latched: bool = False) -> Publisher:
+    """Make a RELIABLE publisher that keeps the newest `depth` messages; ParameterError if an override is not allowed.
+
+    latched: transient_local, so that who subscribes later gets the newest messages too.
+    """
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    qos = QoSProfile(depth=depth, durability=durability)
 
     def make() -> Publisher:
-        return node.create_publisher(kind, topic, QoSProfile(depth=depth), qos_overriding_options=_options())
+        return node.create_publisher(kind, topic, qos, qos_overriding_options=_options())
 
     return _made(node, topic, make)
 
@@ -48,6 +57,28 @@ def subscription(
         )
 
     return _made(node, topic, make)
+
+
+def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
+    """Subscribe to a topic whether it is published transient_local or volatile; each message is taken once.
+
+    DDS has no subscription for both: one that wants what was sent before it came hears no volatile publisher.
+    """
+    taken: deque[tuple[object, object]] = deque(maxlen=2 * depth)
+
+    def once(message: Any, info: Mapping[str, Any]) -> None:
+        # the middleware's own, and so the same in both
+        which = info.get("source_timestamp"), info.get("publication_sequence_number")
+        if any(which) and which in taken:
+            return
+        taken.append(which)
+        callback(message, info)
+
+    subscription(node, kind, topic, once, depth)
+    # a volatile publisher is no reason for its warning
+    silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+    qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(kind, topic, once, qos, event_callbacks=silent)
 
 
 def _options() -> QoSOverridingOptions:

@@ -12,7 +12,18 @@ def dashboard() -> int:
     """Run the node."""
     from starpos_common.node_main import leave, run
 
-    return leave(run(make_nodes))
+    return leave(run(make_nodes, help_text=help_text))
+
+
+def help_text() -> str:
+    """What `--help` says."""
+    from starpos_common.node_help import node_help
+    from starpos_dashboard.parameters import PARAMETERS
+
+    about = (
+        "The instrument in a browser, at http://127.0.0.1:8042 unless parameters say otherwise, until Ctrl-C."
+    )
+    return node_help("starpos_dashboard", "dashboard", about, {"dashboard": PARAMETERS})
 
 
 def make_nodes() -> "Iterator[Node]":

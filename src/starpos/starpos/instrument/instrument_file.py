@@ -128,12 +128,12 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
         content["inclinometer"] = {"model": instrument.inclinometer_model}
     if instrument.vertical is None:
         for key, (name, unit) in INCLINOMETER.items():
-            content[key] = float(getattr(instrument.inclinometer, name) / unit)
+            content[key] = _in_unit(getattr(instrument.inclinometer, name), unit)
     else:
         content["vertical"] = {
             key: np.asarray(getattr(instrument.vertical, key)).tolist() for key in VERTICAL[:2]
         }
-        content["vertical"][VERTICAL[2]] = float(instrument.inclinometer.drift_rad_per_sqrt_hour / ARCSEC)
+        content["vertical"][VERTICAL[2]] = _in_unit(instrument.inclinometer.drift_rad_per_sqrt_hour, ARCSEC)
     content["clock_stddev_s"] = float(instrument.clock_stddev_s)
     if instrument.shutter is not None:
         content["shutter"] = {key: float(getattr(instrument.shutter, key)) for key in SHUTTER}
@@ -306,6 +306,13 @@ def _error(mapping: dict, key: str, unit: float) -> float:
     if not 0 <= given * unit <= most:
         raise InstrumentError(f"{key} is {given:g}: give a finite number from 0 to {most / unit:.4g}")
     return given * unit
+
+
+def _in_unit(value: float, unit: float) -> float:
+    """A value in a unit, with as few digits as `read` needs to have the very same value again."""
+    exact = float(value / unit)
+    short = (float(f"{exact:.{digits}g}") for digits in range(1, 17))
+    return next((number for number in short if number * unit == value), exact)
 
 
 def _row(numbers: list, key: str) -> tuple[float, ...]:

@@ -27,6 +27,13 @@ PARAMETERS = (
         "frame_id", "starpos_link", "Frame of fix and heading: x forward, y left, z up.", form=FRAME_NAME
     ),
     Parameter(
+        "publish_tf",
+        True,
+        "Publish on /tf_static how camera and inclinometer are turned against frame_id; false where "
+        "robot_state_publisher does, or where the inclinometer is an IMU that has its place in the robot's tree: a frame "
+        "with two parents breaks the tree.",
+    ),
+    Parameter(
         "calibration_url",
         "",
         "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock, shutter; '' uses the next three "

@@ -11,7 +11,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
@@ -27,7 +27,7 @@ BURST = 50
 # Where nobody takes part nobody says what is taken: at rate 0 listeners get so long to empty their queues.
 BURST_REST_S = 0.05
 BEGIN_S = 30.0
-# Those who never will hear, because they want another quality of service, must not stop it.
+# Who is never found must not stop it.
 FOUND_S = 10.0
 
 
@@ -118,11 +118,16 @@ class Player:
         return bool(makers) and any(map(self._participants.taking, solvers))
 
     def _all_found(self) -> bool:
-        """Whether all whom the graph knows to listen do."""
+        """Whether all whom the graph knows to listen, and who can, do."""
         return self._participants.all_here() and all(
-            p.get_subscription_count() >= self._node.count_subscribers(name)
-            for name, p in self._publishers.items()
+            p.get_subscription_count() >= self._could_hear(name, p) for name, p in self._publishers.items()
         )
+
+    def _could_hear(self, name: str, publisher: Publisher) -> int:
+        """How many subscriptions accept the publisher's quality of service."""
+        known = self._node.get_subscriptions_info_by_topic(name)
+        verdicts = [qos_check_compatible(publisher.qos_profile, s.qos_profile)[0] for s in known]
+        return sum(verdict != QoSCompatibility.ERROR for verdict in verdicts)
 
     def _is_made(self, name: str) -> bool:
         return any(name == makes for n in self._frame_topics for makes, _ in self._participants.made_of(n))

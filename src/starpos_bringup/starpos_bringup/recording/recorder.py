@@ -17,6 +17,8 @@ from starpos_common.topics import subscription
 LITTLE_BYTES = 1_000_000_000
 # An image may have 42 MB.
 DEPTH, IMAGE_DEPTH = 1000, 3
+# Those that are published transient_local.
+LATCHED = ("camera/camera_info",)
 
 
 class Recorder(Node):
@@ -33,7 +35,7 @@ class Recorder(Node):
             package, message = type_name.split("/msg/")
             kind = getattr(import_module(f"{package}.msg"), message)
             topic = self.resolve_topic_name(name)
-            writer.add_topic(topic, type_name)
+            writer.add_topic(topic, type_name, latched=name in LATCHED)
             depth = IMAGE_DEPTH if message == "Image" else DEPTH
             subscription(self, kind, topic, partial(self._keep, name, topic), depth, raw=True)
         self._counts = dict.fromkeys(topics, 0)

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values of launch arguments, read from their texts; needs no ROS."""
+
+import math
+from collections.abc import Mapping
+
+
+class LaunchError(Exception):
+    """An argument is wrong; the text is one sentence."""
+
+
+def is_true(told: Mapping[str, str], name: str) -> bool:
+    """Read an argument; LaunchError if it is neither true nor false."""
+    words = {"true": True, "1": True, "false": False, "0": False}
+    try:
+        return words[told[name].lower()]
+    except KeyError:
+        raise LaunchError(f"{name}:={told[name]}: give true or false") from None
+
+
+def number(told: Mapping[str, str], name: str, low: float, high: float) -> float:
+    """Read an argument; LaunchError if it is no number from `low` to `high`."""
+    try:
+        value = float(told[name])
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise LaunchError(f"{name}:={told[name]}: give a number from {low:g} to {high:g}")
+    return value
