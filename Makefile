@@ -13,7 +13,7 @@ export PYTHON
 PACKAGES := $(patsubst %/package.xml,%,$(wildcard */package.xml src/*/package.xml))
 INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/package.xml $(p)/setup.* $(p)/CMakeLists.txt \
   $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* \
-  $(p)/layouts $(p)/layouts/* $(p)/sros2 $(p)/sros2/* $(p)/resource/*))
+  $(p)/layouts $(p)/layouts/* $(p)/sros2 $(p)/sros2/* $(p)/urdf $(p)/urdf/* $(p)/resource/*))
 
 .PHONY: build demo emulated test lint clean distclean FORCE
 build: install/.built

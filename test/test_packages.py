@@ -36,7 +36,7 @@ HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py"
 HELPERS |= {"late_starpos"}  # a test writes it
 # starpos_testing stands on these, so they cannot name it: colcon would find a circle
 BELOW_TESTING = {"starpos", "starpos_common"}
-RUN_BY_COMMAND = {"libxml2-utils", "ros2launch"}  # programs, which nothing imports
+RUN_BY_COMMAND = {"libxml2-utils", "ros2launch", "xacro"}  # programs, which nothing imports
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

@@ -20,6 +20,7 @@ setup(
         (f"share/{package}/config", sorted(glob("config/*.yaml") + glob("config/*.xml"))),
         (f"share/{package}/sros2", sorted(glob("sros2/*.xml"))),
         (f"share/{package}/layouts", sorted(glob("layouts/*"))),
+        (f"share/{package}/urdf", sorted(glob("urdf/*"))),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},

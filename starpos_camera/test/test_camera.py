@@ -7,6 +7,7 @@ import signal
 import cv2
 import numpy as np
 import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
@@ -27,6 +28,7 @@ from starpos_testing.skies import raws
 
 SMALL = ("source:=simulated", "focal_mm:=50", "simulated.width:=640", "simulated.height:=480")
 OK, WARN, ERROR = 0, 1, 2
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def hear_all(listener):
@@ -69,6 +71,10 @@ def test_plays_files_and_says_which_one_is_broken(start, listener, folder):
     state = listener.wait_for_state("camera: Capture", OK, "are played")
     assert (state["frames"], state["failed"], state["stamp from"]) == ("2", "1", "file")
     assert state["shutter"] == "global"
+
+    later = listener.hear(CameraInfo, "camera/camera_info", LATCHED)
+    listener.wait(lambda: later)  # though no frame comes any more
+    assert later[-1] == infos[-1]
 
     assert "own exposure" in set_capture(listener, exposure=1.0).message
     assert "own gain" in set_capture(listener, gain=3.0).message

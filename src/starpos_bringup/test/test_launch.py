@@ -27,7 +27,7 @@ import launch_ros
 from starpos_bringup.launch_arguments import LaunchError
 
 FOLDER = Path(__file__).parent.parent / "launch"
-NIGHT = Path(__file__).parents[2] / "test" / "data" / "night"
+NIGHT = Path(__file__).parents[3] / "test" / "data" / "night"
 LAUNCH = """
 import sys
 from launch import LaunchService

@@ -16,7 +16,8 @@ The README of {package} says what it hears and publishes.
 
 def node_help(package: str, executable: str, about: str, nodes: Mapping[str, Sequence[Parameter]]) -> str:
     """Write what an executable is, how its parameters are set, and each of them; nodes: the parameters of each node."""
-    usage = f"usage: ros2 run {package} {executable} [--ros-args [-p NAME:=VALUE]... [--params-file FILE] [-r FROM:=TO]...]"
+    options = "[-p NAME:=VALUE]... [--params-file FILE] [-r FROM:=TO]..."
+    usage = f"usage: ros2 run {package} {executable} [--ros-args {options}]"
     lines = [usage, "", about, "", HOW.rstrip().format(package=package, node=next(iter(nodes)))]
     for node, parameters in nodes.items():
         lines += ["", f"parameters of the node {node}:"]

@@ -170,7 +170,7 @@ def _prepared(
         return _Refused(node.get_parameter(change.name), str(error))
 
 
-def toyaml_value(node_name: str, parameters: Sequence[Parameter]) -> str:
+def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
     """Write a parameter file with every default, each below a comment with its meaning, unit and constraint."""
     lines = ["# SPDX-License-Identifier: Apache-2.0", f"/**/{node_name}:", "  ros__parameters:"]
     for p in parameters:

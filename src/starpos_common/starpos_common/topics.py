@@ -74,11 +74,13 @@ def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, de
         taken.append(which)
         callback(message, info)
 
-    subscription(node, kind, topic, once, depth)
+    # rclpy's types know callbacks of one argument only
+    heard: Callable[..., None] = once
+    subscription(node, kind, topic, heard, depth)
     # a volatile publisher is no reason for its warning
     silent = SubscriptionEventCallbacks(use_default_callbacks=False)
     qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(kind, topic, once, qos, event_callbacks=silent)
+    node.create_subscription(kind, topic, heard, qos, event_callbacks=silent)
 
 
 def _options() -> QoSOverridingOptions:

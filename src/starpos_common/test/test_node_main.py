@@ -28,7 +28,7 @@ def make_nodes():
             %s
     yield Ready()
 
-sys.exit(run(make_nodes))
+sys.exit(run(make_nodes, help_text=lambda: "it is ready"))
 """
 
 
@@ -117,6 +117,13 @@ def test_missing_parameter_file_is_said(start):
     status, err = end(start(arguments=("--ros-args", "--params-file", "/nowhere.yaml")))
     assert status == 1
     assert "/nowhere.yaml" in err and "Traceback" not in err
+
+
+@pytest.mark.parametrize("word", ["--help", "-h"])
+def test_help_is_printed_and_nothing_is_made(start, word):
+    process = start(arguments=(word, "--ros-args", "-p", "nonsense"))
+    out, err = process.communicate(timeout=WAIT_S)
+    assert (process.returncode, out, err) == (0, "it is ready\n", "")
 
 
 def test_a_defect_in_a_callback_shows_its_traceback(start):

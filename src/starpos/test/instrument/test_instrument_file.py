@@ -334,6 +334,21 @@ def test_what_is_written_is_read(full, rng, tmp_path):
         assert (tmp_path / "again.yaml").read_text() == text
 
 
+def test_numbers_are_written_as_people_gave_them(tmp_path):
+    given = """starpos_instrument: 1
+camera: {focal_mm: 600, pixel_um: 6.4}
+tilt_noise_deg: 0.0035
+tilt_drift_arcsec_per_sqrt_hour: 2.1
+tilt_quantum_deg: 0.0005
+tilt_temperature_arcsec_per_c: 3.3
+"""
+    (tmp_path / "given.yaml").write_text(given)
+    write(tmp_path / "i.yaml", read(tmp_path / "given.yaml"))
+    text = (tmp_path / "i.yaml").read_text()
+    for line in given.splitlines()[2:]:
+        assert f"{line}\n" in text
+
+
 def test_what_nobody_knows_is_not_written(tmp_path):
     write(tmp_path / "i.yaml", Instrument(5000.0))
     assert "calibrated" not in (tmp_path / "i.yaml").read_text()
