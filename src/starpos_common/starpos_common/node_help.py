@@ -8,7 +8,7 @@ from starpos.session.parameter import Parameter
 from starpos_common.parameters import yaml_value
 
 WIDTH = 110
-HOW = """A parameter is set with -p NAME:=VALUE, or in a FILE of which config/starpos.yaml of starpos_bringup is the model;
+HOW = """A parameter is set with -p NAME:=VALUE, or in a FILE like config/starpos.yaml of starpos_bringup;
 most also while the node runs: ros2 param set /{node} NAME VALUE. -r __ns:=/NAMESPACE moves its topics and services.
 The README of {package} says what it hears and publishes.
 """
