@@ -15,6 +15,7 @@ from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of, tilts
+from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.fix import Fix
@@ -348,6 +349,7 @@ def print_combined(
             )
             | json_of(all_together, vertical)
             | about
+            | {"iers_table_age_days": table_age_days(all_together.utc_unix_s) if all_together else None}
         )
         return
     if all_together is None:
@@ -364,3 +366,8 @@ def print_combined(
     for name, (east, north, heading) in budget_of(all_together, vertical).items():
         turn = "" if np.isnan(all_together.heading) else f" {heading * 3600:8.2f} arcsec"
         print(f"  {name:<28} {east:8.2f} m E {north:8.2f} m N{turn}")
+    age_days = table_age_days(all_together.utc_unix_s)
+    where = f"{age_days:.0f} days before" if age_days > 0 else "after"
+    print(
+        f"Earth rotation: IERS table, measured until {utc_text(measured_until())[:10]}, {where} these frames"
+    )

@@ -154,6 +154,16 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
     )
 
 
+def measured_until() -> float:
+    """Time (UTC, Unix s) of the last UT1 in the IERS table that is measured; those of later days are predicted."""
+    return (_table().measured_until_mjd - UNIX_EPOCH_JD + 2400000.5) * DAY_S
+
+
+def table_age_days(utc_unix_s: float) -> float:
+    """Days from the last measurement in the IERS table to a time; negative where that is later."""
+    return (utc_unix_s - measured_until()) / DAY_S
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Table:
     """Daily values (N,): mjd, TAI-UTC (s), UT1-TAI (s; without leap seconds, so it can be interpolated), pole (rad)."""
@@ -166,6 +176,7 @@ class _Table:
     pole_y: np.ndarray
     pole_sigma: np.ndarray
     slope: float  # s per day, of UT1-TAI over the last year
+    measured_until_mjd: float
 
 
 @lru_cache(maxsize=1)
@@ -204,6 +215,8 @@ def _table() -> _Table:
         pole_y=filled(38, 46) * ARCSEC,
         pole_sigma=np.maximum(pole_sigma, 1e-10),
         slope=float((ut1[-1] - ut1[-366]) / 365),
+        # I: of IERS Bulletin A, P: predicted
+        measured_until_mjd=float(mjd[np.flatnonzero(lines[:known, 57] == b"I")[-1]]),
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from starpos.earth.orientation import EQUATOR_M_PER_S
+from starpos.earth.orientation import EQUATOR_M_PER_S, table_age_days
 from starpos.fix.solver import Solution
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
@@ -39,6 +39,8 @@ def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
             "sigma north (m)": float(north),
             "residual (arcsec)": answer.fix.residual_arcsec,
         }
+    if answer.utc_unix_s is not None:
+        values["IERS table age (days)"] = table_age_days(answer.utc_unix_s)
     if answer.extrapolated_days > 0:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
         return Diagnosis(Level.WARN, old if answer.ok else answer.message, values)

@@ -2,6 +2,7 @@
 """The command line: what it prints, what it returns, on a small night made by itself."""
 
 import json
+import re
 import shutil
 import struct
 
@@ -50,6 +51,8 @@ def test_solve_without_json(night, capsys):
     status, out, errors = solve(capsys, night, *KNOWN)
     assert (status, errors) == (0, [])
     assert "2 frames together" in out
+    last = out.splitlines()[-1]
+    assert re.fullmatch(r"Earth rotation: IERS table, measured until 20\d\d-\d\d-\d\d, .* these frames", last)
     assert "calibration" in out
     assert "geodetic, WGS 84" in out
 

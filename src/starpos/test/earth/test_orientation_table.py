@@ -26,6 +26,12 @@ def test_it_is_what_astropy_reads():
     np.testing.assert_allclose(ours.pole_sigma, np.maximum(sigma, 1e-10), rtol=1e-12)
 
 
+def test_its_age_counts_from_the_last_day_that_is_measured():
+    theirs = iers.IERS_A.open(IERS_A_FILE)
+    measured = theirs["MJD"][np.asarray(theirs["UT1Flag_A"]) == "I"].to_value("d")
+    assert orientation.measured_until() == (measured[-1] - 40587) * 86400
+
+
 def test_its_leap_seconds_are_those_of_erfa():
     table = orientation._table()
     for year, seconds in ((1973, 12), (1999, 32), (2017, 37), (2025, 37)):

@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from starpos.earth.orientation import measured_until
+from starpos.fix.solver import Solution, Status
 from starpos.frames.shutter import GLOBAL, UNKNOWN, Shutter
+from starpos.frames.stars import no_stars
 from starpos.instrument.instrument import Calibration
 from starpos.session import reports
 from starpos.session.diagnosis import Level
@@ -41,6 +44,17 @@ def test_conditions_that_are_known_are_right():
 def test_what_nobody_told_is_a_warning(values, calibration, temperature_c, shutter, words):
     said = reports.of_conditions(TOLD | values, calibration, tilt(temperature_c), shutter)
     assert said.level == Level.WARN and words in said.message and ";" not in said.message
+
+
+def test_the_age_of_the_iers_table_is_told_with_each_frame():
+    day = no_stars(640, 480, mid_unix_s=measured_until() + 400 * 86400)
+    said = reports.of_solution(Solution.failed(day, Status.NO_TILT, "no tilt"), {})
+    assert said.values["IERS table age (days)"] == pytest.approx(400)
+    timeless = replace(day, mid_unix_s=None)
+    assert (
+        "IERS table age (days)"
+        not in reports.of_solution(Solution.failed(timeless, Status.BAD_INPUT, "no time"), {}).values
+    )
 
 
 def test_each_lack_has_a_sentence():
