@@ -12,7 +12,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 
 from starpos_bringup.launch_arguments import is_true
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, instrument, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
@@ -30,11 +30,7 @@ def nodes(context):
     source = {"source": told["camera"]} if told["camera"] else {}
     port = {"port": told["port"]} if told["port"] else {}
     common = Common.of(told)
-    processes = [
-        process("starpos_camera", "camera_detector", common, {"**": clock, "camera": source}),
-        process("starpos_inclinometer", "inclinometer", common, {"**": clock, "inclinometer": port}),
-        process("starpos_solver", "solver", common, {"**": clock}),
-    ]
+    processes = instrument(common, {"**": clock, "camera": source, "inclinometer": port})
     if is_true(told, "dashboard"):
         processes.append(process("starpos_dashboard", "dashboard", common, {"**": clock}))
     return processes

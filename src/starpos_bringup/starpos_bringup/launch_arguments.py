@@ -2,6 +2,7 @@
 """Values of launch arguments, read from their texts; needs no ROS."""
 
 import math
+import re
 from collections.abc import Mapping
 
 
@@ -16,6 +17,17 @@ def is_true(told: Mapping[str, str], name: str) -> bool:
         return words[told[name].lower()]
     except KeyError:
         raise LaunchError(f"{name}:={told[name]}: give true or false") from None
+
+
+def names(told: Mapping[str, str], name: str) -> list[str]:
+    """Read an argument of names of namespaces, separated by commas; LaunchError if one is none, or comes twice."""
+    found = [word.strip().strip("/") for word in told[name].split(",")]
+    sound = all(re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", word, re.ASCII) for word in found)
+    if not sound or len(set(found)) < len(found):
+        raise LaunchError(
+            f"{name}:={told[name]}: give different names separated by commas, such as left,right"
+        )
+    return found
 
 
 def number(told: Mapping[str, str], name: str, low: float, high: float) -> float:

@@ -74,23 +74,47 @@ def given(context: "LaunchContext", arguments: Arguments) -> dict[str, str]:
     return {name: LaunchConfiguration(name).perform(context) for name, _, _ in arguments}
 
 
+# Package, executable and nodes of each process of an instrument; camera and detector are one.
+INSTRUMENT = (
+    ("starpos_camera", "camera_detector", ("camera", "detector")),
+    ("starpos_inclinometer", "inclinometer", ("inclinometer",)),
+    ("starpos_solver", "solver", ("solver",)),
+)
+
+
+def instrument(
+    common: Common, parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
+) -> list[Node]:
+    """Make the processes of an instrument; parameters and defaults of its nodes as in `process`."""
+
+    def of(nodes: Sequence[str], every: Mapping[str, Mapping]) -> dict[str, Mapping]:
+        return {name: values for name, values in every.items() if name in ("**", *nodes)}
+
+    return [
+        process(package, executable, common, of(nodes, parameters), defaults=of(nodes, defaults))
+        for package, executable, nodes in INSTRUMENT
+    ]
+
+
 def process(
     package: str,
     executable: str,
     common: Common,
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
+    defaults: Mapping[str, Mapping] = {},
     **options: Any,
 ) -> Node:
-    """Make a process; parameters of its nodes, by name ('**' is all), replace those of the parameter file."""
-    files = [common.params_file]
-    parameters = {name: dict(values) for name, values in parameters.items() if values}
-    if parameters:
-        files.append(_written(parameters))
+    """Make a process.
+
+    parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
+    than defaults.
+    """
+    files = [_written(defaults), common.params_file, _written(parameters)]
     return Node(
         package=package,
         executable=executable,
-        parameters=files,
+        parameters=[file for file in files if file],
         arguments=[*arguments, *ros_arguments(executable, common)],
         output="screen",
         respawn=common.respawn,
@@ -112,14 +136,17 @@ def ros_arguments(executable: str, common: Common) -> list[str]:
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:
-    """Write a parameter file that is deleted at the end of this process; return its path.
+    """Write a parameter file that is deleted at the end of this process; return its path, '' without parameters.
 
     A `-p` cannot do this: it reaches all nodes of a process, or one without a namespace.
     """
     content = {
-        ("/**" if name == "**" else f"/**/{name}"): {"ros__parameters": values}
+        ("/**" if name == "**" else f"/**/{name}"): {"ros__parameters": dict(values)}
         for name, values in parameters.items()
+        if values
     }
+    if not content:
+        return ""
     with tempfile.NamedTemporaryFile("w", prefix="starpos_", suffix=".yaml", delete=False) as file:
         yaml.safe_dump(content, file)
     atexit.register(Path(file.name).unlink, missing_ok=True)

@@ -121,6 +121,26 @@ def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, give
         started(name, **given)
 
 
+def test_two_instruments_have_frames_and_enclaves_of_their_own_and_one_file(tmp_path):
+    (tmp_path / "robot.yaml").write_text("/left/solver:\n  ros__parameters: {min_stars: 7}\n")
+    module, context = module_of("instruments"), launch.LaunchContext()
+    given = {"instruments": "left,right", "params_file": str(tmp_path / "robot.yaml"), "enclaves": "/starpos"}
+    for name, _, _ in module.ARGUMENTS:
+        context.launch_configurations[name] = given.get(name, "false" if name == "respawn" else "")
+    for side, group in zip(("left", "right"), module.nodes(context), strict=True):
+        inside = group.get_sub_entities()
+        processes = [a for a in inside if isinstance(a, launch_ros.actions.Node)]
+        assert [p.node_executable for p in processes] == ["camera_detector", "inclinometer", "solver"]
+        solver = processes[-1]
+        defaults, file = (
+            launch.utilities.perform_substitutions(context, f.param_file) for f in solver._Node__parameters
+        )
+        assert file == given["params_file"]  # which counts more, as it comes later
+        frames = yaml.safe_load(Path(defaults).read_text())
+        assert frames == {"/**/solver": {"ros__parameters": {"frame_id": f"{side}_starpos_link"}}}
+        assert f"/starpos/{side}/solver" in solver._Node__arguments
+
+
 def test_a_replay_takes_the_stars_or_finds_them_again():
     stars = started("replay", bag="night", rate="0")
     assert list(stars) == ["solver", "replay"]

@@ -3,13 +3,20 @@
 
 import pytest
 
-from starpos_bringup.launch_arguments import LaunchError, is_true, number
+from starpos_bringup.launch_arguments import LaunchError, is_true, names, number
 
 
 @pytest.mark.parametrize("text", ["abc", "", "nan", "90.5", "inf"])
 def test_what_is_no_number_in_its_range_is_named_with_its_argument(text):
     with pytest.raises(LaunchError, match=f"latitude:={text}: give a number from -90 to 90"):
         number({"latitude": text}, "latitude", -90, 90)
+
+
+def test_names_of_instruments_are_read_and_none_comes_twice():
+    assert names({"instruments": "left, right/upper"}, "instruments") == ["left", "right/upper"]
+    for text in ("", "left,", "left,left", "1st", "le ft", "left//right"):
+        with pytest.raises(LaunchError, match=f"instruments:={text}: give different names"):
+            names({"instruments": text}, "instruments")
 
 
 def test_numbers_and_truths_are_read_as_people_write_them():

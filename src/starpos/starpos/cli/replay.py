@@ -28,7 +28,9 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="BAG",
         help="a rosbag2 with stars, tilts and camera_info: a folder or a file",
     )
-    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
+    parser.add_argument(
+        "--namespace", metavar="NAME", help="of the instrument, in a bag, or a YAML, of several"
+    )
     parser.add_argument(
         "--params-file",
         type=Path,
@@ -98,7 +100,7 @@ class Playing:
     def __call__(self, bag: str) -> PlayedNight:
         night = PlayedNight()
         said = _Said(night)
-        replay = Replay(settings_of(self.params_file, self.given), said, said)
+        replay = Replay(settings_of(self.params_file, self.given, self.namespace), said, said)
         try:
             for output in replay.play(Path(bag), self.namespace):
                 if isinstance(output, Answered):
@@ -116,7 +118,7 @@ def _light(solution: Solution) -> Solution:
 
 
 def run(args: argparse.Namespace) -> int:
-    settings = settings_of(args.params_file, args.param)
+    settings = settings_of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace)
     with jobs.workers_of(args, len(args.bags)) as workers:
         answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags))

@@ -15,14 +15,15 @@ NODE = "solver"
 WILDCARDS = ("*", "**")
 
 
-def settings_of(file: Path | None, given: Sequence[str]) -> Settings:
+def settings_of(file: Path | None, given: Sequence[str], namespace: str | None = None) -> Settings:
     """The Settings of a parameter file (None: none) and of texts NAME:=VALUE, which count more, as the node has them.
 
+    namespace: that of the solver; None: whatever it is, if the file is of one instrument.
     Raises ParameterError if a value is not allowed, InstrumentError if something cannot be read, or is no parameter.
     """
     table = {p.name: p for p in PARAMETERS}
     values: dict[str, Any] = {p.name: p.default for p in PARAMETERS}
-    told = ({} if file is None else dict(_in_file(file))) | dict(map(_assigned, given))
+    told = ({} if file is None else dict(_in_file(file, namespace))) | dict(map(_assigned, given))
     for name, value in told.items():
         # qos_overrides, use_sim_time: they are of the node
         if name.startswith("qos_overrides.") or name == "use_sim_time":
@@ -46,24 +47,52 @@ def _assigned(text: str) -> tuple[str, Any]:
     return name, yaml_file.parse(value, f"{text}: not a readable value")
 
 
-def _in_file(path: Path) -> Iterator[tuple[str, Any]]:
-    """(name, value) of each parameter of the solver, whatever its namespace is, in the order of the file."""
+def _in_file(path: Path, namespace: str | None) -> Iterator[tuple[str, Any]]:
+    """(name, value) of each parameter of the solver, in the order of the file."""
     content = yaml_file.load(path, "parameter file")
     if not isinstance(content, Mapping):
         raise InstrumentError(f"{path}: no parameter file: it has no names of nodes")
-    for pattern, below in content.items():
-        yield from _of_node(path, str(pattern).strip("/").split("/"), below)
+    sections = [s for pattern, below in content.items() for s in _sections(path, _names(str(pattern)), below)]
+    if namespace is not None:
+        node = [*_names(namespace), NODE]
+        sections = [s for s in sections if _fits(s[0], node)]
+    else:
+        several = sorted({"/" + "/".join(names[:-1]) for names, _ in sections if _is_of_one(names)})
+        if len(several) > 1:
+            raise InstrumentError(
+                f"{path}: it is of the instruments {', '.join(several)}: choose one with --namespace"
+            )
+    for _, parameters in sections:
+        yield from _flat("", parameters)
 
 
-def _of_node(path: Path, names: list[str], below: Any) -> Iterator[tuple[str, Any]]:
-    """Go down the names of namespaces and nodes, which may be nested, to `ros__parameters`."""
+def _names(path: str) -> list[str]:
+    return [name for name in path.split("/") if name]
+
+
+def _sections(path: Path, names: list[str], below: Any) -> Iterator[tuple[list[str], Any]]:
+    """Go down the names of namespaces and nodes, which may be nested, to each `ros__parameters` of a solver."""
     if not isinstance(below, Mapping):
         raise InstrumentError(f"{path}: {'/'.join(names)} has no ros__parameters")
     for key, value in below.items():
         if key != "ros__parameters":
-            yield from _of_node(path, [*names, str(key)], value)
-        elif names[-1] in (NODE, *WILDCARDS):
-            yield from _flat("", value)
+            yield from _sections(path, [*names, *_names(str(key))], value)
+        elif names and names[-1] in (NODE, *WILDCARDS):
+            yield names, value
+
+
+def _is_of_one(names: list[str]) -> bool:
+    """Whether a section's names say of which instrument it is, and are no pattern for all."""
+    return names not in (["*"], ["**"]) and not any(name in WILDCARDS for name in names[:-1])
+
+
+def _fits(pattern: list[str], names: list[str]) -> bool:
+    """Whether a pattern of a parameter file is of a node: * stands for one name, ** for any number of them."""
+    if not pattern:
+        return not names
+    if pattern[0] == "**":
+        return any(_fits(pattern[1:], names[k:]) for k in range(len(names) + 1))
+    return bool(names) and pattern[0] in ("*", names[0]) and _fits(pattern[1:], names[1:])
 
 
 def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -2,6 +2,7 @@
 """`starpos replay`: what it prints of a bag, its parameters, its exit status."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 pytest.importorskip("rosbags")
 
 from starpos.cli import main
+from starpos.errors import InstrumentError
+from starpos.session.parameter_file import settings_of
 
 NIGHT = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 if not NIGHT.is_dir():
@@ -55,6 +58,30 @@ def test_a_night_is_told_as_solve_tells_one(capsys, told):
         assert abs(north_m) < 4 * frame["sigma_north_m"]
     status, lines, _ = run(capsys, NIGHT, *told)
     assert status == 0 and "10 frames together" in lines[10]
+
+
+OF_TWO = """
+/**/solver:
+  ros__parameters: {misalignment: [0.31, -0.22, 0.53], min_stars: 1000}
+/left/solver:
+  ros__parameters: {misalignment_stddev: 0.1}
+/right:
+  solver:
+    ros__parameters: {min_stars: 7}
+"""
+
+
+def test_a_file_of_two_instruments_is_read_as_their_nodes_read_it(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text(OF_TWO)
+    left, right = (settings_of(path, (), name).values for name in ("left", "/right/"))
+    assert left["misalignment"] == right["misalignment"] == (0.31, -0.22, 0.53)
+    assert (left["misalignment_stddev"], left["min_stars"]) == (0.1, 1000)
+    assert math.isnan(right["misalignment_stddev"]) and right["min_stars"] == 7
+    with pytest.raises(
+        InstrumentError, match="of the instruments /left, /right: choose one with --namespace"
+    ):
+        settings_of(path, ())
 
 
 def test_two_processes_say_the_same(capsys, told, tmp_path):
