@@ -104,6 +104,12 @@ def test_the_manifest_names_what_the_code_imports_and_no_more(folder):
     )
 
 
+def test_who_installs_a_package_with_launch_files_or_xacros_can_run_them():
+    for files, program in (("launch/*.launch.py", "ros2launch"), ("urdf/*.xacro", "xacro")):
+        folders = [folder for folder in FOLDERS if any(folder.glob(files))]
+        assert folders and all(program in names(parse_package(f).exec_depends) for f in folders)
+
+
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
 def test_the_manifest_names_what_the_tests_import(folder):
     package, wanted = parse_package(folder), keys_of(Code(folder).test, folder.name)
