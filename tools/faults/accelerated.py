@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import NavSatFix
@@ -39,6 +40,10 @@ TILT_TIMEOUT_S = 0.2
 WRONG_SIGMA = 5.0
 # So long the answers to good frames that are still under way are waited for.
 LEFT_S = 5.0
+# So long a busy machine may take to bring tilts to the solver, and to read them.
+ARRIVED_S = 15.0
+# A frame without tilts is exposed so much later than the last one; longer than the solver's patience.
+LACKING_S = 0.25
 # If a good frame has no answer by then, a fault still has an effect.
 ANSWER_S = 1.0
 # An instrument far better than usual, so that small errors count: 15 m, where the paper's claims 190.
@@ -183,10 +188,17 @@ class World:
         assert successful, reason
 
     def until_read(self):
-        """Wait until the solver has read what was sent: its executor takes a call when it has taken what came before."""
-        for _ in range(2):
-            self.spin(0.15)
-            self.restore_parameters()
+        """Wait until the solver has read the tilts that were sent: a frame that lacks its own is answered after that.
+
+        /clock goes on by less than to the next exposure.
+        """
+        self.graph.tilt.wait_for_all_acked(Duration(seconds=ARRIVED_S))
+        shot = shot_of(self.scene, self.now_s + LACKING_S, self.rng)
+        self.stars(shot)
+        for waited in range(1, 4):
+            self.tick(self.now_s + EXPOSURE_S + LATENCY_S + waited * LACKING_S)
+            if self.graph.comes(lambda: shot.stamp in self.graph.solutions, ARRIVED_S / 3):
+                break
 
     def spin(self, seconds: float):
         """Spin for a while, for things that nobody waits for."""

@@ -42,12 +42,12 @@ def tilts_out_of_order(w: World):
 
 @kind(1.5)
 def tilts_from_the_future(w: World):
-    """Tilts 2 s to 11 days ahead; when their time has come the instrument has been turned."""
+    """Tilts 3 s to 11 days ahead; when their time has come the instrument has been turned."""
     shot = w.shot()
     shift(shot.tilts, some_time(w))
     w.send(shot)
     # These are the times of the next frames.
-    for ahead in range(3, 8):
+    for ahead in range(4, 9):
         early = w.shot()
         w.now_s -= 0.8
         shift(early.tilts, 0.8 * ahead)
