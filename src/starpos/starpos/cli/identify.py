@@ -65,6 +65,8 @@ def as_json(path: str, s: Solution) -> dict:
         "mirrored": a.mirrored if a else None,
         "status": s.status.value,
         "warnings": list(s.warnings),
+        "bright_explained": [s.explained.explained, s.explained.bright] if s.explained else None,
+        "bright_seen": [s.explained.seen, s.explained.due] if s.explained else None,
     }
 
 

@@ -117,6 +117,7 @@ def _detect(
         y=2 * s.y + 0.5,
         flux=gain * s.flux,
         covariance=4 * s.covariance,
+        fwhm_px=2 * reduced.fwhm_px,
         width=about["width"],
         height=about["height"],
     )
@@ -163,6 +164,7 @@ def _detect_at_full_size(
         snr=columns["snr"],
         covariance=columns["covariance"],
         flags=columns["flags"],
+        fwhm_px=lesson.psf.fwhm_px,
         **about,
     )
     fwhm_px = lesson.psf.fwhm_px if len(stars) else float("nan")
