@@ -142,13 +142,13 @@ class Solver:
             return _failure(stars, e)
         if found is None:
             return replace(self._unidentified(stars, camera), identify_s=time.perf_counter() - begin)
-        warnings, explained = _judged(stars, directions, camera, sky, found)
+        warnings, explained = judged(stars, directions, camera, sky, found)
         return replace(
             Solution.failed(stars, Status.OK, "identified"),
             names=tuple(self.catalogue.names(found.catalogue)),
             star=found.star,
             magnitudes=self.catalogue.vmag(found.catalogue),
-            attitude=_attitude(found, sky, camera),
+            attitude=attitude_of(found, sky, camera),
             identify_s=time.perf_counter() - begin,
             warnings=warnings,
             explained=explained,
@@ -184,12 +184,12 @@ class Solver:
             return replace(
                 self._unidentified(stars, camera), tilt=tilt, identify_s=time.perf_counter() - begin
             )
-        warnings, explained = _judged(stars, directions, camera, sky, found)
+        warnings, explained = judged(stars, directions, camera, sky, found)
         identified = time.perf_counter()
         names, magnitudes = self.catalogue.names(found.catalogue), self.catalogue.vmag(found.catalogue)
         solution = replace(
             Solution.failed(stars, Status.OK, "fix"),
-            attitude=_attitude(found, sky, camera),
+            attitude=attitude_of(found, sky, camera),
             tilt=tilt,
             identify_s=identified - begin,
             names=tuple(names),
@@ -348,7 +348,7 @@ def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
     return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
 
 
-def _judged(
+def judged(
     stars: Stars, directions: np.ndarray, camera: Camera, sky: Sky, found: Identification
 ) -> tuple[tuple[str, ...], Explained]:
     """Names, sorted, of what is suspicious about the stars' identification, and what it explains; directions (N, 3)."""
@@ -358,7 +358,7 @@ def _judged(
     return names, explained
 
 
-def _attitude(found: Identification, sky: Sky, camera: Camera) -> Attitude:
+def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
     seen = camera.scaled(found.focal_scale)
     x, y = camera.centre_px
