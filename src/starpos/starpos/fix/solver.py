@@ -36,7 +36,7 @@ from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
 
 ENOUGH_SOUND = 8
-SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
+SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 100.0
 # Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
 # not identified, nor are the bright stars there that should be.
 TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"

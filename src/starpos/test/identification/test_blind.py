@@ -10,11 +10,12 @@ import pytest
 from starpos import rotation
 from starpos.detection import detect
 from starpos.fix.blind import BlindSolver
-from starpos.fix.solver import Status
+from starpos.fix.solver import Solver, Status
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
 from starpos.identification import quad_cache, quads
 from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 
 WIDTH, HEIGHT = 1600, 1200
 # field from corner to corner, deg, and the faintest star of a frame
@@ -132,3 +133,11 @@ def test_real_frames_are_found_with_no_option_at_all(shared, solver):
             assert off_arcsec < max(20, 1.5 * float(row["scale_x"])), row["file"]
             right += 1
     assert right >= 0.9 * len(rows)
+
+
+@pytest.mark.parametrize(("field_deg", "limit_mag"), [(80.0, 4.5), (99.0, 4.0)])
+def test_wide_fields_of_a_known_scale_are_found(field_deg, limit_mag, catalogue, rng):
+    for _ in range(3):
+        xy, axis, focal_px = seen(catalogue, field_deg, limit_mag, rng)
+        s = Solver(Instrument(focal_px), catalogue).identify(listed(xy))
+        assert s.ok and np.sqrt(2 - 2 * looks(s, axis)) < 1 / focal_px
