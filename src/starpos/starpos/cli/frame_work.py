@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING
 from starpos.cli.common import clock_of, stars_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
+from starpos.fix.blind import BlindSolver
 from starpos.fix.pointing import IDEAL
 from starpos.fix.solver import Solution, Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
+from starpos.identification.blind import STAGES
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
@@ -133,6 +135,26 @@ class Identifying:
         # `identify` reports the error
         with suppress(StarposError):
             solver.prepare(item.width, item.height)
+        begin = time.process_time()
+        answer = solver.identify(stars_of(item))
+        return answer, 1000 * (time.process_time() - begin)
+
+
+@dataclass(frozen=True)
+class IdentifyingBlind:
+    """Work of `identify` without a focal length: the Solution of a frame, and the CPU time in ms.
+
+    quick: only the search that mostly finds the scale.
+    """
+
+    read: Reader
+    quick: bool = False
+
+    def __call__(self, path: str) -> tuple[Solution, float]:
+        item = self.read(path)
+        stages = STAGES[:1] if self.quick else STAGES
+        solver = BlindSolver(catalogue.load_catalogue(), stages=stages)
+        solver.prepare()
         begin = time.process_time()
         answer = solver.identify(stars_of(item))
         return answer, 1000 * (time.process_time() - begin)

@@ -2,13 +2,17 @@
 """`starpos identify`: where frames look, from their stars alone."""
 
 import argparse
+from contextlib import suppress
 
 import numpy as np
 
 from starpos.cli import common, jobs
-from starpos.cli.frame_work import Identifying, Listing, Look, reader_of
-from starpos.errors import FrameError
+from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, Reader, reader_of
+from starpos.errors import FrameError, StarposError
+from starpos.fix.blind import BlindSolver
 from starpos.fix.solver import Solution, Status
+from starpos.identification import quad_cache
+from starpos.sky.catalogue import load_catalogue
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -21,12 +25,16 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     any_found, unreadable, number = False, False, len(args.frames)
+    lost: str | None = None
     read = reader_of(args)
     with jobs.workers_of(args, number) as workers:
         (about,) = workers.map([(Look(read), tuple(args.frames))])
         # without a frame that can be read, each one reports why it cannot
-        work: Listing | Identifying = Listing(read)
-        if about is not None:
+        work: Listing | Identifying | IdentifyingBlind = Listing(read)
+        if about is not None and args.focal_mm is None and args.pixel_um is None and about.focal_px is None:
+            work = IdentifyingBlind(read)
+            BlindSolver(load_catalogue(), common.ProgressBar()).prepare()
+        elif about is not None:
             instrument = common.instrument_of(args, about)
             work = Identifying(read, instrument)
             jobs.prepare(instrument, about)
@@ -40,13 +48,30 @@ def run(args: argparse.Namespace) -> int:
                 )
             found, cpu_ms = answer
             any_found |= found.ok
+            lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             if not found.ok:
                 common.complain("identify", found.message)
             if args.json:
                 common.print_json(as_json(path, found) | {"cpu_ms": cpu_ms})
             else:
                 print(_line(path, found), flush=True)
+    if lost is not None and not any_found and isinstance(work, Identifying):
+        _say_what_would_fit(read, lost)
     return common.UNREADABLE if unreadable else 0 if any_found else 1
+
+
+def _say_what_would_fit(read: Reader, path: str) -> None:
+    """Say the focal length at which a frame is identified that was not with the given one, if it is quickly found."""
+    if not quad_cache.is_built(load_catalogue()):
+        return
+    with suppress(StarposError):
+        found, _ = IdentifyingBlind(read, quick=True)(path)
+        if found.attitude is not None:
+            focal_px = found.attitude.focal_px
+            common.complain(
+                "identify",
+                f"{path}: a focal length of {focal_px:.0f} px fits: give that one",
+            )
 
 
 def as_json(path: str, s: Solution) -> dict:
@@ -65,6 +90,8 @@ def as_json(path: str, s: Solution) -> dict:
         "mirrored": a.mirrored if a else None,
         "status": s.status.value,
         "warnings": list(s.warnings),
+        "bright_explained": [s.explained.explained, s.explained.bright] if s.explained else None,
+        "bright_seen": [s.explained.seen, s.explained.due] if s.explained else None,
     }
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a frame's stars: background, peaks, PSF and noise learnt from bright stars, a fit of each, a selection."""
+"""Detect a frame's stars: background, peaks, PSF and noise learnt from bright stars, a fit of each, a selection.
+
+Where stars are wider than the peaks' kernels can find, the same is done with the frame reduced by two.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -7,22 +10,28 @@ from typing import Any
 import numpy as np
 
 from starpos.detection.background import measure_background
+from starpos.detection.discs import find_discs, with_discs
 from starpos.detection.finding import find_peaks
 from starpos.detection.learn import learn
-from starpos.detection.plane import plane_of
+from starpos.detection.plane import halved, plane_of
 from starpos.detection.streak import find_streaks
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars, no_stars
+from starpos.frames.stars import BLENDED, EDGE, ELONGATED, Stars, no_stars
 
 # Pixels of stars that are fitted together, on a small and on a large frame: 1 and 5 MB.
 CHUNK_PIXELS = 12_000, 60_000
 # Peaks looked at, or twice the stars wanted if that is more: hot pixels are peaks too.
 PEAKS = 10_000
 # Pixels that are fitted, for each of so many peaks: 2 million take some 10 s. With as many stars, or with wide ones, the
-# faintest are left out. Ordinary frames have a tenth.
+# faintest are left out. Ordinary frames have a tenth. Each reduction by two has half as many as the one before.
 PIXELS_PER_PEAK = 100
+# Stars of at least this FWHM (px), or none at all, are looked for in the frame reduced by two as well, and there again.
+# They are taken if more of them are like stars. A reduced frame has at least so many pixels along its shorter side.
+WIDE_FWHM, SHORTEST_PX = 8.0, 150
+# What is still wider after so many reductions is a cloud.
+MOST_HALVINGS = 3
 
 
 @dataclass(frozen=True)
@@ -82,8 +91,50 @@ class Detection:
 
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
-    plane, mosaic = plane_of(frame)
     about = {"width": frame.width, "height": frame.height} | frame.about
+    return _detect(*plane_of(frame), settings, about, MOST_HALVINGS)
+
+
+def _detect(
+    plane: np.ndarray, mosaic: bool | None, settings: DetectionSettings, about: dict[str, Any], halvings: int
+) -> Detection:
+    """The Detection of a plane (h, w), or of one reduced by two, at most so many times, if that shows more stars."""
+    found = _detect_at_full_size(plane, mosaic, settings, about, halvings)
+    if found.fwhm_px < WIDE_FWHM or not halvings or min(plane.shape) < 2 * SHORTEST_PX:
+        return found
+    smaller, gain = halved(plane)
+    saturation_dn = None if settings.saturation_dn is None else settings.saturation_dn * 4 / gain
+    size = {"width": smaller.shape[1], "height": smaller.shape[0]}
+    reduced = _detect(
+        smaller, False, replace(settings, saturation_dn=saturation_dn), about | size, halvings - 1
+    )
+    if _clear(reduced.stars) <= _clear(found.stars):
+        return found
+    s = reduced.stars
+    stars = replace(
+        s,
+        x=2 * s.x + 0.5,
+        y=2 * s.y + 0.5,
+        flux=gain * s.flux,
+        covariance=4 * s.covariance,
+        fwhm_px=2 * reduced.fwhm_px,
+        width=about["width"],
+        height=about["height"],
+    )
+    return replace(
+        found, stars=stars, fwhm_px=2 * reduced.fwhm_px, chi2=reduced.chi2, left_out=reduced.left_out
+    )
+
+
+def _clear(stars: Stars) -> int:
+    """How many of the stars look like one star."""
+    return int(np.count_nonzero((stars.flags & (EDGE | ELONGATED | BLENDED)) == 0))
+
+
+def _detect_at_full_size(
+    plane: np.ndarray, mosaic: bool | None, settings: DetectionSettings, about: dict[str, Any], halvings: int
+) -> Detection:
+    """The Detection of a plane (h, w) that may be reduced so many times more."""
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
     background = measure_background(plane, settings.mesh_px, mosaic)
@@ -99,11 +150,13 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
     lesson = learn(plane, background, x, y, height, saturation)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 64, *CHUNK_PIXELS)) // pixels)
-    most = min(len(x), limit * PIXELS_PER_PEAK // pixels)
+    most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - halvings) // pixels)
     chunks = [slice(i, min(i + chunk, most)) for i in range(0, most, chunk)]
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    columns = {name: column[: settings.max_stars] for name, column in resolve(columns, lesson.psf).items()}
+    columns = resolve(columns, lesson.psf)
+    columns = with_discs(columns, find_discs(plane, background, lesson.psf.fwhm_px), lesson.psf.fwhm_px)
+    columns = {name: column[: settings.max_stars] for name, column in columns.items()}
     stars = Stars(
         x=columns["x"],
         y=columns["y"],
@@ -111,6 +164,7 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         snr=columns["snr"],
         covariance=columns["covariance"],
         flags=columns["flags"],
+        fwhm_px=lesson.psf.fwhm_px,
         **about,
     )
     fwhm_px = lesson.psf.fwhm_px if len(stars) else float("nan")

@@ -31,6 +31,17 @@ def plane_of(frame: Frame) -> tuple[np.ndarray, bool | None]:
     return plane, True
 
 
+def halved(plane: np.ndarray) -> tuple[np.ndarray, int]:
+    """The plane (h // 2, w // 2), uint16, of sums over squares of 2 x 2 px, and the flux of 1 DN in it.
+
+    Sums that would not fit into 16 bits are means, rounded. A mosaic becomes grey.
+    """
+    height, width = (n // 2 * 2 for n in plane.shape)
+    four = plane[:height, :width].reshape(height // 2, 2, width // 2, 2).sum((1, 3), dtype=np.uint32)
+    gain = 1 if plane.dtype == np.uint8 or four.max(initial=0) < 1 << 16 else 4
+    return ((four + gain // 2) // gain).astype(np.uint16), gain
+
+
 def _measured(pixels: np.ndarray) -> np.ndarray | None:
     """At which (row, column) modulo 2 each colour was measured, (3, 2, 2) bool; None if no mosaic is seen.
 

@@ -15,13 +15,16 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.fix.pointing import IDEAL, pointing_fix
+from starpos.fix.unidentified import why_unidentified
 from starpos.fix.unmoved import check_unmoved
 from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
-from starpos.frames.stars import SATURATED, Stars
+from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangle_cache
+from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
+from starpos.identification.search import frame_stars
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
@@ -33,9 +36,10 @@ from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
 
 ENOUGH_SOUND = 8
-SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 60.0
-# A name in `Solution.warnings`: bright stars that were not identified are a sky of their own.
-TWO_SKIES = "two_skies"
+SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 100.0
+# Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
+# not identified, nor are the bright stars there that should be.
+TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
 
 # the tilt at (mid_unix_s, exposure_s, spread_s)
 Tilts = Callable[[float, float, float], Tilt]
@@ -74,7 +78,8 @@ class Solution:
     star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
     identify_s, fix_s: seconds that the two steps took.
     extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
-    warnings: names, sorted, of what is suspicious about an identification; TWO_SKIES is the only one.
+    warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
+    explained: how much of the frame the identification explains.
     hint: helps to identify the next frame.
     """
 
@@ -95,6 +100,7 @@ class Solution:
     extrapolated_days: float = 0.0
     hint: Hint | None = None
     warnings: tuple[str, ...] = ()
+    explained: Explained | None = None
 
     @classmethod
     def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
@@ -135,16 +141,17 @@ class Solver:
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
-            return replace(self._unidentified(stars), identify_s=time.perf_counter() - begin)
-        warnings = _warnings(stars, directions, camera, sky, found)
+            return replace(self._unidentified(stars, camera), identify_s=time.perf_counter() - begin)
+        warnings, explained = judged(stars, directions, camera, sky, found)
         return replace(
             Solution.failed(stars, Status.OK, "identified"),
             names=tuple(self.catalogue.names(found.catalogue)),
             star=found.star,
             magnitudes=self.catalogue.vmag(found.catalogue),
-            attitude=_attitude(found, sky, camera),
+            attitude=attitude_of(found, sky, camera),
             identify_s=time.perf_counter() - begin,
             warnings=warnings,
+            explained=explained,
         )
 
     def solve(
@@ -174,25 +181,34 @@ class Solver:
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
-            return replace(self._unidentified(stars), tilt=tilt, identify_s=time.perf_counter() - begin)
-        warnings = _warnings(stars, directions, camera, sky, found)
+            return replace(
+                self._unidentified(stars, camera), tilt=tilt, identify_s=time.perf_counter() - begin
+            )
+        warnings, explained = judged(stars, directions, camera, sky, found)
         identified = time.perf_counter()
         names, magnitudes = self.catalogue.names(found.catalogue), self.catalogue.vmag(found.catalogue)
         solution = replace(
             Solution.failed(stars, Status.OK, "fix"),
-            attitude=_attitude(found, sky, camera),
+            attitude=attitude_of(found, sky, camera),
             tilt=tilt,
             identify_s=identified - begin,
             names=tuple(names),
             star=found.star,
             magnitudes=magnitudes,
             warnings=warnings,
+            explained=explained,
         )
         try:
             if TWO_SKIES in warnings:
                 raise FixError(
                     f"{stars.source or 'the frame'}: two skies in one frame, its bright stars are those of two "
                     "pointings: keep the camera still while it exposes, and expose once"
+                )
+            if UNEXPLAINED in warnings:
+                raise FixError(
+                    f"{stars.source or 'the frame'}: only {explained.explained} of its {explained.bright} brightest "
+                    f"detections are stars of the sky found, and only {explained.seen} of the {explained.due} brightest "
+                    "stars there are detected: look at the frame"
                 )
             fix = self._fix(stars, found, camera, tilt, state)
         except StarposError as e:
@@ -300,19 +316,9 @@ class Solver:
     def _triangles(self, camera: Camera) -> TriangleCatalogue:
         return triangle_cache.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
 
-    def _unidentified(self, stars: Stars) -> Solution:
-        place, n = stars.source or "the frame", len(stars)
-        if n < FEWEST_STARS:
-            saturated = int(np.sum((stars.flags & SATURATED) != 0))
-            hint = f" ({saturated} saturated)" if saturated else ""
-            needed = f"at least {FEWEST_STARS} are needed: check clouds, focus and exposure"
-            message = f"{place}: {n} stars detected{hint}, {needed}"
-            return Solution.failed(stars, Status.TOO_FEW_STARS, message)
-        message = (
-            f"{place}: none of the sky fits its {n} stars: check the focal length "
-            f"({self.instrument.focal_px:.0f} px given, 3 % is allowed), clouds and exposure"
-        )
-        return Solution.failed(stars, Status.NOT_IDENTIFIED, message)
+    def _unidentified(self, stars: Stars, camera: Camera) -> Solution:
+        status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
+        return Solution.failed(stars, status, why_unidentified(stars, camera, self.catalogue))
 
 
 def _inside(stars: Stars) -> np.ndarray | None:
@@ -342,14 +348,17 @@ def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
     return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
 
 
-def _warnings(
+def judged(
     stars: Stars, directions: np.ndarray, camera: Camera, sky: Sky, found: Identification
-) -> tuple[str, ...]:
-    """Names, sorted, of what is suspicious about the identification of stars in the directions (N, 3)."""
-    return (TWO_SKIES,) if two_skies(directions, stars.sigma, stars.flux, camera, sky, found) else ()
+) -> tuple[tuple[str, ...], Explained]:
+    """Names, sorted, of what is suspicious about the stars' identification, and what it explains; directions (N, 3)."""
+    explained = explained_by(found, frame_stars(directions, stars.sigma, camera), sky)
+    twice = two_skies(directions, stars.sigma, stars.flux, camera, sky, found)
+    names = (TWO_SKIES,) * twice + (UNEXPLAINED,) * (not explained.enough)
+    return names, explained
 
 
-def _attitude(found: Identification, sky: Sky, camera: Camera) -> Attitude:
+def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
     seen = camera.scaled(found.focal_scale)
     x, y = camera.centre_px

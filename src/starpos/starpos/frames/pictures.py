@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read frames from the bytes of PNG, TIFF and JPEG files."""
+"""Read frames from the bytes of PNG, TIFF, JPEG and BMP files."""
 
 import struct
 import zlib
@@ -13,6 +13,7 @@ from starpos.frames.frame import Frame, to_unsigned
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8\xff"
+BMP_START = b"BM"
 # Segments of a JPEG that hold its size, and the one where its image begins.
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 SCAN = 0xDA
@@ -23,17 +24,17 @@ WIDTH, HEIGHT, BITS, SAMPLES = 256, 257, 258, 277
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
-    """Read the bytes of a PNG, TIFF or JPEG by the rules of `reading.read_frame`; FrameError for anything else.
+    """Read the bytes of a PNG, TIFF, JPEG or BMP by the rules of `reading.read_frame`; FrameError for anything else.
 
     place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
     """
     size = _size(data)
     if size is None:
-        raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; give one, or FITS.")
+        raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; give one, or FITS.")
     check_pixels(*size, place)
     pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else data)
     if pixels is None:
-        raise FrameError(f"{place}: this is not a whole PNG, TIFF or JPEG image; take or copy it again.")
+        raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; take or copy it again.")
     if pixels.ndim == 3:
         # without the alpha channel
         pixels = pixels[:, :, :3]
@@ -71,10 +72,22 @@ def _size(data: bytes) -> tuple[int, int, float] | None:
         if data.startswith(PNG_START):
             width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
             return width, height, PNG_SAMPLES.get(colour, 4) * max(bits, 8) / 8
+        if data.startswith(BMP_START):
+            return _bmp_size(data)
         return _jpeg_size(data) if data.startswith(JPEG_START) else _tiff_size(data)
     # the data end too early
     except struct.error:
         return None
+
+
+def _bmp_size(data: bytes) -> tuple[int, int, float] | None:
+    """Width, height and bytes of a decoded pixel of a BMP by its header; None if its end is missing."""
+    length, _, start, _, width, height, _, bits, packing = struct.unpack_from("<IIIIiiHHI", data, 2)
+    # rows that run top-down have a negative height
+    width, height = max(0, width), abs(height)
+    # rows end at multiples of 4 bytes; packed ones have any length
+    whole = start + (width * bits + 31) // 32 * 4 * height if packing in (0, 3) else length
+    return (width, height, max(bits, 24) / 8) if len(data) >= whole else None
 
 
 def _tiff_size(data: bytes) -> tuple[int, int, float] | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read frames from files: FITS, TIFF, PNG, JPEG, camera raw; and stars from a CSV of centroids."""
+"""Read frames from files: FITS, TIFF, PNG, JPEG, BMP, camera raw; and stars from a CSV of centroids."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +17,7 @@ from starpos.frames.star_list import read_star_list
 from starpos.frames.stars import Stars
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
-PICTURE = (".png", ".tif", ".tiff")
+PICTURE = (".png", ".tif", ".tiff", ".bmp")
 JPEG = (".jpg", ".jpeg")  # beside raw files usually a copy of them
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 
@@ -33,7 +33,7 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range is wider than that
     or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
     light (frame.LOUDEST) are clipped.
-    TIFF, PNG, JPEG: 8 or 16 bits, grey or colour. 16-bit colour is scaled down to bgr8.
+    TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour. 16-bit colour is scaled down to bgr8.
     Camera raw: the mosaic as the sensor gave it, through rawpy.
     The exposure of pictures and raw files comes from EXIF if exifread is installed; their time too, but only with a
     clock.

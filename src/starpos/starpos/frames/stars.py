@@ -33,6 +33,7 @@ class Stars(Exposure):
     covariance      (N, 2, 2) px2 of (x, y)
     flags           (N,) uint8, a sum of SATURATED, EDGE, ELONGATED, BLENDED
     width, height   px, of the frame
+    fwhm_px         width of the star images, px; None: unknown
 
     Sequences are converted to arrays. FrameError if the columns do not fit together or hold impossible values.
     """
@@ -45,6 +46,7 @@ class Stars(Exposure):
     flags: np.ndarray
     width: int
     height: int
+    fwhm_px: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

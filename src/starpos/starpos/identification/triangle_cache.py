@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.identification import triangles
+from starpos.identification.quads import QuadCatalogue
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -71,13 +72,13 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
     folder = cache_folder() / f"{PREFIX}{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
     if (stored := _map(folder, len(catalogue))) is not None:
         return stored
-    with _one_builder(folder.parent):
+    with one_builder(folder.parent):
         # another process may have been first
         if (stored := _map(folder, len(catalogue))) is not None:
             return stored
         built = triangles.build(catalogue, half_diagonal, progress)
         try:
-            _store(built, folder)
+            store(built, folder)
         except OSError as e:
             warnings.warn(
                 f"{folder.parent}: the triangle catalogue cannot be kept there ({e.strerror}), so that each start builds "
@@ -89,7 +90,7 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
 
 
 @contextmanager
-def _one_builder(cache: Path) -> Iterator[None]:
+def one_builder(cache: Path) -> Iterator[None]:
     """Let one process build in the cache while others wait, if folders can be locked; a killed process holds no lock."""
     folder = None
     with suppress(OSError, ImportError):
@@ -105,7 +106,7 @@ def _one_builder(cache: Path) -> Iterator[None]:
             os.close(folder)
 
 
-def _store(table: TriangleCatalogue, folder: Path) -> None:
+def store(table: TriangleCatalogue | QuadCatalogue, folder: Path) -> None:
     """Write all columns into a new folder, then rename it, so that all of it is there or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     _clear(folder.parent)

@@ -14,7 +14,7 @@ import numpy as np
 
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.sky.zones import cell_starts, ranges
+from starpos.sky.zones import CELLS, ZONES, cell_starts, ranges
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -118,6 +118,23 @@ class TriangleCatalogue:
         return (self.shape[triangle, 2] + 0.5) * (self.longest_allowed[0] / CODES)
 
 
+def no_triangles() -> TriangleCatalogue:
+    """A TriangleCatalogue without any, for a sky whose field is not known beforehand."""
+    none, bins = np.zeros(0, np.int32), int(np.prod(BINS))
+    return TriangleCatalogue(
+        star=none,
+        cell_start=np.zeros(ZONES * CELLS + 1, np.int32),
+        rank=none,
+        beacon=none,
+        beacons=np.zeros((0, 3)),
+        corners=np.zeros((0, 3), np.int32),
+        counter_clockwise=np.zeros(0, bool),
+        shape=np.zeros((0, 3), np.uint16),
+        longest_allowed=np.ones(1),
+        bin_start=np.zeros(bins + 1, np.int8),
+    )
+
+
 def _coded(shape: np.ndarray, longest_allowed: float) -> np.ndarray:
     """Shapes (n, 3) in CODES, limited to the ranges."""
     part = shape - [np.pi / 3, 0.0, 0.0]
@@ -153,7 +170,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     v = catalogue.directions(pool)
     brightest_first = np.argsort(rank)
     beacon = np.sort(brightest_first[: int(BEACONS * len(pool))])
-    apart = brightest_first[_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
+    apart = brightest_first[well_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
     tree = cKDTree(v[apart])
     key = np.zeros(0, np.int64)
     for k, (radius, spacing, most) in enumerate(_affordable(half_diagonal)):
@@ -176,7 +193,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     )
 
 
-def _apart(v: np.ndarray, nearest: float) -> np.ndarray:
+def well_apart(v: np.ndarray, nearest: float) -> np.ndarray:
     """Rows of the stars v (N, 3), brightest first, that have no brighter star within `nearest` rad.
 
     Close groups make no triangles among themselves, but would use up the stars of a circle.
@@ -192,7 +209,7 @@ def _apart(v: np.ndarray, nearest: float) -> np.ndarray:
 def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
     """CIRCLES with fewer stars where a small field would exceed MAX_TRIANGLES."""
     taken = [most for _, _, most in CIRCLES]
-    circles = np.array([_circles(radius * half_diagonal, spacing) for radius, spacing, _ in CIRCLES])
+    circles = np.array([circle_count(radius * half_diagonal, spacing) for radius, spacing, _ in CIRCLES])
     while (made := circles * [comb(n, 3) for n in taken]).sum() > MAX_TRIANGLES:
         taken[int(made.argmax())] -= 1
     return [(radius, spacing, n) for (radius, spacing, _), n in zip(CIRCLES, taken, strict=True)]
@@ -200,7 +217,7 @@ def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
 
 def _triples_of_circles(tree: "cKDTree", radius: float, spacing: float, most: int) -> np.ndarray:
     """Keys of all triples among the `most` first rows of the cKDTree in each circle: (a n + b) n + c, a < b < c."""
-    centres = _spread(_circles(radius, spacing))
+    centres = spread_points(circle_count(radius, spacing))
     n, chord = tree.n, 2 * np.sin(radius / 2)
     found = []
     for block in np.array_split(centres, max(1, len(centres) // 1000)):
@@ -221,12 +238,12 @@ def _distinct(keys: np.ndarray) -> np.ndarray:
     return keys[np.concatenate([[True], keys[1:] != keys[:-1]])] if len(keys) else keys
 
 
-def _circles(radius: float, spacing: float) -> int:
+def circle_count(radius: float, spacing: float) -> int:
     """Number of circles of this radius (rad) on a sphere that lie spacing * radius apart."""
     return int(4 * np.pi / (spacing * radius) ** 2) + 50
 
 
-def _spread(n: int) -> np.ndarray:
+def spread_points(n: int) -> np.ndarray:
     """Unit vectors (n, 3) spread almost evenly over the sphere, from south to north: a golden spiral."""
     k = np.arange(n)
     z = (2 * k + 1) / n - 1

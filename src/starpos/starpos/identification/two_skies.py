@@ -5,12 +5,16 @@ The bright stars that an identification leaves over are mostly few. If they are 
 is a constant offset: every star is there twice, which shows whatever the lens does and however few stars were matched.
 The second is another pose of the same camera: what is left over is identified as any frame is, and accepted by the same
 evidence. In both the second sky must be about as bright as the first: ghosts and glare are much fainter.
+
+Two skies a few pixels apart may be identified as one between them. Then the residuals of neighbouring stars differ by
+much more than their errors, and as much as those of distant stars, which no lens does.
 """
 
 import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from starpos.identification.evidence import DOUBLE_PX
 from starpos.identification.full import ENOUGH, Identification, identified
@@ -49,6 +53,15 @@ SAME_FOCAL, WORSE, WORSE_PX = 0.01, 2.0, 0.5
 LEAST_SHARE_SECOND = 0.5
 # From a star of the first sky to its neighbour, what a lens bends changes by at most this share of their distance.
 STEEPEST_BEND = 0.2
+# Between two skies the residuals of neighbours differ by so many px, by their errors times the first number plus the
+# second over the square root of the number of stars, and by this share of what those of distant stars do.
+MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.35
+# Errors of centroids (px) that nobody states.
+LEAST_ERROR_PX = 0.1
+# Of so many stars or more only this share, those that fit best, are compared.
+FEW_WRONG, ROBUST = 32, 0.9
+# A lens bends by a polynomial of so many terms, the more the more stars there are.
+BENDS = (12, 3), (20, 6), (32, 10)
 
 
 def two_skies(
@@ -64,15 +77,45 @@ def two_skies(
     directions, sigma_px  (N, 3), (N,): as given to `identify_directions`
     flux                  (N,): in any unit, brightest first
     """
+    field = frame_stars(directions, sigma_px, camera)
+    if _between_two(field, sky, found):
+        return True
     left = np.ones(len(flux), bool)
     left[found.star] = False
     bright = left[:TEST_STARS]
     if bright.sum() < max(LEAST_LEFT, LEAST_SHARE_LEFT * len(bright)):
         return False
-    field = frame_stars(directions, sigma_px, camera)
     mag = -2.5 * np.log10(np.maximum(flux, np.finfo(float).tiny))
     return _every_star_twice(field.xy[0], mag, left, 2 * field.half) or _another_pose(
         field, mag, left, sky, found
+    )
+
+
+def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
+    """Whether the residuals of neighbouring stars differ as only those of two skies do."""
+    stars = len(found.star)
+    xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
+    residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
+    if np.square(residual).mean() < MIXED_PX**2 * MIXED_EVERYWHERE:
+        return False
+    u, v = ((xy - field.middle) / field.half.max()).T
+    powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
+    terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
+    residual, kept = residual - terms @ np.linalg.lstsq(terms, residual)[0], np.arange(stars)
+    if stars >= FEW_WRONG:
+        # where a lens bends much, some stars are matched wrongly
+        kept = np.sort(np.argsort(np.square(residual).sum(1))[: int(ROBUST * stars)])
+        residual = residual - terms @ np.linalg.lstsq(terms[kept], residual[kept])[0]
+    nearest = cKDTree(xy[kept]).query(xy[kept], 2)[1][:, 1]
+    residual, error2 = residual[kept], error2[kept]
+    # mean squares along an axis, of one star
+    near2 = np.square(residual - residual[nearest]).mean() / 2
+    far2 = np.square(residual).sum() / (2 * max(len(kept) - terms.shape[1], 1))
+    expected2 = (error2 + error2[nearest]).mean() / 2
+    return bool(
+        near2 > MIXED_PX**2
+        and near2 > (MIXED + MIXED_BY_CHANCE / math.sqrt(stars)) ** 2 * expected2
+        and near2 > MIXED_EVERYWHERE * far2
     )
 
 

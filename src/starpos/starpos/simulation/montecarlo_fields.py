@@ -132,7 +132,7 @@ def draw(catalogue: Catalogue, conditions: Conditions, seed: int, number: int) -
     seen = (xy > 0).all(1) & (xy < [camera.width - 1, camera.height - 1]).all(1) & (mag < c.limit_mag)
     seen &= rng.random(len(index)) >= c.missing
     order = np.flatnonzero(seen)[np.argsort(mag[seen], kind="stable")]
-    return Field(*_blended(xy[order], mag[order], c.blend_px), attitude[2], f"seed {seed} field {number}")
+    return Field(*blended(xy[order], mag[order], c.blend_px), attitude[2], f"seed {seed} field {number}")
 
 
 def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
@@ -143,7 +143,7 @@ def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
     return Field(xy, np.sort(rng.uniform(4, 9, n)), None, f"seed {seed} points {number}")
 
 
-def _blended(xy: np.ndarray, mag: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
+def blended(xy: np.ndarray, mag: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Places and magnitudes after stars closer than reach_px were joined to the brighter one; brightest first."""
     xy, light, single = xy.copy(), 10 ** (-0.4 * mag), np.ones(len(mag), bool)
     apart = np.linalg.norm(xy[:, None] - xy, axis=2)

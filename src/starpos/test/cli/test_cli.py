@@ -191,7 +191,7 @@ BAD_CALLS = {
     "no frame": ("solve",),
     "no tilt": ("identify",),
     "half a focal length": ("identify", "STARS", "--focal-mm", "600"),
-    "no focal length": ("identify", "STARS"),
+    "no focal length": ("solve", "STARS", "--tilt", "TILT"),
     "a negative focal length": ("identify", "STARS", "--focal-mm=-600", "--pixel-um", "6"),
     "a focal length of nan": ("identify", "STARS", "--focal-mm", "nan", "--pixel-um", "6"),
     "a word for a number": ("identify", "STARS", "--focal-mm", "long", "--pixel-um", "6"),
@@ -248,6 +248,24 @@ def test_identify(night, lists, capsys):
     status, out, _ = run(capsys, "identify", *frames, *WIDE)
     assert status == 0
     assert out.count("RA ") == 2
+
+
+def test_identify_needs_no_option_at_all(lists, capsys):
+    """The scale is found with the stars; random points have none."""
+    status, out, errors = run(capsys, "identify", lists / "stars_0000.csv", "--json")
+    (answer,) = objects(out)
+    assert (status, errors) == (0, []) and answer["focal_px"] == pytest.approx(4636, rel=3e-3)
+    _, out, _ = run(capsys, "identify", lists / "stars_0000.csv", *WIDE, "--json")
+    assert objects(out)[0]["ra"] == pytest.approx(answer["ra"], abs=1e-4)
+
+
+def test_identify_says_which_focal_length_fits(lists, capsys):
+    status, _, errors = run(
+        capsys, "identify", lists / "stars_0000.csv", "--focal-mm", "40", "--pixel-um", "6.4"
+    )
+    assert status == 1 and len(errors) == 2
+    assert "check the focal length (6250 px given" in errors[0]
+    assert "a focal length of 46" in errors[1] and "px fits: give that one" in errors[1]
 
 
 def test_identify_needs_only_the_size_of_a_list(lists, tmp_path, capsys):

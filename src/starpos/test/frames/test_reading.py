@@ -286,7 +286,7 @@ def test_damaged_pictures_are_told_in_the_error_only(tmp_path, capfd):
         flipped[len(whole) // 2] ^= 255
         for damaged in (whole[: len(whole) // 2], whole[:-1], flipped):
             path.write_bytes(damaged)
-            with pytest.raises(FrameError, match="PNG, TIFF or JPEG"):
+            with pytest.raises(FrameError, match="PNG, TIFF, JPEG or BMP"):
                 read_frame(path)
     # OpenCV before 4.7 cannot be kept from it for a TIFF
     told = [line for line in capfd.readouterr().err.splitlines() if line and "imdecode_" not in line]

@@ -60,10 +60,10 @@ def test_what_is_lost_and_scattered(catalogue):
 def test_close_stars_are_one():
     xy = np.array([[100.0, 100], [300, 300], [103, 100], [300, 303.5], [300, 400]])
     mag = np.array([2.0, 3.0, 2.0, 4.0, 5.0])
-    joined, light = mc._blended(xy, mag, 4.0)
+    joined, light = mc.blended(xy, mag, 4.0)
     np.testing.assert_allclose(joined, [[101.5, 100], [300, 300 + 3.5 / (1 + 10**0.4)], [300, 400]])
     assert light[0] == pytest.approx(2 - 2.5 * np.log10(2))
-    np.testing.assert_array_equal(mc._blended(xy, mag, 0.0)[0], xy[[0, 2, 1, 3, 4]])
+    np.testing.assert_array_equal(mc.blended(xy, mag, 0.0)[0], xy[[0, 2, 1, 3, 4]])
 
 
 def test_false_stars_outshine_all(catalogue, conditions):

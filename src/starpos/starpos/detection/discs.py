@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stars so bright that the sensor or the plate shows a flat disc, wider than the PSF: they have no peak and no fit.
+
+Their light is told by the area of the disc. Nothing else puts the brightest stars of a frame first.
+"""
+
+import cv2
+import numpy as np
+
+from starpos.detection.background import Background
+from starpos.frames.stars import SATURATED
+
+# Pixels above this share of the frame's brightest discs belong to a disc: a plate or a JPEG has no sharp limit.
+FLAT = 0.8
+# A disc's radius over the FWHM of the stars: smaller ones are fitted by their wings. At least so many px.
+WIDER, LEAST_PX = 1.3, 4.0
+# A disc's radius is at most this share of the frame's shorter side: larger ones are lamps, roofs or the Moon.
+WIDEST = 0.05
+# The disc's top is at least so many sigma of a pixel's noise above the sky.
+CLEAR = 20.0
+# The squared axes of an ellipse of the disc's moments differ at most by this factor; it has that share of its area.
+LONGEST, FULLEST = 3.0, 0.8
+# At most so many discs, the largest.
+MOST = 500
+# The centre of a disc is known to this share of its radius.
+OFF_CENTRE = 0.04
+# Light grows with this power of the area, as the wings of stars fall.
+GROWTH = 2.0
+
+
+def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dict[str, np.ndarray]:
+    """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2."""
+    level, noise = float(np.median(background.level)), float(np.median(background.noise))
+    least = max(WIDER * fwhm_px, LEAST_PX)
+    # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
+    step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
+    sample = plane[:-1:step, :-1:step]
+    row, column = np.nonzero(sample > level + CLEAR * noise)
+    y, x = step * row, step * column
+    # no single hot pixel
+    height = np.minimum.reduce([plane[y + i, x + j] for i in (0, 1) for j in (0, 1)]).astype(float)
+    if height.max(initial=0) < level + CLEAR * noise:
+        return _columns([], fwhm_px, 0.0)
+    top = float(height.max())
+    limit = level + FLAT * (top - level)
+    mask = np.zeros(sample.shape, np.uint8)
+    mask[row, column] = height >= limit
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    boxes = boxes[1:][np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")]
+    most = WIDEST * min(plane.shape)
+    fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
+    discs = [_disc(plane, box[:4] * step, 2 * step, limit) for box in boxes[fits][:MOST]]
+    return _columns([d for d in discs if d is not None and least < d[2] < most], fwhm_px, top - level)
+
+
+def _disc(plane: np.ndarray, box: np.ndarray, around: int, limit: float) -> tuple[float, float, float] | None:
+    """Centre x, y and radius (px) of the disc of pixels above the limit in a box (left, top, width, height) px.
+
+    None if it is not round, or goes on beyond the box and `around` px more.
+    """
+    left, top = (max(0, int(v) - around) for v in box[:2])
+    right, bottom = (int(v + size) + around for v, size in zip(box[:2], box[2:], strict=True))
+    window = (plane[top:bottom, left:right] >= limit).astype(np.uint8)
+    number, _, boxes, _ = cv2.connectedComponentsWithStats(window, connectivity=8)
+    if number < 2:
+        return None
+    k = 1 + int(boxes[1:, cv2.CC_STAT_AREA].argmax())
+    x0, y0, width, height, area = boxes[k]
+    if x0 == 0 or y0 == 0 or x0 + width == window.shape[1] or y0 + height == window.shape[0]:
+        return None
+    # holes, as some sensors have where they overflow, count
+    outline, _ = cv2.findContours(
+        window[y0 : y0 + height, x0 : x0 + width], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    filled = cv2.drawContours(np.zeros((height, width), np.uint8), [max(outline, key=len)], -1, 1, cv2.FILLED)
+    rows, columns = np.nonzero(filled)
+    area = len(rows)
+    if area < LEAST_PX**2:
+        return None
+    spread = np.linalg.eigvalsh(np.cov(columns, rows))
+    if (
+        spread[0] <= 0
+        or spread[1] > LONGEST * spread[0]
+        or area < FULLEST * 4 * np.pi * np.sqrt(spread.prod())
+    ):
+        return None
+    return left + x0 + columns.mean(), top + y0 + rows.mean(), float(np.sqrt(area / np.pi))
+
+
+def _columns(discs: list[tuple[float, float, float]], fwhm_px: float, height: float) -> dict[str, np.ndarray]:
+    """Discs as columns; height: of their tops above the sky, DN. One as wide as a star's FWHM has that star's flux."""
+    x, y, radius = np.array(discs, float).reshape(-1, 3).T
+    flux = 1.133 * fwhm_px**2 * height * (2 * radius / fwhm_px) ** (2 * GROWTH)
+    return {
+        "x": x,
+        "y": y,
+        "radius": radius,
+        "flux": flux,
+        "covariance": (OFF_CENTRE * radius[:, None, None]) ** 2 * np.eye(2),
+    }
+
+
+def with_discs(
+    stars: dict[str, np.ndarray], discs: dict[str, np.ndarray], fwhm_px: float
+) -> dict[str, np.ndarray]:
+    """The columns of measured stars with those of the discs, brightest first.
+
+    A star measured by its wings, near a disc's middle, keeps its place. All else on the disc and its rim is its light.
+    """
+    if not len(discs["x"]):
+        return stars
+    apart = np.hypot(stars["x"][:, None] - discs["x"], stars["y"][:, None] - discs["y"])
+    rows = np.arange(len(discs["x"]))
+    middle = (apart < 0.5 * discs["radius"]) & ((stars["flags"] & SATURATED) != 0)[:, None]
+    fitted = (
+        np.where(middle.any(0), np.argmin(np.where(middle, apart, np.inf), axis=0), -1)
+        if len(apart)
+        else -1 + 0 * rows
+    )
+    own = {
+        "x": discs["x"],
+        "y": discs["y"],
+        "flux": discs["flux"],
+        "snr": np.sqrt(discs["flux"]),
+        "covariance": discs["covariance"],
+        "flags": np.full(len(rows), SATURATED, stars["flags"].dtype),
+        "chi2": np.ones(len(rows)),
+    }
+    known = fitted >= 0
+    for name in ("x", "y", "covariance", "chi2"):
+        own[name][known] = stars[name][fitted[known]]
+    own["flux"][known] = np.maximum(own["flux"][known], stars["flux"][fitted[known]])
+    rest = ~(apart < discs["radius"] + fwhm_px).any(1)
+    columns = {name: np.concatenate([own[name], stars[name][rest]]) for name in own}
+    order = np.argsort(-columns["flux"], kind="stable")
+    return {name: column[order] for name, column in columns.items()}

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of unknown scale: found in fields of 1 to 90 deg, mirrored, under false stars; random points are not."""
+
+import csv
+import time
+
+import numpy as np
+import pytest
+
+from starpos import rotation
+from starpos.detection import detect
+from starpos.fix.blind import BlindSolver
+from starpos.fix.solver import Solver, Status
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import Stars
+from starpos.identification import quad_cache, quads
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
+
+WIDTH, HEIGHT = 1600, 1200
+# field from corner to corner, deg, and the faintest star of a frame
+FIELDS = [(1.2, 11.0), (2.0, 11.0), (5.0, 9.5), (13.0, 7.5), (30.0, 6.0), (55.0, 5.0), (90.0, 4.5)]
+
+
+@pytest.fixture(scope="module")
+def solver(catalogue):
+    return BlindSolver(catalogue)
+
+
+def listed(xy, sigma_px=0.1):
+    n = len(xy)
+    return Stars(
+        x=xy[:, 0],
+        y=xy[:, 1],
+        flux=np.arange(n, 0, -1.0),
+        snr=np.full(n, 20.0),
+        covariance=np.broadcast_to(sigma_px**2 * np.eye(2), (n, 2, 2)),
+        flags=np.zeros(n),
+        width=WIDTH,
+        height=HEIGHT,
+    )
+
+
+def seen(catalogue, field_deg, limit_mag, rng, scatter_mag=0.2):
+    """Stars (N, 2) px, brightest first, of a random frame; the direction of its middle; its focal length."""
+    focal_px = np.hypot(WIDTH, HEIGHT) / 2 / np.tan(np.radians(field_deg / 2))
+    camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
+    attitude = rotation.best_rotation(rng.normal(size=(1, 3, 3)), rng.normal(size=(1, 3, 3)))[0]
+    index = catalogue.cone(attitude[2], camera.half_diagonal_rad, limit_mag)
+    xy = camera.project(catalogue.directions(index) @ attitude.T) + rng.normal(0, 0.1, (len(index), 2))
+    mag = catalogue.vmag(index) + rng.normal(0, scatter_mag, len(index))
+    on = ((xy > 0) & (xy < [WIDTH - 1, HEIGHT - 1])).all(1) & (rng.random(len(index)) > 0.05)
+    on = np.flatnonzero(on)[np.argsort(mag[on])]
+    return xy[on], attitude[2], focal_px
+
+
+def looks(s, axis):
+    a = s.attitude
+    return np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)]) @ axis
+
+
+@pytest.mark.parametrize(("field_deg", "limit_mag"), FIELDS)
+def test_frames_of_any_scale_are_found(field_deg, limit_mag, solver, catalogue, rng):
+    found = 0
+    for _ in range(4):
+        xy, axis, focal_px = seen(catalogue, field_deg, limit_mag, rng)
+        s = solver.identify(listed(xy))
+        if s.ok:
+            assert np.sqrt(2 - 2 * looks(s, axis)) < 1 / focal_px
+            assert s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
+            assert s.warnings == ()
+            found += 1
+    assert found >= 3
+
+
+def test_a_mirrored_frame_is_found_and_said(solver, catalogue, rng):
+    xy, axis, _ = seen(catalogue, 8.0, 8.5, rng)
+    s = solver.identify(listed(np.stack([xy[:, 0], HEIGHT - 1 - xy[:, 1]], 1)))
+    assert s.ok and s.attitude.mirrored and looks(s, axis) > 1 - 1e-6
+
+
+def test_a_few_false_stars_brighter_than_all_others_do_not_matter(solver, catalogue, rng):
+    xy, axis, _ = seen(catalogue, 8.0, 8.5, rng)
+    false = rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (5, 2))
+    s = solver.identify(listed(np.concatenate([false, xy])))
+    assert s.ok and looks(s, axis) > 1 - 1e-6
+
+
+def test_random_points_are_refused_in_bounded_time(solver, rng):
+    begin = time.process_time()
+    for n in (0, 3, 4, 14):
+        s = solver.identify(listed(rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (n, 2))))
+        assert s.status is (Status.TOO_FEW_STARS if n < 4 else Status.NOT_IDENTIFIED)
+    assert "at any scale" in s.message
+    assert time.process_time() - begin < 60
+
+
+def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):
+    flat = rng.normal(size=(50, 4, 2)) * 0.001
+    v = rotation.normalised(np.concatenate([flat, np.ones((50, 4, 1))], 2))
+    order, shape, size = quads.shapes(v)
+    shuffled = rng.permutation(4)
+    w = rotation.normalised(np.concatenate([2 * flat[:, shuffled] * [-1, 1], np.ones((50, 4, 1))], 2))
+    again, shape2, size2 = quads.shapes(w @ rotation.from_vector([0.3, -0.2, 1.0]))
+    assert np.allclose(shape, shape2, atol=1e-4) and np.allclose(2 * size, size2, rtol=1e-4)
+    assert np.array_equal(shuffled[again], order)
+
+
+def test_a_damaged_cache_is_built_again(catalogue, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(quads, "LEVELS", ((19.4, 6), (29.0, 6)))
+    monkeypatch.setattr(quad_cache, "_in_use", {})
+    # a copy, because the file below it is damaged
+    first = quad_cache.cached(catalogue).shape.copy()
+    assert quad_cache.is_built(catalogue) and len(first) > 100
+    (folder,) = (tmp_path / "starpos").glob("quads-*")
+    (folder / "shape.npy").write_bytes(b"no")
+    quad_cache._in_use.clear()
+    assert np.array_equal(quad_cache.cached(catalogue).shape, first)
+    assert (folder / "shape.npy").stat().st_size > 100
+
+
+def test_real_frames_are_found_with_no_option_at_all(shared, solver):
+    with (shared / "real" / "truth.csv").open() as f:
+        rows = [row for row in csv.DictReader(f) if row["solved"] == "1"][::3]
+    right = 0
+    for row in rows:
+        s = solver.identify(detect(read_frame(shared / "real" / row["set"] / row["file"])).stars)
+        if s.ok:
+            ra, dec = np.radians([float(row["ra_deg"]), float(row["dec_deg"])])
+            axis = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+            off_arcsec = np.degrees(np.sqrt(max(2 - 2 * looks(s, axis), 0))) * 3600
+            assert off_arcsec < max(20, 1.5 * float(row["scale_x"])), row["file"]
+            right += 1
+    assert right >= 0.9 * len(rows)
+
+
+@pytest.mark.parametrize(("field_deg", "limit_mag"), [(80.0, 4.5), (99.0, 4.0)])
+def test_wide_fields_of_a_known_scale_are_found(field_deg, limit_mag, catalogue, rng):
+    for _ in range(3):
+        xy, axis, focal_px = seen(catalogue, field_deg, limit_mag, rng)
+        s = Solver(Instrument(focal_px), catalogue).identify(listed(xy))
+        assert s.ok and np.sqrt(2 - 2 * looks(s, axis)) < 1 / focal_px
