@@ -94,6 +94,7 @@ def driven(recipe) -> Driven:
     return drive(recipe)
 
 
+@pytest.mark.montecarlo
 def test_the_place_is_within_its_claim_though_fixes_share_their_errors(driven):
     assert driven.chi2.mean() < 2.5  # 2 where claims are true
     assert np.mean(driven.chi2 < 9.21) > 0.98  # 99 % of two numbers
@@ -111,6 +112,7 @@ def test_yaw_between_fixes_is_as_good_as_the_odometry(driven):
     assert np.mean(np.abs(driven.yaw_rad) < 2.58 * driven.yaw_sigma_rad) > 0.98
 
 
+@pytest.mark.montecarlo
 def test_robot_localizations_own_process_noise_does_not_do(recipe):
     """So that the drives would tell: its place claims a tenth of its error, its yaw knows nothing after 3 s."""
     driven = drive(recipe | {"process_noise_covariance": DEFAULT})

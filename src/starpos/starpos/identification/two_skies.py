@@ -101,11 +101,11 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
-    residual, kept = residual - terms @ np.linalg.lstsq(terms, residual)[0], np.arange(stars)
+    residual, kept = residual - terms @ np.linalg.lstsq(terms, residual, rcond=None)[0], np.arange(stars)
     if stars >= FEW_WRONG:
         # where a lens bends much, some stars are matched wrongly
         kept = np.sort(np.argsort(np.square(residual).sum(1))[: int(ROBUST * stars)])
-        residual = residual - terms @ np.linalg.lstsq(terms[kept], residual[kept])[0]
+        residual = residual - terms @ np.linalg.lstsq(terms[kept], residual[kept], rcond=None)[0]
     nearest = cKDTree(xy[kept]).query(xy[kept], 2)[1][:, 1]
     residual, error2 = residual[kept], error2[kept]
     # mean squares along an axis, of one star

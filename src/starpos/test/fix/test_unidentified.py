@@ -53,6 +53,7 @@ def test_many_stars_that_are_too_wide(catalogue, rng):
     assert "25 stars: its stars are 11 px wide (FWHM)" in message and "catalogue" not in message
 
 
+@pytest.mark.montecarlo
 def test_a_field_with_too_few_stars_of_the_catalogue(catalogue, rng):
     _, message = said_of(points(25, rng), catalogue, NARROW)
     assert "a field of 0.6 x 0.48 deg holds only" in message and "starpos catalogue build" in message
