@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same bag again and again through fresh nodes, beside busy processes: are all outputs the same to the last byte?
+"""A bag again and again through fresh nodes, beside busy processes: are all outputs the same to the last byte?
 
     python tools/soaks/soak_replay.py [--runs 50] [--busy 8] [--rates 0 1 10] [--processes 1 4] [--lanes 2]
 

@@ -70,7 +70,7 @@ def images_with_hits_and_lines(w: World):
 
 @kind(0.5)
 def images_doubled_or_out_of_order(w: World):
-    """The same image twice; two images the other way round."""
+    """An image twice; two images the other way round."""
     made = [w.photograph() for _ in range(2)]
     w.tick()
     for shot, _, _ in made:

@@ -302,6 +302,27 @@ def test_readings_of_two_and_of_three_axes_are_not_mixed():
     assert (mean.theta_z, mean.variance_z) == pytest.approx((deep.theta_z, 2e-10))
 
 
+def test_an_empty_cell_is_an_unknown_value(tmp_path):
+    path = tmp_path / "tilt.csv"
+    path.write_text(
+        "utc_unix_s,theta_x_deg,theta_y_deg,temperature_c,sigma_deg\n10,1,2,,0.05\n10.1,1,,20, \r\n10.2,1,2,20,\n"
+    )
+    read = read_tilt_csv(path, noise_rad=0.01 * DEG)
+    np.testing.assert_array_equal(np.isnan(read.temperature_c), [True, False, False])
+    np.testing.assert_array_equal(np.isnan(read.theta[:, 1]), [False, True, False])
+    np.testing.assert_allclose(np.sqrt(read.variance[:, 0]) / DEG, [0.05, 0.01, 0.01])
+
+
+@pytest.mark.parametrize("name", ["temperature", "Temperature_C", "sigma_degs", "theta_z"])
+def test_a_column_that_is_almost_called_like_one_that_is_read_is_refused(tmp_path, name):
+    path = tmp_path / "tilt.csv"
+    path.write_text(f"utc_unix_s,theta_x_deg,theta_y_deg,{name}\n10,1,2,3\n")
+    with pytest.raises(TiltError, match=f"its column {name} is not read: call it"):
+        read_tilt_csv(path)
+    path.write_text("utc_unix_s,theta_x_deg,theta_y_deg,battery_v\n10,1,2,3\n")
+    assert len(read_tilt_csv(path).theta) == 1
+
+
 HOSTILE = {
     "empty": b"",
     "header only": b"utc_unix_s,theta_x_deg,theta_y_deg\n",
