@@ -22,7 +22,7 @@ import numpy as np
 from starpos.cli.common import ProgressBar
 from starpos.cli.montecarlo import looking
 from starpos.fix.solver import Solver
-from starpos.identification import triangle_cache
+from starpos.identification import table_cache
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.simulation import montecarlo_fields
@@ -52,7 +52,7 @@ def cedar_solve(stars, args) -> montecarlo_fields.Answer:
 
     fov_deg = math.degrees(2 * math.atan(CAMERA.width / 2 / CAMERA.fx))
     limit = LIMIT_MAG + DEEPER_MAG
-    database = triangle_cache.cache_folder() / f"cedar-{fov_deg:.2f}deg-{limit:g}mag-{stars.fingerprint}.npz"
+    database = table_cache.cache_folder() / f"cedar-{fov_deg:.2f}deg-{limit:g}mag-{stars.fingerprint}.npz"
     solver = Tetra3(load_database=None)
     logging.getLogger("tetra3.Tetra3").setLevel(logging.WARNING)
     if not database.exists():

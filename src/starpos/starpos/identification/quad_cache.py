@@ -3,15 +3,11 @@
 
 import hashlib
 import threading
-import warnings
-from dataclasses import fields
 from pathlib import Path
-
-import numpy as np
 
 from starpos.identification import quads
 from starpos.identification.quads import QuadCatalogue
-from starpos.identification.triangle_cache import cache_folder, one_builder, store
+from starpos.identification.table_cache import cache_folder, load_or_build, mapped, rising
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 
@@ -33,7 +29,14 @@ def cached(catalogue: Catalogue, progress: Progress = quiet) -> QuadCatalogue:
     with _lock:
         if digest not in _in_use:
             _in_use.clear()
-            _in_use[digest] = _load_or_build(catalogue, _folder(catalogue), progress)
+            folder = _folder(catalogue)
+            _in_use[digest] = load_or_build(
+                folder,
+                PREFIX,
+                lambda: _map(folder, len(catalogue)),
+                lambda: quads.build(catalogue, progress),
+                "star quads",
+            )
         return _in_use[digest]
 
 
@@ -47,46 +50,18 @@ def _folder(catalogue: Catalogue) -> Path:
     return cache_folder() / f"{PREFIX}{_digest(catalogue)}"
 
 
-def _load_or_build(catalogue: Catalogue, folder: Path, progress: Progress) -> QuadCatalogue:
-    if (stored := _map(folder, len(catalogue))) is not None:
-        return stored
-    with one_builder(folder.parent):
-        # another process may have been first
-        if (stored := _map(folder, len(catalogue))) is not None:
-            return stored
-        built = quads.build(catalogue, progress)
-        try:
-            store(built, folder)
-        except OSError as e:
-            warnings.warn(
-                f"{folder.parent}: the star quads cannot be kept there ({e.strerror}), so that each start builds them "
-                "again: make the folder writable or set XDG_CACHE_HOME",
-                stacklevel=3,
-            )
-            return built
-    return _map(folder, len(catalogue)) or built
-
-
 def _map(folder: Path, catalogue_stars: int) -> QuadCatalogue | None:
     """The stored quads; None if they are missing or their columns do not fit together."""
-    try:
-        columns = {
-            f.name: np.asarray(np.load(folder / f"{f.name}.npy", mmap_mode="r", allow_pickle=False))
-            for f in fields(QuadCatalogue)
-        }
-    except (OSError, ValueError, EOFError):
+    q = mapped(QuadCatalogue, folder, "iufi")
+    if q is None:
         return None
-    q = QuadCatalogue(**columns)
     count = len(q.corners)
     fit = (
-        [column.dtype.kind for column in columns.values()] == list("iufi")
-        and q.corners.shape == (count, 4)
+        q.corners.shape == (count, 4)
         and q.shape.shape == (count, 5)
         and q.log_size.shape == (count,)
         and q.bin_start.shape == (quads.BINS**4 * quads.SIZE_BINS + 1,)
-        and q.bin_start[0] == 0
-        and q.bin_start[-1] == count
-        and bool(np.all(np.diff(q.bin_start) >= 0))
+        and rising(q.bin_start, count)
         and (count == 0 or 0 <= q.corners.min() <= q.corners.max() < catalogue_stars)
     )
     return q if fit else None

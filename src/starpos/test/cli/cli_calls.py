@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from starpos.cli import main
+from starpos_testing.command_line import run
 
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
 # the same, with an A3 that is known
@@ -17,17 +17,6 @@ SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "l
               "residual_arcsec", "log_odds", "status", "warnings"}  # fmt: skip
 IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
                  "log_odds", "status", "warnings", "bright_explained", "bright_seen", "cpu_ms"}  # fmt: skip
-
-
-def run(capsys, *args):
-    """Exit status, standard output, lines of standard error."""
-    capsys.readouterr()
-    try:
-        status = main([str(a) for a in args])
-    except SystemExit as e:
-        status = e.code
-    said = capsys.readouterr()
-    return status, said.out, said.err.splitlines()
 
 
 def objects(out):

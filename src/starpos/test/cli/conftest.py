@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+from functools import partial
+
 import pytest
 from cli_calls import AIR, PLACE, WIDE
 
 from starpos.cli import main
+from starpos_testing import command_line
 
 
 @pytest.fixture(scope="module")
@@ -36,3 +39,9 @@ def lists(tmp_path_factory):
     ]
     assert main([*command, "--tilt-noise", "0"]) == 0
     return folder
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command: exit status, standard output, lines of standard error."""
+    return partial(command_line.run, capsys)

@@ -8,9 +8,10 @@ import struct
 
 import numpy as np
 import pytest
-from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, run, solve
+from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, solve
 
 from starpos.cli import main
+from starpos_testing.command_line import run
 
 
 def test_solve_a_night_of_frames(night, capsys):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from starpos.calibration.camera_adjustment import PARAMETERS
-from starpos.cli import main
 from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file
 from starpos.instrument.instrument import Calibration
@@ -44,20 +43,6 @@ def skies(tmp_path_factory, catalogue):
     (folder / "tilt.csv").write_text("\n".join(tilts) + "\n")
     (folder / "instrument.yaml").write_text(INSTRUMENT.format("{focal_mm: 27.5, pixel_um: 10}"))
     return true, folder
-
-
-@pytest.fixture
-def run(capsys):
-    def of(*args):
-        capsys.readouterr()
-        try:
-            status = main([str(a) for a in args])
-        except SystemExit as e:
-            status = e.code
-        said = capsys.readouterr()
-        return status, said.out, said.err.splitlines()
-
-    return of
 
 
 def frames(folder: Path) -> list[Path]:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starpos.cli import main
 from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file, instrument_file
 from starpos.utc import utc_text
@@ -67,20 +66,6 @@ def elsewhere(tmp_path_factory, catalogue):
         longitude_deg=130.0,
     )
     return written(shot, tmp_path_factory.mktemp("elsewhere"))
-
-
-@pytest.fixture
-def run(capsys):
-    def of(*args):
-        capsys.readouterr()
-        try:
-            status = main([str(a) for a in args])
-        except SystemExit as e:
-            status = e.code
-        said = capsys.readouterr()
-        return status, said.out, said.err.splitlines()
-
-    return of
 
 
 def check_elsewhere(run, elsewhere, instrument):

@@ -4,10 +4,11 @@
 import json
 
 import pytest
-from cli_calls import AIR, PLACE, WIDE, objects, run
+from cli_calls import AIR, PLACE, WIDE, objects
 
 from starpos.cli import main
 from starpos.instrument.instrument_file import read
+from starpos_testing.command_line import run
 
 
 def simulated(folder, *more):

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from starpos.cli import main
+from starpos_testing.command_line import run
 
 OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
 # that A3 is known
@@ -23,17 +24,6 @@ def simulate(folder, *more, frames=6, place=PLACE):
     wide = ("--stars-only", "--size", "1000", "700", *OPTICS, *AIR)
     assert main(["simulate", str(folder), "-n", str(frames), *wide, *at, *map(str, more)]) == 0
     return folder
-
-
-def run(capsys, *args):
-    """Run a command; returns exit status, standard output, and the lines of standard error."""
-    capsys.readouterr()
-    try:
-        status = main([str(a) for a in args])
-    except SystemExit as e:
-        status = e.code
-    said = capsys.readouterr()
-    return status, said.out, said.err.splitlines()
 
 
 def solved(capsys, night, *more):
