@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,10 +31,14 @@ LINTERS = [
 ]
 NO_TESTS = 5  # pytest's exit status where a -k left none
 SHOWN = 20  # of the slowest tests
-LANES = 3  # at once: on two cores, because tests of nodes mostly wait
+LANES = 4  # at once: on two cores, because tests of nodes mostly wait
+# a folder's files in so many parts, which run as lanes are free
+PARTS = {"graph": 5, "starpos": 6, "starpos_camera": 3, "starpos_inclinometer": 2}
 # for so many at once: a thread that has no processor of its own makes the others wait for it
 ONE_THREAD = {"OPENCV_FOR_THREADS_NUM": "1"}
-LONGEST_FIRST = ("graph", "starpos", "starpos_camera", "starpos, Ubuntu's", "starpos_inclinometer")
+# parts that mostly wait run beside those that mostly compute
+FIRST = ("graph", "starpos", "starpos_camera", "starpos_inclinometer")
+UBUNTU = "Ubuntu's "
 VERSIONS = "tools/setup/ubuntu-24.04.txt"
 UNDERLAY = ROOT / ".underlay"
 # with the newest versions only: what waits for nodes or other processes, and what draws many nights (montecarlo)
@@ -108,18 +112,26 @@ def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
 
 
 def pytest(
-    folder: str,
+    files: list[str],
     report: str,
     pytest_args: list[str],
     out,
     python=sys.executable,
     environment: dict[str, str] | None = None,
 ) -> Outcome:
-    """A folder's tests."""
+    """The tests of some files."""
     since, path = time.time(), ROOT / "log" / f"{report}.xml"
-    command = [python, "-m", "pytest", folder, f"--junit-xml={path}", *pytest_args]
-    status = run(command, out, (environment or dict(os.environ)) | ONE_THREAD)
+    command = [python, "-m", "pytest", *files, f"--junit-xml={path}", *pytest_args]
+    status = run(command, out, (environment or dict(os.environ)) | ONE_THREAD | one_cache())
     return outcome_of(path, since, status, out)
+
+
+def one_cache() -> dict[str, str]:
+    """Where all parts keep tables of stars: in the user's cache where there is one, else beside the build."""
+    if (Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "starpos").is_dir():
+        return {}
+    (ROOT / "build" / "cache" / "starpos").mkdir(parents=True, exist_ok=True)
+    return {"XDG_CACHE_HOME": str(ROOT / "build" / "cache")}
 
 
 def folders() -> dict[str, str]:
@@ -129,11 +141,22 @@ def folders() -> dict[str, str]:
     return {folder.parent.name: str(folder.relative_to(ROOT)) for folder in tests}
 
 
+def parts(folders: dict[str, str], without: Collection[str] = ()) -> dict[str, list[str]]:
+    """Files of tests, by the name of their part."""
+    made = {}
+    for name, folder in folders.items():
+        files = [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob("**/test_*.py"))]
+        files = [path for path in files if path not in without]
+        count = min(PARTS.get(name, 1), len(files))
+        made |= {f"{name} {k + 1}" if count > 1 else name: files[k::count] for k in range(count)}
+    return made
+
+
 def newest(pytest_args: list[str]) -> Tests:
     """Tests of all packages and of the graph, in the workspace."""
     return {
-        name: partial(pytest, folder, name, pytest_args)
-        for name, folder in (folders() | {"graph": "test"}).items()
+        name: partial(pytest, files, name.replace(" ", "-"), pytest_args)
+        for name, files in parts(folders() | {"graph": "test"}).items()
     }
 
 
@@ -170,8 +193,8 @@ def bare_environment(python: Path, programs: Path) -> dict[str, str]:
     return rest | {"PATH": f"{python.parent}{os.pathsep}{programs}"}
 
 
-def older(folder: str, report: str, pytest_args: list[str], out) -> Outcome:
-    """A folder's tests with the versions that Ubuntu 24.04 has, and nothing that a bare machine has not."""
+def older(files: list[str], report: str, pytest_args: list[str], out) -> Outcome:
+    """The tests of some files with the versions that Ubuntu 24.04 has, and nothing that a bare machine has not."""
     ubuntu = UNDERLAY / "ubuntu"
     if not made(ubuntu, out):
         print("Ubuntu 24.04's versions could not be installed", file=out)
@@ -180,8 +203,8 @@ def older(folder: str, report: str, pytest_args: list[str], out) -> Outcome:
     with tempfile.TemporaryDirectory() as programs:
         os.chmod(programs, 0o755)  # some tests become another user
         environment = bare_environment(python, Path(programs))
-        chosen = ["-m", "not montecarlo", *(f"--ignore={path}" for path in NEWEST_ONLY), *pytest_args]
-        return pytest(folder, report, chosen, out, python=str(python), environment=environment)
+        chosen = ["-m", "not montecarlo", *pytest_args]
+        return pytest(files, report, chosen, out, python=str(python), environment=environment)
 
 
 def shown(name: str, tests: Callable) -> Outcome:
@@ -195,13 +218,17 @@ def shown(name: str, tests: Callable) -> Outcome:
     return outcome
 
 
+def turn(name: str) -> tuple[bool, int, int]:
+    """When a part runs: the first of each package, then the second of each; Ubuntu's versions last."""
+    package, *number = name.removeprefix(UBUNTU).split()
+    first = FIRST.index(package) if package in FIRST else len(FIRST)
+    return name.startswith(UBUNTU), int(*number) if number else max(PARTS.values()) // 2, first
+
+
 def all_of(tests: Tests) -> Outcome:
     """The outcome of all, some at once."""
-    names = sorted(
-        tests, key=lambda n: (LONGEST_FIRST.index(n) if n in LONGEST_FIRST else len(LONGEST_FIRST), n)
-    )
     with ThreadPoolExecutor(LANES) as lanes:
-        return sum(lanes.map(lambda name: shown(name, tests[name]), names), Outcome())
+        return sum(lanes.map(lambda name: shown(name, tests[name]), sorted(tests, key=turn)), Outcome())
 
 
 def main(args: list[str]) -> int:
@@ -211,8 +238,8 @@ def main(args: list[str]) -> int:
     tests = {} if which & {"--lint", "--ubuntu"} else newest(pytest_args)
     if which & {"--ubuntu", "--both"}:
         tests |= {
-            f"{name}, Ubuntu's": partial(older, folder, f"{name}-ubuntu", pytest_args)
-            for name, folder in folders().items()
+            f"{UBUNTU}{name}": partial(older, files, f"{name.replace(' ', '-')}-ubuntu", pytest_args)
+            for name, files in parts(folders(), NEWEST_ONLY).items()
         }
     total += all_of(tests)
     for reason, count in sorted(total.skipped.items()):

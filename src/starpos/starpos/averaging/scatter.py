@@ -113,39 +113,33 @@ def scatter_of(frames: Frames) -> Scatter:
     prior = np.append(
         AS_STATED, np.tile((1 - AS_STATED) * _shrinking(sizes), len(kinds)) / max(len(kinds), 1)
     )
-    answers, log_weights = [], []
-    wide_prior = np.append(AS_STATED, (1 - AS_STATED) * _shrinking(np.array(RESPONSES[1:])))
     number = len(RESPONSES) if frames.response.any() else 1
-    variances = [(0.0, 0.0)] + [(k.of_pose * s**2, k.of_frame * s**2) for k in kinds for s in sizes]
-    covariances = [stated, *(stated + s**2 * k.kernel for k in kinds for s in sizes)]
-    for n, covariance in enumerate(covariances):
-        sums = (normal, pull, bare) if n == 0 else _sums(y, j, covariance)
-        for wide, share_of in zip(RESPONSES[:number], wide_prior, strict=False):
-            sd = frames.prior_sigma.copy()
-            sd[frames.response] = np.hypot(sd[frames.response], wide)
-            moved, spread, evidence = _answer(*sums, sd)
-            answers.append((moved, spread, variances[n]))
-            log_weights.append(evidence + np.log(prior[n] * share_of))
-    weight = np.exp(np.array(log_weights) - max(log_weights))
+    wide_prior = np.append(AS_STATED, (1 - AS_STATED) * _shrinking(np.array(RESPONSES[1:])))[:number]
+    variances = np.array([(0.0, 0.0)] + [(k.of_pose * s**2, k.of_frame * s**2) for k in kinds for s in sizes])
+    sums = [(normal, pull, bare)] + [_sums(y, j, stated + s**2 * k.kernel) for k in kinds for s in sizes]
+    # each hypothesis of the scatter with each of the response, one after another
+    wide = np.tile(RESPONSES[:number], len(sums))[:, None]
+    prior_sigma = np.where(frames.response, np.hypot(frames.prior_sigma, wide), frames.prior_sigma)
+    all_sums = (np.repeat(np.array(each), number, axis=0) for each in zip(*sums, strict=True))
+    moved, spread, evidence = _answers(*all_sums, prior_sigma)
+    log_weight = evidence + np.log(np.outer(prior, wide_prior).ravel())
+    weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     # nobody's word against a sensor is enough to doubt its response: the frames have to show it
     wider = np.arange(len(weight)) % number > 0
     if weight[wider].sum() < SHOWN:
         weight[wider] = 0.0
         weight /= weight.sum()
-    mean = weight @ np.array([moved for moved, _, _ in answers])
-    total = sum(
-        w * (spread + np.outer(moved - mean, moved - mean))
-        for w, (moved, spread, _) in zip(weight, answers, strict=True)
-    )
-    pose2, frame2 = weight @ np.array([v for _, _, v in answers])
+    mean = weight @ moved
+    off = moved - mean
+    pose2, frame2 = weight @ np.repeat(variances, number, axis=0)
     return Scatter(
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
         evident=bool(weight[0] < EVIDENT),
         moved=mean,
-        covariance=np.asarray(total),
-        stated=answers[0][1],
+        covariance=np.tensordot(weight, spread, 1) + (weight * off.T) @ off,
+        stated=spread[0],
     )
 
 
@@ -193,13 +187,14 @@ def _told(normal: np.ndarray, prior_sigma: np.ndarray) -> float:
     return float(np.sum(told / (1 + told)))
 
 
-def _answer(
-    normal: np.ndarray, pull: np.ndarray, bare: float, prior_sigma: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Parameters (n,), their covariance, and the logarithm of the evidence."""
+def _answers(
+    normal: np.ndarray, pull: np.ndarray, bare: np.ndarray, prior_sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parameters (H, n), their covariances, and the logarithms (H,) of the evidence, of H hypotheses."""
     # in units of the prior, so that the loose and the tight are of one size
-    whole = normal * np.outer(prior_sigma, prior_sigma) + np.eye(len(pull))
-    inverse = np.linalg.inv(whole)
-    moved = inverse @ (pull * prior_sigma)
-    evidence = (moved @ (pull * prior_sigma) - bare - np.linalg.slogdet(whole)[1]) / 2
-    return prior_sigma * moved, np.outer(prior_sigma, prior_sigma) * inverse, float(evidence)
+    scale = prior_sigma[:, :, None] * prior_sigma[:, None]
+    whole = normal * scale + np.eye(pull.shape[1])
+    inverse, pull = np.linalg.inv(whole), pull * prior_sigma
+    moved = (inverse @ pull[..., None])[..., 0]
+    evidence = (np.sum(moved * pull, axis=1) - bare - np.linalg.slogdet(whole)[1]) / 2
+    return prior_sigma * moved, scale * inverse, evidence

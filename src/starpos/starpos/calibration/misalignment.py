@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.averaging.scatter import Scatter
-from starpos.calibration.plumb_line import FEWEST_POSES, PlumbLine, hang, settled, typical
+from starpos.calibration.plumb_fit import PlumbLine
+from starpos.calibration.plumb_line import FEWEST_POSES, hang, settled, typical
 from starpos.calibration.readings import FixedFrame, Readings
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError

@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from starpos.calibration.misalignment import Calibrated, calibrate
-from starpos.calibration.plumb_line import PlumbLine, Readings, level
+from starpos.calibration.plumb_fit import PlumbLine
+from starpos.calibration.plumb_line import level
+from starpos.calibration.readings import Readings
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing

@@ -14,7 +14,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from starpos.identification.evidence import DOUBLE_PX
 from starpos.identification.full import ENOUGH, Identification, identified
@@ -106,6 +105,9 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
         # where a lens bends much, some stars are matched wrongly
         kept = np.sort(np.argsort(np.square(residual).sum(1))[: int(ROBUST * stars)])
         residual = residual - terms @ np.linalg.lstsq(terms[kept], residual[kept], rcond=None)[0]
+    # slow to import, and seldom needed
+    from scipy.spatial import cKDTree
+
     nearest = cKDTree(xy[kept]).query(xy[kept], 2)[1][:, 1]
     residual, error2 = residual[kept], error2[kept]
     # mean squares along an axis, of one star

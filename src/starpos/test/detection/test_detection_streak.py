@@ -59,8 +59,8 @@ def test_a_trail_is_no_ring_however_few_the_stars(count, electrons, rng):
 
 @pytest.mark.montecarlo
 def test_a_long_trail_on_a_large_frame_hides_no_star(rng):
-    size, start, end = (3744, 5616), (-20, 750), (5636, 3000)
-    stars = grid(size, 700, 9000, rng)
+    size, start, end = (1872, 2808), (-20, 375), (2828, 1500)
+    stars = grid(size, 180, 9000, rng)
     light = field(size, stars) + trail(start, end, 300, size=size)
     found = detect(Frame(noisy(light, rng))).stars
     index = match(found, stars)
