@@ -120,8 +120,8 @@ def scatter_of(frames: Frames) -> Scatter:
     # each hypothesis of the scatter with each of the response, one after another
     wide = np.tile(RESPONSES[:number], len(sums))[:, None]
     prior_sigma = np.where(frames.response, np.hypot(frames.prior_sigma, wide), frames.prior_sigma)
-    all_sums = (np.repeat(np.array(each), number, axis=0) for each in zip(*sums, strict=True))
-    moved, spread, evidence = _answers(*all_sums, prior_sigma)
+    normals, pulls, bares = (np.repeat(np.array(each), number, axis=0) for each in zip(*sums, strict=True))
+    moved, spread, evidence = _answers(normals, pulls, bares, prior_sigma)
     log_weight = evidence + np.log(np.outer(prior, wide_prior).ravel())
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
