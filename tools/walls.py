@@ -74,9 +74,9 @@ def modules() -> list[Module]:
     return found
 
 
-def tests() -> list[Module]:
-    """All tests, and what they share."""
-    folders = (*ROOT.glob("*/test"), *ROOT.glob("src/*/test"), ROOT / "test")
+def beside() -> list[Module]:
+    """All tests, what they share, and the tools."""
+    folders = (*ROOT.glob("*/test"), *ROOT.glob("src/*/test"), ROOT / "test", ROOT / "tools")
     paths = sorted({p for folder in folders for p in folder.rglob("*.py")})
     return [Module(path.stem, path, path.read_text()) for path in paths]
 
@@ -193,7 +193,7 @@ def keywords(house: list[Module]) -> Iterator[str]:
 
 
 def words(house: list[Module]) -> Iterator[str]:
-    """Docstrings that make a reader stop, and files of two topics, of the product and of its tests."""
+    """Docstrings that make a reader stop, and files of two topics, of the product, its tests and its tools."""
     for module in house:
         for node in ast.walk(module.tree):
             said = ast.get_docstring(node) if isinstance(node, DOCUMENTED) else None
@@ -208,7 +208,7 @@ def breaches() -> list[str]:
     """All that is against the rules."""
     house = modules()
     return [line for rule in (layers, aliases, twins, keywords) for line in rule(house)] + [
-        *words(house + tests())
+        *words(house + beside())
     ]
 
 

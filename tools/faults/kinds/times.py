@@ -82,7 +82,7 @@ def clock_set(w: World):
 
 @kind(0.3)
 def clock_set_and_instrument_turned(w: World):
-    """The same, and the instrument is turned before the clock is right again; then solver/reset."""
+    """A clock that is set, as above, and the instrument is turned before it is right again; then solver/reset."""
     off = some_time(w, 2, 3600) * w.rng.choice([-1, 1])
     w.clock_off_s = off
     for k in range(8):
