@@ -145,6 +145,18 @@ def layers(house: list[Module]) -> Iterator[str]:
                     yield module.at(node, f"{module.room} (floor {own}) imports {room} (floor {above})")
 
 
+def core() -> Iterator[str]:
+    """What the compiled core may not import, and its files of two topics."""
+    folder = packages()["starpos"] / "core"
+    for path in sorted((*folder.glob("*.pyx"), *folder.glob("*.pxd"))):
+        lines = path.read_text().splitlines()
+        for number, line in enumerate(lines, 1):
+            if re.match(r"\s*(from|import|cimport)\s+starpos(?!\.core\b)", line):
+                yield f"{path.relative_to(ROOT)}:{number}: the core imports {line.split()[1]}"
+        if len(lines) > MOST_LINES:
+            yield f"{path.relative_to(ROOT)}:1: {len(lines)} lines: more than one topic?"
+
+
 def aliases(house: list[Module]) -> Iterator[str]:
     """Imports under another name: two things have one name."""
     for module in house:
@@ -208,7 +220,8 @@ def breaches() -> list[str]:
     """All that is against the rules."""
     house = modules()
     return [line for rule in (layers, aliases, twins, keywords) for line in rule(house)] + [
-        *words(house + beside())
+        *words(house + beside()),
+        *core(),
     ]
 
 

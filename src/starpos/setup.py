@@ -1,7 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-from setuptools import find_packages, setup
+from glob import glob
+from pathlib import Path
+
+from setuptools import Extension, find_packages, setup
 
 package = "starpos"
+# the compiled core: a module is a .pyx; what several of them share is in .pxd
+SHARED = sorted(glob("starpos/core/*.pxd"))
+CORE = [
+    Extension(f"starpos.core.{Path(source).stem}", [source], depends=SHARED, extra_compile_args=["-O3"])
+    for source in sorted(glob("starpos/core/*.pyx"))
+]
 
 setup(
     name=package,
@@ -13,6 +22,7 @@ setup(
     python_requires=">=3.10",
     packages=find_packages(include=["starpos", "starpos.*"]),
     package_data={package: ["*/data/*", "*.pyi", "py.typed"]},
+    ext_modules=CORE,
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

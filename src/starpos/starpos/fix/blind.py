@@ -11,6 +11,7 @@ from starpos.fix.solver import Solution, Status, attitude_of, judged, status_of
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Sky, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
+from starpos.identification.search import frame_stars
 from starpos.identification.triangles import no_triangles
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -56,7 +57,9 @@ class BlindSolver:
                 Solution.failed(stars, Status.NOT_IDENTIFIED, message), identify_s=time.perf_counter() - begin
             )
         camera, found = answer
-        warnings, explained = judged(seen, camera.directions(seen.x, seen.y), camera, sky, found)
+        warnings, explained = judged(
+            seen, frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera), sky, found
+        )
         return replace(
             Solution.failed(stars, Status.OK, "identified"),
             names=tuple(self.catalogue.names(found.catalogue)),

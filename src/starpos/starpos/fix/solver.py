@@ -6,10 +6,11 @@ import time
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 
-import erfa
 import numpy as np
 
+from starpos.core.frame import all_within, mean_sigma, place_of, unit_vectors
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
@@ -20,11 +21,12 @@ from starpos.fix.unmoved import check_unmoved
 from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
-from starpos.frames.stars import Stars
-from starpos.identification import FEWEST_STARS, Identification, Sky, identify_directions, triangle_cache
+from starpos.frames.stars import EDGE_PX, Stars
+from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
-from starpos.identification.search import frame_stars
+from starpos.identification.pose import FrameStars
+from starpos.identification.search import frame_stars, identify_frame
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
@@ -34,6 +36,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
+from starpos.units import ARCSEC
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 100.0
@@ -126,7 +129,7 @@ class Solver:
 
     def prepare(self, width: int, height: int) -> None:
         """Load the triangles for frames of this size in px, or build them; raises StarposError."""
-        self._triangles(self._camera(width, height))
+        Sky(self.catalogue, self._view(width, height)[1]).load()
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars and pointing of the camera.  Stars without a time: J2000 places, no aberration."""
@@ -134,17 +137,21 @@ class Solver:
             return _for_all(stars, inside, self.identify(stars.take(inside)))
         begin = time.perf_counter()
         try:
-            camera = self._camera(stars.width, stars.height)
-            sky = Sky.at(self.catalogue, self._triangles(camera), stars.mid_unix_s)
-            directions = camera.directions(stars.x, stars.y)
-            found = identify_directions(directions, stars.sigma, camera, sky)
+            camera, triangles = self._view(stars.width, stars.height)
+            sky = Sky.at(self.catalogue, triangles, stars.mid_unix_s)
+            field = frame_stars(directions_of(camera, stars), mean_sigma(stars.covariance), camera)
+            found = identify_frame(field, sky)
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
             return replace(self._unidentified(stars, camera), identify_s=time.perf_counter() - begin)
-        warnings, explained = judged(stars, directions, camera, sky, found)
-        return replace(
-            Solution.failed(stars, Status.OK, "identified"),
+        warnings, explained = judged(stars, field, sky, found)
+        return Solution(
+            Status.OK,
+            "identified",
+            source=stars.source,
+            utc_unix_s=stars.mid_unix_s,
+            stars_detected=len(stars),
             names=tuple(self.catalogue.names(found.catalogue)),
             star=found.star,
             magnitudes=self.catalogue.vmag(found.catalogue),
@@ -170,21 +177,22 @@ class Solver:
             return _for_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
         try:
             state, tilt = self.levelled(stars, tilt)
-            camera = self._camera(stars.width, stars.height)
+            camera, triangles = self._view(stars.width, stars.height)
             mounting = self.instrument.mounting
             g = level_of(mounting.up(tilt)) @ mounting.a3
             begin = time.perf_counter()
-            directions = self.atmosphere.refraction().unbend(camera.directions(stars.x, stars.y) @ g.T) @ g
+            directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             priors = hint.priors(state, g[2]) if hint else ()
-            sky = Sky(self.catalogue, self._triangles(camera), state.year, tuple(state.velocity))
-            found = identify_directions(directions, stars.sigma, camera, sky, priors)
+            sky = Sky(self.catalogue, triangles, state.year, tuple(state.velocity))
+            field = frame_stars(directions, mean_sigma(stars.covariance), camera)
+            found = identify_frame(field, sky, priors)
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
             return replace(
                 self._unidentified(stars, camera), tilt=tilt, identify_s=time.perf_counter() - begin
             )
-        warnings, explained = judged(stars, directions, camera, sky, found)
+        warnings, explained = judged(stars, field, sky, found)
         identified = time.perf_counter()
         names, magnitudes = self.catalogue.names(found.catalogue), self.catalogue.vmag(found.catalogue)
         solution = replace(
@@ -303,18 +311,26 @@ class Solver:
         """The shutter as the instrument states it, else as the stars' source does."""
         return self.instrument.shutter or stars.shutter or UNKNOWN
 
-    def _camera(self, width: int, height: int) -> Camera:
-        camera = self.instrument.camera_for(width, height)
-        field_deg = np.degrees(2 * camera.half_diagonal_rad)
-        if not SMALLEST_FIELD_DEG <= field_deg <= LARGEST_FIELD_DEG:
-            raise InstrumentError(
-                f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works from "
-                f"{SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size"
-            )
-        return camera
+    @cached_property
+    def _views(self) -> dict[tuple[int, int], tuple[Camera, TriangleCatalogue]]:
+        """What `_view` has given last, by size."""
+        return {}
 
-    def _triangles(self, camera: Camera) -> TriangleCatalogue:
-        return triangle_cache.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
+    def _view(self, width: int, height: int) -> tuple[Camera, TriangleCatalogue]:
+        """The camera for frames of this size in px and the triangles for its field; raises StarposError."""
+        if (width, height) not in self._views:
+            camera = self.instrument.camera_for(width, height)
+            field_deg = math.degrees(2 * camera.half_diagonal_rad)
+            if not SMALLEST_FIELD_DEG <= field_deg <= LARGEST_FIELD_DEG:
+                raise InstrumentError(
+                    f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
+                    f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size"
+                )
+            triangles = triangle_cache.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
+            # one size is usual
+            self._views.clear()
+            self._views[width, height] = camera, triangles
+        return self._views[width, height]
 
     def _unidentified(self, stars: Stars, camera: Camera) -> Solution:
         status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
@@ -323,8 +339,16 @@ class Solver:
 
 def _inside(stars: Stars) -> np.ndarray | None:
     """Rows of the stars that lie on their frame; None if all do, as is usual."""
-    on = stars.on_frame
-    return None if on.all() else np.flatnonzero(on)
+    if all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
+        return None
+    return np.flatnonzero(stars.on_frame)
+
+
+def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
+    """Unit vectors (N, 3) in C of the stars' pixels."""
+    if any(camera.distortion):
+        return camera.directions(stars.x, stars.y)
+    return unit_vectors(stars.x, stars.y, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
@@ -349,32 +373,30 @@ def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
 
 
 def judged(
-    stars: Stars, directions: np.ndarray, camera: Camera, sky: Sky, found: Identification
+    stars: Stars, field: FrameStars, sky: Sky, found: Identification
 ) -> tuple[tuple[str, ...], Explained]:
-    """Names, sorted, of what is suspicious about the stars' identification, and what it explains; directions (N, 3)."""
-    explained = explained_by(found, frame_stars(directions, stars.sigma, camera), sky)
-    twice = two_skies(directions, stars.sigma, stars.flux, camera, sky, found)
-    names = (TWO_SKIES,) * twice + (UNEXPLAINED,) * (not explained.enough)
+    """Names, sorted, of what is suspicious about the stars' identification, and what it explains."""
+    explained = explained_by(found, field)
+    names = (TWO_SKIES,) * two_skies(field, stars.flux, sky, found) + (UNEXPLAINED,) * (not explained.enough)
     return names, explained
 
 
 def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
-    seen = camera.scaled(found.focal_scale)
+    fx, fy = camera.fx * found.focal_scale, camera.fy * found.focal_scale
     x, y = camera.centre_px
-    centre, above = sky.unaberrated(seen.directions([x, x], [y, y - 1.0]) @ found.attitude)
-    ra, dec = erfa.c2s(centre)
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    up = above - centre
-    if found.mirrored:
-        up = -up
+    if any(camera.distortion):
+        v = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
+    else:
+        across, down = (x - camera.cx) / fx, (y - camera.cy) / fy
+        v = np.array([[across, down, 1.0], [across, down - 1 / fy, 1.0]])
+    ra, dec, roll = place_of(v, found.attitude, sky.velocity, found.mirrored)
     return Attitude(
         ra=full_turn(ra),
-        dec=float(dec),
-        roll=full_turn(np.arctan2(up @ east, up @ north)),
-        focal_px=float(seen.fx),
-        residual_arcsec=float(found.residual_px * seen.scale_arcsec),
+        dec=dec,
+        roll=full_turn(roll),
+        focal_px=fx,
+        residual_arcsec=found.residual_px / math.sqrt(fx * fy) / ARCSEC,
         log_odds=found.log_odds,
         mirrored=found.mirrored,
     )

@@ -19,20 +19,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.identification.pairs import close_pairs
-from starpos.identification.pose import CROWD_STARS, Pose, slopes
+from starpos.core.poses import log_ratio
+from starpos.identification.pose import Pose
+from starpos.identification.triangles import SCALE_TOLERANCE
 
 # Errors of the centroids beside their own (px) and their probabilities: none, errors of the catalogue, unknown lenses.
 ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0.1])
-# The focal length may be off by this share.
-SCALE_TOLERANCE = 0.03
 # Limits on the error of its logarithm, and their probabilities.
 SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)
 # Probability that a frame is mirrored.
 MIRRORED = 0.1
 # Width of all rotations about each axis, and of the likeliest focal lengths.
 WIDTH = np.append(np.full(3, np.cbrt(8 * np.pi**2)), 2 * SCALES[0][0])
-EARLIER = np.tri(CROWD_STARS, k=-1, dtype=bool)
 # Closer detections may be the same star, so the second says nothing new.
 DOUBLE_PX = 3.0
 
@@ -48,11 +46,6 @@ class Prior:
 
     log_density: Callable[[Pose], float]
     width: np.ndarray
-
-    @property
-    def information(self) -> np.ndarray:
-        """Information matrix (4, 4) of a Gaussian of that width."""
-        return np.diag(2 * np.pi / self.width**2)
 
 
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
@@ -96,21 +89,18 @@ def log_evidence(
     rank          (M,): brightness rank of their catalogue stars on the frame
     w             (M, 3): directions of these
     """
-    predicted, slope = slopes(pose, w)
-    distance2 = np.square(xy[star] - predicted).sum(1)
-    n = np.arange(len(xy))
-    hit = np.zeros(len(xy), int)
-    hit[star] = 1
-    odds = np.empty((len(ERRORS_PX), len(xy)))
-    odds[:] = (n - hit.cumsum() + hit + 1) / (n + 3)
-    passed = rank - (EARLIER[: len(star), : len(star)] & (rank[:, None] > rank)).sum(1)
-    right = (np.arange(len(star)) + 2) / (star + 3)
-    variance = sigma_px[star] ** 2 + ERRORS_PX[:, None] ** 2
-    density = np.exp(-0.5 * distance2 / variance) / (2 * np.pi * variance)
-    odds[:, star] += right * area_px2 / ((passed + 1) * (passed + 2)) * density
-    odds[:, close_pairs(xy, DOUBLE_PX)[1]] = 1.0
-    slope = slope.reshape(-1, 4)
-    information = slope.T @ slope / variance.min(1)[:, None, None] + prior.information
-    volume = 0.5 * (4 * np.log(2 * np.pi) - np.linalg.slogdet(information)[1])
-    best = np.log(odds).cumsum(1).max(1) + volume + LOG_SHARES
-    return float(best.max() + prior.log_density(pose))
+    ratio = log_ratio(
+        xy,
+        sigma_px,
+        area_px2,
+        pose.attitude,
+        pose.focal_px,
+        prior.width,
+        star,
+        rank,
+        w,
+        ERRORS_PX,
+        LOG_SHARES,
+        DOUBLE_PX,
+    )
+    return ratio + prior.log_density(pose)

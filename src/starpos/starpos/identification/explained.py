@@ -5,17 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.identification.full import Identification, OnFrame
-from starpos.identification.pose import TEST_STARS, FrameStars, Pose
-from starpos.identification.sky import Sky
+from starpos.identification.full import Identification
+from starpos.identification.pose import TEST_STARS, FrameStars
 
 # At least so many catalogue stars are asked for, where the frame has as many.
 LEAST_DUE = 8
 # An identification explains a frame if it explains this share of its bright detections, or if this share of the bright
 # stars that should be there are: then the other detections are false stars.
 ENOUGH_EXPLAINED, ENOUGH_SEEN = 0.5, 0.6
-# A star so near the frame's edge (px) may be cut off.
-MARGIN_PX = 5.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,7 @@ class Explained:
         return self.explained >= ENOUGH_EXPLAINED * self.bright or self.seen >= ENOUGH_SEEN * self.due
 
 
-def explained_by(found: Identification, field: FrameStars, sky: Sky) -> Explained:
+def explained_by(found: Identification, field: FrameStars) -> Explained:
     """How much of a frame's stars an identification explains.
 
     As many of the brightest catalogue stars are due as bright detections are explained: where these are the brightest
@@ -45,8 +42,5 @@ def explained_by(found: Identification, field: FrameStars, sky: Sky) -> Explaine
     """
     bright = min(len(field), TEST_STARS)
     explained = int(np.count_nonzero(found.star < bright))
-    pose = Pose(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
-    stars = OnFrame.of(field, sky, pose, TEST_STARS)
-    inside = np.abs(pose.project(stars.directions) - field.middle) < field.half - MARGIN_PX
-    due = stars.index[inside.all(1)][: max(explained, LEAST_DUE)]
-    return Explained(explained, bright, int(np.isin(due, found.catalogue).sum()), len(due))
+    due = found.expected[: max(explained, LEAST_DUE)].tolist()
+    return Explained(explained, bright, len(set(due).intersection(found.catalogue.tolist())), len(due))

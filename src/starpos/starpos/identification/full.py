@@ -2,17 +2,15 @@
 """Verify a pose by a frame's stars, and match all detections with all catalogue stars of the field."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from starpos import rotation
+from starpos.core.poses import fitted, settled
 from starpos.identification.evidence import Prior, log_evidence
-from starpos.identification.pairs import close_pairs, mutual_nearest
-from starpos.identification.pose import FrameStars, Pose, directions
+from starpos.identification.pose import SMALL_STEP, STEPS, FrameStars, Pose
 from starpos.identification.sky import Sky
 from starpos.normal import SIGMA_PER_MAD
-from starpos.sky.catalogue import Catalogue
-from starpos.sky.zones import rows_near
 
 # An identification has at least so many stars.
 FEWEST_STARS = 4
@@ -29,22 +27,54 @@ FLOOR_PX = 0.05
 BENT_PX = 0.3
 # Closer stars make one image.
 BLEND_PX = 2.5
+# Stars so far beyond the frame (px) are on it, and a star so near its edge may be cut off.
+EDGE_PX, INSIDE_PX = 2.0, 5.0
 
-Pairs = tuple[np.ndarray, np.ndarray]  # rows of the detections and of the stars matched with them
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """Rules by which the compiled core settles on pairs, as the constants here have them."""
+
+    rounds: int
+    fewest_stars: int
+    steps: int
+    small_step: float
+    floor_px: float
+    sigma_per_mad: float
+    least_spread_px: float
+    gate_sigma: float
+    gate_px: float
+    inside_px: float
+
+
+RULES = Rules(
+    rounds=ROUNDS,
+    fewest_stars=FEWEST_STARS,
+    steps=STEPS,
+    small_step=SMALL_STEP,
+    floor_px=FLOOR_PX,
+    sigma_per_mad=SIGMA_PER_MAD,
+    least_spread_px=LEAST_SPREAD_PX,
+    gate_sigma=GATE_SIGMA,
+    gate_px=GATE_PX,
+    inside_px=INSIDE_PX,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Identification:
     """M matched stars and the attitude they give.
 
-    star         (M,): rows of the input
-    catalogue    (M,): rows of the star catalogue
-    blend_px     (M,): how far unresolved neighbours may move each star's image
-    attitude     (3, 3): `Sky`'s directions into C
-    focal_scale  factor on the camera's focal length
-    residual_px  rms along one axis, with the weights of the fit
-    log_odds     of the identification, by `log_evidence`
-    mirrored     whether the frame's rows run bottom-up; the attitude is that of the flipped frame
+    star             (M,): rows of the input
+    catalogue        (M,): rows of the star catalogue
+    blend_px         (M,): how far unresolved neighbours may move each star's image
+    attitude         (3, 3): `Sky`'s directions into C
+    focal_scale      factor on the camera's focal length
+    residual_px      rms along one axis, with the weights of the fit
+    mean_square_px2  of the residuals along one axis, all alike
+    log_odds         of the identification, by `log_evidence`
+    expected         (E,): rows of the catalogue's stars well inside the frame, brightest first
+    mirrored         whether the frame's rows run bottom-up; the attitude is that of the flipped frame
     """
 
     star: np.ndarray
@@ -53,7 +83,9 @@ class Identification:
     attitude: np.ndarray
     focal_scale: float
     residual_px: float
+    mean_square_px2: float
     log_odds: float
+    expected: np.ndarray
     mirrored: bool
 
 
@@ -73,22 +105,41 @@ class OnFrame:
     @classmethod
     def of(cls, field: FrameStars, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
         """The stars that the field's brightest detections may be, at most `most_detections` of them."""
-        catalogue, stars = sky.catalogue, min(len(field), most_detections)
-        axis = np.append(field.middle / field.focal_px, 1.0) @ pose.attitude
-        index = rows_near(catalogue.cell_start, axis, field.radius_rad)
-        light = catalogue.vmag_centi[index]
-        # three times too many, because the cells reach beyond the frame
-        most = 12 * stars + 300
-        if len(index) > most:
-            brightest = np.argpartition(light, most)[:most]
-            index, light = index[brightest], light[brightest]
-        index = index[np.argsort(light, kind="stable")]
-        w = sky.directions(index)
-        pixel = pose.project(w)
-        on = np.flatnonzero(field.holds(pixel))[: 3 * stars + 50]
-        single, drawn = _resolved(catalogue, index[on], pixel[on], w[on], field.focal_px)
-        on = on[single]
-        return cls(index[on], w[on], drawn[single])
+        stars = min(len(field), most_detections)
+        found = sky.stars.on_frame(
+            field.compiled,
+            pose.attitude,
+            pose.focal_px,
+            sky.years,
+            sky.velocity,
+            EDGE_PX,
+            3 * stars + 50,
+            # three times too many again, because the cells reach beyond the frame
+            12 * stars + 300,
+            BLEND_PX,
+        )
+        return cls(*found)
+
+
+class Match(NamedTuple):
+    """Stars on which a pose has settled.
+
+    attitude, focal_px  the pose
+    star, near          (M,): rows of the detections and of the stars matched with them
+    inside              (S,): whether each catalogue star is well inside the frame
+    spread_px           standard deviation that the median of the residuals shows
+    rms_px              of the residuals along one axis, with the weights of the fit
+    mean_square_px2     of the residuals along one axis, all alike
+    """
+
+    attitude: np.ndarray
+    focal_px: float
+    star: np.ndarray
+    near: np.ndarray
+    inside: np.ndarray
+    spread_px: float
+    rms_px: float
+    mean_square_px2: float
 
 
 def identified(
@@ -98,103 +149,70 @@ def identified(
 
     None unless the evidence is beyond doubt (ENOUGH).
     """
-    xy, sigma = field.xy[int(near_pose.mirrored), :FAINTEST_FIT], field.sigma[:FAINTEST_FIT]
-    tested = xy[: field.tested]
-    stars = OnFrame.of(field, sky, near_pose, field.tested)
-    pair = mutual_nearest(tested, near_pose.project(stars.directions), radius_px[: field.tested])
-    match = _settled(field, tested, sigma, stars, near_pose, pair)
+    mirrored, tested = near_pose.mirrored, min(len(field), field.tested)
+    stars = OnFrame.of(field, sky, near_pose, tested)
+    match = _settled(field, tested, stars, near_pose, radius_px)
     if match is None:
         return None
-    pose, (star, near), residual = match
-    log_odds = log_evidence(tested, sigma, field.area_px2, pose, prior, star, near, stars.directions[near])
+    pose = Pose(match.attitude, match.focal_px, mirrored)
+    xy, sigma, w = field.xy[int(mirrored), :tested], field.sigma[:tested], stars.directions[match.near]
+    log_odds = log_evidence(xy, sigma, field.area_px2, pose, prior, match.star, match.near, w)
     # true for NaN too
     if not log_odds >= ENOUGH:
         return None
-    if len(xy) > len(tested):
-        stars = OnFrame.of(field, sky, pose, FAINTEST_FIT)
-        pair = mutual_nearest(xy, pose.project(stars.directions), _gate(residual, sigma))
-        match = _settled(field, xy, sigma, stars, pose, pair)
+    if len(field) > tested:
+        most = min(len(field), FAINTEST_FIT)
+        stars = OnFrame.of(field, sky, pose, most)
+        gate_px = GATE_SIGMA * np.hypot(max(match.spread_px, LEAST_SPREAD_PX), field.sigma[:most]) + GATE_PX
+        match = _settled(field, most, stars, pose, gate_px)
         if match is None:
             return None
-        pose, (star, near), residual = match
-    spread = _spread(residual)
-    if spread > BENT_PX:
-        w, error = stars.directions[near], np.hypot(sigma[star], spread)
-        pose = _fitted_alone(field.focal_px, pose.mirrored, xy[star], w, error)
-        residual = xy[star] - pose.project(w)
+    if match.spread_px > BENT_PX:
+        match = _all_alike(field, mirrored, stars, match)
     return Identification(
-        star=star,
-        catalogue=stars.index[near],
-        blend_px=stars.blend_px[near],
-        attitude=pose.attitude,
-        focal_scale=pose.focal_px / field.focal_px,
-        residual_px=_rms(residual, np.hypot(sigma[star], FLOOR_PX)),
+        star=match.star,
+        catalogue=stars.index[match.near],
+        blend_px=stars.blend_px[match.near],
+        attitude=match.attitude,
+        focal_scale=match.focal_px / field.focal_px,
+        residual_px=match.rms_px,
+        mean_square_px2=match.mean_square_px2,
         log_odds=log_odds,
-        mirrored=pose.mirrored,
+        expected=stars.index[match.inside],
+        mirrored=mirrored,
     )
 
 
-def _settled(
-    field: FrameStars,
-    xy: np.ndarray,
-    sigma: np.ndarray,
-    stars: OnFrame,
-    pose: Pose,
-    pair: tuple[np.ndarray, np.ndarray],
-) -> tuple[Pose, tuple[np.ndarray, np.ndarray], np.ndarray] | None:
-    """Fit a pose to pairs and match again, until the pairs no longer change.
+def _settled(field: FrameStars, most: int, stars: OnFrame, pose: Pose, radius_px: np.ndarray) -> Match | None:
+    """Match the `most` brightest within radius_px (most,) of their places by a pose, fit it, and match again.
 
-    Returns the pose, the pairs and their residuals (M, 2) px; None if there are fewer than FEWEST_STARS pairs.
+    None if there are fewer than FEWEST_STARS pairs.
     """
-    for _ in range(ROUNDS):
-        star, near = pair
-        if len(star) < FEWEST_STARS:
-            return None
-        w = stars.directions[near]
-        pose = _fitted_alone(field.focal_px, pose.mirrored, xy[star], w, np.hypot(sigma[star], FLOOR_PX))
-        predicted = pose.project(stars.directions)
-        residual = xy[star] - predicted[near]
-        pair = mutual_nearest(xy, predicted, _gate(residual, sigma[: len(xy)]))
-        if np.array_equal(pair[0], star) and np.array_equal(pair[1], near):
-            break
-    return pose, (star, near), residual
+    found = settled(
+        field.compiled,
+        pose.mirrored,
+        most,
+        stars.directions,
+        pose.attitude,
+        pose.focal_px,
+        radius_px,
+        RULES,
+    )
+    return None if found is None else Match(*found)
 
 
-def _gate(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
-    return GATE_SIGMA * np.hypot(max(_spread(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
-
-
-def _spread(residual: np.ndarray) -> float:
-    """Standard deviation (px) that the median of residuals (M, 2) shows."""
-    # np.median, without its overhead
-    return SIGMA_PER_MAD * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
-
-
-def _rms(residual: np.ndarray, sigma_px: np.ndarray) -> float:
-    """Root mean square of residuals (M, 2) along one axis, with the weights of the fit."""
-    weight = 1 / np.square(sigma_px)
-    return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
-
-
-def _fitted_alone(
-    focal_px: float, mirrored: bool, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray
-) -> Pose:
-    """Fit the pose to matched stars without a starting pose, so that the result does not depend on the search."""
-    v = directions(xy[None], np.array([focal_px]))[0]
-    return Pose(rotation.best_rotation(w, v), focal_px, mirrored).fitted(xy, w, sigma_px)
-
-
-def _resolved(
-    catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which stars (N,), brightest first, are not blended with a brighter one; how far fainter ones move them (px)."""
-    single, drawn = np.ones(len(index), bool), np.zeros(len(index))
-    brighter, fainter = close_pairs(pixel, BLEND_PX)
-    if len(fainter):
-        ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
-        # from directions and rounded, so that it does not depend on the pose
-        apart = np.round(focal_px * np.linalg.norm(w[fainter] - w[brighter], axis=1), 6)
-        np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
-        single[fainter] = False
-    return single, drawn
+def _all_alike(field: FrameStars, mirrored: bool, stars: OnFrame, match: Match) -> Match:
+    """The match with the pose to which all stars count alike."""
+    xy, w = field.xy[int(mirrored), match.star], stars.directions[match.near]
+    sigma = field.sigma[match.star]
+    attitude, focal_px = fitted(
+        xy, w, np.hypot(sigma, match.spread_px), match.attitude, field.focal_px, True, STEPS, SMALL_STEP
+    )
+    square = np.square(xy - Pose(attitude, focal_px, mirrored).project(w)).sum(1)
+    weight = 1 / (sigma**2 + FLOOR_PX**2)
+    return match._replace(
+        attitude=attitude,
+        focal_px=focal_px,
+        rms_px=float(np.sqrt(square @ weight / (2 * weight.sum()))),
+        mean_square_px2=float(square.mean() / 2),
+    )

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose of a pinhole camera among the stars, and a frame's stars in pixels from the principal point."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
+from starpos.core.frame import Frame
+from starpos.core.poses import fitted
 from starpos.instrument.camera import Camera
 
 # Most steps of a fit; a step below this (rad) is the last one.
@@ -59,20 +63,15 @@ class FrameStars:
     def __len__(self) -> int:
         return len(self.sigma)
 
-    @property
-    def whole_px2(self) -> float:
-        """Area of the frame, including its margins."""
-        return float(4 * self.half[0] * self.half[1])
+    def take(self, row: np.ndarray) -> "FrameStars":
+        """The stars of these rows, in the same order."""
+        return replace(self, xy=np.ascontiguousarray(self.xy[:, row]), sigma=self.sigma[row])
 
-    @property
-    def radius_rad(self) -> float:
-        """Radius of a cone about the frame's centre that contains the frame."""
-        return float(np.arctan(np.hypot(*self.half) / self.focal_px)) * 1.05 + 2e-4
-
-    def holds(self, pixel: np.ndarray) -> np.ndarray:
-        """Whether pixels (N, 2) are on the frame (N,)."""
-        on = np.abs(pixel - self.middle) < self.half + 2
-        return on[..., 0] & on[..., 1]
+    @cached_property
+    def compiled(self) -> Frame:
+        """The stars, for the compiled core; the cone about the frame's centre has some margin."""
+        radius_rad = math.atan(math.hypot(*self.half.tolist()) / self.focal_px) * 1.05 + 2e-4
+        return Frame(self.xy, self.sigma, self.middle, self.half, self.focal_px, radius_rad)
 
 
 @dataclass(frozen=True)
@@ -90,40 +89,8 @@ class Pose:
 
     def fitted(self, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> "Pose":
         """Fit attitude and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
-        pose, weight = self, 1 / sigma_px[:, None]
-        for _ in range(STEPS):
-            pixel, slope = slopes(pose, w)
-            j = (slope * weight[:, None]).reshape(-1, 4)
-            residual = ((xy - pixel) * weight).ravel()
-            try:
-                *turn, scale = np.linalg.solve(j.T @ j, j.T @ residual).tolist()
-            # all stars in one place
-            except np.linalg.LinAlgError:
-                break
-            step = max(map(abs, (*turn, scale)))
-            # true for NaN too
-            if not step < 1:
-                break
-            turned = rotation.from_vector(turn) @ pose.attitude
-            pose = Pose(turned, pose.focal_px * (1 + scale), pose.mirrored)
-            # the remaining error is about its square
-            if step < SMALL_STEP:
-                break
-        return pose
-
-
-def slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of directions w (N, 3), and their derivatives (N, 2, 4).
-
-    The derivatives are by small rotations (rad) about C's axes and by the logarithm of the focal length.
-    """
-    u = w @ pose.attitude.T
-    x, y = (u[:, :2] / u[:, 2:]).T
-    slope = np.empty((len(w), 2, 4))
-    slope[:, 0, 0], slope[:, 0, 1], slope[:, 0, 2], slope[:, 0, 3] = -x * y, 1 + x * x, -y, x
-    slope[:, 1, 0], slope[:, 1, 1], slope[:, 1, 2], slope[:, 1, 3] = -1 - y * y, x * y, x, y
-    slope *= pose.focal_px
-    return slope[:, :, 3].copy(), slope
+        attitude, focal_px = fitted(xy, w, sigma_px, self.attitude, self.focal_px, False, STEPS, SMALL_STEP)
+        return Pose(attitude, focal_px, self.mirrored)
 
 
 @dataclass(frozen=True)
@@ -140,18 +107,6 @@ class Poses:
     def __len__(self) -> int:
         return len(self.focal_px)
 
-    @classmethod
-    def of_triangles(cls, xy: np.ndarray, w: np.ndarray, focal_px: float, mirrored: np.ndarray) -> "Poses":
-        """Poses that bring the stars of triangles, directions w (K, 3, 3), to the pixels xy (K, 3, 2).
-
-        The focal length makes a triangle's perimeter right, then the rotation brings it into place.
-        """
-        wanted = _perimeter(w)
-        focal = np.full(len(xy), float(focal_px))
-        for _ in range(2):
-            focal = focal * _perimeter(directions(xy, focal)) / wanted
-        return cls(rotation.best_rotation(w, directions(xy, focal)), focal, mirrored)
-
 
 def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
     """Unit vectors (K, N, 3) in C of pixels xy (K, N, 2) from the principal point, with focal lengths (K,)."""
@@ -159,9 +114,3 @@ def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:
     v[..., :2] = xy
     v[..., 2] = focal_px[:, None]
     return rotation.normalised(v)
-
-
-def _perimeter(v: np.ndarray) -> np.ndarray:
-    """Perimeters (K,) of triangles of unit vectors (K, 3, 3), along the chords."""
-    side = v - v[:, [1, 2, 0]]
-    return np.sqrt(np.einsum("kni,kni->kn", side, side)).sum(1)

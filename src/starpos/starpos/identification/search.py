@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from starpos.core.frame import projected
 from starpos.identification.evidence import anywhere
 from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
-from starpos.identification.pose import CROWD_STARS, FrameStars, Pose, Poses
+from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, FrameStars, Pose, Poses
 from starpos.identification.prior import Attempt, PlumbPrior, PointingPrior
 from starpos.identification.screen import MATCH_SIGMA, promising
 from starpos.identification.sky import Sky
@@ -19,8 +20,6 @@ from starpos.instrument.camera import Camera
 # (number of brightest stars, their error in px); the last stages are for lenses with distortion.
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
 LOG_HALF = math.log(0.5)
-# Candidates looked at in each stage.
-MOST_LOOKED_AT = 25
 # Stars so far beyond the frame (px) need no margin; a margin is at most this share of the frame.
 EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
@@ -45,7 +44,7 @@ def identify(
 
     None if no part of the sky fits beyond doubt. ValueError if a pixel or an error is not a finite number.
     """
-    return _identify(FrameStars.of(xy, sigma_px, camera), sky, priors)
+    return identify_frame(FrameStars.of(xy, sigma_px, camera), sky, priors)
 
 
 def identify_directions(
@@ -56,7 +55,7 @@ def identify_directions(
     priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
     """Identify stars as `identify` does, from unit vectors (N, 3) in C, with refraction removed, of any camera."""
-    return _identify(frame_stars(directions, sigma_px, camera), sky, priors)
+    return identify_frame(frame_stars(directions, sigma_px, camera), sky, priors)
 
 
 def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars:
@@ -65,24 +64,21 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
     squeeze = camera.fx / camera.fy
     width, height = camera.width, max(1, round(camera.height * squeeze))
     cx, cy = camera.cx, camera.cy * squeeze
-    xy = Camera(width=width, height=height, fx=camera.fx, fy=camera.fx, cx=cx, cy=cy).project(directions)
+    xy, sigma, beyond = projected(directions, sigma_px, camera.fx, cx, cy, width, height, LEAST_SIGMA_PX)
     # without distortion, stars that a lens has drawn in may lie beyond the frame: it gets a margin
-    beyond = float(np.maximum(-xy, xy - (width - 1, height - 1)).max(initial=0.0))
-    widest = WIDEST_MARGIN * max(width, height)
-    margin = math.ceil(min(beyond - EDGE_PX, widest)) if beyond > EDGE_PX else 0
-    ideal = Camera(
-        width=width + 2 * margin,
-        height=height + 2 * margin,
-        fx=camera.fx,
-        fy=camera.fx,
-        cx=cx + margin,
-        cy=cy + margin,
+    margin = math.ceil(min(beyond - EDGE_PX, WIDEST_MARGIN * max(width, height))) if beyond > EDGE_PX else 0
+    return FrameStars(
+        xy=xy,
+        sigma=sigma,
+        middle=np.array([(width - 1) / 2 - cx, (height - 1) / 2 - cy]),
+        half=np.array([width / 2 + margin, height / 2 + margin]),
+        focal_px=camera.fx,
+        area_px2=float(width * height),
     )
-    return FrameStars.of(xy + margin, sigma_px, ideal, margin)
 
 
-def _identify(field: FrameStars, sky: Sky, priors: Priors) -> Identification | None:
-    """The first attempt that is accepted; None if there is none."""
+def identify_frame(field: FrameStars, sky: Sky, priors: Priors = ()) -> Identification | None:
+    """Identify stars as `identify` does, from FrameStars."""
     if len(field) < FEWEST_STARS:
         return None
     for pose, radius_px, prior in attempts(field, sky, priors, STAGES):
@@ -106,9 +102,9 @@ def crowded_attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[At
     )
     for stars, error_px in dict.fromkeys(stages):
         candidates = lookup.supported(stars, error_px)
-        poses, radius_px = _of_triangles(field, sky, candidates, error_px)
-        for k in range(len(poses)):
-            yield poses[k], radius_px[k], lost
+        made, radius_px = _of_triangles(field, sky, candidates, error_px)
+        for k in range(len(made)):
+            yield made[k], radius_px[k], lost
 
 
 def attempts(
@@ -134,25 +130,26 @@ def _lost_in_space(
         candidates = lookup.candidates(min(stars, len(field)), error_px)
         # mostly the first one is right
         if len(candidates):
-            poses, radius_px = _of_triangles(field, sky, candidates[:1], error_px)
-            yield poses[0], radius_px[0]
+            made, radius_px = _of_triangles(field, sky, candidates[:1], error_px)
+            yield made[0], radius_px[0]
         if len(candidates) > 1:
-            others = candidates[1:MOST_LOOKED_AT]
-            poses, radius_px = _of_triangles(field, sky, others, error_px)
-            for k in promising(field, sky, poses, others.star, radius_px / MATCH_SIGMA):
-                yield poses[k], radius_px[k]
+            others = candidates[1:]
+            made, radius_px = _of_triangles(field, sky, others, error_px)
+            for k in promising(field, sky, made, others.star, radius_px):
+                yield made[k], radius_px[k]
 
 
 def _of_triangles(field: FrameStars, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
     """The poses of K candidates, and the distance (K, n) px by which the field's brightest stars may be off."""
-    xy = field.xy[c.mirrored.astype(int), : field.tested]
-    each = np.arange(len(c))[:, None]
-    corners = xy[each, c.star]
-    w = sky.bright(c.corner.ravel()).reshape(-1, 3, 3)
-    poses = Poses.of_triangles(corners, w, field.focal_px, c.mirrored)
-    # a triangle's error grows with the distance from it
-    middle = corners.mean(1, keepdims=True)
-    size2 = np.maximum(np.square(corners - middle).sum((1, 2)) / 3, 1.0)[:, None]
-    away2 = np.square(xy - middle).sum(2)
-    sigma = np.hypot(field.sigma[: xy.shape[1]], error_px)
-    return poses, MATCH_SIGMA * sigma * np.sqrt(1 + away2 / size2)
+    attitude, focal_px, radius_px = sky.brightest.poses(
+        field.compiled,
+        c.star,
+        c.corner,
+        c.mirrored,
+        sky.years,
+        sky.velocity,
+        error_px,
+        MATCH_SIGMA,
+        field.tested,
+    )
+    return Poses(attitude, focal_px, c.mirrored), radius_px

@@ -2,9 +2,12 @@
 """The stars of the catalogue in the directions in which they are seen at a date."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
+from starpos.core.screen import BrightTable
+from starpos.core.sky import StarTable
 from starpos.earth.orientation import earth_motion
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.rotation import normalised
@@ -28,9 +31,29 @@ class Sky:
         year, velocity = earth_motion(utc_unix_s)
         return cls(catalogue, triangles, year, tuple(velocity))
 
+    @property
+    def stars(self) -> StarTable:
+        """The catalogue, for the compiled core."""
+        return _stars(self.catalogue)
+
+    @property
+    def brightest(self) -> BrightTable:
+        """The triangle catalogue's stars, for the compiled core."""
+        return _brightest(self.catalogue, self.triangles)
+
+    def load(self) -> None:
+        """Make what the first identification would have to wait for."""
+        _brightest(self.catalogue, self.triangles)
+        _ = self.triangles.compiled
+
+    @property
+    def years(self) -> float:
+        """Julian years since the catalogue's epoch."""
+        return self.year - EPOCH
+
     def directions(self, index: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of the catalogue's rows `index` (n,)."""
-        return normalised(self.catalogue.directions(index, self.year) + np.asarray(self.velocity))
+        return self.stars.directions(np.asarray(index, np.intp), self.years, self.velocity)
 
     def bright(self, row: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of the triangle catalogue's rows `row` (n,)."""
@@ -39,3 +62,13 @@ class Sky:
     def unaberrated(self, v: np.ndarray) -> np.ndarray:
         """ICRS directions (n, 3) of stars seen in the directions v (n, 3)."""
         return normalised(v - np.asarray(self.velocity))
+
+
+@lru_cache(maxsize=2)
+def _stars(catalogue: Catalogue) -> StarTable:
+    return StarTable(catalogue)
+
+
+@lru_cache(maxsize=4)
+def _brightest(catalogue: Catalogue, triangles: TriangleCatalogue) -> BrightTable:
+    return BrightTable(_stars(catalogue), triangles.star, triangles.rank, triangles.cell_start)

@@ -2,6 +2,7 @@
 """Keep triangle catalogues: in memory, and in a cache on the disk from which they are memory-mapped."""
 
 import hashlib
+import math
 import threading
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
 
     The field is rounded up to steps of 5 %, so that a refined focal length does not need a new one.
     """
-    half_diagonal = float(1.05 ** np.ceil(np.log(half_diagonal_rad) / np.log(1.05)))
+    half_diagonal = 1.05 ** math.ceil(math.log(half_diagonal_rad) / math.log(1.05))
     with _lock:
         key = (catalogue.fingerprint, half_diagonal)
         if key not in _in_use:

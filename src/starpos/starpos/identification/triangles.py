@@ -6,24 +6,24 @@ field's size gives its own brightest stars, so that every field of the instrumen
 """
 
 from dataclasses import dataclass
-from itertools import combinations
+from functools import cached_property
 from math import comb
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starpos.core.circles import binned, triples_of_circles
+from starpos.core.triangles import TriangleTable
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.sky.zones import CELLS, ZONES, cell_starts, ranges
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+from starpos.sky.zones import CELLS, ZONES, cell_starts
 
 # Shortest side over the longest allowed one: the errors of centroids blur the angles of smaller triangles.
 SHORTEST_SIDE = 0.03
 # Shapes (largest angle 60..180 deg, smallest 0..60 deg, longest side 0..the longest allowed) are kept to 1/65536 of
 # these ranges; the highest bits of the three are a triangle's bin.
 CODES = 1 << 16
+# The focal length may be off by this share, and a triangle by so many sigma of its stars.
+SCALE_TOLERANCE, TRIANGLE_SIGMA = 0.03, 3.0
 # Density of shapes where they are looked up, over the mean density.
 CROWDED = 5.0
 BIN_BITS = (8, 7, 6)
@@ -35,7 +35,6 @@ BEACONS = 0.25
 # Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
 # first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
-BLOCK = 100_000
 # Limit, counted before duplicates of overlapping circles are removed.
 MAX_TRIANGLES = 6_000_000
 
@@ -61,7 +60,7 @@ def angles(side: np.ndarray) -> np.ndarray:
     return 2 * np.arctan2(np.sqrt(rest[..., [1, 0, 0]] * rest[..., [2, 2, 1]]), np.sqrt(np.sin(s) * rest))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TriangleCatalogue:
     """T triangles of the sky's S brightest stars, in bins of their shape.
 
@@ -87,35 +86,10 @@ class TriangleCatalogue:
     longest_allowed: np.ndarray
     bin_start: np.ndarray
 
-    def near(self, shape: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Triangles within tolerance (Q, 3) of shape (Q, 3): largest angle, smallest angle and longest side, rad.
-
-        Returns arrays of query (M,) and triangle (M,), in any order. Only the bins that a query touches are read, so the
-        time grows with the number of answers, not with the catalogue.
-        """
-        box = np.concatenate([shape - tolerance, shape + tolerance])
-        low, high = _coded(box, self.longest_allowed[0]).reshape(2, -1, 3)
-        first, last = _bins(low), _bins(high)
-        query, row = ranges(first[:, 0], last[:, 0] - first[:, 0] + 1)
-        of, column = ranges(first[query, 1], (last - first)[query, 1] + 1)
-        query, run = query[of], (row[of] * BINS[1] + column) * BINS[2]
-        begin, end = self.bin_start[run + first[query, 2]], self.bin_start[run + last[query, 2] + 1]
-        of, triangle = ranges(begin, end - begin)
-        query = query[of]
-        code = self.shape[triangle]
-        close = (code >= low[query]) & (code <= high[query])
-        # faster than all(1)
-        close = close[:, 0] & close[:, 1] & close[:, 2]
-        return query[close], triangle[close]
-
-    def expected(self, tolerance: np.ndarray) -> np.ndarray:
-        """Approximate number of triangles (Q,) within tolerance (Q, 3) of a shape."""
-        ranges_rad = np.array([2 * np.pi / 3, np.pi / 3, self.longest_allowed[0]])
-        return CROWDED * len(self.corners) * np.prod(np.minimum(2 * tolerance / ranges_rad, 1.0), axis=1)
-
-    def longest(self, triangle: np.ndarray) -> np.ndarray:
-        """Longest sides (M,) of triangles, rad."""
-        return (self.shape[triangle, 2] + 0.5) * (self.longest_allowed[0] / CODES)
+    @cached_property
+    def compiled(self) -> TriangleTable:
+        """The triangles, for the compiled core."""
+        return TriangleTable(self, CROWDED, SCALE_TOLERANCE, TRIANGLE_SIGMA)
 
 
 def no_triangles() -> TriangleCatalogue:
@@ -135,49 +109,29 @@ def no_triangles() -> TriangleCatalogue:
     )
 
 
-def _coded(shape: np.ndarray, longest_allowed: float) -> np.ndarray:
-    """Shapes (n, 3) in CODES, limited to the ranges."""
-    part = shape - [np.pi / 3, 0.0, 0.0]
-    part *= CODES / np.array([2 * np.pi / 3, np.pi / 3, longest_allowed])
-    return np.minimum(np.maximum(part, 0).astype(np.int32), CODES - 1)
-
-
-def _bins(code: np.ndarray) -> np.ndarray:
-    """Bins (n, 3) of shapes (n, 3) in CODES."""
-    return code >> (16 - np.array(BIN_BITS))
-
-
-def counter_clockwise(v: np.ndarray) -> np.ndarray:
-    """Whether triangles (M, 3, 3) are counter-clockwise, seen from within the sphere."""
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.moveaxis(v, 0, -1)
-    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) < 0
-
-
 def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet) -> TriangleCatalogue:
     """Triangles for a field of this half diagonal (rad): those of the brightest stars of every circle over the sky.
 
     A circle takes its own brightest stars, however bright its neighbours are, so that every part of the sky has enough.
     """
-    # slow to import, and mostly the cache has all
-    from scipy.spatial import cKDTree
-
     by_light = np.argsort(catalogue.vmag_centi, kind="stable")
     smallest_circle = min(radius for radius, _, _ in CIRCLES) * half_diagonal
     # so many circles have the area of the sphere
-    circles = 4 / smallest_circle**2
-    pool = np.sort(by_light[: int(POOL_PER_CIRCLE * circles) + 1000])
+    pool = np.sort(by_light[: int(POOL_PER_CIRCLE * 4 / smallest_circle**2) + 1000])
     rank = np.argsort(np.argsort(catalogue.vmag_centi[pool], kind="stable"))
     v = catalogue.directions(pool)
     brightest_first = np.argsort(rank)
     beacon = np.sort(brightest_first[: int(BEACONS * len(pool))])
     apart = brightest_first[well_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
-    tree = cKDTree(v[apart])
-    key = np.zeros(0, np.int64)
+    keys = []
     for k, (radius, spacing, most) in enumerate(_affordable(half_diagonal)):
-        key = np.union1d(key, _triples_of_circles(tree, radius * half_diagonal, spacing, most))
+        centres = spread_points(circle_count(radius * half_diagonal, spacing))
+        keys.append(triples_of_circles(v[apart], centres, radius * half_diagonal, most))
         progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
-    del tree
-    corners, counter_clockwise, shape, longest_allowed, bin_start = _in_bins(v, apart, key, 2 * half_diagonal)
+    longest = 2 * half_diagonal
+    corners, counter_clockwise, shape, bin_start = binned(
+        v, apart.astype(np.int32), _distinct(keys), SHORTEST_SIDE * longest, longest, int(np.prod(BINS))
+    )
     progress("star triangles", 1.0)
     return TriangleCatalogue(
         star=pool.astype(np.int32),
@@ -188,7 +142,7 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         corners=corners,
         counter_clockwise=counter_clockwise,
         shape=shape,
-        longest_allowed=longest_allowed,
+        longest_allowed=np.array([longest]),
         bin_start=bin_start,
     )
 
@@ -215,27 +169,10 @@ def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
     return [(radius, spacing, n) for (radius, spacing, _), n in zip(CIRCLES, taken, strict=True)]
 
 
-def _triples_of_circles(tree: "cKDTree", radius: float, spacing: float, most: int) -> np.ndarray:
-    """Keys of all triples among the `most` first rows of the cKDTree in each circle: (a n + b) n + c, a < b < c."""
-    centres = spread_points(circle_count(radius, spacing))
-    n, chord = tree.n, 2 * np.sin(radius / 2)
-    found = []
-    for block in np.array_split(centres, max(1, len(centres) // 1000)):
-        lists = [near[:most] for near in tree.query_ball_point(block, chord, return_sorted=True)]
-        size = np.array([len(near) for near in lists])
-        for m in range(3, most + 1):
-            rows = np.array([near for near, k in zip(lists, size == m, strict=True) if k], np.int64).reshape(
-                -1, m
-            )
-            i, j, k = np.array(list(combinations(range(m), 3))).T
-            found.append(_distinct(((rows[:, i] * n + rows[:, j]) * n + rows[:, k]).ravel()))
-    return _distinct(np.concatenate(found))
-
-
-def _distinct(keys: np.ndarray) -> np.ndarray:
-    """The distinct ones of keys (K,), ascending: `numpy.unique` takes fifty times as long for millions of integers."""
-    keys = np.sort(keys)
-    return keys[np.concatenate([[True], keys[1:] != keys[:-1]])] if len(keys) else keys
+def _distinct(keys: list[np.ndarray]) -> np.ndarray:
+    """The distinct ones of keys, ascending: `numpy.unique` takes fifty times as long for millions of integers."""
+    ordered = np.sort(np.concatenate(keys))
+    return ordered[np.concatenate([[True], ordered[1:] != ordered[:-1]])] if len(ordered) else ordered
 
 
 def circle_count(radius: float, spacing: float) -> int:
@@ -250,38 +187,3 @@ def spread_points(n: int) -> np.ndarray:
     angle = k * (np.pi * (3 - np.sqrt(5)))
     level = np.sqrt(1 - z * z)
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], -1)
-
-
-def _in_bins(
-    v: np.ndarray, rows: np.ndarray, triples: np.ndarray, longest_side: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Usable triangles, sorted by their bins: the columns of `TriangleCatalogue` from `corners` on."""
-    n, parts = len(rows), []
-    # in blocks, because all triangles together would take 500 MB
-    for key in np.array_split(triples, len(triples) // BLOCK + 1):
-        corner = rows[np.stack([key // (n * n), key // n % n, key % n], -1)]
-        parts.append(_measured(v, corner, longest_side))
-    corner, turn, code, bins = (np.concatenate(column) for column in zip(*parts, strict=True))
-    del parts
-    order = np.argsort(bins, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(bins, minlength=np.prod(BINS)))])
-    return corner[order], turn[order], code[order], np.array([longest_side]), starts.astype(np.int32)
-
-
-def _measured(
-    v: np.ndarray, corner: np.ndarray, longest_side: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles (M, 3) with usable sides, the corner of the largest angle first; their orientation, shape and bin."""
-    length = opposite_sides(v[corner])
-    good = (length.max(1) < longest_side) & (length.min(1) > SHORTEST_SIDE * longest_side)
-    corner, length = corner[good], length[good]
-    angle = angles(length)
-    corner = np.take_along_axis(corner, np.argsort(-angle, axis=1, kind="stable"), 1)
-    code = _coded(np.stack([angle.max(1), angle.min(1), length.max(1)], -1), longest_side)
-    bins = np.ravel_multi_index(_bins(code).T, BINS)
-    return (
-        corner.astype(np.int32),
-        counter_clockwise(v[corner]),
-        code.astype(np.uint16),
-        bins.astype(np.int32),
-    )

@@ -20,9 +20,8 @@ from starpos.identification.full import ENOUGH, Identification, identified
 from starpos.identification.pairs import close_pairs
 from starpos.identification.pose import TEST_STARS, FrameStars, Pose
 from starpos.identification.prior import PointingPrior
-from starpos.identification.search import STAGES, attempts, frame_stars
+from starpos.identification.search import STAGES, attempts
 from starpos.identification.sky import Sky
-from starpos.instrument.camera import Camera
 
 # A second sky leaves at least so many of the TEST_STARS brightest over, and this share of them.
 LEAST_LEFT, LEAST_SHARE_LEFT = 4, 0.12
@@ -63,27 +62,18 @@ FEW_WRONG, ROBUST = 32, 0.9
 BENDS = (12, 3), (20, 6), (32, 10)
 
 
-def two_skies(
-    directions: np.ndarray,
-    sigma_px: np.ndarray,
-    flux: np.ndarray,
-    camera: Camera,
-    sky: Sky,
-    found: Identification,
-) -> bool:
+def two_skies(field: FrameStars, flux: np.ndarray, sky: Sky, found: Identification) -> bool:
     """Whether the stars that an identification has left over are a sky of their own.
 
-    directions, sigma_px  (N, 3), (N,): as given to `identify_directions`
-    flux                  (N,): in any unit, brightest first
+    flux (N,): of the field's stars, in any unit, brightest first.
     """
-    field = frame_stars(directions, sigma_px, camera)
     if _between_two(field, sky, found):
         return True
+    bright = min(len(field), TEST_STARS)
+    if bright - np.count_nonzero(found.star < bright) < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
+        return False
     left = np.ones(len(flux), bool)
     left[found.star] = False
-    bright = left[:TEST_STARS]
-    if bright.sum() < max(LEAST_LEFT, LEAST_SHARE_LEFT * len(bright)):
-        return False
     mag = -2.5 * np.log10(np.maximum(flux, np.finfo(float).tiny))
     return _every_star_twice(field.xy[0], mag, left, 2 * field.half) or _another_pose(
         field, mag, left, sky, found
@@ -92,11 +82,11 @@ def two_skies(
 
 def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     """Whether the residuals of neighbouring stars differ as only those of two skies do."""
+    if found.mean_square_px2 < MIXED_PX**2 * MIXED_EVERYWHERE:
+        return False
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
     residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
-    if np.square(residual).mean() < MIXED_PX**2 * MIXED_EVERYWHERE:
-        return False
     u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
@@ -193,7 +183,7 @@ def _another_pose(
     """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
     row, first = np.flatnonzero(left)[:MOST_STARS], _pose(field, found)
     while len(row) >= LEAST_LEFT:
-        rest = replace(field, focal_px=first.focal_px, xy=field.xy[:, row], sigma=field.sigma[row])
+        rest = replace(field.take(row), focal_px=first.focal_px)
         second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
         if second is None:
             return False

@@ -26,7 +26,7 @@ def field(sky, rng):  # noqa: F811
 
 def explained(xy, sky):  # noqa: F811
     sigma = np.full(len(xy), SIGMA_PX)
-    return explained_by(identify(xy, sigma, CAMERA, sky), FrameStars.of(xy, sigma, CAMERA), sky)
+    return explained_by(identify(xy, sigma, CAMERA, sky), FrameStars.of(xy, sigma, CAMERA))
 
 
 def test_a_clear_frame_is_explained_and_all_its_stars_are_there(field, sky):  # noqa: F811

@@ -11,7 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starpos.identification import triangle_cache, triangles
+from starpos.identification.pose import FrameStars, directions
 from starpos.instrument.camera import Camera
+from starpos.rotation import shortest_turn
 from starpos_testing.patience import WAIT_S
 
 WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
@@ -87,27 +89,50 @@ def shapes(table, places):
     return np.stack([angle.max(1), angle.min(1), side.max(1)], -1)
 
 
-def test_near_is_what_brute_force_finds(table, places, rng):
-    known = shapes(table, places)
-    shape = known[rng.integers(0, len(known), 40)] + rng.normal(0, 1e-3, (40, 3))
-    shape[:4, 0], shape[:4, 1] = (
-        (np.pi, np.pi / 3, 2.0, 3.2),
-        (0.0, np.pi / 3, 0.0, -0.01),
-    )  # the table's edges
-    tolerance = rng.uniform(1e-4, 5e-3, (40, 3))
-    query, found = table.near(shape, tolerance)
+def queries(v, error_rad):
+    """What is asked for three stars v (3, 3): their order, and shape and tolerance (3,) of each; the plain form."""
+    side = triangles.opposite_sides(v)
+    angle = triangles.angles(side)
+    order = np.argsort(-angle)
+    (a, b, c), angle, error = side[order], angle[order], triangles.TRIANGLE_SIGMA * error_rad
+    largest = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
+    smallest = error * np.sqrt(1 / a**2 + 1 / b**2 + (c / (a * b)) ** 2)
+    orders = [order]
+    if angle[0] - angle[1] < 2 * largest:
+        orders.append(order[[1, 0, 2]])
+    if angle[1] - angle[2] < 2 * largest:
+        orders.append(order[[0, 2, 1]])
+    tolerance = np.array([largest, smallest, triangles.SCALE_TOLERANCE * a + error])
+    return orders, np.array([angle[0], angle[2], a]), tolerance
+
+
+def test_what_is_looked_up_is_what_brute_force_finds(table, places, rng):
+    camera, known, answers = Camera.from_focal(1000, 700, 610.3 / np.tan(WIDE)), shapes(table, places), 0
     rounding = 1e-4  # of the shapes as they are kept
-    for q in range(40):
-        answer = set(found[query == q].tolist())
-        apart = np.abs(known - shape[q])
-        assert set(np.flatnonzero((apart <= tolerance[q]).all(1)).tolist()) <= answer
-        assert answer <= set(np.flatnonzero((apart <= tolerance[q] + rounding).all(1)).tolist())
-    assert len(found) > 20
+    for triangle in rng.integers(0, len(known), 60):
+        v = places[table.corners[triangle]]
+        xy = camera.project(v @ shortest_turn(unit_sum(v), np.array([0.0, 0.0, 1.0])).T)
+        frame = FrameStars.of(xy + rng.normal(0, 0.3, (3, 2)), np.full(3, 0.3), camera)
+        seen = directions(frame.xy[:1], np.array([camera.fx]))[0]
+        if rng.random() < 0.3:
+            frame = FrameStars.of(xy, np.full(3, 1.5), camera)
+            seen = directions(frame.xy[:1], np.array([camera.fx]))[0]
+        star, corner, mirrored = table.compiled.candidates(frame.compiled, 0, 3, 0.2, 1e9, 100_000, False)
+        found = {(*s, *c) for s, c in zip(star.tolist(), corner.tolist(), strict=True)}
+        orders, shape, tolerance = queries(seen, np.hypot(0.2, frame.sigma[0]) / camera.fx)
+        apart = np.abs(known - shape)
+        inside, near = ((apart <= tolerance + more).all(1) for more in (-rounding, rounding))
+        for which, is_answer in ((inside, found.issuperset), (near, found.issubset)):
+            rows = table.corners[which].tolist()
+            assert is_answer({(*o.tolist(), *c) for o in orders for c in rows})
+        own = [c == table.corners[triangle].tolist() for c in corner.tolist()]
+        assert any(own) and not mirrored[own.index(True)]
+        answers += len(found)
+    assert answers > 100
 
 
-def test_near_without_queries(table):
-    query, found = table.near(np.zeros((0, 3)), np.zeros((0, 3)))
-    assert len(query) == len(found) == 0
+def unit_sum(v):
+    return v.sum(0) / np.linalg.norm(v.sum(0))
 
 
 def test_triangles_are_those_of_their_corners(table, places, rng):
@@ -117,8 +142,9 @@ def test_triangles_are_those_of_their_corners(table, places, rng):
     assert np.all(np.diff(found, axis=1) <= 1e-12)  # the largest's corner first, the smallest's last
     turn = np.einsum("ni,ni->n", np.cross(v[:, 0], v[:, 1]), v[:, 2])
     np.testing.assert_array_equal(table.counter_clockwise[pick], turn < 0)
-    np.testing.assert_allclose(table.longest(pick), triangles.opposite_sides(v).max(1), atol=1e-5)
-    assert table.longest(pick).max() < 2 * WIDE * 1.05
+    longest = (table.shape[pick, 2] + 0.5) * (table.longest_allowed[0] / triangles.CODES)
+    np.testing.assert_allclose(longest, triangles.opposite_sides(v).max(1), atol=1e-5)
+    assert longest.max() < 2 * WIDE * 1.05
 
 
 def test_no_triangle_is_there_twice(table):

@@ -12,7 +12,7 @@ from starpos.detection import detect
 from starpos.fix.solver import TWO_SKIES, Solver, Status
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
-from starpos.identification import identify_directions
+from starpos.identification.search import frame_stars, identify_frame
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
@@ -58,9 +58,10 @@ def warns(light: Light, catalogue, rng) -> bool:
     on = np.flatnonzero(on)[np.argsort(mag[on])]
     xy, flux = light.xy[on] + rng.normal(0, SIGMA_PX, (len(on), 2)), 10 ** (-0.4 * mag[on])
     v, sigma, sky = CAMERA.directions(*xy.T), np.full(len(on), SIGMA_PX), sky_for(catalogue, CAMERA)
-    found = identify_directions(v, sigma, CAMERA, sky)
+    seen = frame_stars(v, sigma, CAMERA)
+    found = identify_frame(seen, sky)
     assert found is not None
-    return two_skies(v, sigma, flux, CAMERA, sky, found)
+    return two_skies(seen, flux, sky, found)
 
 
 def turned(attitude, shift_px, rng, roll=0.0):

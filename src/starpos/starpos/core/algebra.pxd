@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+# Rotations, small systems of equations and sorting, for the other modules here; matrices are rows after rows.
+
+from libc.math cimport NAN, cos, fabs, log, sin, sqrt
+
+
+cdef struct Point:
+    double x
+    double y
+    int row
+
+
+cdef inline void turned(const double *rotation, const double *v, double *out) noexcept nogil:
+    """Set `out` (3,) to rotation (3, 3) times v (3,)."""
+    cdef int i
+    for i in range(3):
+        out[i] = rotation[3 * i] * v[0] + rotation[3 * i + 1] * v[1] + rotation[3 * i + 2] * v[2]
+
+
+cdef inline void turn_by(const double *v, double *rotation) noexcept nogil:
+    """Multiply a rotation (3, 3) from the left by one of |v| rad about v (3,) (Rodrigues)."""
+    cdef double x = v[0], y = v[1], z = v[2], angle2 = x * x + y * y + z * z, angle = sqrt(angle2)
+    cdef double s = sin(angle) / angle if angle > 1e-8 else 1.0
+    cdef double c = (1 - cos(angle)) / angle2 if angle > 1e-4 else 0.5 - angle2 / 24
+    cdef double[9] by
+    cdef double[3] before
+    cdef double[3] after
+    cdef int i, j
+    by[0], by[1], by[2] = 1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
+    by[3], by[4], by[5] = c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x
+    by[6], by[7], by[8] = c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)
+    for j in range(3):
+        for i in range(3):
+            before[i] = rotation[3 * i + j]
+        turned(by, before, after)
+        for i in range(3):
+            rotation[3 * i + j] = after[i]
+
+
+cdef inline void best_rotation(const double *b, double *rotation) noexcept nogil:
+    """Set rotation (3, 3) to the one nearest to b (3, 3), the sum of target times source transposed over pairs of vectors.
+
+    Horn's quaternion (1987, J. Opt. Soc. Am. A 4, 629): the eigenvector of a 4 x 4 matrix, by Jacobi's rotations.
+    """
+    cdef double[4][4] n
+    cdef double[4][4] vector
+    cdef double off, angle, t, c, s, one, other, w, x, y, z
+    cdef int i, j, k, sweep, best = 0
+    n[0][0] = b[0] + b[4] + b[8]
+    n[1][1] = b[0] - b[4] - b[8]
+    n[2][2] = -b[0] + b[4] - b[8]
+    n[3][3] = -b[0] - b[4] + b[8]
+    n[0][1] = n[1][0] = b[7] - b[5]
+    n[0][2] = n[2][0] = b[2] - b[6]
+    n[0][3] = n[3][0] = b[3] - b[1]
+    n[1][2] = n[2][1] = b[3] + b[1]
+    n[1][3] = n[3][1] = b[2] + b[6]
+    n[2][3] = n[3][2] = b[7] + b[5]
+    for i in range(4):
+        for j in range(4):
+            vector[i][j] = 1.0 if i == j else 0.0
+    for sweep in range(20):
+        off = 0.0
+        for i in range(3):
+            for j in range(i + 1, 4):
+                if fabs(n[i][j]) <= 1e-17 * (fabs(n[i][i]) + fabs(n[j][j])):
+                    continue
+                off += fabs(n[i][j])
+                angle = (n[j][j] - n[i][i]) / (2 * n[i][j])
+                t = (1.0 if angle >= 0 else -1.0) / (fabs(angle) + sqrt(angle * angle + 1))
+                c = 1 / sqrt(t * t + 1)
+                s = t * c
+                for k in range(4):
+                    one, other = n[k][i], n[k][j]
+                    n[k][i], n[k][j] = c * one - s * other, s * one + c * other
+                for k in range(4):
+                    one, other = n[i][k], n[j][k]
+                    n[i][k], n[j][k] = c * one - s * other, s * one + c * other
+                for k in range(4):
+                    one, other = vector[k][i], vector[k][j]
+                    vector[k][i], vector[k][j] = c * one - s * other, s * one + c * other
+        if off == 0.0:
+            break
+    for i in range(1, 4):
+        if n[i][i] > n[best][best]:
+            best = i
+    w, x, y, z = vector[0][best], vector[1][best], vector[2][best], vector[3][best]
+    rotation[0], rotation[1], rotation[2] = w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)
+    rotation[3], rotation[4], rotation[5] = 2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)
+    rotation[6], rotation[7], rotation[8] = 2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z
+
+
+cdef inline double factored(double *a, int n) noexcept nogil:
+    """Replace the lower half of a (n, n) by its Cholesky factor; the logarithm of the determinant, NaN if there is none."""
+    cdef double total = 0.0, value
+    cdef int i, j, k
+    for i in range(n):
+        for j in range(i + 1):
+            value = a[i * n + j]
+            for k in range(j):
+                value -= a[i * n + k] * a[j * n + k]
+            if i > j:
+                a[i * n + j] = value / a[j * n + j]
+            elif value > 0:
+                a[i * n + i] = sqrt(value)
+                total += log(value)
+            else:
+                return NAN
+    return total
+
+
+cdef inline void solved(const double *factor, double *b, int n) noexcept nogil:
+    """Replace b (n,) by the solution of the equations of a Cholesky factor (n, n)."""
+    cdef int i, k
+    for i in range(n):
+        for k in range(i):
+            b[i] -= factor[i * n + k] * b[k]
+        b[i] /= factor[i * n + i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= factor[k * n + i] * b[k]
+        b[i] /= factor[i * n + i]
+
+
+cdef inline void sort_by_x(Point *points, int n) noexcept nogil:
+    """Sort points by x (Shell's method with Ciura's gaps)."""
+    cdef int[12] gaps
+    cdef int g, gap, i, j
+    cdef Point moved
+    gaps[0], gaps[1], gaps[2], gaps[3], gaps[4], gaps[5] = 8929, 3968, 1750, 701, 301, 132
+    gaps[6], gaps[7], gaps[8], gaps[9], gaps[10], gaps[11] = 57, 23, 10, 4, 1, 0
+    for g in range(11):
+        gap = gaps[g]
+        for i in range(gap, n):
+            moved = points[i]
+            j = i
+            while j >= gap and points[j - gap].x > moved.x:
+                points[j] = points[j - gap]
+                j -= gap
+            points[j] = moved

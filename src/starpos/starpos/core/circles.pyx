@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Build a catalogue of triangles: those of the brightest stars of circles over the sky, measured and put in bins."""
+
+from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, hypot, sin, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+from starpos.core.triangles cimport CODES, angles_of, bin_of, code_of, is_counter_clockwise
+
+
+cdef enum:
+    MOST_TAKEN = 32
+
+
+cdef class Cells:
+    """Stars in cells about as wide as a circle: zones of declination, each parted in right ascension."""
+
+    cdef const double[:, ::1] v
+    cdef double radius, chord2
+    cdef int zones
+    # first cell of each zone, first place of each cell in `row`
+    cdef int[::1] zone
+    cdef int[::1] start
+    cdef int[::1] row
+
+    def __init__(self, const double[:, ::1] v, double radius):
+        cdef int k, n = v.shape[0], place
+        self.v, self.radius, self.chord2 = v, radius, (2 * sin(radius / 2)) ** 2
+        self.zones = max(1, <int>(M_PI / radius))
+        middles = (np.arange(self.zones) + 0.5) * np.pi / self.zones - np.pi / 2
+        parts = np.maximum(1, (2 * np.pi * np.cos(middles) / radius).astype(np.int32))
+        self.zone = np.concatenate([[0], np.cumsum(parts)]).astype(np.int32)
+        of = np.empty(n, np.int32)
+        cdef int[::1] cell = of
+        for k in range(n):
+            cell[k] = self._cell(self._zone(asin(max(-1.0, min(1.0, v[k, 2])))), atan2(v[k, 1], v[k, 0]))
+        # within a cell in their order, brightest first
+        self.row = np.argsort(of, kind="stable").astype(np.int32)
+        self.start = np.searchsorted(of[self.row], np.arange(self.zone[self.zones] + 1)).astype(np.int32)
+
+    cdef int _zone(self, double dec) noexcept nogil:
+        return max(0, min(<int>floor((dec / M_PI + 0.5) * self.zones), self.zones - 1))
+
+    cdef int _cell(self, int zone, double ra) noexcept nogil:
+        cdef int parts = self.zone[zone + 1] - self.zone[zone]
+        return self.zone[zone] + min(<int>((ra / (2 * M_PI) + 0.5) * parts), parts - 1)
+
+    cdef int brightest(self, const double *centre, int most, int *taken) noexcept nogil:
+        """Set `taken` to the rows of the `most` first stars within the circle about a centre, ascending; how many."""
+        cdef double dec = asin(max(-1.0, min(1.0, centre[2]))), ra = atan2(centre[1], centre[0]), wide = M_PI
+        cdef int zone, first, last, cell, parts, k, j, row, count = 0
+        # half the circle's width in right ascension; if a pole is inside, it has all of it
+        if fabs(dec) + self.radius < M_PI / 2 - 1e-9:
+            wide = asin(min(sin(self.radius) / cos(dec), 1.0)) + 1e-9
+        for zone in range(self._zone(dec - self.radius), self._zone(dec + self.radius) + 1):
+            parts = self.zone[zone + 1] - self.zone[zone]
+            first = <int>floor(((ra - wide) / (2 * M_PI) + 0.5) * parts)
+            last = <int>floor(((ra + wide) / (2 * M_PI) + 0.5) * parts)
+            for k in range(first, min(last, first + parts - 1) + 1):
+                cell = self.zone[zone] + (k + 2 * parts) % parts
+                for j in range(self.start[cell], self.start[cell + 1]):
+                    row = self.row[j]
+                    # the others of the cell are fainter
+                    if count == most and row > taken[count - 1]:
+                        break
+                    if (
+                        (self.v[row, 0] - centre[0]) ** 2 + (self.v[row, 1] - centre[1]) ** 2
+                        + (self.v[row, 2] - centre[2]) ** 2
+                    ) <= self.chord2:
+                        count = _inserted(taken, count, most, row)
+        return count
+
+
+cdef inline int _inserted(int *rows, int count, int most, int row) noexcept nogil:
+    """Insert a row into ascending ones, of which the `most` lowest are kept; how many there are."""
+    cdef int j = count if count < most else most - 1
+    while j > 0 and rows[j - 1] > row:
+        rows[j] = rows[j - 1]
+        j -= 1
+    rows[j] = row
+    return min(count + 1, most)
+
+
+def triples_of_circles(const double[:, ::1] v, const double[:, ::1] centres, double radius, int most):
+    """Keys of all triples among the `most` first of the stars v (n, 3) in each circle: (a n + b) n + c, a < b < c."""
+    cdef Cells cells = Cells(v, radius)
+    cdef long long n = v.shape[0]
+    cdef int[MOST_TAKEN] taken
+    cdef int circle, count, a, b, c
+    cdef Py_ssize_t place = 0
+    if not 3 <= most <= MOST_TAKEN:
+        raise ValueError(f"{most} stars of each circle: it must be 3 to {MOST_TAKEN}")
+    found = np.empty(len(centres) * (most * (most - 1) * (most - 2) // 6), np.int64)
+    cdef long long[::1] key = found
+    for circle in range(centres.shape[0]):
+        count = cells.brightest(&centres[circle, 0], most, taken)
+        for a in range(count):
+            for b in range(a + 1, count):
+                for c in range(b + 1, count):
+                    key[place] = (taken[a] * n + taken[b]) * n + taken[c]
+                    place += 1
+    return found[:place]
+
+
+def binned(
+    const double[:, ::1] v, const int[::1] rows, const long long[::1] keys, double shortest, double longest,
+    int bins,
+):
+    """The triangles of keys whose sides are longer than `shortest` and shorter than `longest`, rad, in bins of their shape.
+
+    v, rows  directions (S, 3) of all stars, and the rows (n,) of those that the keys number
+
+    Returns corners (T, 3), counter_clockwise (T,), shape (T, 3) and bin_start, as `TriangleCatalogue` has them.
+    """
+    cdef long long n = rows.shape[0]
+    cdef Py_ssize_t k, place, kept = 0
+    cdef int i, j
+    cdef int[3] corner
+    cdef double[3] side
+    cdef double[3] angle
+    cdef double[3] per_unit
+    cdef int[3] code
+    per_unit[0], per_unit[1], per_unit[2] = CODES / (2 * M_PI / 3), CODES / (M_PI / 3), CODES / longest
+    of, codes = np.empty(len(keys), np.int32), np.empty((len(keys), 3), np.uint16)
+    corners_, turns_ = np.empty((len(keys), 3), np.int32), np.empty(len(keys), np.uint8)
+    starts = np.zeros(bins + 1, np.int32)
+    cdef int[::1] bin = of
+    cdef unsigned short[:, ::1] shape = codes
+    cdef int[:, ::1] corners = corners_
+    cdef unsigned char[::1] turns = turns_
+    cdef int[::1] start = starts
+    with nogil:
+        for k in range(keys.shape[0]):
+            corner[0] = rows[keys[k] // (n * n)]
+            corner[1] = rows[keys[k] // n % n]
+            corner[2] = rows[keys[k] % n]
+            for i in range(3):
+                side[i] = _side(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
+            # the largest angle lies opposite the longest side
+            for i in range(2):
+                for j in range(2 - i):
+                    if side[j] < side[j + 1]:
+                        side[j], side[j + 1] = side[j + 1], side[j]
+                        corner[j], corner[j + 1] = corner[j + 1], corner[j]
+            if not (side[0] < longest and side[2] > shortest):
+                continue
+            angles_of(side, angle)
+            code[0] = code_of(angle[0], M_PI / 3, per_unit[0])
+            code[1] = code_of(angle[2], 0.0, per_unit[1])
+            code[2] = code_of(side[0], 0.0, per_unit[2])
+            for i in range(3):
+                corners[kept, i], shape[kept, i] = corner[i], <unsigned short>code[i]
+            turns[kept] = is_counter_clockwise(&v[corner[0], 0], &v[corner[1], 0], &v[corner[2], 0])
+            bin[kept] = bin_of(code[0], code[1], code[2])
+            start[bin[kept] + 1] += 1
+            kept += 1
+    np.cumsum(starts, out=starts)
+    next_, order_ = starts[:bins].copy(), np.empty(kept, np.int32)
+    cdef int[::1] next = next_
+    cdef int[::1] order = order_
+    with nogil:
+        for k in range(kept):
+            order[next[bin[k]]] = <int>k
+            next[bin[k]] += 1
+    return corners_[order_], turns_[order_].astype(bool), codes[order_], starts
+
+
+cdef inline double _side(const double *a, const double *b) noexcept nogil:
+    """Angle between two directions, rad."""
+    cdef double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2]
+    return 2 * asin(min(1.0, 0.5 * sqrt(x * x + y * y + z * z)))

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The stars of a frame in pixels from the principal point, as the other modules here take them."""
+
+from libc.math cimport atan2, hypot, isfinite, sqrt
+
+import numpy as np
+
+
+cdef class Frame:
+    """Stars of a frame: as `pose.FrameStars` has them.
+
+    xy            (2, N, 2) px, as they are and flipped
+    sigma         (N,) px
+    middle, half  (2,) px: the frame's centre, and half its size
+    focal_px      approximate focal length
+    radius_rad    of a cone about the frame's centre that contains the frame
+    """
+
+    def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad):
+        self.xy, self.sigma = xy, sigma
+        self.middle[0], self.middle[1] = middle
+        self.half[0], self.half[1] = half
+        self.focal, self.radius = focal_px, radius_rad
+
+
+def projected(
+    const double[:, ::1] v, const double[::1] sigma, double focal_px, double centre_x, double centre_y, int width,
+    int height, double least_sigma,
+):
+    """Project unit vectors v (N, 3) in C with an ideal camera.
+
+    sigma                       (N,) px
+    centre_x, centre_y          px of the principal point
+    width, height               px of the frame
+    least_sigma                 px; smaller errors become it
+
+    Returns pixels (2, N, 2) from the principal point, as they are and with the frame's rows flipped; the errors (N,); and
+    how far (px) the farthest star lies beyond the frame. ValueError if one is behind the camera or not a finite number.
+    """
+    cdef Py_ssize_t n = v.shape[0], k
+    cdef double x, y, beyond = 0.0
+    cdef bint sound = sigma.shape[0] == n
+    pixels, errors = np.empty((2, n, 2)), np.empty(n)
+    cdef double[:, :, ::1] xy = pixels
+    cdef double[::1] error = errors
+    for k in range(n if sound else 0):
+        x, y = v[k, 0] / v[k, 2] * focal_px, v[k, 1] / v[k, 2] * focal_px
+        sound = sound and v[k, 2] > 0 and isfinite(x) and isfinite(y) and isfinite(sigma[k])
+        xy[0, k, 0] = xy[1, k, 0] = x
+        xy[0, k, 1], xy[1, k, 1] = y, height - 1 - 2 * centre_y - y
+        error[k] = max(sigma[k], least_sigma)
+        beyond = max(beyond, max(-x - centre_x, x + centre_x - (width - 1)))
+        beyond = max(beyond, max(-y - centre_y, y + centre_y - (height - 1)))
+    if not sound:
+        raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
+    return pixels, errors, beyond
+
+
+def all_within(const double[::1] x, const double[::1] y, double width, double height, double edge_px):
+    """Whether all pixels x, y (N,) lie on a frame of this size or less than edge_px beyond it."""
+    cdef Py_ssize_t k
+    for k in range(x.shape[0]):
+        if not (-edge_px < x[k] < width - 1 + edge_px and -edge_px < y[k] < height - 1 + edge_px):
+            return False
+    return True
+
+
+def unit_vectors(const double[::1] x, const double[::1] y, double fx, double fy, double cx, double cy):
+    """Unit vectors (N, 3) in C of pixels x, y (N,) of a pinhole camera with these focal lengths and principal point."""
+    cdef Py_ssize_t k
+    cdef double across, down, norm
+    out = np.empty((x.shape[0], 3))
+    cdef double[:, ::1] v = out
+    for k in range(x.shape[0]):
+        across, down = (x[k] - cx) / fx, (y[k] - cy) / fy
+        norm = sqrt(across * across + down * down + 1)
+        v[k, 0], v[k, 1], v[k, 2] = across / norm, down / norm, 1 / norm
+    return out
+
+
+def mean_sigma(const double[:, :, ::1] covariance):
+    """Standard deviations (N,) along one axis, averaged over directions, of covariances (N, 2, 2)."""
+    cdef Py_ssize_t k
+    out = np.empty(covariance.shape[0])
+    cdef double[::1] sigma = out
+    for k in range(covariance.shape[0]):
+        sigma[k] = sqrt((covariance[k, 0, 0] + covariance[k, 1, 1]) / 2)
+    return out
+
+
+def place_of(const double[:, ::1] v, const double[:, ::1] attitude, velocity, bint mirrored):
+    """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
+
+    v         (2, 3): vectors in C, of any length, of the frame's centre and of a pixel above it
+    attitude  (3, 3): ICRS into C
+    velocity  (3,): of the Earth, in units of c
+    mirrored  whether the frame's rows run bottom-up
+    """
+    cdef double[2][3] seen
+    cdef double[3] up
+    cdef double norm, flat, east, north
+    cdef int k, i
+    for k in range(2):
+        norm = sqrt(v[k, 0] * v[k, 0] + v[k, 1] * v[k, 1] + v[k, 2] * v[k, 2])
+        for i in range(3):
+            seen[k][i] = (v[k, 0] * attitude[0, i] + v[k, 1] * attitude[1, i] + v[k, 2] * attitude[2, i]) / norm
+            seen[k][i] -= velocity[i]
+        norm = sqrt(seen[k][0] ** 2 + seen[k][1] ** 2 + seen[k][2] ** 2)
+        for i in range(3):
+            seen[k][i] /= norm
+    flat = hypot(seen[0][0], seen[0][1])
+    for i in range(3):
+        up[i] = (seen[1][i] - seen[0][i]) * (-1 if mirrored else 1)
+    if flat > 0:
+        east = (up[1] * seen[0][0] - up[0] * seen[0][1]) / flat
+        north = up[2] * flat - (up[0] * seen[0][0] + up[1] * seen[0][1]) * seen[0][2] / flat
+    else:
+        # at a pole, on the meridian of right ascension 0
+        east, north = up[1], -up[0] * seen[0][2]
+    return atan2(seen[0][1], seen[0][0]), atan2(seen[0][2], flat), atan2(east, north)

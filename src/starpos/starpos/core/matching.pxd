@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+# Which detections and which stars are nearest to each other, for the other modules here.
+
+from libc.stdlib cimport malloc
+
+from starpos.core.algebra cimport Point, sort_by_x
+
+
+cdef struct Matching:
+    # Detections in the order of x; and for each detection and each star its nearest partner and their squared distance.
+    Point *sorted
+    int *near
+    int *back
+    double *near2
+    double *back2
+    void *memory
+
+
+cdef inline int begin(Matching *m, int detections, int stars) except -1 nogil:
+    """Take memory for so many detections and stars."""
+    cdef size_t each = detections * (sizeof(Point) + sizeof(double) + sizeof(int)) + stars * (sizeof(double) + sizeof(int))
+    m.memory = malloc(each + 64)
+    if m.memory == NULL:
+        with gil:
+            raise MemoryError
+    m.sorted = <Point *>m.memory
+    m.near2 = <double *>(m.sorted + detections)
+    m.back2 = m.near2 + detections
+    m.near = <int *>(m.back2 + stars)
+    m.back = m.near + detections
+    return 0
+
+
+cdef inline void order(Matching *m, const double[:, ::1] xy, int n) noexcept nogil:
+    """Sort the first n of the detections xy by x."""
+    cdef int i
+    for i in range(n):
+        m.sorted[i].x, m.sorted[i].y, m.sorted[i].row = xy[i, 0], xy[i, 1], i
+    sort_by_x(m.sorted, n)
+
+
+cdef inline void match(Matching *m, int n, const double *star, int stars, const double *radius) noexcept nogil:
+    """Find for each detection (n,) the star (stars, 2) within its radius (n,) px that is nearest to it, and it to that one.
+
+    m.near of the others becomes -1.
+    """
+    cdef double widest = 0.0, x, y, apart2
+    cdef int i, j, s, low, high, middle
+    for i in range(n):
+        widest = max(widest, radius[i])
+        m.near[i], m.near2[i] = -1, 1e300
+    for s in range(stars):
+        x, y = star[2 * s], star[2 * s + 1]
+        m.back[s], m.back2[s] = -1, 1e300
+        low, high = 0, n
+        while low < high:
+            middle = (low + high) // 2
+            if m.sorted[middle].x < x - widest:
+                low = middle + 1
+            else:
+                high = middle
+        while low < n and m.sorted[low].x <= x + widest:
+            i = m.sorted[low].row
+            apart2 = (m.sorted[low].x - x) ** 2 + (m.sorted[low].y - y) ** 2
+            if apart2 < m.near2[i]:
+                m.near[i], m.near2[i] = s, apart2
+            if apart2 < m.back2[s] or apart2 == m.back2[s] and i < m.back[s]:
+                m.back[s], m.back2[s] = i, apart2
+            low += 1
+    for i in range(n):
+        j = m.near[i]
+        if j >= 0 and not (m.near2[i] < radius[i] * radius[i] and m.back[j] == i):
+            m.near[i] = -1

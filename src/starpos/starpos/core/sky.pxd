@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+from starpos.core.algebra cimport Point
+from starpos.core.frame cimport Frame
+
+
+cdef enum:
+    ZONES = 180
+    CELLS = 360
+    # Of rows: two in each zone.
+    MOST_RUNS = 360
+
+
+cdef struct Date:
+    double years
+    double[3] velocity
+    bint moved
+
+
+cdef class StarTable:
+    cdef const unsigned int[::1] ra
+    cdef const int[::1] dec
+    cdef const short[::1] pm_ra
+    cdef const short[::1] pm_dec
+    cdef const short[::1] vmag
+    cdef const int[::1] cell_start
+
+    cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil
+    cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil
+    cdef int _projected(
+        self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
+        const Date *date, int most, Py_ssize_t[::1] row, double[:, ::1] w, Point *pixel,
+    ) noexcept nogil
+    cdef int _unblended(
+        self, Point *pixel, int n, double blend_px, double focal_px, Py_ssize_t[::1] row, double[:, ::1] w,
+        double[::1] moved, int *single,
+    ) noexcept nogil
+
+
+cdef Date date_of(double years, velocity) except *
+cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil

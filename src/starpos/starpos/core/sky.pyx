@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Catalogue stars in the directions in which they are seen at a date, and those of them that lie on a frame."""
+
+from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, hypot, pow, rint, sin, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+from starpos.core.algebra cimport Point, sort_by_x, turned
+from starpos.core.frame cimport Frame, axis_of, on_frame, pixel_of
+
+cdef enum:
+    # In mas.
+    DEGREE = 3600000
+    # Of brightness: V from -10.24 to 30.71 in steps of 0.01.
+    BINS = 4096
+    BRIGHTEST = -1024
+
+cdef double MAS = M_PI / 180 / DEGREE
+
+# Sine and cosine of the middle of each degree of right ascension, and of declination from -90.
+cdef double[CELLS] sin_ra, cos_ra
+cdef double[ZONES + 1] sin_dec, cos_dec
+
+
+cdef void _fill_tables() noexcept:
+    cdef int k
+    for k in range(CELLS):
+        sin_ra[k], cos_ra[k] = sin((k + 0.5) * M_PI / 180), cos((k + 0.5) * M_PI / 180)
+    for k in range(ZONES + 1):
+        sin_dec[k], cos_dec[k] = sin((k - 89.5) * M_PI / 180), cos((k - 89.5) * M_PI / 180)
+
+
+_fill_tables()
+
+
+cdef inline void _of_small(double x, double *sine, double *cosine) noexcept nogil:
+    """Sine and cosine of at most half a degree: the next terms of the series are below 1e-18."""
+    cdef double x2 = x * x
+    sine[0] = x * (1 - x2 / 6 * (1 - x2 / 20 * (1 - x2 / 42)))
+    cosine[0] = 1 - x2 / 2 * (1 - x2 / 12 * (1 - x2 / 30))
+
+
+cdef class StarTable:
+    """Columns of a star catalogue: places in mas, motions in mas/yr, V in 0.01 mag, first rows of the cells of the sky."""
+
+    def __init__(self, catalogue):
+        self.ra = np.ascontiguousarray(catalogue.ra_mas, np.uint32)
+        self.dec = np.ascontiguousarray(catalogue.dec_mas, np.int32)
+        self.pm_ra = np.ascontiguousarray(catalogue.pm_ra, np.int16)
+        self.pm_dec = np.ascontiguousarray(catalogue.pm_dec, np.int16)
+        self.vmag = np.ascontiguousarray(catalogue.vmag_centi, np.int16)
+        self.cell_start = np.ascontiguousarray(catalogue.cell_start, np.int32)
+
+    cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil:
+        """Set w (3,) to the unit vector of a row at a date."""
+        cdef long long ra = self.ra[row], dec = self.dec[row] + 90 * <long long>DEGREE
+        cdef long long i = ra // DEGREE, j = dec // DEGREE
+        cdef double s, c, sr, cr, sd, cd, east, north, norm
+        _of_small((ra - i * DEGREE - DEGREE // 2) * MAS, &s, &c)
+        sr, cr = sin_ra[i] * c + cos_ra[i] * s, cos_ra[i] * c - sin_ra[i] * s
+        _of_small((dec - j * DEGREE - DEGREE // 2) * MAS, &s, &c)
+        sd, cd = sin_dec[j] * c + cos_dec[j] * s, cos_dec[j] * c - sin_dec[j] * s
+        w[0], w[1], w[2] = cd * cr, cd * sr, sd
+        if not date.moved:
+            return
+        east, north = self.pm_ra[row] * date.years * MAS, self.pm_dec[row] * date.years * MAS
+        w[0] += -sr * east - sd * cr * north
+        w[1] += cr * east - sd * sr * north
+        w[2] += cd * north
+        norm = 1 / sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+        for i in range(3):
+            w[i] = w[i] * norm + date.velocity[i]
+        norm = 1 / sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+        for i in range(3):
+            w[i] *= norm
+
+    def directions(self, const Py_ssize_t[::1] index, double years, velocity):
+        """Unit vectors (n, 3) of rows (n,), `years` after J2000, with aberration by `velocity` (3,) in units of c."""
+        cdef Date date = date_of(years, velocity)
+        cdef Py_ssize_t k
+        out = np.empty((len(index), 3))
+        cdef double[:, ::1] w = out
+        for k in range(len(index)):
+            if not 0 <= index[k] < len(self.ra):
+                raise IndexError(f"the star catalogue has no row {index[k]}")
+            self.direction(index[k], &date, &w[k, 0])
+        return out
+
+    def on_frame(
+        self, Frame frame, const double[:, ::1] attitude, double focal_px, double years, velocity, double margin_px,
+        int most, int cut, double blend_px,
+    ):
+        """The brightest stars on a frame: rows (S,), directions (S, 3), and how far (px) fainter ones move the image.
+
+        attitude, focal_px  the pose
+        margin_px           stars so far beyond the frame are on it
+        most, cut           so many stars are taken, of so many brightest in the cells about the frame
+        blend_px            closer stars make one image
+        """
+        cdef Date date = date_of(years, velocity)
+        cdef int[2 * MOST_RUNS] runs
+        cdef double[3] axis
+        cdef int i, n = 0, count
+        axis_of(frame, &attitude[0, 0], axis)
+        count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
+        for i in range(count):
+            n += runs[2 * i + 1] - runs[2 * i]
+        most = min(most, n)
+        index, directions, drawn = np.empty(most, np.intp), np.empty((most, 3)), np.empty(most)
+        cdef Py_ssize_t[::1] row = index
+        cdef double[:, ::1] w = directions
+        cdef double[::1] moved = drawn
+        cdef int *near = <int *>malloc((n + 1) * sizeof(int))
+        cdef Point *pixel = <Point *>malloc((most + 1) * sizeof(Point))
+        try:
+            if near == NULL or pixel == NULL:
+                raise MemoryError
+            n = self._by_light(runs, count, cut, near)
+            n = self._projected(near, n, frame, &attitude[0, 0], focal_px, margin_px, &date, most, row, w, pixel)
+            n = self._unblended(pixel, n, blend_px, frame.focal, row, w, moved, near)
+        finally:
+            free(near)
+            free(pixel)
+        return index[:n], directions[:n], drawn[:n]
+
+    cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil:
+        """Write the rows of runs to `near`, brightest first, about `cut` of them; how many."""
+        cdef int[BINS] first
+        cdef int i, k, bin, total = 0, kept, low = BINS - 1, high = 0
+        for i in range(count):
+            for k in range(runs[2 * i], runs[2 * i + 1]):
+                bin = _light(self.vmag[k])
+                low, high = min(low, bin), max(high, bin)
+        for bin in range(low, high + 1):
+            first[bin] = 0
+        for i in range(count):
+            for k in range(runs[2 * i], runs[2 * i + 1]):
+                first[_light(self.vmag[k])] += 1
+        # how many are brighter; stars that come after `cut` others are left out
+        for bin in range(low, high + 1):
+            kept = first[bin] if total < cut else 0
+            first[bin] = total if kept else -1
+            total += kept
+        for i in range(count):
+            for k in range(runs[2 * i], runs[2 * i + 1]):
+                bin = _light(self.vmag[k])
+                if first[bin] >= 0:
+                    near[first[bin]] = k
+                    first[bin] += 1
+        return total
+
+    cdef int _projected(
+        self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
+        const Date *date, int most, Py_ssize_t[::1] row, double[:, ::1] w, Point *pixel,
+    ) noexcept nogil:
+        """Keep of the rows `near` (n,) those on the frame, with their directions and pixels, at most so many."""
+        cdef int k, kept = 0
+        cdef double[3] u
+        for k in range(n):
+            if kept == most:
+                break
+            self.direction(near[k], date, &w[kept, 0])
+            turned(attitude, &w[kept, 0], u)
+            pixel_of(u, focal_px, u)
+            if on_frame(frame, u, margin_px):
+                row[kept] = near[k]
+                pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
+                kept += 1
+        return kept
+
+    cdef int _unblended(
+        self, Point *pixel, int n, double blend_px, double focal_px, Py_ssize_t[::1] row, double[:, ::1] w,
+        double[::1] moved, int *single,
+    ) noexcept nogil:
+        """Leave those out that make one image with a brighter star, which they move; how many stay."""
+        cdef int i, j, a, b, kept = 0
+        cdef double apart, ratio
+        for i in range(n):
+            moved[i], single[i] = 0.0, 1
+        sort_by_x(pixel, n)
+        for i in range(n):
+            for j in range(i + 1, n):
+                if pixel[j].x - pixel[i].x >= blend_px:
+                    break
+                if (pixel[j].x - pixel[i].x) ** 2 + (pixel[j].y - pixel[i].y) ** 2 >= blend_px * blend_px:
+                    continue
+                a, b = min(pixel[i].row, pixel[j].row), max(pixel[i].row, pixel[j].row)
+                ratio = pow(10, -0.004 * (self.vmag[row[b]] - self.vmag[row[a]]))
+                apart = sqrt((w[b, 0] - w[a, 0]) ** 2 + (w[b, 1] - w[a, 1]) ** 2 + (w[b, 2] - w[a, 2]) ** 2)
+                # from directions and rounded, so that it does not depend on the pose
+                apart = rint(focal_px * apart * 1e6) / 1e6
+                moved[a] += apart * ratio / (1 + ratio)
+                single[b] = 0
+        for i in range(n):
+            if single[i]:
+                row[kept], moved[kept] = row[i], moved[i]
+                for j in range(3):
+                    w[kept, j] = w[i, j]
+                kept += 1
+        return kept
+
+
+cdef inline int _light(short vmag) noexcept nogil:
+    """The bin of a brightness."""
+    return max(0, min(vmag - BRIGHTEST, BINS - 1))
+
+
+cdef Date date_of(double years, velocity) except *:
+    """The date `years` after J2000, with the Earth's velocity (3,) in units of c."""
+    cdef Date date
+    date.years = years
+    date.velocity[0], date.velocity[1], date.velocity[2] = velocity
+    date.moved = years != 0 or date.velocity[0] != 0 or date.velocity[1] != 0 or date.velocity[2] != 0
+    return date
+
+
+cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil:
+    """Write the first rows and the ends of all runs of cells that a cone about a vector (3,) touches; how many.
+
+    As `starpos.sky.zones.rows_near` does.
+    """
+    cdef double flat = hypot(axis[0], axis[1]), ra = atan2(axis[1], axis[0]) * 180 / M_PI, dec = atan2(axis[2], flat)
+    cdef double wide = 180.0
+    cdef int low, high, first, width, zone, count = 0
+    if fabs(dec) + radius < M_PI / 2 - 1e-9:
+        wide = asin(min(sin(radius) / cos(dec), 1.0)) * 180 / M_PI
+    low = max(<int>((dec - radius) * 180 / M_PI + 90), 0)
+    high = min(<int>((dec + radius) * 180 / M_PI + 90), ZONES - 1)
+    first = <int>floor(ra - wide)
+    width = min(<int>floor(ra + wide) - first + 1, CELLS)
+    first = (first + 2 * CELLS) % CELLS
+    for zone in range(low, high + 1):
+        runs[2 * count] = cell_start[zone * CELLS + first]
+        runs[2 * count + 1] = cell_start[zone * CELLS + min(first + width, CELLS)]
+        count += 1
+        # a run that passes 360 deg continues at 0
+        if first + width > CELLS:
+            runs[2 * count] = cell_start[zone * CELLS]
+            runs[2 * count + 1] = cell_start[zone * CELLS + first + width - CELLS]
+            count += 1
+    return count

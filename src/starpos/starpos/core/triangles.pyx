@@ -1,0 +1,419 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Look up a frame's triangles of bright stars among those of the sky, by their shape."""
+
+from libc.math cimport M_PI, asin, fabs, hypot, log, sqrt
+from libc.stdlib cimport calloc, free, malloc, realloc
+
+import numpy as np
+
+from starpos.core.frame cimport Frame, direction_of
+
+cdef extern from *:
+    """
+    #define STARPOS_FETCH(address) __builtin_prefetch(address)
+    """
+    void fetch "STARPOS_FETCH"(const void *address) noexcept nogil
+
+cdef enum:
+    # Queries that are prepared before the first of them is answered, so that memory has time.
+    AHEAD = 16
+    # Of the number of candidates that chance makes: 64 for each power of two.
+    STEPS = 4096
+    # Logarithm of the size of a table that fits into a processor's cache.
+    LOG_MARKS = 18
+
+# Tolerances of smallest and largest angles that are too wide to tell anything, rad.
+cdef double WORST_SMALLEST = 0.1, WORST_LARGEST = 0.2
+cdef double LEAST_SIDE = 1e-9
+
+ctypedef unsigned long long key_t
+
+
+cdef struct Query:
+    int[3] star
+    # of the shape in CODES
+    int[3] low
+    int[3] high
+    double longest
+    bint turn
+
+
+cdef struct Candidate:
+    int[3] star
+    int[3] corner
+    bint mirrored
+    int support
+    # Longest side, over that of the frame's triangle.
+    double size
+
+
+cdef struct Shape:
+    # The corners, and the sides opposite to them: the longest first.
+    int[3] star
+    double[3] side
+    # Of the largest and the smallest angle and of the longest side.
+    double[3] tolerance
+    bint usable
+
+
+cdef struct Search:
+    # Of the frame's stars: directions, errors (rad), and the distance (rad) of star b from a brighter one a at [a, b].
+    int stars
+    double *v
+    double *error
+    double *side
+    Query[2 * AHEAD] waiting
+    int queries
+    Candidate *found
+    int count
+    int room
+
+
+cdef class TriangleTable:
+    """Columns of a `TriangleCatalogue`, and how its shapes are looked up.
+
+    crowded          density of shapes where they are looked up, over the mean density
+    scale_tolerance  the share by which the focal length may be off
+    sigmas           a triangle may be off by so many sigma of its stars
+    """
+
+    cdef const int[:, ::1] corners
+    cdef const unsigned char[::1] turn
+    cdef const unsigned short[:, ::1] shape
+    cdef const int[::1] bin_start
+    cdef double crowded, scale_tolerance, sigmas
+    cdef double[3] codes
+
+    def __init__(self, table, double crowded, double scale_tolerance, double sigmas):
+        self.corners = np.ascontiguousarray(table.corners, np.int32)
+        self.turn = np.ascontiguousarray(table.counter_clockwise, bool).view(np.uint8)
+        self.shape = np.ascontiguousarray(table.shape, np.uint16)
+        self.bin_start = np.ascontiguousarray(table.bin_start, np.int32)
+        self.crowded, self.scale_tolerance, self.sigmas = crowded, scale_tolerance, sigmas
+        self.codes[0], self.codes[1] = CODES / (2 * M_PI / 3), CODES / (M_PI / 3)
+        self.codes[2] = CODES / table.longest_allowed[0]
+
+    def candidates(
+        self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose
+    ):
+        """Candidates for triangles of a frame's stars whose faintest is first .. last - 1, brightest first.
+
+        error_px       of all stars, beside their own
+        most_expected  no more triangles are looked up once chance makes so many candidates
+        most           so many are returned: best supported first, then those of the likeliest size
+        loose          only those that another one supports
+
+        Returns star (K, 3), corner (K, 3) and mirrored (K,).
+        """
+        cdef Search s
+        cdef Shape shape
+        cdef double expected = 0.0
+        cdef int a, b, c, total
+        try:
+            _begin(&s, frame, last, error_px)
+            # triangles of the brightest stars come first
+            for c in range(first, s.stars):
+                for total in range(1, 2 * c - 2):
+                    for a in range(max(0, total - c + 1), (total + 1) // 2):
+                        b = total - a
+                        self._measure(&s, a, b, c, &shape)
+                        if shape.usable and expected < most_expected:
+                            self._ask(&s, &shape)
+                            expected += self._expected(&shape)
+            self._answer(&s)
+            return _best(&s, most, 1 if loose else 0, True)
+        finally:
+            free(s.found)
+            free(s.v)
+
+    def supported(self, Frame frame, int stars, double error_px, double most_expected, int most):
+        """Candidates as `candidates` returns them, those that at least two others support, in a crowd of false stars.
+
+        Only the triangles that chance matches least are looked up, until it makes so many candidates.
+        """
+        cdef Search s
+        cdef Shape shape
+        cdef double limit
+        cdef int a, b, c
+        try:
+            _begin(&s, frame, stars, error_px)
+            limit = self._rarest(&s, most_expected)
+            for a in range(s.stars):
+                for b in range(a + 1, s.stars):
+                    for c in range(b + 1, s.stars):
+                        self._measure(&s, a, b, c, &shape)
+                        if shape.usable and self._expected(&shape) < limit:
+                            self._ask(&s, &shape)
+            self._answer(&s)
+            return _best(&s, most, 2, False)
+        finally:
+            free(s.found)
+            free(s.v)
+
+    cdef double _rarest(self, const Search *s, double most_expected) except? -1:
+        """The number of chance candidates of one triangle below which all triangles together make most_expected."""
+        cdef Shape shape
+        cdef int a, b, c, k
+        cdef double total = 0.0, one
+        cdef double *sums = <double *>calloc(STEPS, sizeof(double))
+        if sums == NULL:
+            raise MemoryError
+        for a in range(s.stars):
+            for b in range(a + 1, s.stars):
+                for c in range(b + 1, s.stars):
+                    self._measure(s, a, b, c, &shape)
+                    if shape.usable:
+                        one = self._expected(&shape)
+                        sums[max(0, min(<int>((log(one) / log(2.0) + 40) * 64), STEPS - 1))] += one
+        for k in range(STEPS):
+            total += sums[k]
+            if total >= most_expected:
+                break
+        free(sums)
+        return 2.0 ** (k / 64.0 - 40) if total >= most_expected else 1e300
+
+    cdef void _measure(self, const Search *s, int a, int b, int c, Shape *out) noexcept nogil:
+        """Set the sides and the tolerances of the triangle of three stars, in ascending order."""
+        cdef double error, x, y, z
+        cdef int i, j
+        out.star[0], out.star[1], out.star[2] = a, b, c
+        out.side[0] = s.side[b * s.stars + c]
+        out.side[1] = s.side[a * s.stars + c]
+        out.side[2] = s.side[a * s.stars + b]
+        # the largest angle lies opposite the longest side
+        for i in range(2):
+            for j in range(2 - i):
+                if out.side[j] < out.side[j + 1]:
+                    out.side[j], out.side[j + 1] = out.side[j + 1], out.side[j]
+                    out.star[j], out.star[j + 1] = out.star[j + 1], out.star[j]
+        x, y, z = out.side[0], max(out.side[1], LEAST_SIDE), max(out.side[2], LEAST_SIDE)
+        error = self.sigmas * max(s.error[a], max(s.error[b], s.error[c]))
+        out.tolerance[0] = error * sqrt(1 / (y * y) + 1 / (z * z) + (x / (y * z)) ** 2)
+        x = max(x, LEAST_SIDE)
+        out.tolerance[1] = error * sqrt(1 / (x * x) + 1 / (y * y) + (z / (x * y)) ** 2)
+        out.tolerance[2] = self.scale_tolerance * x + error
+        out.usable = out.tolerance[1] < WORST_SMALLEST and out.tolerance[0] < WORST_LARGEST
+
+    cdef double _expected(self, const Shape *shape) noexcept nogil:
+        """Approximate number of the sky's triangles within the tolerance of a shape."""
+        cdef double share = 1.0
+        cdef int i
+        for i in range(3):
+            share *= min(2 * shape.tolerance[i] * self.codes[i] / CODES, 1.0)
+        return self.crowded * self.corners.shape[0] * share
+
+    cdef int _ask(self, Search *s, const Shape *shape) except -1 nogil:
+        """Ask for a triangle, in both orders of two corners whose angles are alike."""
+        cdef double[3] angle
+        cdef double[3] middle
+        cdef double[3] least
+        cdef int i, swap
+        cdef Query *q
+        least[0], least[1], least[2] = M_PI / 3, 0.0, 0.0
+        angles_of(shape.side, angle)
+        middle[0], middle[1], middle[2] = angle[0], angle[2], max(shape.side[0], LEAST_SIDE)
+        for swap in range(3):
+            if swap > 0 and not angle[swap - 1] - angle[swap] < 2 * shape.tolerance[0]:
+                continue
+            q = &s.waiting[s.queries]
+            s.queries += 1
+            for i in range(3):
+                q.star[i] = shape.star[i]
+                q.low[i] = code_of(middle[i] - shape.tolerance[i], least[i], self.codes[i])
+                q.high[i] = code_of(middle[i] + shape.tolerance[i], least[i], self.codes[i])
+            if swap > 0:
+                q.star[swap - 1], q.star[swap] = q.star[swap], q.star[swap - 1]
+            q.longest = middle[2]
+            q.turn = is_counter_clockwise(&s.v[3 * q.star[0]], &s.v[3 * q.star[1]], &s.v[3 * q.star[2]])
+            fetch(&self.bin_start[bin_of(q.low[0], q.low[1], q.low[2])])
+        if s.queries >= AHEAD:
+            self._answer(s)
+        return 0
+
+    cdef int _answer(self, Search *s) except -1 nogil:
+        """Add the candidates of all queries that wait."""
+        cdef const Query *q
+        cdef int k, row, column, run, t, i, last = <int>self.shape.shape[0] - 1
+        cdef Candidate *c
+        for k in range(s.queries if last >= 0 else 0):
+            q = &s.waiting[k]
+            t = min(self.bin_start[bin_of(q.low[0], q.low[1], q.low[2])], last)
+            fetch(&self.shape[t, 0])
+            fetch(&self.corners[t, 0])
+            fetch(&self.turn[t])
+        for k in range(s.queries):
+            q = &s.waiting[k]
+            for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
+                for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
+                    run = (row << BITS_1 | column) << BITS_2
+                    for t in range(
+                        self.bin_start[run + (q.low[2] >> SHIFT_2)], self.bin_start[run + (q.high[2] >> SHIFT_2) + 1]
+                    ):
+                        if not (
+                            q.low[0] <= self.shape[t, 0] <= q.high[0]
+                            and q.low[1] <= self.shape[t, 1] <= q.high[1]
+                            and q.low[2] <= self.shape[t, 2] <= q.high[2]
+                        ):
+                            continue
+                        if s.count == s.room:
+                            _grow(s)
+                        c = &s.found[s.count]
+                        s.count += 1
+                        for i in range(3):
+                            c.star[i], c.corner[i] = q.star[i], self.corners[t, i]
+                        c.mirrored = self.turn[t] != q.turn
+                        c.size = (self.shape[t, 2] + 0.5) / self.codes[2] / q.longest
+        s.queries = 0
+        return 0
+
+
+cdef int _begin(Search *s, Frame frame, int stars, double error_px) except -1:
+    """Take directions, errors and distances of a frame's brightest stars."""
+    cdef int a, b
+    cdef double x, y, z
+    s.found, s.count, s.room, s.queries = NULL, 0, 0, 0
+    s.stars = stars = min(stars, <int>frame.sigma.shape[0])
+    s.v = <double *>malloc((4 * stars + stars * stars + 1) * sizeof(double))
+    if s.v == NULL:
+        raise MemoryError
+    s.error = s.v + 3 * stars
+    s.side = s.error + stars
+    for b in range(stars):
+        direction_of(frame.xy[0, b, 0], frame.xy[0, b, 1], frame.focal, &s.v[3 * b])
+        s.error[b] = hypot(error_px, frame.sigma[b]) / frame.focal
+        for a in range(b):
+            x, y, z = s.v[3 * a] - s.v[3 * b], s.v[3 * a + 1] - s.v[3 * b + 1], s.v[3 * a + 2] - s.v[3 * b + 2]
+            s.side[a * stars + b] = 2 * asin(min(1.0, 0.5 * sqrt(x * x + y * y + z * z)))
+    return 0
+
+
+cdef int _grow(Search *s) except -1 nogil:
+    """Make room for more candidates."""
+    s.room = max(256, 2 * s.room)
+    cdef Candidate *more = <Candidate *>realloc(s.found, s.room * sizeof(Candidate))
+    if more == NULL:
+        with gil:
+            raise MemoryError
+    s.found = more
+    return 0
+
+
+cdef inline key_t _mixed(int star, int corner) noexcept nogil:
+    """A scrambled number of a detection and its identity."""
+    cdef key_t key = ((<key_t>star << 40 | <key_t>corner) + 1) * <key_t>0x9E3779B97F4A7C15
+    key ^= key >> 29
+    return key * <key_t>0xBF58476D1CE4E5B9
+
+
+cdef inline void _sides(const Candidate *c, key_t *side) noexcept nogil:
+    """Set the keys (3,) of a candidate's sides: of two stars with their identities, in either order."""
+    cdef key_t[3] mixed
+    cdef int i
+    for i in range(3):
+        mixed[i] = _mixed(c.star[i], c.corner[i])
+    for i in range(3):
+        # 0 stands for an empty slot
+        side[i] = (mixed[i] + mixed[(i + 1) % 3] + 2 * <key_t>c.mirrored) | 1
+
+
+cdef void _drop_lonely(Search *s, unsigned char *marks) noexcept nogil:
+    """Drop most of the candidates that share no side: mark each side in a small table, as seen once or more often."""
+    cdef key_t[3] side
+    cdef int k, i, kept = 0
+    cdef unsigned char *mark
+    for k in range(s.count):
+        _sides(&s.found[k], side)
+        for i in range(3):
+            mark = &marks[side[i] >> (64 - LOG_MARKS)]
+            mark[0] = min(mark[0] + 1, 2)
+    for k in range(s.count):
+        _sides(&s.found[k], side)
+        for i in range(3):
+            if marks[side[i] >> (64 - LOG_MARKS)] > 1:
+                s.found[kept] = s.found[k]
+                kept += 1
+                break
+    s.count = kept
+
+
+cdef int _support(Search *s) except -1:
+    """Count for each candidate how many others share a side with it."""
+    cdef int slots = 64, k, i, slot, others
+    cdef key_t[3] side
+    while slots < 4 * s.count:
+        slots *= 2
+    cdef key_t *keys = <key_t *>calloc(slots, sizeof(key_t))
+    cdef int *counts = <int *>calloc(slots, sizeof(int))
+    cdef int *places = <int *>malloc(3 * (s.count + 1) * sizeof(int))
+    try:
+        if keys == NULL or counts == NULL or places == NULL:
+            raise MemoryError
+        for k in range(s.count):
+            _sides(&s.found[k], side)
+            for i in range(3):
+                slot = (side[i] >> 20) & (slots - 1)
+                while keys[slot] != 0 and keys[slot] != side[i]:
+                    slot = (slot + 1) & (slots - 1)
+                keys[slot] = side[i]
+                counts[slot] += 1
+                places[3 * k + i] = slot
+        for k in range(s.count):
+            others = -3
+            for i in range(3):
+                others += counts[places[3 * k + i]]
+            s.found[k].support = others
+    finally:
+        free(keys)
+        free(counts)
+        free(places)
+    return 0
+
+
+cdef _best(Search *s, int most, int least_support, bint by_size):
+    """The `most` candidates with most support, equal ones by their size or in their order: star, corner, mirrored."""
+    cdef int k, j, kept = 0
+    cdef Candidate *c
+    cdef int *order = <int *>malloc((most + 1) * sizeof(int))
+    cdef unsigned char *marks = <unsigned char *>calloc(1 << LOG_MARKS, 1) if least_support > 0 else NULL
+    try:
+        if order == NULL or (marks == NULL and least_support > 0):
+            raise MemoryError
+        if least_support > 0:
+            _drop_lonely(s, marks)
+        _support(s)
+        for k in range(s.count):
+            c = &s.found[k]
+            if c.support < least_support:
+                continue
+            j = kept
+            while j > 0 and _precedes(c, &s.found[order[j - 1]], by_size):
+                order[j] = order[j - 1]
+                j -= 1
+            if j < most:
+                order[j] = k
+                kept = min(kept + 1, most)
+        return _columns(s, order, kept)
+    finally:
+        free(order)
+        free(marks)
+
+
+cdef inline bint _precedes(const Candidate *one, const Candidate *other, bint by_size) noexcept nogil:
+    if one.support != other.support:
+        return one.support > other.support
+    return by_size and fabs(log(one.size)) < fabs(log(other.size))
+
+
+cdef _columns(const Search *s, const int *order, int count):
+    """Candidates in an order as arrays: star, corner, mirrored."""
+    cdef int k, i
+    stars, corners, mirror = np.empty((count, 3), np.intp), np.empty((count, 3), np.intp), np.empty(count, bool)
+    cdef Py_ssize_t[:, ::1] star = stars
+    cdef Py_ssize_t[:, ::1] corner = corners
+    cdef unsigned char[::1] mirrored = mirror.view(np.uint8)
+    for k in range(count):
+        for i in range(3):
+            star[k, i], corner[k, i] = s.found[order[k]].star[i], s.found[order[k]].corner[i]
+        mirrored[k] = s.found[order[k]].mirrored
+    return stars, corners, mirror
