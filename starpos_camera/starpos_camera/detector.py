@@ -154,6 +154,7 @@ class DetectorNode(Node):
             threshold=v["threshold"],
             min_snr=v["min_snr"],
             max_stars=v["max_stars"],
+            threads=v["threads"],
             saturation_dn=saturation,
         )
 

@@ -32,6 +32,14 @@ PARAMETERS = (
         maximum=100000,
     ),
     Parameter(
+        "threads",
+        1,
+        "Threads that search a frame; more answer sooner where processors are idle, and cost others time where none is.",
+        unit="",
+        minimum=1,
+        maximum=64,
+    ),
+    Parameter(
         "saturation",
         math.nan,
         "Pixel value from which a pixel is full; unset finds it in each frame. Too high, and the centroids of "

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peaks of the smoothed frame, where something like a star stands out of the noise. One pass, strip by strip."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from scipy import ndimage, sparse, spatial
 
+from starpos.core.peaks import peaks, smoothed
 from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
 from starpos.normal import SIGMA_PER_MAD
 
-# Rows of a strip: few enough that it stays in the processor's cache.
+# Rows of a strip, which has one limit.
 STRIP = 64
 # Peaks whose surroundings are looked at together.
 CHUNK = 4096
@@ -36,6 +37,12 @@ class Kernel:
     sigma: float
     reach: int
     flat: int
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Weights (reach + 1,) along one axis, from the middle outwards."""
+        weight = np.exp(-0.5 * (np.arange(self.reach + 1) / self.sigma) ** 2)
+        return (weight / (2 * weight.sum() - weight[0])).astype(np.float32)
 
     @property
     def norm(self) -> float:
@@ -64,7 +71,9 @@ class Peaks:
     left_out: int = 0
 
 
-def find_peaks(plane: np.ndarray, background: Background, threshold: float, limit: int) -> Peaks:
+def find_peaks(
+    plane: np.ndarray, background: Background, threshold: float, limit: int, threads: int = 1
+) -> Peaks:
     """Find at most `limit` Peaks that stand out of plane (h, w) by `threshold` sigma.
 
     A star through a defocused telescope with a central obstruction is a ring, with several peaks close together. If
@@ -72,11 +81,11 @@ def find_peaks(plane: np.ndarray, background: Background, threshold: float, limi
     The peaks along a streak or a twig are close together too, but continue to both sides; those of a pair of stars
     are higher than the wide peak.
     """
-    sharp = _peaks_of(plane, background, SHARP, threshold, limit)
+    sharp = _peaks_of(plane, background, SHARP, threshold, limit, threads)
     bright = _no_dots(plane, background, sharp)
     if not _crowded(bright):
         return sharp
-    wide = _peaks_of(plane, background, WIDE, threshold, limit)
+    wide = _peaks_of(plane, background, WIDE, threshold, limit, threads)
     if not _are_rings(plane.shape, bright, _no_dots(plane, background, wide)):
         return sharp
     return _with_others(wide, bright, limit)
@@ -140,7 +149,7 @@ def _with_others(wide: Peaks, sharp: Peaks, limit: int) -> Peaks:
 
 
 def _peaks_of(
-    plane: np.ndarray, background: Background, kernel: Kernel, threshold: float, limit: int
+    plane: np.ndarray, background: Background, kernel: Kernel, threshold: float, limit: int, threads: int
 ) -> Peaks:
     """The Peaks of the frame smoothed by a Kernel.
 
@@ -153,29 +162,12 @@ def _peaks_of(
     noise = noise * kernel.norm * correlation
     wanted = (level + threshold * noise).astype(np.float32)
     lowest = _columns(wanted, background)
-    neighbours = np.ones((2 * kernel.flat + 1,) * 2, np.uint8)
-    found = []
-    for top in range(0, plane.shape[0], STRIP):
-        bottom = min(top + STRIP, plane.shape[0])
-        smooth, offset = _smooth(plane, kernel, top, bottom)
-        # the strip against the lowest threshold of its mesh rows; the exact threshold follows below
-        (first, last), _ = background.cell(0, np.array([top, bottom - 1]))
-        above = smooth > lowest[int(first) : int(last) + 2].min(0)
-        if not above.any():
-            continue
-        above &= smooth == cv2.dilate(smooth, neighbours)
-        # faster than nonzero in two dimensions
-        place = np.flatnonzero(above[offset : offset + bottom - top])
-        y, x = np.divmod(place, plane.shape[1])
-        value = smooth[y + offset, x]
-        # in a saturated disc every pixel is a peak: one peak for each connected part
-        if np.any(np.diff(place) == 1):
-            _, part = cv2.connectedComponents(above[offset : offset + bottom - top].astype(np.uint8))
-            x, y, value = _merged(x, y, value, part[y, x] - 1)
-        found.append(np.stack([x, y + top, value]))
-    if not found:
-        return Peaks(np.zeros(0, int), np.zeros(0, int), np.zeros(0), correlation)
-    x, y, value = np.concatenate(found, 1)
+    strips = np.arange(0, plane.shape[0], STRIP)
+    # each strip against the lowest threshold of its mesh rows; the exact threshold follows below
+    (first, last), _ = background.cell(0, np.stack([strips, np.minimum(strips + STRIP, plane.shape[0]) - 1]))
+    floor = np.stack([lowest[int(i) : int(j) + 2].min(0) for i, j in zip(first, last, strict=True)])
+    x, y, value = _in_parts(plane, kernel, floor, threads)
+    x, y = np.rint(x).astype(int), np.rint(y).astype(int)
     local, sigma = (ndimage.map_coordinates(m, background.cell(x, y), order=1) for m in (level, noise))
     height = (value - local) / sigma
     left_out = max(0, len(height) - 4 * limit)
@@ -196,18 +188,21 @@ def _peaks_of(
     return Peaks(x[:limit], y[:limit], height[:limit], correlation, left_out)
 
 
-def _smooth(plane: np.ndarray, kernel: Kernel, top: int, bottom: int) -> tuple[np.ndarray, int]:
-    """Rows top - flat to bottom + flat of the smoothed frame, and the index of row `top` in them."""
-    around = kernel.flat + kernel.reach
-    first, last = max(0, top - around), min(plane.shape[0], bottom + around)
-    smooth = cv2.GaussianBlur(
-        plane[first:last].astype(np.float32),
-        (2 * kernel.reach + 1,) * 2,
-        kernel.sigma,
-        borderType=cv2.BORDER_REFLECT_101,
-    )
-    start = max(first, top - kernel.flat)
-    return smooth[start - first : min(last, bottom + kernel.flat) - first], top - start
+def _in_parts(
+    plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, w), found by so many threads."""
+    height, parts = plane.shape[0], min(threads, len(limit))
+    ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
+
+    def found(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return peaks(plane, kernel.weight, kernel.flat, limit, STRIP, ends[k], ends[k + 1])
+
+    if parts == 1:
+        return found(0)
+    with ThreadPoolExecutor(parts) as pool:
+        x, y, value = (np.concatenate(column) for column in zip(*pool.map(found, range(parts)), strict=True))
+    return x, y, value
 
 
 def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) -> tuple[float, float]:
@@ -217,8 +212,8 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     SNR of a star. The second is the sky's unevenness within the background's cells, from clouds: it raises the threshold.
     """
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
-    strips = [_smooth(plane, kernel, top, min(top + 16, len(plane))) for top in tops]
-    value = np.concatenate([smooth[offset : offset + 16 : 4, ::4] for smooth, offset in strips])
+    strips = [smoothed(plane, kernel.weight, top, min(top + 16, len(plane))) for top in tops.tolist()]
+    value = np.concatenate([smooth[::4, ::4] for smooth in strips])
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
     x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
     level, noise = background.at(x.ravel(), y.ravel())

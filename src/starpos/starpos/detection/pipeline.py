@@ -7,6 +7,7 @@ Where stars are wider than the peaks' kernels can find, the same is done with th
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from starpos.detection.background import measure_background
@@ -34,7 +35,7 @@ WIDE_FWHM, SHORTEST_PX = 8.0, 150
 MOST_HALVINGS = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DetectionSettings:
     """Settings of `detect`; FrameError if one is out of its range.
 
@@ -42,6 +43,7 @@ class DetectionSettings:
     min_snr         flux of a star over its sigma in the sky's noise
     max_stars       how many stars are kept, brightest first
     mesh_px         size of the background's cells, 16 or more
+    threads         of the processor, so many at most
     saturation_dn   DN from which a pixel is saturated; None: the type's largest value, or the frame's largest if several
                     pixels of a star share it
     """
@@ -50,15 +52,22 @@ class DetectionSettings:
     min_snr: float = 6.5
     max_stars: int = 10000
     mesh_px: int = 64
+    threads: int = 1
     saturation_dn: float | None = None
 
     def __post_init__(self) -> None:
-        for name, low in (("threshold", 3), ("min_snr", 0), ("max_stars", 1), ("mesh_px", 16)):
+        for name, low in (
+            ("threshold", 3),
+            ("min_snr", 0),
+            ("max_stars", 1),
+            ("mesh_px", 16),
+            ("threads", 1),
+        ):
             if isinstance(getattr(self, name), str) or not low <= getattr(self, name) < np.inf:
                 raise FrameError(
                     f"The detection setting {name} is {getattr(self, name)}; it must be {low} or more."
                 )
-        for name in ("max_stars", "mesh_px"):
+        for name in ("max_stars", "mesh_px", "threads"):
             if getattr(self, name) != int(getattr(self, name)):
                 raise FrameError(f"The detection setting {name} is {getattr(self, name)}; it must be whole.")
             object.__setattr__(self, name, int(getattr(self, name)))
@@ -92,6 +101,8 @@ class Detection:
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
     about = {"width": frame.width, "height": frame.height} | frame.about
+    # OpenCV would take all processors for a little, and wait for them where others work
+    cv2.setNumThreads(settings.threads)
     return _detect(*plane_of(frame), settings, about, MOST_HALVINGS)
 
 
@@ -140,7 +151,7 @@ def _detect_at_full_size(
     background = measure_background(plane, settings.mesh_px, mosaic)
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
     limit = max(PEAKS, 2 * settings.max_stars)
-    peaks = find_peaks(plane, background, settings.threshold, limit)
+    peaks = find_peaks(plane, background, settings.threshold, limit, settings.threads)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return _starless(about, level, noise)

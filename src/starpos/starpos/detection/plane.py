@@ -19,7 +19,7 @@ def plane_of(frame: Frame) -> tuple[np.ndarray, bool | None]:
     """
     pixels = frame.pixels
     if pixels.ndim == 2:
-        return pixels, True if frame.pattern else None
+        return np.ascontiguousarray(pixels), True if frame.pattern else None
     measured = _measured(pixels)
     if measured is None:
         blue, green, red = cv2.split(pixels)

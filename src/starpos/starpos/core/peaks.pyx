@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Peaks of a smoothed frame, in one pass over its 8- or 16-bit pixels: a few rows at a time, which stay in the cache."""
+
+from libc.stdlib cimport free, malloc, realloc
+from libc.string cimport memset
+
+import numpy as np
+
+cdef extern from *:
+    """
+    /* Add to a row three pairs of others, each times its weight. */
+    static void starpos_add(float *restrict out, const float *restrict w, Py_ssize_t n,
+                            const float *restrict a, const float *restrict b, const float *restrict c,
+                            const float *restrict d, const float *restrict e, const float *restrict f) {
+        const float u = w[0], v = w[1], t = w[2];
+        for (Py_ssize_t i = 0; i < n; i++)
+            out[i] += u * (a[i] + b[i]) + v * (c[i] + d[i]) + t * (e[i] + f[i]);
+    }
+    static void starpos_scale(float *restrict out, const float *restrict in, float w, Py_ssize_t n) {
+        for (Py_ssize_t i = 0; i < n; i++)
+            out[i] = w * in[i];
+    }
+    /* Whether a pixel of the row is above its limit. */
+    static int starpos_any_above(const float *restrict row, const float *restrict limit, Py_ssize_t n) {
+        int any = 0;
+        for (Py_ssize_t i = 0; i < n; i++)
+            any |= row[i] > limit[i];
+        return any;
+    }
+    """
+    void add "starpos_add"(
+        float *out, const float *weight, Py_ssize_t n, const float *a, const float *b, const float *c,
+        const float *d, const float *e, const float *f,
+    ) noexcept nogil
+    void scale "starpos_scale"(float *out, const float *row, float weight, Py_ssize_t n) noexcept nogil
+    bint any_above "starpos_any_above"(const float *row, const float *limit, Py_ssize_t n) noexcept nogil
+
+ctypedef fused pixel_t:
+    unsigned char
+    unsigned short
+
+cdef enum:
+    # Pairs of rows that are added at once, and pixels of a row that are compared at once.
+    TOGETHER = 3
+    BLOCK = 256
+
+
+cdef struct Group:
+    # Of pixels side by side that are all peaks, as in a saturated disc: one of them stands for those it is merged into.
+    int into
+    double x
+    double y
+    double value
+    double count
+
+
+cdef struct Groups:
+    Group *each
+    int count
+    int room
+    # Of each pixel of this row and of the one above, its group, or -1.
+    int *here
+    int *above
+
+
+cdef struct Rolling:
+    # Of the plane's rows those before `loaded`, as floats, each at its number modulo their count; weights; a row with margins.
+    float *raw
+    int rows
+    int loaded
+    float *weight
+    int reach
+    int padded
+    float *margined
+
+
+cdef int _begin(Rolling *r, Py_ssize_t width, const float[::1] weight) except -1:
+    """Take memory for smoothing rows."""
+    cdef int k
+    r.reach = weight.shape[0] - 1
+    r.padded, r.rows, r.loaded = (r.reach + 2) // 3 * 3, 2 * r.reach + 1, 0
+    r.raw = <float *>malloc((r.rows * width + width + 2 * r.padded + r.padded + 1) * sizeof(float))
+    if r.raw == NULL:
+        raise MemoryError
+    r.margined = r.raw + r.rows * width
+    r.weight = r.margined + width + 2 * r.padded
+    for k in range(r.padded + 1):
+        r.weight[k] = weight[k] if k <= r.reach else 0.0
+    return 0
+
+
+cdef void _smooth_row(const pixel_t[:, ::1] plane, Rolling *r, int row, float *out) noexcept nogil:
+    """Set `out` (w,) to a row of the smoothed plane; the rows before it have been asked for."""
+    cdef Py_ssize_t x, width = plane.shape[1]
+    cdef int height = plane.shape[0]
+    r.loaded = max(r.loaded, row - r.reach)
+    while r.loaded < min(row + r.reach + 1, height):
+        for x in range(width):
+            r.raw[(r.loaded % r.rows) * width + x] = <float>plane[r.loaded, x]
+        r.loaded += 1
+    _across_rows(r, width, height, row, r.margined + r.padded)
+    _along_row(r, width, out)
+
+
+def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, int first, int last):
+    """Rows first .. last - 1 of a plane (h, w) smoothed along both axes by weights (reach + 1,) from the middle outwards.
+
+    Beyond its edges the plane continues as in a mirror.
+    """
+    cdef Rolling r
+    cdef int row
+    out = np.empty((max(last - first, 0), plane.shape[1]), np.float32)
+    cdef float[:, ::1] smooth = out
+    _begin(&r, plane.shape[1], weight)
+    with nogil:
+        for row in range(first, last):
+            _smooth_row(plane, &r, row, &smooth[row - first, 0])
+    free(r.raw)
+    return out
+
+
+def peaks(
+    const pixel_t[:, ::1] plane, const float[::1] weight, int flat, const float[:, ::1] limit, int strip, int first,
+    int last,
+):
+    """Peaks of a plane (h, w) smoothed as in `smoothed`: pixels above a limit, of which none within `flat` px is higher.
+
+    limit        (strips, w): of each strip of so many rows
+    first, last  the rows in which peaks are looked for
+
+    Peaks side by side are one. Returns x, y (N,) px, their means, and the smoothed value (N,).
+    """
+    cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1]
+    cdef int kept = 2 * flat + 1, row, done = max(first - flat, 0)
+    cdef Groups g
+    cdef Rolling r
+    g.each, g.count, g.room = NULL, 0, 0
+    _begin(&r, width, weight)
+    cdef float *smooth = <float *>malloc(kept * width * sizeof(float))
+    cdef int *marks = <int *>malloc(2 * (width + 2) * sizeof(int))
+    try:
+        if smooth == NULL or marks == NULL:
+            raise MemoryError
+        g.here, g.above = marks, marks + width + 2
+        with nogil:
+            memset(marks, 0xFF, 2 * (width + 2) * sizeof(int))
+            for row in range(first, last):
+                while done < min(row + flat + 1, <int>height):
+                    _smooth_row(plane, &r, done, smooth + (done % kept) * width)
+                    done += 1
+                _take_peaks(smooth, kept, width, height, row, flat, &limit[row // strip, 0], &g)
+        return _columns(&g)
+    finally:
+        free(smooth)
+        free(marks)
+        free(r.raw)
+        free(g.each)
+
+
+cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
+    """The row that stands for row k, which may lie beyond the edges."""
+    while n > 1 and not 0 <= k < n:
+        k = -k if k < 0 else 2 * (n - 1) - k
+    return k if n > 1 else 0
+
+
+cdef void _across_rows(const Rolling *r, Py_ssize_t width, Py_ssize_t height, Py_ssize_t row, float *out) noexcept nogil:
+    """Smooth a row with those above and below it."""
+    cdef const float *pair[2 * TOGETHER]
+    cdef int k, j, near
+    scale(out, r.raw + (row % r.rows) * width, r.weight[0], width)
+    for k in range(1, r.padded + 1, 3):
+        for j in range(TOGETHER):
+            # a weight of 0 takes any row
+            near = k + j if k + j <= r.reach else 0
+            pair[2 * j] = r.raw + (_mirrored(row - near, height) % r.rows) * width
+            pair[2 * j + 1] = r.raw + (_mirrored(row + near, height) % r.rows) * width
+        _add_three(out, &r.weight[k], width, pair)
+
+
+cdef void _along_row(const Rolling *r, Py_ssize_t width, float *out) noexcept nogil:
+    """Smooth along itself the row in r.margined."""
+    cdef const float *pair[2 * TOGETHER]
+    cdef float *row = r.margined + r.padded
+    cdef int k, j
+    for k in range(1, r.padded + 1):
+        row[-k], row[width - 1 + k] = row[_mirrored(-k, width)], row[_mirrored(width - 1 + k, width)]
+    scale(out, row, r.weight[0], width)
+    for k in range(1, r.padded + 1, 3):
+        for j in range(TOGETHER):
+            pair[2 * j], pair[2 * j + 1] = row - (k + j), row + (k + j)
+        _add_three(out, &r.weight[k], width, pair)
+
+
+cdef inline void _add_three(float *out, const float *w, Py_ssize_t width, const float **pair) noexcept nogil:
+    add(out, w, width, pair[0], pair[1], pair[2], pair[3], pair[4], pair[5])
+
+
+cdef int _take_peaks(
+    const float *smooth, int kept, Py_ssize_t width, Py_ssize_t height, Py_ssize_t row, int flat, const float *limit,
+    Groups *g,
+) except -1 nogil:
+    """Add the peaks of a row to their groups."""
+    cdef const float *own = smooth + (row % kept) * width
+    cdef const float *other
+    cdef Py_ssize_t begin, x, i, y
+    cdef float value
+    cdef bint highest
+    g.here, g.above = g.above, g.here
+    memset(g.here, 0xFF, (width + 2) * sizeof(int))
+    for begin in range(0, width, 256):
+        if not any_above(own + begin, limit + begin, min(BLOCK, width - begin)):
+            continue
+        for x in range(begin, min(begin + BLOCK, width)):
+            value = own[x]
+            if not value > limit[x]:
+                continue
+            highest = True
+            for y in range(max(row - flat, 0), min(row + flat + 1, height)):
+                other = smooth + (y % kept) * width
+                for i in range(max(x - flat, 0), min(x + flat + 1, width)):
+                    if other[i] > value:
+                        highest = False
+                        break
+                if not highest:
+                    break
+            if highest:
+                _join(g, x, row, value)
+    return 0
+
+
+cdef int _join(Groups *g, Py_ssize_t x, Py_ssize_t y, float value) except -1 nogil:
+    """Add a peak to the group of its neighbours, or to a new one."""
+    cdef int k, other, group = -1
+    cdef Group *more
+    # one to the left, three above; the places are shifted by one
+    for k in range(4):
+        other = g.here[x] if k == 3 else g.above[x + k]
+        if other < 0:
+            continue
+        while g.each[other].into != other:
+            other = g.each[other].into
+        if group < 0:
+            group = other
+        elif other != group:
+            g.each[other].into = group
+            g.each[group].x += g.each[other].x
+            g.each[group].y += g.each[other].y
+            g.each[group].value += g.each[other].value
+            g.each[group].count += g.each[other].count
+    if group < 0:
+        if g.count == g.room:
+            g.room = max(1024, 2 * g.room)
+            more = <Group *>realloc(g.each, g.room * sizeof(Group))
+            if more == NULL:
+                with gil:
+                    raise MemoryError
+            g.each = more
+        group = g.count
+        g.count += 1
+        g.each[group].into = group
+        g.each[group].x = g.each[group].y = g.each[group].value = g.each[group].count = 0.0
+    g.each[group].x += x
+    g.each[group].y += y
+    g.each[group].value += value
+    g.each[group].count += 1
+    g.here[x + 1] = group
+    return 0
+
+
+cdef _columns(const Groups *g):
+    """Mean x, y and value (N,) of the groups."""
+    cdef int k, count = 0
+    out = np.empty((3, g.count))
+    cdef double[:, ::1] column = out
+    for k in range(g.count):
+        if g.each[k].into == k:
+            column[0, count] = g.each[k].x / g.each[k].count
+            column[1, count] = g.each[k].y / g.each[k].count
+            column[2, count] = g.each[k].value / g.each[k].count
+            count += 1
+    return out[0, :count], out[1, :count], out[2, :count]
