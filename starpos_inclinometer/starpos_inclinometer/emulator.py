@@ -16,7 +16,8 @@ import sys
 import time
 import tty
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from starpos.instrument.inclinometer import sca100t_volts
 from starpos_inclinometer.sources import mcu_protocol, sca100t
@@ -33,15 +34,20 @@ WINDOW_MS = 20
 POLL_S = 0.2
 
 
+def _fault(what: str) -> Any:
+    """Make a field of Faults: the probability that this happens."""
+    return field(default=0.0, metadata={"help": what})
+
+
 @dataclass(frozen=True)
 class Faults:
     """Probabilities of faults: per line, except `flip`, which is per bit."""
 
-    garbage: float = 0.0  # random bytes before the line
-    drop: float = 0.0  # the line is lost
-    truncate: float = 0.0  # the line ends early
-    double: float = 0.0  # the line comes twice
-    flip: float = 0.0
+    garbage: float = _fault("random bytes before the line")
+    drop: float = _fault("the line is lost")
+    truncate: float = _fault("the line ends early")
+    double: float = _fault("the line comes twice")
+    flip: float = _fault("the bit is the other way round")
 
     def apply(self, line: bytes, rng: random.Random) -> bytes:
         """Return the bytes that arrive when a line is sent."""
@@ -287,8 +293,9 @@ def _parser() -> argparse.ArgumentParser:
     number = _number
     add = parser.add_argument
     add("--link", metavar="PATH", help="make the serial port appear under this stable path (a symbolic link)")
-    add("--tilt-x", type=number(-90, 90), default=0.0, metavar="DEG")
-    add("--tilt-y", type=number(-90, 90), default=0.0, metavar="DEG")
+    for axis in "xy":
+        words = f"elevation of the sensor's {axis.upper()}' axis (0)"
+        add(f"--tilt-{axis}", type=number(-90, 90), default=0.0, metavar="DEG", help=words)
     add(
         "--noise",
         type=number(0, 10),
@@ -296,27 +303,36 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEG",
         help="white noise of a sample (%(default)s)",
     )
-    add("--temperature", type=number(-40, 125), default=20.0, metavar="C")
+    add("--temperature", type=number(-40, 125), default=20.0, metavar="C", help="of the sensor (20)")
     add(
         "--rate",
         type=int,
         choices=range(1, mcu_protocol.MAX_RATE_HZ + 1),
         default=DEFAULT_RATE_HZ,
         metavar="HZ",
+        help="samples a second (%(default)s)",
     )
     add(
         "--drift-ppm",
         type=number(-5e4, 5e4),
         default=0.0,
         metavar="PPM",
-        help="of the microcontroller's clock",
+        help="error of the microcontroller's clock (0)",
     )
     add("--seed", type=int, help="of the noise, for the same samples every time")
-    faults = parser.add_argument_group("faults", "probabilities a line, but --flip: a bit")
+    faults = parser.add_argument_group("faults", "P is the probability for each line, of --flip for each bit")
     for fault in fields(Faults):
-        faults.add_argument(f"--{fault.name}", type=number(0, 1), default=0.0, metavar="P")
-    faults.add_argument("--reset-every", type=number(0, 1e9), default=0.0, metavar="S", help="reset the MCU")
-    faults.add_argument("--freeze", action="store_true", help="the ADC repeats one code")
+        faults.add_argument(
+            f"--{fault.name}", type=number(0, 1), default=0.0, metavar="P", help=fault.metadata["help"]
+        )
+    faults.add_argument(
+        "--reset-every",
+        type=number(0, 1e9),
+        default=0.0,
+        metavar="S",
+        help="reset the microcontroller every S seconds (0: never)",
+    )
+    faults.add_argument("--freeze", action="store_true", help="the converter repeats one value")
     return parser
 
 

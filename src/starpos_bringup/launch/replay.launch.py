@@ -6,12 +6,14 @@
 If a bag holds images and no stars, detector:=true finds the stars again.
 """
 
+from pathlib import Path
+
 from launch import LaunchDescription
 from launch.actions import OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import PushRosNamespace
 
-from starpos_bringup.launch_arguments import is_true
+from starpos_bringup.launch_arguments import LaunchError, is_true, number
 from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
 
 ARGUMENTS = (
@@ -21,11 +23,16 @@ ARGUMENTS = (
     ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
     ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
 )
+MOST_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
 
 
 def nodes(context):
     told = given(context, ARGUMENTS)
+    rate = number(told, "rate", 0, MOST_RATE)
+    bag = Path(told["bag"]).expanduser()
+    if not bag.exists():
+        raise LaunchError(f"bag:={bag}: there is no such bag")
     common = Common.of(told)
     processes = [process("starpos_solver", "solver", common, SIMULATED)]
     inputs = "stars"
@@ -34,7 +41,7 @@ def nodes(context):
         inputs = "images"
     if is_true(told, "dashboard"):
         processes.append(process("starpos_dashboard", "dashboard", common, SIMULATED))
-    player = ["--rate", told["rate"], "--inputs", inputs, "--", told["bag"]]
+    player = ["--rate", f"{rate:g}", "--inputs", inputs, "--", str(bag)]
     processes.append(
         process(
             "starpos_bringup",

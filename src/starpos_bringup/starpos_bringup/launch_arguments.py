@@ -3,7 +3,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 
 class LaunchError(Exception):
@@ -28,6 +28,13 @@ def names(told: Mapping[str, str], name: str) -> list[str]:
             f"{name}:={told[name]}: give different names separated by commas, such as left,right"
         )
     return found
+
+
+def one_of(told: Mapping[str, str], name: str, words: Collection[str]) -> str:
+    """Read an argument; LaunchError if it is none of the words."""
+    if told[name].lower() not in words:
+        raise LaunchError(f"{name}:={told[name]}: give {', '.join(words)}")
+    return told[name].lower()
 
 
 def number(told: Mapping[str, str], name: str, low: float, high: float) -> float:

@@ -15,12 +15,13 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from starpos_bringup.launch_arguments import LaunchError, is_true
+from starpos_bringup.launch_arguments import LaunchError, is_true, one_of
 
 if TYPE_CHECKING:
     from launch.launch_context import LaunchContext
 
 Arguments = Iterable[tuple[str, Any, str]]
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 # Name, default and description of each argument.
 COMMON_ARGUMENTS = (
     ("namespace", "", "moves the whole instrument: /NAMESPACE/fix and so on"),
@@ -29,7 +30,7 @@ COMMON_ARGUMENTS = (
         PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "starpos.yaml"]),
         "parameters of all nodes",
     ),
-    ("log_level", "info", "debug, info, warn or error"),
+    ("log_level", "info", ", ".join(LOG_LEVELS)),
     (
         "enclaves",
         "/starpos",
@@ -53,13 +54,14 @@ class Common:
 
     @classmethod
     def of(cls, told: Mapping[str, str]) -> "Common":
-        """Make them from the arguments; LaunchError if there is no such parameter file."""
+        """Make them from the arguments; LaunchError if there is no such parameter file or level."""
         # launch_ros only warns of a missing file, and the instrument would run with defaults.
         path = Path(told["params_file"]).expanduser()
         if not path.is_file():
             raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
         respawn = is_true(told, "respawn") if "respawn" in told else False
-        return cls(str(path), told["log_level"], told["enclaves"].rstrip("/"), respawn)
+        level = one_of(told, "log_level", LOG_LEVELS)
+        return cls(str(path), level, told["enclaves"].rstrip("/"), respawn)
 
 
 def declared(arguments: Arguments) -> list[DeclareLaunchArgument]:

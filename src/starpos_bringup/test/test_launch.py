@@ -92,7 +92,7 @@ def test_each_process_is_in_its_enclave_of_the_policy():
     enclaves = {e.attrib["path"] for e in policy.iter("enclave")}
     for name, given in (
         ("starpos", {"dashboard": "true"}),
-        ("replay", {"bag": "night", "detector": "true"}),
+        ("replay", {"bag": str(NIGHT), "detector": "true"}),
         ("demo", {}),
     ):
         named = {words[words.index("--enclave") + 1] for _, words in started(name, **given).values()}
@@ -111,9 +111,12 @@ def test_each_process_is_in_its_enclave_of_the_policy():
         ),
         ("starpos", {"use_sim_time": "perhaps"}, "use_sim_time:=perhaps: give true or false"),
         ("starpos", {"respawn": "yes"}, "respawn:=yes: give true or false"),
-        ("replay", {"bag": "night", "detector": "on"}, "detector:=on: give true or false"),
+        ("replay", {"bag": str(NIGHT), "detector": "on"}, "detector:=on: give true or false"),
         ("demo", {"latitude": "abc"}, "latitude:=abc: give a number from -90 to 90"),
         ("demo", {"cadence": ""}, "cadence:=: give a number"),
+        ("demo", {"log_level": "loud"}, "log_level:=loud: give debug, info, warn, error, fatal"),
+        ("replay", {"bag": str(NIGHT), "rate": "quick"}, "rate:=quick: give a number from 0"),
+        ("replay", {"bag": "/nowhere/night"}, "bag:=/nowhere/night: there is no such bag"),
     ],
 )
 def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, given, words):
@@ -124,7 +127,12 @@ def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, give
 def test_two_instruments_have_frames_and_enclaves_of_their_own_and_one_file(tmp_path):
     (tmp_path / "robot.yaml").write_text("/left/solver:\n  ros__parameters: {min_stars: 7}\n")
     module, context = module_of("instruments"), launch.LaunchContext()
-    given = {"instruments": "left,right", "params_file": str(tmp_path / "robot.yaml"), "enclaves": "/starpos"}
+    given = {
+        "instruments": "left,right",
+        "params_file": str(tmp_path / "robot.yaml"),
+        "enclaves": "/starpos",
+        "log_level": "info",
+    }
     for name, _, _ in module.ARGUMENTS:
         context.launch_configurations[name] = given.get(name, "false" if name == "respawn" else "")
     for side, group in zip(("left", "right"), module.nodes(context), strict=True):
@@ -142,11 +150,11 @@ def test_two_instruments_have_frames_and_enclaves_of_their_own_and_one_file(tmp_
 
 
 def test_a_replay_takes_the_stars_or_finds_them_again():
-    stars = started("replay", bag="night", rate="0")
+    stars = started("replay", bag=str(NIGHT), rate="0")
     assert list(stars) == ["solver", "replay"]
-    assert stars["replay"][1][:6] == ["--rate", "0", "--inputs", "stars", "--", "night"]
+    assert stars["replay"][1][:6] == ["--rate", "0", "--inputs", "stars", "--", str(NIGHT)]
     assert stars["solver"][0] == {"/**": {"use_sim_time": True}}
-    images = started("replay", bag="night", detector="true")
+    images = started("replay", bag=str(NIGHT), detector="true")
     assert "detector" in images and "images" in images["replay"][1]
 
 

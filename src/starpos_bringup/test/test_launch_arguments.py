@@ -3,7 +3,7 @@
 
 import pytest
 
-from starpos_bringup.launch_arguments import LaunchError, is_true, names, number
+from starpos_bringup.launch_arguments import LaunchError, is_true, names, number, one_of
 
 
 @pytest.mark.parametrize("text", ["abc", "", "nan", "90.5", "inf"])
@@ -17,6 +17,12 @@ def test_names_of_instruments_are_read_and_none_comes_twice():
     for text in ("", "left,", "left,left", "1st", "le ft", "left//right"):
         with pytest.raises(LaunchError, match=f"instruments:={text}: give different names"):
             names({"instruments": text}, "instruments")
+
+
+def test_a_word_is_one_of_those_that_there_are():
+    assert one_of({"log_level": "WARN"}, "log_level", ("info", "warn")) == "warn"
+    with pytest.raises(LaunchError, match="log_level:=loud: give info, warn"):
+        one_of({"log_level": "loud"}, "log_level", ("info", "warn"))
 
 
 def test_numbers_and_truths_are_read_as_people_write_them():

@@ -42,13 +42,21 @@ def run(
         signal.signal(number, lambda signum, frame: stopped.append(signum))
     try:
         if help_text is not None and _asks_for_help(sys.argv[1:] if args is None else args):
-            print(help_text(), flush=True)
+            _show(help_text())
             return 0
         return _run(make_nodes, args, stopped)
     finally:
         # launch sends a second SIGINT: the default handler must not get it while the interpreter ends.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
+
+
+def _show(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # The reader has seen enough (`--help | head`); nor must Python's exit fail when it flushes what is left.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _asks_for_help(args: list[str]) -> bool:
@@ -70,7 +78,7 @@ def leave(status: int) -> int:
 
 def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, stopped: list[int]) -> int:
     import rclpy
-    from rclpy._rclpy_pybind11 import RCLError
+    from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
     from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions, install_signal_handlers
@@ -82,6 +90,9 @@ def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, sto
         return 0
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except UnknownROSArgsError as error:
+        # Its text is the list of them alone.
+        return 0 if stopped else _refuse(f"unknown arguments after --ros-args: {error}")
     except Exception as error:
         # The command line or a parameter file is wrong; rcl has an error class for each.
         return 0 if stopped else _refuse(error)
@@ -118,7 +129,7 @@ def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, sto
     return 0
 
 
-def _refuse(error: Exception) -> int:
+def _refuse(error: Exception | str) -> int:
     sentence = " ".join(str(error).split()) or type(error).__name__
     print(f"{Path(sys.argv[0]).name}: {sentence}", file=sys.stderr, flush=True)
     return 1

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exit statuses of a node's process, whatever signal comes whenever."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -113,6 +114,12 @@ def test_bad_command_line_is_said(start):
     assert "nonsense" in err.splitlines()[-1] and "Traceback" not in err
 
 
+def test_what_ros_does_not_know_is_named(start):
+    status, err = end(start(arguments=("--ros-args", "--nonsense")))
+    assert status == 1
+    assert err.splitlines()[-1] == "-c: unknown arguments after --ros-args: ['--nonsense']"
+
+
 def test_missing_parameter_file_is_said(start):
     status, err = end(start(arguments=("--ros-args", "--params-file", "/nowhere.yaml")))
     assert status == 1
@@ -124,6 +131,17 @@ def test_help_is_printed_and_nothing_is_made(start, word):
     process = start(arguments=(word, "--ros-args", "-p", "nonsense"))
     out, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, out, err) == (0, "it is ready\n", "")
+
+
+def test_help_that_nobody_reads_to_its_end_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-c", PROGRAM % ("pass", "pass"), "--help"]
+    done = subprocess.run(
+        command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=WAIT_S, check=False
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_defect_in_a_callback_shows_its_traceback(start):

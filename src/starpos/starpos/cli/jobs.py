@@ -20,14 +20,14 @@ MOST_JOBS = 1000
 AUTO = "auto"
 
 
-def add_jobs(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `workers_of` reads."""
+def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
+    """Add the options that `workers_of` reads; what: that which is worked."""
     parser.add_argument(
         "-j",
         "--jobs",
         type=_jobs,
         metavar="N|auto",
-        help="work frames on so many processes of this machine (1; auto or 0: one a processor)",
+        help=f"work {what} on so many processes of this machine (1; auto or 0: one a processor)",
     )
     parser.add_argument(
         "--scheduler",
@@ -53,12 +53,12 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     return Here() if number <= 1 else Processes(number)
 
 
-def watched(answers: Iterable, number: int) -> Iterator:
+def watched(answers: Iterable, number: int, what: str = "frame") -> Iterator:
     """The answers as they are, with a progress bar unless standard output shows them on the same terminal."""
     bar = common.ProgressBar()
     for k, answer in enumerate(answers, 1):
         if not sys.stdout.isatty():
-            bar(f"frame {k} of {number}", k / number)
+            bar(f"{what} {k} of {number}", k / number)
         yield answer
 
 

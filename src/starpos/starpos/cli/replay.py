@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starpos.averaging.average import Average
-from starpos.calibration.unknown import unknown_a3
+from starpos.calibration.unknown import BY_PARAMETERS, unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder
 from starpos.cli.solve import NO_FIX, Solved, json_about, json_of, line_of, print_combined
@@ -46,7 +46,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="a parameter of the node solver, such as misalignment_stddev:=5.0; it counts more than the file's",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object a frame instead of a table")
-    jobs.add_jobs(parser)
+    jobs.add_jobs(parser, "bags")
     parser.set_defaults(run=run)
 
 
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     settings = settings_of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace)
     with jobs.workers_of(args, len(args.bags)) as workers:
-        answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags))
+        answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
             tell(args, bag, night, settings.vertical, settings.calibration(None))
             for bag, night in zip(args.bags, answers, strict=True)
@@ -148,10 +148,11 @@ def tell(
             print(line_of(f"{bag} {time}", solution, turning=False), flush=True)
     common.tell_extrapolation("replay", solved)
     if solved:
-        if night.average and (unknown := unknown_a3(calibration, night.average.covariance)):
+        if night.average and (unknown := unknown_a3(calibration, night.average.covariance, BY_PARAMETERS)):
             common.complain("replay", f"{bag}: {unknown}")
         warnings = {warning for s in night.solutions for warning in s.warnings}
         whole = NightFolder((), None, bag if len(args.bags) > 1 else None)
         print_combined(whole, night.average, solved, warnings, args, vertical)
-    common.complain("replay", f"{bag}: {night.trouble or night.summary}")
+    # a trouble names its bag
+    common.complain("replay", night.trouble or f"{bag}: {night.summary}")
     return common.UNREADABLE if night.trouble else 0 if solved else NO_FIX

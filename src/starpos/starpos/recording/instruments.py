@@ -36,6 +36,10 @@ def instrument_in(
             f"{path}: {'neither ' if len(needed) > 1 else 'no '}{names} in it: record stars, tilt and camera/camera_info"
         )
     wanted = "/" + namespace.strip("/") if namespace is not None else able[0]
+    if able == ["/"] and wanted != "/":
+        raise FrameError(
+            f"{path}: the instrument in it has no namespace, not {wanted}: leave --namespace out"
+        )
     if wanted not in able or (namespace is None and len(able) > 1):
         raise FrameError(f"{path}: the instruments in it are {', '.join(able)}: choose one with --namespace")
     return wanted, found[wanted]

@@ -84,6 +84,11 @@ def test_a_file_of_two_instruments_is_read_as_their_nodes_read_it(tmp_path):
         settings_of(path, ())
 
 
+def test_what_to_do_about_an_unknown_misalignment_is_said_in_parameters(capsys):
+    status, _, errors = run(capsys, NIGHT)
+    assert status == 0 and "set self_calibration:=true" in errors and "--misalignment" not in errors
+
+
 def test_two_processes_say_the_same(capsys, told, tmp_path):
     shutil.copytree(NIGHT, tmp_path / "another")
     bags = NIGHT, tmp_path / "another"
@@ -103,7 +108,10 @@ def test_a_parameter_that_is_given_counts_more_than_the_files(capsys, told):
         (("-p", "min_stars"), "write NAME:=VALUE"),
         (("-p", "calibration_url:=/nowhere.yaml"), "/nowhere.yaml"),
         (("--params-file", "/nowhere.yaml"), "not a readable parameter file"),
-        (("--namespace", "rover"), "the instruments in it are /"),
+        (
+            ("--namespace", "rover"),
+            "the instrument in it has no namespace, not /rover: leave --namespace out",
+        ),
     ],
 )
 def test_a_bad_call_is_one_line(capsys, words, said):
@@ -113,4 +121,5 @@ def test_a_bad_call_is_one_line(capsys, words, said):
 
 def test_one_broken_bag_does_not_stop_the_others(capsys, told, tmp_path):
     status, lines, errors = run(capsys, tmp_path / "none", NIGHT, *told)
-    assert status == 2 and len(lines) > 10 and "there is no such bag" in errors
+    assert status == 2 and len(lines) > 10
+    assert f"starpos replay: {tmp_path / 'none'}: there is no such bag" in errors

@@ -63,12 +63,12 @@ def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="replay",
-        description="Play a rosbag2 (a folder, or one .mcap or .db3 file) into the running graph, with /clock from "
-        "the time it was recorded at: start the nodes with -p use_sim_time:=true.",
+        description="Play a rosbag2 into the running graph, with /clock from the time it was recorded at: start the "
+        "nodes with -p use_sim_time:=true.",
         epilog="Exit status: 0 played, 1 cut short, or frames of which none was answered, 2 a bad call or a bag that "
         "cannot be read.",
     )
-    parser.add_argument("bag", type=Path, metavar="BAG")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="its folder, or one .mcap or .db3 file")
     parser.add_argument(
         "--rate",
         type=_rate,
