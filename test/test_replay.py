@@ -19,9 +19,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from starpos_bringup.recording.bag_writer import offered_qos
-from starpos_interfaces.msg import Solution
+from starpos_interfaces.msg import Solution, StarArray
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import photograph
+from starpos_testing.patience import WAIT_S
 
 NIGHT = Path(__file__).parent / "data" / "night"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -38,6 +39,23 @@ def test_a_replay_that_nobody_hears_says_so(graph, run):  # before there is an i
     assert replay.wait() == 1
     assert "13 frames, 0 answers, 0 fixes" in replay.output, replay.output
     assert "nobody subscribes to" in replay.output and "/stars" in replay.output, replay.output
+
+
+def test_a_replay_that_only_strangers_hear_says_so(graph, run):
+    heard = [
+        graph.node.create_subscription(kind, name, lambda message: None, 10)
+        for kind, name in ((StarArray, "/stars"), (Clock, "/clock"))
+    ]
+    replay = run(
+        "starpos_bringup",
+        "replay",
+        arguments=(str(NIGHT), "--topics", "/stars", "--rate", "0", "--wait", str(WAIT_S)),
+    )
+    assert replay.wait() == 1, replay.output
+    assert "10 frames, 0 answers, 0 fixes" in replay.output
+    assert "do not say what they take: start detector and solver with use_sim_time" in replay.output
+    for subscription in heard:
+        graph.node.destroy_subscription(subscription)
 
 
 @pytest.fixture(scope="module")

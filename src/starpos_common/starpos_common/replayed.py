@@ -32,8 +32,8 @@ class Replayed:
     """Holds back the messages of a replay until it is their turn.
 
     takes: what takes the messages of a topic, by its relative name.
-    makes: the publishers, the first that of what comes of a frame; count it in `made` and `fixes`.
-    busy: whether the node still works on what it has taken; call `go_on` when it does no more.
+    makes: the node's publishers, first that of what it makes of a frame; the node counts this in `made` and `fixes`.
+    busy: whether the node still works on what it has taken; it calls `go_on` when that is done.
     end: called when no more messages come.
     """
 
@@ -115,7 +115,7 @@ class Replayed:
         return True
 
     def _of(self, turn: Played) -> tuple[Any, Mapping[str, Any]] | None:
-        """The message of a turn, if it has come."""
+        """The message whose turn it is, if it has come."""
         held = self._held.get(turn.topic, deque())
         for k, (message, _) in enumerate(held):
             if message.header.stamp == turn.stamp:

@@ -245,7 +245,7 @@ def _agreeing(
 
 
 def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray) -> np.ndarray:
-    """Indices of the frames without those that pull the fit of all towards them, and hide in the scatter that this makes.
+    """Indices of the frames without outliers that pull the fit of all towards them, and so seem to agree with it.
 
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
     Few poses fit almost anything; then these are all.
@@ -269,7 +269,7 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3
 
 
 def _left(whole: Readings, plumb: PlumbLine) -> np.ndarray:
-    """What a plumb line leaves (K, 3) of readings, in S, whether it was fitted to them or not."""
+    """Residuals (K, 3) in S of readings against a plumb line, whether it was fitted to them or not."""
     return whole.plumb - np.einsum("ij,kjl,l->ki", plumb.a3, whole.to_camera, plumb.zenith)
 
 

@@ -12,7 +12,7 @@ from starpos.errors import FrameError, TiltError
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path; None of a camera that is its own level.  folder: None if the frames were named one by one.
+    tilt: absolute path; None for a camera that is fixed to the ground.  folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
@@ -21,7 +21,7 @@ class NightFolder:
 
 
 def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> list[NightFolder | FrameError]:
-    """One night from frames and a table, or without one of a camera that is its own level.
+    """One night from frames and a table, or without one for a camera that is fixed to the ground.
 
     Else a night for each folder, or the error why it is none.
 

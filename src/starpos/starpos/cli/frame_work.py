@@ -164,7 +164,7 @@ class IdentifyingBlind:
 class Solving:
     """Work of `solve`: the Solution of a frame.
 
-    tilt: absolute path of the table; None of a camera that is its own level.
+    tilt: absolute path of the table; None for a camera that is fixed to the ground.
     """
 
     read: Reader

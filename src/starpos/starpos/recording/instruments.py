@@ -20,7 +20,7 @@ INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
 def instrument_in(
     bag: BagReader, path: Path, namespace: str | None, topics: Mapping[str, str], needed: Collection[str]
 ) -> "tuple[str, Sequence[Connection]]":
-    """Namespace and connections of the instrument; raises FrameError if it is not there or one of several.
+    """Find namespace and connections of an instrument; FrameError if there is none, or several and none is named.
 
     topics: types by relative names.  needed: types of which one has to be there, with a message.
     """

@@ -26,7 +26,7 @@ class Answered:
 
 @dataclass(frozen=True)
 class Averaged:
-    """The average that a frame is part of, with the stamp of its message."""
+    """The average after a frame was added to it, with the stamp of that frame's message."""
 
     stamp: Any
     place: Average

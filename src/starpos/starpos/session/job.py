@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work of several seconds that others wait for: what it gives, who runs it, and one who runs it when told to."""
+"""Jobs of several seconds: what comes of one, the interface of who runs them, and a runner without a thread."""
 
 import traceback
 from collections.abc import Callable, Generator

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whom a session tells what it says and what it hears."""
+"""What a session needs from whoever drives it: a log for its sentences, and an account of its messages."""
 
 from typing import Protocol
 

@@ -232,14 +232,14 @@ class SolverSession:
             self.instrument.go_on_to(self._waiting[0].stars.mid_unix_s)
             if not self._ready(self._waiting[0], now):
                 break
-            # After a stall those are of the frame.
+            # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
                 self._take_tilt(message, sent, now)
             made += self._solve(self._dated(self._waiting.popleft(), now), now)
         return made
 
     def _dated(self, frame: Waiting, now: Now) -> Waiting:
-        """The frame with how far it is ahead of a clock that is played, which may have been heard only after it."""
+        """Correct how far a frame is ahead of a played clock, whose tick may have been heard only after the frame."""
         if not now.played:
             return frame
         return replace(frame, ahead_s=min(now.ahead_s(frame.stars.mid_unix_s), frame.ahead_s))
@@ -250,7 +250,7 @@ class SolverSession:
         if math.isnan(frame.since_s):
             frame = self._waiting[0] = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
-        # less than none: the clock has begun anew
+        # a negative wait: the clock has begun anew
         if mid is None or self._ended or waited_s > self._values["tilt_timeout"] or waited_s < 0:
             return True
         if self.instrument.solver is None:

@@ -126,7 +126,7 @@ class TiltBuffer:
             self._steps.append((sample.utc_unix_s, sample.theta - before.theta, variance))
 
     def _excess(self, end_unix_s: float) -> float:
-        """Noise over the stated one of the samples until the end of an exposure: later ones are there by chance."""
+        """Measured noise over the stated one, by samples up to the exposure's end: it is chance how many came since."""
         steps = [(step, variance) for t, step, variance in self._steps if t <= end_unix_s]
         if not steps or len({len(step) for step, _ in steps}) > 1:
             return 1.0

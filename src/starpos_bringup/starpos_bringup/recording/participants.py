@@ -18,7 +18,7 @@ LOST_S = 30.0
 
 
 class _Participant:
-    """A node: its last words, when they came, since when it has taken nothing new, and what it had made before."""
+    """A node: its newest Taken and when that came, since when it has taken nothing new, and its first Taken."""
 
     def __init__(self, words: Taken) -> None:
         self.before = words
@@ -35,7 +35,7 @@ class _Participant:
 
 
 class Participants:
-    """Tells them what is played, and knows what each has taken.
+    """Tells the nodes that take part what is played, and keeps what each has taken.
 
     say: takes a sentence for the person at the terminal.
     """
@@ -75,7 +75,7 @@ class Participants:
         return [p for p in self._present if topic in p.words.takes]
 
     def made_of(self, topic: str) -> list[tuple[str, int]]:
-        """The topics on which others publish what they make of this one's messages, and how many so far."""
+        """The topics made from this one (stars from images), each with how many messages have been published so far."""
         return [(p.words.makes[0], p.words.made) for p in self.taking(topic)]
 
     def answers(self, topic: str) -> tuple[int, int]:

@@ -34,7 +34,7 @@ FOUND_S = 10.0
 class Player:
     """Publishes the topics of a bag, and has the nodes that take part take them one after another.
 
-    frames: of those that were published, or made of others, how many a solver could answer.
+    frames: how many frames a solver could answer: those that were played, and star lists made from played images.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Player:
         return bool(makers) and any(map(self._participants.taking, solvers))
 
     def _all_found(self) -> bool:
-        """Whether all whom the graph knows to listen, and who can, do."""
+        """Whether each subscription that the graph shows, and whose QoS fits, is matched."""
         return self._participants.all_here() and all(
             p.get_subscription_count() >= self._could_hear(name, p) for name, p in self._publishers.items()
         )
@@ -174,7 +174,7 @@ class Player:
         self._progress()
 
     def _agree(self, topic: Topic, stamp: Any, before: list[tuple[str, int]]) -> bool:
-        """Have those who take part take a message, and what they make of it; return whether they made something."""
+        """Wait until the nodes have taken a message, and then what they made of it; return whether they made anything."""
         frame = topic.type_name in (STARS, IMAGE)
         answer = frame or self.count % BURST == 0
         self._tell(topic.name, stamp, answer)
@@ -197,7 +197,7 @@ class Player:
         self._participants.tell(Played.MESSAGE, self._now_ns, topic, stamp, answer=answer)
 
     def _taken(self, at_most_s: float | None = None) -> None:
-        """Wait until all is taken that was told; whoever hangs is given up by then."""
+        """Wait until the nodes have taken all that was played; one that hangs is given up, which ends the wait."""
         while not self._participants.have_taken_all() and not self._stopped:
             if not self._spin(at_most_s or 1.0, self._participants.have_taken_all) and at_most_s:
                 return
