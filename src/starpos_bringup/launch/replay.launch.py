@@ -27,6 +27,13 @@ MOST_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
 
 
+def over(event, context):
+    """End everything with the bag; a replay that failed makes launch's exit status 1."""
+    if event.returncode:
+        raise LaunchError(f"the replay ended with exit status {event.returncode}: it says why above")
+    return Shutdown(reason="the bag is played")
+
+
 def nodes(context):
     told = given(context, ARGUMENTS)
     rate = number(told, "rate", 0, MOST_RATE)
@@ -48,7 +55,7 @@ def nodes(context):
             "replay",
             common,
             arguments=player,
-            on_exit=Shutdown(reason="the bag is played"),
+            on_exit=over,
         )
     )
     return processes

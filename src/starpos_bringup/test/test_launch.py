@@ -226,8 +226,16 @@ def test_a_process_that_is_killed_is_started_again_where_that_is_asked_for(run):
     ctrl_c(process)
 
 
+def test_a_replay_that_fails_is_no_success_of_launch(run, tmp_path):
+    process = run("replay", f"bag:={tmp_path}", "rate:=0")
+    out, _ = process.communicate(timeout=WAIT_S)
+    assert process.returncode == 1 and "the replay ended with exit status 2" in out, out
+
+
 @pytest.mark.skipif(not NIGHT.is_dir(), reason="no bag beside the package")
 def test_a_replay_ends_with_its_bag(run):
-    out, _ = run("replay", f"bag:={NIGHT}", "rate:=0").communicate(timeout=WAIT_S)
+    process = run("replay", f"bag:={NIGHT}", "rate:=0")
+    out, _ = process.communicate(timeout=WAIT_S)
+    assert process.returncode == 0, out
     assert "fixes are coming" in out and "messages in" in out, out
     assert "Traceback" not in out and "has died" not in out
