@@ -55,6 +55,14 @@ def test_every_link_and_every_tool_that_is_named_is_there(document):
         assert any((folder / tool).exists() for folder in (ROOT, document.parent, *PACKAGES)), tool
 
 
+def test_the_readme_names_every_folder_of_starpos():
+    section = (
+        (ROOT / "README.md").read_text().split("## Building it, changing it\n", 1)[1].split("\n## ", 1)[0]
+    )
+    folders = {p.parent.name for p in MODULES["starpos"].glob("*/__init__.py")}
+    assert folders and {name for name in folders if f"`{name}`" not in section} == set()
+
+
 def test_every_parameter_is_in_its_packages_readme():
     nodes = yaml.safe_load((ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml").read_text())
     for name, node in nodes.items():
