@@ -15,6 +15,7 @@ from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
+from starpos.fix.horizon import check_above_horizon
 from starpos.fix.pointing import IDEAL, pointing_fix
 from starpos.fix.unidentified import why_unidentified
 from starpos.fix.unmoved import check_unmoved
@@ -262,7 +263,7 @@ class Solver:
             fix = pointing_fix(
                 pointing, camera, tilt, self.instrument.mounting, self.atmosphere, state, clock_s
             )
-            check_unmoved(fix, self.instrument, clock_s)
+            self._check(fix, clock_s)
         except StarposError as e:
             return _failure(pointing, e)
         return replace(
@@ -300,8 +301,13 @@ class Solver:
             stars.stamp_stddev_s,
             self.shutter(stars),
         )
-        check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
+        self._check(fix, self.clock_stddev_s(stars))
         return replace(fix, used=np.flatnonzero(use)[fix.used])
+
+    def _check(self, fix: Fix, clock_stddev_s: float) -> None:
+        """Raise FixError if the instrument cannot have stood as a fix has it."""
+        check_above_horizon(fix, self.instrument.calibration)
+        check_unmoved(fix, self.instrument, clock_stddev_s)
 
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
         """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""
