@@ -209,7 +209,7 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:
         return full, full.fx
     _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion"))
     for side in ("width", "height"):
-        if not isinstance(camera.get(side), int) or not 1 <= camera[side] <= LARGEST_SIDE:
+        if type(camera.get(side)) is not int or not 1 <= camera[side] <= LARGEST_SIDE:
             raise InstrumentError(
                 f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
             )
@@ -291,7 +291,10 @@ def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
 
 def _number(mapping: dict, key: str) -> float:
     try:
-        # float also reads 1e-3, which YAML takes for text
+        # float would make 1 of true, which YAML also reads from yes and on
+        if isinstance(mapping[key], bool):
+            raise TypeError
+        # and it reads 1e-3, which YAML takes for text
         return float(mapping[key])
     except KeyError:
         raise InstrumentError(f"{key} is missing: give a number") from None

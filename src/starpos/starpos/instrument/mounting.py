@@ -23,7 +23,8 @@ class Mounting:
     calibrated_unix_s         time of the calibration; NaN: unknown, then the covariance includes the drift until now
     calibrated_temperature_c  temperature of the inclinometer then; NaN: unknown
     calibrated_tilt           its two or three angles then, rad; an error of its response grows with the distance from
-    them response                  (m,) coefficients of its response that were found, or none
+                              them
+    response                  (m,) coefficients of its response that were found, or none
     response_covariance       (m, m) of these
     """
 

@@ -131,6 +131,8 @@ REFUSED = {
     "a frame of terapixels": (FULL.replace("1392", "1" + "0" * 12), "width"),
     "a number beyond floats": (SIMPLE.replace("600", "0x" + "f" * 5000), "focal_mm is a number beyond"),
     "no noise at all": (SIMPLE + "tilt_noise_deg: 0\n", "tilt_noise_deg) is 0 deg: must be positive"),
+    "yes for the noise": (SIMPLE + "tilt_noise_deg: yes\n", "tilt_noise_deg is True: give a number"),
+    "true for an angle": (SIMPLE + "misalignment_deg: [0, true, 0]\n", "is True: give a number"),
     "a list for the noise": (SIMPLE + "tilt_noise_deg: [1]\n", "tilt_noise_deg is [1]: give a number"),
     "one error": (
         SIMPLE + "calibration_stddev_arcsec: 5\n",
