@@ -17,8 +17,9 @@ def check_above_horizon(fix: Fix, calibration: Calibration) -> None:
     if calibration.unknown or np.cos(fix.zenith_distance) >= MIN_COS_ZENITH:
         return
     altitude_deg = 90 - np.degrees(fix.zenith_distance)
+    side = "above" if altitude_deg > 0 else "below"
+    least_deg = np.degrees(np.arcsin(MIN_COS_ZENITH))
     raise FixError(
-        f"by the tilts and A3 the camera looks {abs(altitude_deg):.1f} deg {'above' if altitude_deg > 0 else 'below'} the "
-        f"horizon, and stars tell a place from {np.degrees(np.arcsin(MIN_COS_ZENITH)):.0f} deg above it: check the signs "
-        "and the order of the inclinometer's axes, and A3"
+        f"by the tilts and A3 the camera looks {abs(altitude_deg):.1f} deg {side} the horizon, and stars tell a place "
+        f"from {least_deg:.0f} deg above it: check the signs and the order of the inclinometer's axes, and A3"
     )

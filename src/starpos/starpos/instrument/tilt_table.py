@@ -16,7 +16,7 @@ import numpy as np
 from starpos.errors import TiltError
 from starpos.files import open_regular
 from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, elevations
-from starpos.instrument.tilt_log import BRACKET_S, TiltLog
+from starpos.instrument.tilt_log import BRACKET_S, OUTLIER_SIGMA, TiltLog
 
 # A week at 10 Hz.
 MAX_CSV_BYTES = 300_000_000
@@ -30,12 +30,18 @@ CURE = (
 # a cell, but a line's first, that holds nothing
 EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
 # a column's name so much like one that is read may be meant for it
-ALIKE = 0.7
+ALIKE_NAME = 0.7
 # no angle is less certain, and still one
 MOST_SIGMA_DEG = 45.0
 # Readings alternate where, of three in a row, the outer two are nearer to each other than two neighbours in so large a
 # share. Of white noise it is a half, and so many sigma above it less than once in 10^7 tables.
 ALTERNATING, ALTERNATING_SIGMA = 0.75, 6.0
+# Readings that leap to another tilt and back within BRACKET_S: so many sigma of noise, and steps of the readings, are a
+# leap. So many leaps, of one size but for a few, and so large a share of the readings are no wild ones. Sizes are one
+# within their noise, or that share.
+LEAP_SIGMA, LEAP_STEPS, FEWEST_LEAPS, ONE_SIZE, LEAPING, ALIKE_SIZE = 12.0, 3.0, 5, 0.8, 0.03, 0.1
+# a quarter of a Gaussian's deviations are below so many sigma
+QUARTER = 0.3186
 
 
 def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
@@ -62,7 +68,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
             f"{path}: a tilt table needs the columns {', '.join(NEEDED)} and at least one row: {CURE}"
         )
     for name in set(names) - {*NEEDED, *OPTIONAL}:
-        for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE):
+        for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE_NAME):
             raise TiltError(
                 f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise"
             )
@@ -124,6 +130,8 @@ def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray], rows: np.nda
         seen = "its times go back into those that it already holds"
     elif _alternate(column["utc_unix_s"][in_time], angles):
         seen = "its readings alternate between two tilts"
+    elif any(_leaps(column["utc_unix_s"][in_time], axis) for axis in angles.T):
+        seen = "its readings leap to another tilt and back"
     else:
         return
     raise TiltError(f"{path}: {seen}, as if it had the readings of two inclinometers: give the table of one")
@@ -142,6 +150,30 @@ def _alternate(t: np.ndarray, angles: np.ndarray) -> bool:
     told = more + less
     beyond_chance = more - less > ALTERNATING_SIGMA * np.sqrt(told)
     return bool((beyond_chance & (more > ALTERNATING * told)).any())
+
+
+def _leaps(t: np.ndarray, angle: np.ndarray) -> bool:
+    """Whether readings (N,) of an axis, in the order of their times t (N,), leap to another tilt and back time and again.
+
+    So do those of two sensors of which one is read more often; a mount does not go there and back so quickly.
+    """
+    known = np.isfinite(angle)
+    t, angle = t[known], angle[known]
+    step, near = np.diff(angle), np.diff(t) <= BRACKET_S
+    if len(step) < FEWEST_LEAPS:
+        return False
+    # of readings that alternate, those of one sensor are two apart
+    apart = [np.quantile(np.abs(angle[lag:] - angle[:-lag]), 0.25) for lag in (1, 2, 3)]
+    noise = min(apart) / QUARTER / np.sqrt(2)
+    quantum = np.diff(np.unique(angle)).min(initial=np.inf)
+    leaps = np.flatnonzero(near & (np.abs(step) > max(LEAP_SIGMA * noise, LEAP_STEPS * quantum)))
+    there, back = step[leaps[:-1]], step[leaps[1:]]
+    alike = np.maximum(OUTLIER_SIGMA * np.sqrt(2) * noise, ALIKE_SIZE * np.abs(there))
+    returns = (np.abs(there + back) <= alike) & (t[leaps[1:]] - t[leaps[:-1] + 1] <= BRACKET_S)
+    size = np.abs(there[returns])
+    if len(size) < max(FEWEST_LEAPS, LEAPING * len(step)):
+        return False
+    return bool(np.mean(np.abs(size - np.median(size)) <= alike[returns]) >= ONE_SIZE)
 
 
 def _first_line(error: Exception) -> str:

@@ -13,7 +13,7 @@ from starpos.instrument.instrument import Calibration
 
 
 def upside_down(tilt):
-    """The same tilt as a sensor with three axes has it whose Z' points downwards."""
+    """A tilt as a sensor with three axes has it whose Z' points downwards."""
     third = -np.arcsin(np.sqrt(1 - np.sin(tilt.theta) @ np.sin(tilt.theta)))
     return Tilt(tilt.theta_x, tilt.theta_y, tilt.covariance, utc_unix_s=tilt.utc_unix_s, theta_z=third)
 
