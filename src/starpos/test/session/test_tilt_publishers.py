@@ -36,6 +36,15 @@ def test_two_publishers_are_seen_within_two_messages_of_each(frames, begin, ofte
     assert "stop all but one" in publishers.several
 
 
+@pytest.mark.parametrize("frames", [("s", "other"), ("s", "s")])
+def test_two_publishers_that_send_seldom_are_seen(frames):
+    """Each is silent for longer than a second before the other sends."""
+    messages = [(frames[k % 2], 1 + k // 2, 1.3 * k) for k in range(20)]
+    assert all(heard(messages[:k]).several for k in range(5, 20))
+    alone = [(frames[0], 11 + k, 26 + 2.6 * k) for k in range(5)]
+    assert not heard([*messages, *alone]).several
+
+
 def test_a_frame_that_changes_is_another_inclinometer():
     assert "'a' and 'b'" in heard([("a", 1, 0.0), ("b", 2, 0.1)]).several
 
@@ -52,6 +61,9 @@ def test_a_publisher_that_was_restarted_is_trusted_after_a_second():
     assert heard([*before, ("a", 1, 10.0)]).several
     assert not heard([*before, *(("a", 1 + n, 10.0 + 0.1 * n) for n in range(12))]).several
     assert not heard([*before, ("a", 1, 12.0)]).several
+    # its numbers pass those that it had before
+    again = [("a", 1 + n, 10.0 + 0.05 * n) for n in range(150)]
+    assert not any(heard([*before, *again[:n]]).several for n in range(60, 150))
 
 
 def test_a_middleware_that_numbers_nothing_tells_frames_apart():
