@@ -20,6 +20,8 @@ SCA100T_NOISE_RAD = np.radians(0.0035)  # of one 10 Hz sample, 1 sigma: the pape
 # less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose) by less than LEAST_SQUARE
 SQUARE, LEAST_SQUARE = 0.1, 0.01
 SQUARE_SIGMA = 5.0
+# what the stated errors explain of it
+EXPLAINED_SIGMA = 3.0
 # no inclinometer measures at a higher temperature
 MOST_CELSIUS = 300.0
 # one vertical axis: L's X, which lies below S's X', is taken below Y' instead
@@ -150,6 +152,28 @@ class InclinometerErrors:
         """Raise TiltError if three axes contradict each other by more than the sensor's errors make possible."""
         if tilt.axes == 2:
             return
+        off, sigma = self._off_square(tilt)
+        most = min(SQUARE, LEAST_SQUARE + SQUARE_SIGMA * sigma)
+        if abs(off) > most:
+            angles = ", ".join(f"{angle:.3f}" for angle in np.degrees(tilt.theta))
+            raise TiltError(
+                f"tilts of {angles} deg contradict each other: the squares of their sines add up to {1 + off:.4f}, not "
+                f"to 1 within the {most:.4f} that the inclinometer's stated errors make possible: check it, or name its "
+                "model"
+            )
+
+    def contradiction(self, tilt: Tilt) -> float:
+        """Error of each axis' sine by which three axes contradict each other beyond the stated errors; 0 of two axes.
+
+        A sum of squares tells the error along gravity alone; those across it are taken to be as large.
+        """
+        if tilt.axes == 2:
+            return 0.0
+        off, sigma = self._off_square(tilt)
+        return max(abs(off) - EXPLAINED_SIGMA * sigma, 0.0) / 2
+
+    def _off_square(self, tilt: Tilt) -> tuple[float, float]:
+        """By how much the squares of the sines of three axes do not add up to 1, and the stated sigma of that."""
         sines = np.sin(tilt.theta)
         squares = sines**2
         # each axis shows a share of the other two
@@ -161,15 +185,7 @@ class InclinometerErrors:
             + self.scale**2 * (squares @ squares)
             + self.cross**2 * cross
         )
-        most = min(SQUARE, LEAST_SQUARE + 2 * SQUARE_SIGMA * float(np.sqrt(variance)))
-        off = float(squares.sum()) - 1
-        if abs(off) > most:
-            angles = ", ".join(f"{angle:.3f}" for angle in np.degrees(tilt.theta))
-            raise TiltError(
-                f"tilts of {angles} deg contradict each other: the squares of their sines add up to {1 + off:.4f}, not "
-                f"to 1 within the {most:.4f} that the inclinometer's stated errors make possible: check it, or name its "
-                "model"
-            )
+        return float(squares.sum()) - 1, 2 * float(np.sqrt(variance))
 
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.

@@ -8,7 +8,10 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, up_of
-from starpos.instrument.response import response_columns, stated_variances
+from starpos.instrument.response import angles_at, response_columns, stated_variances
+
+# an error of its sine is none of the angle of a vertical axis
+LEAST_COSINE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +47,18 @@ class Mounting:
         return up_of(np.asarray(self.calibrated_tilt))
 
     def response_at(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
-        """Change (3, m) of up for each coefficient of the response at a tilt, and their covariance (m, m)."""
-        columns = response_columns(tilt.theta, self.calibrated_up)
+        """Change (3, m) of up for each coefficient of the response at a tilt, and their covariance (m, m).
+
+        Zeros that nobody found are as wrong as the axes contradict each other.
+        """
         if not self.response:
-            return columns, np.diag(stated_variances(self.inclinometer, tilt.axes))
+            # of three axes those that agree, as the calibration's do: so nothing counts at its lean
+            theta = angles_at(tilt.up, tilt.axes)
+            variances = stated_variances(self.inclinometer, tilt.axes)
+            wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), LEAST_COSINE)
+            variances[: tilt.axes] += wrong**2
+            return response_columns(theta, self.calibrated_up), np.diag(variances)
+        columns = response_columns(tilt.theta, self.calibrated_up)
         if columns.shape[1] != len(self.response):
             raise InstrumentError(
                 f"the calibration's response has {len(self.response)} coefficients, and a tilt of {tilt.axes} axes needs "
