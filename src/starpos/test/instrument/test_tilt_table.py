@@ -47,7 +47,7 @@ def test_two_inclinometers_of_which_one_is_read_more_often_are_refused(tmp_path,
 
 
 def test_wild_readings_and_turns_are_of_one_inclinometer(tmp_path, rng):
-    """Also many that are wild, a few that are wild alike, and a mount that goes to and fro."""
+    """Also many that are wild, a few that are wild alike, and a mount that goes there and back."""
     t = 1000 + 0.1 * np.arange(1000)
     x, y = rng.normal(0, 0.0035, (2, 1000))
     wild, alike = rng.random(1000) < 0.1, np.arange(1000) % 50 == 7
