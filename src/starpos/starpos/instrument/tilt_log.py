@@ -141,9 +141,9 @@ class TiltLog:
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
 
-        Two readings of the same time count once. A reading far from the others is left out. If they scatter more than
-        stated (wind, footsteps), the covariance is larger. TiltError if the readings do not cover the exposure, the
-        instrument moved, or the sensor was stuck.
+        Two readings of the same time count once. A reading far from the others is left out; two that follow each other
+        and agree are of a turn. If the readings scatter more than stated (wind, footsteps), the covariance is larger.
+        TiltError if they do not cover the exposure, the instrument moved, or the sensor was stuck.
 
         spread_s: the whole width in which the middle may lie, where a clock counts in whole seconds; then readings within
         it stand for the exposure, if all of them agree.
@@ -209,7 +209,11 @@ class TiltLog:
         noise = self.excess * np.sqrt(self.variance[use].mean())
         from_middle = np.abs(theta - np.median(theta, axis=0))
         spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
-        if spread.max() > REST * noise:
+        sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)
+        wild = np.flatnonzero(~sane)
+        # wild readings differ from each other; neighbours that agree are of another lean
+        turned = any(self._agree(use[k], use[k + 1]) for k in wild[:-1] if not sane[k + 1])
+        if turned or spread.max() > REST * noise:
             # angles that cannot be, as in another unit, scatter as well
             _check_possible(theta[from_middle.max(1).argmin()])
             raise TiltError(
@@ -217,7 +221,6 @@ class TiltLog:
                 "the instrument was not at rest, or its inclinometer has more noise than the "
                 f"{np.degrees(noise):.2g} deg that are stated"
             )
-        sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)
         theta, use = theta[sane], use[sane]
         n = len(use)
         variance = self.variance[use].mean(0) * self.excess**2

@@ -164,6 +164,15 @@ def test_an_instrument_that_moves_during_the_exposure():
         log(np.linspace(0, 5, 11)).average(1000.5, 1.0)
 
 
+@pytest.mark.parametrize("late", [2, 3, 5, 7, 8])
+@pytest.mark.parametrize("step_deg", [0.06, 1.0])
+def test_a_turn_before_or_after_the_middle_of_the_exposure_is_no_wild_reading(rng, late, step_deg):
+    """However few readings are of the other lean, if two are that follow each other."""
+    readings = log(1 + step_deg * (np.arange(10) >= 10 - late) + rng.normal(0, 0.0035, 10))
+    with pytest.raises(TiltError, match="not at rest"):
+        readings.average(1000.45, 0.98)
+
+
 def test_noise_beyond_the_stated_and_angles_that_cannot_be_are_named_as_such(rng):
     noisy = log(3 + rng.normal(0, 1, 60))
     with pytest.raises(
