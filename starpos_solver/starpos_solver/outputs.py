@@ -72,7 +72,7 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     """Make the Solution message with everything known about one frame."""
     message = msg.Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
-    message.ids = list(answer.names)
+    message.ids, message.warnings = list(answer.names), list(answer.warnings)
     message.indices = [] if answer.star is None else answer.star.tolist()
     message.magnitudes = [] if answer.magnitudes is None else answer.magnitudes.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s

@@ -92,6 +92,13 @@ def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
     )
 
 
+def test_what_is_suspicious_about_the_identification_is_named():
+    answer = answer_facing(0.0)
+    suspicious = replace(answer, status=Status.POOR_FIT, fix=None, warnings=("two_skies", "unexplained"))
+    assert outputs.solution(Header(), suspicious, None).warnings == ["two_skies", "unexplained"]
+    assert outputs.solution(Header(), answer, ground_of(answer.fix, EXACT)).warnings == []
+
+
 def test_rates_and_accelerations_are_declared_unmeasured():
     answer = answer_facing(10.0)
     message = outputs.imu(Header(), answer.fix, ground_of(answer.fix, EXACT))

@@ -87,7 +87,17 @@ starpos_interfaces/Star[] stars
 FIRST = {"Tilt": FIRST_TILT, "Capture": FIRST_CAPTURE, "StarArray": FIRST_STARS}
 
 
-class FirstReleaseBag(NightBag):
+class NoWarningsBag(NightBag):
+    """Writes a bag as of before Solution had `warnings`."""
+
+    def __init__(self, path):
+        super().__init__(path)
+        kind = "starpos_interfaces/msg/Solution"
+        constants, fields = self.store.fielddefs.pop(kind)
+        self.store.register({kind: (constants, [f for f in fields if f[0] != "warnings"])})
+
+
+class FirstReleaseBag(NoWarningsBag):
     """Writes a bag as the first release did, whose Tilt had no third axis, and which knew of no shutter."""
 
     def __init__(self, path):
@@ -95,6 +105,21 @@ class FirstReleaseBag(NightBag):
         for name, text in FIRST.items():
             del self.store.fielddefs[f"starpos_interfaces/msg/{name}"]
             self.store.register(get_types_from_msg(text, f"starpos_interfaces/msg/{name}"))
+
+
+@pytest.mark.parametrize("kind", [NoWarningsBag, NightBag])
+def test_solutions_that_knew_of_no_warnings_are_played_without_any(tmp_path, kind):
+    from rclpy.serialization import deserialize_message
+
+    with kind(tmp_path / "night") as bag:
+        tilt = bag.message("Tilt", 1000.5, x=0.1, z=0.75, z_variance=1e-9)
+        bag.write("solver/solution", bag.message("Solution", 1001.0, tilt=tilt, ids=["a"], status=7), 1001.0)
+    with Bag(tmp_path / "night") as bag:
+        topics = bag.topics(None, left_out=pytest.fail)
+        [(topic, _, data)] = bag.messages(topics)
+    solved = deserialize_message(data, topic.kind)
+    assert (solved.status, solved.ids, solved.warnings) == (7, ["a"], [])
+    assert (solved.tilt.x, solved.tilt.z, solved.tilt.z_variance) == (0.1, 0.75, 1e-9)
 
 
 @pytest.mark.parametrize("frame_id", ["", "s", "starpos_inclinometer_frame"])
@@ -122,6 +147,7 @@ def test_tilts_and_solutions_of_the_first_release_are_played_as_those_of_two_axe
         assert got.header.frame_id == frame_id and got.covariance.tolist() == [1e-9, 0, 0, 2e-9]
         assert math.isnan(got.z) and math.isnan(got.z_variance)
     assert (solved.tilt_samples, solved.ids, solved.xi, solved.fix_seconds) == (3, ids, 4.0, 0.25)
+    assert solved.warnings == []
     assert [(t.name, t.east, t.common) for t in solved.budget] == [("tilt", 1.5, True)]
 
 

@@ -17,8 +17,8 @@ from starpos_interfaces.msg import Solution, Tilt
 
 # Most letters of a text from outside.
 NAME_LETTERS, SENTENCE_LETTERS = 80, 300
-# Most terms of an error budget.
-TERMS = 16
+# Most terms of an error budget, and warnings of an identification.
+TERMS, WARNINGS = 16, 4
 STALE, ERROR = 3, 2  # levels of DiagnosticStatus
 # By so much the length of a quaternion may differ from 1.
 UNIT = 1e-3
@@ -119,6 +119,7 @@ def solution(message: Solution) -> dict:
         "stars_detected": int(message.stars_detected),
         "stars_matched": int(message.stars_matched),
         "residual": number(message.residual),
+        "warnings": [text(w, NAME_LETTERS) for w in message.warnings[:WARNINGS]],
         "budget": terms,
         "stamp": stamp_to_unix(message.header.stamp),
     }

@@ -50,10 +50,14 @@ def tilt(x_deg=12.0, y_deg=-6.0, sigma_deg=0.0035, flags=0) -> Tilt:
     )
 
 
-def solution(status=Solution.OK, sentence="21 stars fit") -> Solution:
+def solution(status=Solution.OK, sentence="21 stars fit", warnings=()) -> Solution:
     good = status == Solution.OK
     message = Solution(
-        status=status, status_text=sentence, stars_detected=41, stars_matched=21 if good else 0
+        status=status,
+        status_text=sentence,
+        stars_detected=41,
+        stars_matched=21 if good else 0,
+        warnings=warnings,
     )
     message.residual = 0.83 if good else NAN
     if good:

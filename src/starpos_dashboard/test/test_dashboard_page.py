@@ -65,6 +65,16 @@ def test_the_bubble_is_at_its_place_and_red_where_a_flag_is_set(page):
     assert page.run("return document.querySelector('#bubble-dot.out') !== null")
 
 
+def test_what_is_suspicious_about_an_identification_is_named(page):
+    page.shows(warnings="")
+    page.instrument.works(
+        solver__solution=said.solution(
+            Solution.POOR_FIT, "two skies in one frame", ["two_skies", "unexplained"]
+        )
+    )
+    page.shows(warnings="identification: two_skies, unexplained")
+
+
 def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_text(page):
     def spoken():
         seen = [lamp for lamp in page.run(LAMPS) if ":" in lamp[0]]

@@ -69,6 +69,7 @@ class Shot:
     utc_unix_s: NaN if unknown.  size: of the frame in px.  tilt: in rad.
     xy, residual_px (M, 2): seen places of the stars of its fix, and these minus the fitted ones.
     camera_to_itrs (3, 3): attitude against the Earth by the stars alone.
+    warnings: what is suspicious about its identification, as `Solution.warnings`.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Shot:
     identify_s: float = float("nan")
     fix_s: float = float("nan")
     camera_to_itrs: np.ndarray | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

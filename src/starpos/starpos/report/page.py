@@ -136,6 +136,9 @@ def _summary(night: Night) -> str:
     for why in failed:
         first = next(s for s in night.shots if s.place is None and s.status.value == why)
         rows.append((f"First &lsquo;{escape(why)}&rsquo;", escape(first.message)))
+    warned = Counter(warning for s in night.shots for warning in s.warnings)
+    if warned:
+        rows.append(("Warnings", ", ".join(f"{n} {escape(what)}" for what, n in sorted(warned.items()))))
     times = [s.utc_unix_s for s in night.shots if np.isfinite(s.utc_unix_s)]
     if times:
         rows.append(("From, to", f"{escape(utc_text(min(times)))}, {escape(utc_text(max(times)))}"))

@@ -95,6 +95,8 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
         tilt=(_finite(m.tilt.x), _finite(m.tilt.y)) if m.tilt_samples else NO_TILT,
         identify_s=_finite(m.identify_seconds),
         fix_s=_finite(m.fix_seconds),
+        # older bags do not have it
+        warnings=tuple(getattr(m, "warnings", ())),
     )
 
 

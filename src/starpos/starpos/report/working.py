@@ -174,6 +174,7 @@ def _shot(exposure: StarList, s: Solution) -> Shot:
         identify_s=s.identify_s,
         fix_s=s.fix_s,
         residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+        warnings=s.warnings,
     )
     if isinstance(stars, Stars) and s.star is not None and s.magnitudes is not None:
         shot = replace(shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes)

@@ -22,7 +22,7 @@ from starpos_testing.skies.bags import NightBag, typestore
 
 RECORDED = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 FOCAL_PX = 29.67e3 / 6.4
-NOT_IDENTIFIED = 2
+NOT_IDENTIFIED, POOR_FIT = 2, 7
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +136,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
         for stars, one in zip(lists, said, strict=True):
             bag.solution(stars.mid_unix_s, one)
         bag.failure(lists[-1].mid_unix_s + 5.0, NOT_IDENTIFIED, "none of the sky fits <its> stars")
+        bag.failure(lists[-1].mid_unix_s + 6.0, POOR_FIT, "two skies", warnings=["two_skies"])
     status, page, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
     assert status == 0
     latitude, longitude = (np.mean([one[k] for one in said]) for k in ("latitude", "longitude"))
@@ -144,7 +145,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
     ground = [np.mean([one[f"{k}_geodetic"] for one in said]) for k in ("latitude", "longitude")]
     assert "{:+.6f}°, {:+.6f}° ±".format(*ground) in page.text
     assert "as the solver recorded it" in page.text and "none of the sky fits <its> stars" in page.text
-    assert "7: 6 with a fix, 1 not identified" in page.text
+    assert "8: 6 with a fix, 1 not identified, 1 poor fit" in page.text and "1 two_skies" in page.text
     assert any("upper bound" in line for line in errors)
     assert {"Each frame with its own tilt", "Scatter of the fixes", "Error budget", "Frame by frame"} == set(
         page.pictures

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.errors import BagError
 from starpos.recording.bag import BagReader
-from starpos_bringup.recording.first_release import FirstRelease
+from starpos_bringup.recording.older_types import OlderTypes
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -23,14 +23,14 @@ LAST_NS = (2**31 - 1) * 10**9
 class Topic:
     """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too.
 
-    old: its messages are of a type as the first release had it, and are upgraded.
+    older: hash of its type, if that is one of an earlier version: its messages are upgraded; '' for the type of today.
     """
 
     name: str
     kind: type
     type_name: str
     latched: bool
-    old: bool
+    older: str
 
 
 class Bag:
@@ -39,7 +39,7 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._reader = BagReader(path)
-        self._first_release = FirstRelease()
+        self._older = OlderTypes()
 
     def __enter__(self) -> "Bag":
         self._reader.__enter__()
@@ -73,7 +73,7 @@ class Bag:
             if c.topic == "/clock" or (wanted and c.topic not in wanted):
                 continue
             try:
-                topics[c.id] = _topic(c, self._first_release)
+                topics[c.id] = _topic(c, self._older)
             except BagError as error:
                 left_out(f"{self.path}: {c.topic!r} is left out: {error}")
         if not topics:
@@ -89,10 +89,14 @@ class Bag:
                     f"{self.path}: a message of {connection.topic} was logged at {log_ns} ns, no time until 2038"
                 )
             topic = topics[connection.id]
-            yield topic, log_ns, self._first_release.upgraded(data, topic.type_name) if topic.old else data
+            yield (
+                topic,
+                log_ns,
+                self._older.upgraded(data, topic.type_name, topic.older) if topic.older else data,
+            )
 
 
-def _topic(connection: "Connection", first_release: FirstRelease) -> Topic:
+def _topic(connection: "Connection", older: OlderTypes) -> Topic:
     """Make the topic of a connection; raises BagError if its type is not installed here, or differs."""
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.validate_full_topic_name import validate_full_topic_name
@@ -104,14 +108,14 @@ def _topic(connection: "Connection", first_release: FirstRelease) -> Topic:
     kind = _message_class(connection.msgtype)
     known = _type_hash(connection.msgtype)
     differs = connection.digest.startswith("RIHS01_") and bool(known) and connection.digest != known
-    old = differs and first_release.knows(connection.msgtype, connection.digest)
-    if differs and not old:
+    known_then = differs and older.knows(connection.msgtype, connection.digest)
+    if differs and not known_then:
         raise BagError(
             f"its {connection.msgtype} differs from the one installed here: use the version it was recorded with"
         )
     durabilities = [q.durability.name for q in getattr(connection.ext, "offered_qos_profiles", ())]
     latched = bool(durabilities) and all(name == "TRANSIENT_LOCAL" for name in durabilities)
-    return Topic(connection.topic, kind, connection.msgtype, latched, old)
+    return Topic(connection.topic, kind, connection.msgtype, latched, connection.digest if known_then else "")
 
 
 def _message_class(name: str) -> type:

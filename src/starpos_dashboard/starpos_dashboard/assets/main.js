@@ -136,6 +136,7 @@ function showTime() {
   say("fix-age", !last ? text.UNKNOWN : age < -AHEAD_S ? `${text.age(-age)} ahead` : text.age(age));
   say("stars", solution ? `${solution.stars_matched} of ${solution.stars_detected}` : text.UNKNOWN);
   say("residual", solution?.residual != null ? `${solution.residual.toFixed(2)}″` : text.UNKNOWN);
+  say("warnings", solution?.warnings.length ? `identification: ${solution.warnings.join(", ")}` : "");
 }
 
 function showHeading() {

@@ -110,10 +110,15 @@ class NightBag:
         made = self.message("Solution", unix_s, budget=terms, residual=solved["residual_arcsec"], **given)
         self.write("solver/solution", made, unix_s)
 
-    def failure(self, unix_s, status, text):
+    def failure(self, unix_s, status, text, **more):
         """Write a Solution without a fix."""
         nothing = np.full(9, np.nan)
-        about = {"status": status, "status_text": text, "covariance": nothing, "covariance_geodetic": nothing}
+        about = {
+            "status": status,
+            "status_text": text,
+            "covariance": nothing,
+            "covariance_geodetic": nothing,
+        } | more
         nan = dict.fromkeys(("latitude", "longitude", "heading", "right_ascension", "residual"), float("nan"))
         self.write("solver/solution", self.message("Solution", unix_s, **about, **nan), unix_s)
 
