@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos import table_cache
 from starpos.cli.common import ProgressBar
 from starpos.cli.montecarlo import looking
 from starpos.fix.solver import Solver
-from starpos.identification import table_cache
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.simulation import montecarlo_fields

@@ -27,6 +27,7 @@ from starpos.identification import Identification, PointingPrior, Sky, identify_
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
+from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 
 # the first rounds have coarse matches and fit few terms: with more, wrong matches in the corners would confirm themselves
@@ -68,6 +69,7 @@ def calibrate_camera(
                 f"{stars.source}: the frame is {stars.width} x {stars.height} px but the first or the instrument has "
                 f"{given.width} x {given.height}: give frames of one size"
             )
+    catalogue = deeper.for_field(catalogue, given, progress)
     table = triangle_cache.cached(catalogue, given.half_diagonal_rad, progress)
     skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
     camera, before = given, 0

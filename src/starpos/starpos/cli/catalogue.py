@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos catalogue`: shows and builds the catalogues of stars and triangles."""
+"""`starpos catalogue`: shows, builds and deepens the catalogues of stars and triangles."""
 
 import argparse
 import sys
@@ -10,11 +10,16 @@ import numpy as np
 from starpos.cli import common
 from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
-from starpos.sky import catalogue
+from starpos.sky import catalogue, deeper
+from starpos.table_cache import cache_folder
 
 ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source package tycho2:
     apt-get source --download-only tycho2        (with a deb-src line in the apt sources)
 which brings tycho2_2.orig.tar.xz; give that archive, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat."""
+
+DEEPER = """The catalogue that comes with starpos goes to V = 11. Fields that hold too few of its stars take
+the deeper one (70 MB in the cache) by themselves. Where STARPOS_TYCHO2 names the original files, it
+is built as soon as a field needs it."""
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -37,6 +42,14 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
     )
     build.set_defaults(run=build_file)
+    deepen = kinds.add_parser(
+        "deepen",
+        help="keep all stars of Tycho-2's original files in the cache, for small fields",
+        epilog=f"{ORIGINALS}\n\n{DEEPER}",
+    )
+    deepen.formatter_class = argparse.RawDescriptionHelpFormatter
+    deepen.add_argument("originals", metavar="ORIGINALS", help="folder or archive of the original files")
+    deepen.set_defaults(run=keep_deeper)
     triangle = kinds.add_parser("triangles", help="the catalogue of triangles of a field; the paper's")
     triangle.add_argument("--paper", action="store_true", help="count the paper's triangles again instead")
     common.add_optics(triangle)
@@ -58,6 +71,13 @@ def show(args: argparse.Namespace) -> int:
             break
         inside = v < limit
         print(f"   {limit:7.1f} {inside.sum():9d}   {np.median(sigma_mas[inside]):6.0f} mas")
+    if args.path is None:
+        more = deeper.kept()
+        print(
+            "no deeper catalogue in the cache: small fields want one (`starpos catalogue deepen --help`)"
+            if more is None
+            else f"{len(more)} stars of the deeper catalogue are in the cache, for small fields"
+        )
     print("Tycho-2: Hog et al. 2000, A&A 355, L27; distributed by Debian under the 2-clause BSD licence")
     return 0
 
@@ -73,6 +93,15 @@ def build_file(args: argparse.Namespace) -> int:
         raise CatalogueError(f"{args.out}: cannot be written ({e.strerror}): give another --out") from None
     size = Path(args.out).stat().st_size / 1e6
     print(f"{args.out}: {len(made)} stars with V < {args.limit_mag:g}, {size:.1f} MB", file=sys.stderr)
+    return 0
+
+
+def keep_deeper(args: argparse.Namespace) -> int:
+    """Build the deeper catalogue from the original files into the cache; raises CatalogueError."""
+    made = deeper.build(args.originals, common.ProgressBar(), anew=True)
+    print(
+        f"{len(made)} stars are kept in {cache_folder()}: small fields take them from now on", file=sys.stderr
+    )
     return 0
 
 
@@ -112,8 +141,11 @@ def show_field(camera: Camera) -> int:
     from starpos.identification import triangle_cache
     from starpos.instrument.instrument import Instrument
 
-    c = catalogue.load_catalogue()
-    Solver(Instrument(camera.fx), c, progress=common.ProgressBar()).prepare(camera.width, camera.height)
+    progress = common.ProgressBar()
+    Solver(Instrument(camera.fx), catalogue.load_catalogue(), progress=progress).prepare(
+        camera.width, camera.height
+    )
+    c = deeper.for_field(catalogue.load_catalogue(), camera)
     table = triangle_cache.cached(c, camera.half_diagonal_rad)
     used = np.unique(table.corners)
     size = sum(getattr(table, column).nbytes for column in table.__dataclass_fields__) / 1e6

@@ -367,17 +367,26 @@ def tell_extrapolation(command: str, solved: Sequence[HasFix]) -> None:
 
 
 UNREADABLE = 2  # exit status
+# s between lines of progress
+LINE_EVERY_S = 5.0
 
 
 class ProgressBar:
-    """A bar on standard error for work of more than half a second; silent if that is no terminal."""
+    """Progress on standard error: a bar for work of more than half a second, or lines now and then if it is no terminal.
 
-    def __init__(self) -> None:
-        self.begin = time.monotonic()
+    terminal_only: no such lines, for work whose results show how far it is.
+    """
+
+    def __init__(self, *, terminal_only: bool = False) -> None:
+        self.begin = self.said = time.monotonic()
         self.shown = False
+        self._terminal_only = terminal_only
 
     def __call__(self, what: str, done: float) -> None:
-        if not sys.stderr.isatty() or (time.monotonic() - self.begin < 0.5 and not self.shown):
+        if not sys.stderr.isatty():
+            self._say(what, done)
+            return
+        if time.monotonic() - self.begin < 0.5 and not self.shown:
             return
         self.shown = True
         filled = int(30 * min(done, 1.0))
@@ -388,3 +397,9 @@ class ProgressBar:
             file=sys.stderr,
             flush=True,
         )
+
+    def _say(self, what: str, done: float) -> None:
+        now = time.monotonic()
+        if not self._terminal_only and now - self.said > LINE_EVERY_S:
+            self.said = now
+            print(f"{what}: {100 * done:.0f} % done", file=sys.stderr, flush=True)

@@ -24,7 +24,6 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.identification.blind import STAGES
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
@@ -142,18 +141,13 @@ class Identifying:
 
 @dataclass(frozen=True)
 class IdentifyingBlind:
-    """Work of `identify` without a focal length: the Solution of a frame, and the CPU time in ms.
-
-    quick: only the search that mostly finds the scale.
-    """
+    """Work of `identify` without a focal length: the Solution of a frame, and the CPU time in ms."""
 
     read: Reader
-    quick: bool = False
 
     def __call__(self, path: str) -> tuple[Solution, float]:
         item = self.read(path)
-        stages = STAGES[:1] if self.quick else STAGES
-        solver = BlindSolver(catalogue.load_catalogue(), stages=stages)
+        solver = BlindSolver(catalogue.load_catalogue())
         solver.prepare()
         begin = time.process_time()
         answer = solver.identify(stars_of(item))

@@ -2,16 +2,15 @@
 """`starpos identify`: where frames look, from their stars alone."""
 
 import argparse
-from contextlib import suppress
 
 import numpy as np
 
 from starpos.cli import common, jobs
-from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, Reader, reader_of
-from starpos.errors import FrameError, StarposError
+from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, reader_of
+from starpos.cli.what_fits import say_what_would_fit
+from starpos.errors import FrameError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solver import Solution, Status
-from starpos.identification import quad_cache
 from starpos.sky.catalogue import load_catalogue
 
 
@@ -37,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         elif about is not None:
             instrument = common.instrument_of(args, about)
             work = Identifying(read, instrument)
-            jobs.prepare(instrument, about)
+            jobs.prepare("identify", instrument, about)
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
@@ -56,22 +55,8 @@ def run(args: argparse.Namespace) -> int:
             else:
                 print(_line(path, found), flush=True)
     if lost is not None and not any_found and isinstance(work, Identifying):
-        _say_what_would_fit(read, lost)
+        say_what_would_fit("identify", read, work.instrument, lost)
     return common.UNREADABLE if unreadable else 0 if any_found else 1
-
-
-def _say_what_would_fit(read: Reader, path: str) -> None:
-    """Say the focal length at which a frame is identified that was not with the given one, if it is quickly found."""
-    if not quad_cache.is_built(load_catalogue()):
-        return
-    with suppress(StarposError):
-        found, _ = IdentifyingBlind(read, quick=True)(path)
-        if found.attitude is not None:
-            focal_px = found.attitude.focal_px
-            common.complain(
-                "identify",
-                f"{path}: a focal length of {focal_px:.0f} px fits: give that one",
-            )
 
 
 def as_json(path: str, s: Solution) -> dict:

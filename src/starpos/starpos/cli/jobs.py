@@ -55,16 +55,17 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
 
 def watched(answers: Iterable, number: int, what: str = "frame") -> Iterator:
     """The answers as they are, with a progress bar unless standard output shows them on the same terminal."""
-    bar = common.ProgressBar()
+    bar = common.ProgressBar(terminal_only=True)
     for k, answer in enumerate(answers, 1):
         if not sys.stdout.isatty():
             bar(f"{what} {k} of {number}", k / number)
         yield answer
 
 
-def prepare(instrument: Instrument, about: About) -> None:
-    """Put the triangles into the cache, where all processes of a machine find them."""
+def prepare(command: str, instrument: Instrument, about: About) -> None:
+    """Put the tables of a field into the cache, where all processes of a machine find them; says what it lacks."""
     solver = Solver(instrument, catalogue.load_catalogue(), progress=common.ProgressBar())
     # the frames report the error
     with suppress(StarposError):
-        solver.prepare(about.width, about.height)
+        if thin := solver.prepare(about.width, about.height):
+            common.complain(command, thin)

@@ -17,7 +17,7 @@ from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.simulation import montecarlo_fields
-from starpos.sky import catalogue
+from starpos.sky import catalogue, deeper
 from starpos.sky.catalogue import Catalogue
 
 # % identified of 1000 fields with so many false stars, and of fields of so many stars
@@ -84,7 +84,8 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    stars, camera = catalogue.load_catalogue(), common.camera_of(args)
+    camera = common.camera_of(args)
+    stars = deeper.for_field(catalogue.load_catalogue(), camera, common.ProgressBar())
     conditions = _conditions(args, stars, camera)
     solver = Solver(Instrument(camera.fx), stars, progress=common.ProgressBar())
     solver.prepare(camera.width, camera.height)

@@ -2,8 +2,9 @@
 """`starpos solve`: position and heading from frames with their tilts, for each frame and for all together."""
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of, tilts
+from starpos.cli.what_fits import say_what_would_fit
 from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
@@ -123,7 +125,12 @@ def run(args: argparse.Namespace) -> int:
             if args.self_calibrate:
                 rows = _turned(args, plan, list(rows))
             known = None if plan.solver is None or args.self_calibrate else plan.solver.instrument.calibration
-            statuses.append(tell(args, plan.night, rows, vertical, known))
+            fits = (
+                None
+                if plan.solver is None
+                else partial(say_what_would_fit, "solve", read, plan.solver.instrument)
+            )
+            statuses.append(tell(args, plan.night, rows, vertical, known, fits))
     return max(statuses)
 
 
@@ -141,7 +148,7 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
         return Plan(night, Listing(read))
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
     table = None if night.tilt is None else tilts(night.tilt, instrument.inclinometer.noise_rad)
-    jobs.prepare(instrument, about)
+    jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=common.ProgressBar())
     return Plan(
         night,
@@ -157,16 +164,22 @@ def tell(
     rows: Iterable,
     vertical: Vertical,
     calibration: Calibration | None = None,
+    fits: Callable[[str], None] | None = None,
 ) -> int:
-    """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status."""
+    """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status.
+
+    fits: says which focal length fits a frame that was not identified.
+    """
     solved: list[Solved] = []
     warnings: set[str] = set()
-    unreadable = False
+    unreadable, lost = False, ""
     for path, answer in rows:
         if isinstance(answer, FrameError):
             unreadable = True
             answer = Solution(Status.BAD_INPUT, str(answer), source=path, utc_unix_s=None, stars_detected=0)
         warnings |= set(answer.warnings)
+        if answer.status is Status.NOT_IDENTIFIED:
+            lost = lost or path
         if answer.fix:
             solved.append(Solved.of(answer, answer.fix))
         else:
@@ -175,6 +188,8 @@ def tell(
             common.print_json({"file": path} | json_of(answer.fix, vertical) | json_about(answer))
         else:
             print(line_of(path, answer, args.self_calibrate), flush=True)
+    if lost and not solved and fits is not None:
+        fits(lost)
     common.tell_extrapolation("solve", solved)
     together = _combine(night, solved)
     if solved:

@@ -36,11 +36,12 @@ from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.rotation import full_turn
+from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
 
 ENOUGH_SOUND = 8
-SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.5, 100.0
+SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
 # Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
 # not identified, nor are the bright stars there that should be.
 TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
@@ -120,7 +121,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class Solver:
-    """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone."""
+    """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone.
+
+    catalogue: or the deeper one in its stead, for a field that needs it.
+    """
 
     instrument: Instrument
     catalogue: Catalogue
@@ -128,9 +132,14 @@ class Solver:
     min_stars: int = 5
     progress: Progress = quiet
 
-    def prepare(self, width: int, height: int) -> None:
-        """Load the triangles for frames of this size in px, or build them; raises StarposError."""
-        Sky(self.catalogue, self._view(width, height)[1]).load()
+    def prepare(self, width: int, height: int) -> str:
+        """Load the tables for frames of this size in px, or build them; raises StarposError.
+
+        Returns what such a field lacks in the catalogue, as `too_thin` says it, '' if nothing.
+        """
+        camera, catalogue, triangles = self.view(width, height)
+        Sky(catalogue, triangles).load()
+        return deeper.too_thin(catalogue, camera)
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars and pointing of the camera.  Stars without a time: J2000 places, no aberration."""
@@ -138,14 +147,14 @@ class Solver:
             return _for_all(stars, inside, self.identify(stars.take(inside)))
         begin = time.perf_counter()
         try:
-            camera, triangles = self._view(stars.width, stars.height)
-            sky = Sky.at(self.catalogue, triangles, stars.mid_unix_s)
+            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field = frame_stars(directions_of(camera, stars), mean_sigma(stars.covariance), camera)
             found = identify_frame(field, sky)
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
-            return replace(self._unidentified(stars, camera), identify_s=time.perf_counter() - begin)
+            return replace(_unidentified(stars, camera, sky), identify_s=time.perf_counter() - begin)
         warnings, explained = judged(stars, field, sky, found)
         return Solution(
             Status.OK,
@@ -153,9 +162,9 @@ class Solver:
             source=stars.source,
             utc_unix_s=stars.mid_unix_s,
             stars_detected=len(stars),
-            names=tuple(self.catalogue.names(found.catalogue)),
+            names=tuple(catalogue.names(found.catalogue)),
             star=found.star,
-            magnitudes=self.catalogue.vmag(found.catalogue),
+            magnitudes=catalogue.vmag(found.catalogue),
             attitude=attitude_of(found, sky, camera),
             identify_s=time.perf_counter() - begin,
             warnings=warnings,
@@ -178,24 +187,24 @@ class Solver:
             return _for_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
         try:
             state, tilt = self.levelled(stars, tilt)
-            camera, triangles = self._view(stars.width, stars.height)
+            camera, catalogue, triangles = self.view(stars.width, stars.height)
             mounting = self.instrument.mounting
             g = level_of(mounting.up(tilt)) @ mounting.a3
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             priors = hint.priors(state, g[2]) if hint else ()
-            sky = Sky(self.catalogue, triangles, state.year, tuple(state.velocity))
+            sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = frame_stars(directions, mean_sigma(stars.covariance), camera)
             found = identify_frame(field, sky, priors)
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
             return replace(
-                self._unidentified(stars, camera), tilt=tilt, identify_s=time.perf_counter() - begin
+                _unidentified(stars, camera, sky), tilt=tilt, identify_s=time.perf_counter() - begin
             )
         warnings, explained = judged(stars, field, sky, found)
         identified = time.perf_counter()
-        names, magnitudes = self.catalogue.names(found.catalogue), self.catalogue.vmag(found.catalogue)
+        names, magnitudes = catalogue.names(found.catalogue), catalogue.vmag(found.catalogue)
         solution = replace(
             Solution.failed(stars, Status.OK, "fix"),
             attitude=attitude_of(found, sky, camera),
@@ -219,7 +228,7 @@ class Solver:
                     f"detections are stars of the sky found, and only {explained.seen} of the {explained.due} brightest "
                     "stars there are detected: look at the frame"
                 )
-            fix = self._fix(stars, found, camera, tilt, state)
+            fix = self._fix(stars, found, camera, tilt, state, sky.catalogue)
         except StarposError as e:
             return replace(solution, status=status_of(stars, e), message=str(e))
         return replace(
@@ -274,7 +283,15 @@ class Solver:
             extrapolated_days=state.orientation.extrapolated_days,
         )
 
-    def _fix(self, stars: Stars, found: Identification, camera: Camera, tilt: Tilt, state: EarthState) -> Fix:
+    def _fix(
+        self,
+        stars: Stars,
+        found: Identification,
+        camera: Camera,
+        tilt: Tilt,
+        state: EarthState,
+        catalogue: Catalogue,
+    ) -> Fix:
         if len(found.star) < self.min_stars:
             raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
         if found.mirrored:
@@ -286,8 +303,8 @@ class Solver:
         matched = MatchedStars(
             np.stack([stars.x, stars.y], -1)[star],
             stars.covariance[star],
-            self.catalogue.directions(index, state.year),
-            np.hypot(self.catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
+            catalogue.directions(index, state.year),
+            np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
             index,
         )
         fix = solve_fix(
@@ -318,12 +335,12 @@ class Solver:
         return self.instrument.shutter or stars.shutter or UNKNOWN
 
     @cached_property
-    def _views(self) -> dict[tuple[int, int], tuple[Camera, TriangleCatalogue]]:
-        """What `_view` has given last, by size."""
+    def _views(self) -> dict[tuple[int, int], tuple[Camera, Catalogue, TriangleCatalogue]]:
+        """What `view` has given last, by size."""
         return {}
 
-    def _view(self, width: int, height: int) -> tuple[Camera, TriangleCatalogue]:
-        """The camera for frames of this size in px and the triangles for its field; raises StarposError."""
+    def view(self, width: int, height: int) -> tuple[Camera, Catalogue, TriangleCatalogue]:
+        """The camera for frames of this size in px, the catalogue for its field and its triangles; raises StarposError."""
         if (width, height) not in self._views:
             camera = self.instrument.camera_for(width, height)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
@@ -332,15 +349,17 @@ class Solver:
                     f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
                     f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size"
                 )
-            triangles = triangle_cache.cached(self.catalogue, camera.half_diagonal_rad, self.progress)
+            catalogue = deeper.for_field(self.catalogue, camera, self.progress)
+            triangles = triangle_cache.cached(catalogue, camera.half_diagonal_rad, self.progress)
             # one size is usual
             self._views.clear()
-            self._views[width, height] = camera, triangles
+            self._views[width, height] = camera, catalogue, triangles
         return self._views[width, height]
 
-    def _unidentified(self, stars: Stars, camera: Camera) -> Solution:
-        status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
-        return Solution.failed(stars, status, why_unidentified(stars, camera, self.catalogue))
+
+def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
+    status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
+    return Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
 
 
 def _inside(stars: Stars) -> np.ndarray | None:

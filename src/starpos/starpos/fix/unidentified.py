@@ -6,12 +6,11 @@ import numpy as np
 from starpos.frames.stars import SATURATED, Stars
 from starpos.identification import FEWEST_STARS
 from starpos.instrument.camera import Camera
+from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 
 # Images wider than this (FWHM, px) are out of focus, or the frame has more pixels than its lens resolves.
 WIDE_PX = 8.0
-# A frame should hold so many of the catalogue's stars on average: then few parts of the sky have too few.
-ENOUGH_ON_FRAME = 10
 # If so many of the brightest detections are saturated, their order of brightness may be wrong.
 BRIGHTEST, MANY = 20, 0.5
 
@@ -31,17 +30,8 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
         )
         return f"{stars.place}: {found}, at least {FEWEST_STARS} are needed: {focus}"
     causes = []
-    on_frame = mean_on_frame(camera, catalogue)
-    if on_frame < ENOUGH_ON_FRAME:
-        width, height = (
-            np.degrees(2 * np.arctan(n_px / (2 * f)))
-            for n_px, f in ((camera.width, camera.fx), (camera.height, camera.fy))
-        )
-        faintest = catalogue.vmag_centi.max() / 100
-        causes.append(
-            f"a field of {width:.2g} x {height:.2g} deg holds only {on_frame:.1f} stars of the catalogue "
-            f"(V < {faintest:.1f}) on average: make a deeper one (`starpos catalogue build --help`)"
-        )
+    if thin := deeper.too_thin(catalogue, camera):
+        causes.append(thin)
     if wide:
         causes.append(f"its stars are {stars.fwhm_px:.0f} px wide (FWHM): focus, or bin the pixels")
     if np.mean(saturated[:BRIGHTEST]) >= MANY:
@@ -51,12 +41,3 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
         )
     causes.append(f"check the focal length ({camera.fx:.0f} px given, 3 % is allowed), clouds and exposure")
     return f"{stars.place}: none of the sky fits its {n} stars: {'; '.join(causes)}"
-
-
-def mean_on_frame(camera: Camera, catalogue: Catalogue) -> float:
-    """How many stars of the catalogue a frame of this camera holds, averaged over the sky."""
-    u, v = (np.arange(-20, 21) / 20 * n / 2 for n in (camera.width / camera.fx, camera.height / camera.fy))
-    # the solid angle of a pinhole's pixel falls with the cube of the cosine
-    share = np.mean((1 + u[:, None] ** 2 + v**2) ** -1.5)
-    solid_angle = camera.width / camera.fx * camera.height / camera.fy * share
-    return float(len(catalogue) * solid_angle / (4 * np.pi))

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from starpos.identification import quads
 from starpos.identification.quads import QuadCatalogue
-from starpos.identification.table_cache import cache_folder, load_or_build, mapped, rising
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
+from starpos.table_cache import cache_folder, load_or_build, mapped, rising
 
 # Name of the folder in the cache; the number is that of the format.
 PREFIX = "quads-1-"

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from starpos.identification import triangles
-from starpos.identification.table_cache import cache_folder, load_or_build, mapped, rising
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import CELLS, ZONES
+from starpos.table_cache import cache_folder, load_or_build, mapped, rising
 
 # Names of folders in the cache; the number is that of the format.
-PREFIX = "triangles-9-"
+PREFIX = "triangles-10-"
 MOST_IN_USE = 4
 
 
@@ -43,11 +43,10 @@ def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progres
     settings = (
         catalogue.fingerprint,
         half_diagonal,
-        triangles.CIRCLES,
+        triangles.affordable(half_diagonal),
         triangles.POOL_PER_CIRCLE,
         triangles.BEACONS,
         triangles.SHORTEST_SIDE,
-        triangles.MAX_TRIANGLES,
     )
     digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
     folder = cache_folder() / f"{PREFIX}{np.degrees(2 * half_diagonal):.2f}deg-{digest}"

@@ -35,8 +35,10 @@ BEACONS = 0.25
 # Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
 # first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
-# Limit, counted before duplicates of overlapping circles are removed.
-MAX_TRIANGLES = 6_000_000
+# Limits, counted before duplicates of overlapping circles are removed. Beyond the first one there are no larger circles,
+# beyond the second one down to FEWEST_TAKEN stars are taken of the smallest, and one less beyond twice as many triangles:
+# the table of a field of 0.3 deg has 600 MB.
+MAX_TRIANGLES, MOST_TRIANGLES, FEWEST_TAKEN = 9_000_000, 16_000_000, 5
 
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
@@ -124,10 +126,11 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     beacon = np.sort(brightest_first[: int(BEACONS * len(pool))])
     apart = brightest_first[well_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
     keys = []
-    for k, (radius, spacing, most) in enumerate(_affordable(half_diagonal)):
+    taken = affordable(half_diagonal)
+    for k, (radius, spacing, most) in enumerate(taken):
         centres = spread_points(circle_count(radius * half_diagonal, spacing))
         keys.append(triples_of_circles(v[apart], centres, radius * half_diagonal, most))
-        progress("star triangles", (k + 1) / (len(CIRCLES) + 1))
+        progress("star triangles", (k + 1) / (len(taken) + 1))
     longest = 2 * half_diagonal
     corners, counter_clockwise, shape, bin_start = binned(
         v, apart.astype(np.int32), _distinct(keys), SHORTEST_SIDE * longest, longest, int(np.prod(BINS))
@@ -160,13 +163,23 @@ def well_apart(v: np.ndarray, nearest: float) -> np.ndarray:
     return np.flatnonzero(alone)
 
 
-def _affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
-    """CIRCLES with fewer stars where a small field would exceed MAX_TRIANGLES."""
-    taken = [most for _, _, most in CIRCLES]
-    circles = np.array([circle_count(radius * half_diagonal, spacing) for radius, spacing, _ in CIRCLES])
-    while (made := circles * [comb(n, 3) for n in taken]).sum() > MAX_TRIANGLES:
-        taken[int(made.argmax())] -= 1
-    return [(radius, spacing, n) for (radius, spacing, _), n in zip(CIRCLES, taken, strict=True)]
+def affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
+    """CIRCLES that a field can afford; a small one without the larger ones, whose triangles seldom fit on a frame."""
+    taken = list(CIRCLES)
+    while len(taken) > 1 and _made(taken, half_diagonal) > MAX_TRIANGLES:
+        taken.pop()
+    radius, spacing, most = taken[0]
+    while _made(taken, half_diagonal) > MOST_TRIANGLES and most > FEWEST_TAKEN:
+        most -= 1
+        taken[0] = radius, spacing, most
+    if _made(taken, half_diagonal) > 2 * MOST_TRIANGLES:
+        taken[0] = radius, spacing, FEWEST_TAKEN - 1
+    return taken
+
+
+def _made(taken: list[tuple[float, float, int]], half_diagonal: float) -> int:
+    """How many triangles circles make over the whole sky, before duplicates are removed."""
+    return sum(circle_count(radius * half_diagonal, spacing) * comb(n, 3) for radius, spacing, n in taken)
 
 
 def _distinct(keys: list[np.ndarray]) -> np.ndarray:

@@ -7,14 +7,14 @@ from importlib import metadata
 from pathlib import Path
 
 import starpos
-from starpos.sky import catalogue
+from starpos.sky import catalogue, deeper
 
 Same = dict[str, str]  # version by name
 
 
 @lru_cache(maxsize=1)
 def same_here() -> Same:
-    """Versions of starpos, its catalogue and the Earth orientation tables in this process."""
+    """Versions of starpos, its catalogues and the Earth orientation tables in this process."""
     root = Path(starpos.__file__).parent
     digest = hashlib.sha256()
     for source in sorted(root.rglob("*.py")):
@@ -22,6 +22,7 @@ def same_here() -> Same:
     return {
         "starpos": f"{starpos.__version__} ({digest.hexdigest()[:8]})",
         "star catalogue": catalogue.load_catalogue().fingerprint,
+        "deeper catalogue": "none" if (more := deeper.kept()) is None else more.fingerprint,
         "astropy-iers-data": metadata.version("astropy-iers-data"),
     }
 

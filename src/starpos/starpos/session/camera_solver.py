@@ -16,7 +16,8 @@ class CameraSolver:
     """Keeps the camera that frames are of, and makes its Solver as a job when it changes.
 
     make: makes the Solver for a camera with the present parameters and calibration; it may raise a StarposError.
-    changed: called when the camera is another one.  say: takes a sentence about why there is no Solver.
+    changed: called when the camera is another one.  say: takes a sentence about why there is no Solver, or what the
+    catalogue lacks for it.
     topic: full name of the topic of the camera's intrinsics.
     """
 
@@ -87,10 +88,9 @@ class CameraSolver:
     def _prepare(self, camera: Camera) -> None:
         """Prepare the triangles of this field as a job, because building them takes seconds."""
 
-        def work() -> Solver:
+        def work() -> tuple[Solver, str]:
             solver = self._make(camera)
-            solver.prepare(camera.width, camera.height)
-            return solver
+            return solver, solver.prepare(camera.width, camera.height)
 
         self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
 
@@ -99,9 +99,9 @@ class CameraSolver:
             # Another camera_info has come meanwhile.
             self._prepare(self.camera)
             return
-        self.solver, self.trouble = made.value, made.trouble
-        if self.trouble:
-            self._say(self.trouble)
-        else:
+        (self.solver, thin), self.trouble = made.value or (None, ""), made.trouble
+        if self.trouble or thin:
+            self._say(self.trouble or thin)
+        if self.solver is not None:
             # The parameters may have changed meanwhile.
             self.remake()

@@ -8,7 +8,7 @@ import sys
 import pytest
 from cli_calls import WIDE
 
-from starpos.cli import COMMANDS
+from starpos.cli import COMMANDS, common
 from starpos_testing.command_line import run
 from starpos_testing.patience import WAIT_S
 
@@ -71,7 +71,7 @@ def test_python_m_starpos(tmp_path):
 
 
 def starpos(*args, **environment):
-    """A whole process: its exit status and its lines of standard error."""
+    """A whole process: its exit status and its lines of standard error but those of progress."""
     done = subprocess.run(
         [sys.executable, "-m", "starpos", *map(str, args)],
         env={**os.environ, **environment},
@@ -80,7 +80,7 @@ def starpos(*args, **environment):
         timeout=300,
         check=False,
     )
-    return done.returncode, done.stderr.splitlines()
+    return done.returncode, [line for line in done.stderr.splitlines() if not line.endswith("% done")]
 
 
 def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_path):
@@ -112,3 +112,10 @@ def test_a_reader_that_goes_away_is_no_error(lists):
     process.stdout.close()
     _, errors = process.communicate(timeout=WAIT_S)
     assert errors == b""
+
+
+def test_progress_is_told_where_no_terminal_is(capsys, monkeypatch):
+    monkeypatch.setattr(common, "LINE_EVERY_S", -1.0)
+    common.ProgressBar()("star triangles", 0.25)
+    common.ProgressBar(terminal_only=True)("frame 1 of 4", 0.25)
+    assert capsys.readouterr().err == "star triangles: 25 % done\n"

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The focal length at which a frame is identified that was not with the given one."""
+
+from starpos.errors import StarposError
+from starpos.fix.solver import Solver
+from starpos.frames.stars import Stars
+from starpos.identification import FEWEST_STARS, Sky, identify_directions
+
+# Each try bears an error of 3 %; so many are made on either side.
+STEP, TRIES = 1.055, 6
+
+
+def focal_that_fits(solver: Solver, stars: Stars) -> float | None:
+    """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None if there is none.
+
+    Triangles are found by their angles, which hardly depend on the focal length, so those of the given field serve.
+    """
+    seen = stars.take(stars.on_frame.nonzero()[0])
+    if len(seen) < FEWEST_STARS:
+        return None
+    try:
+        given, catalogue, triangles = solver.view(seen.width, seen.height)
+        sky = Sky.at(catalogue, triangles, seen.mid_unix_s)
+        for k in sorted(range(-TRIES, TRIES + 1), key=abs):
+            camera = given.scaled(STEP**k)
+            found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
+            if found is not None:
+                return camera.fx * found.focal_scale
+    except StarposError:
+        # the frame's own sentence says it
+        return None
+    return None

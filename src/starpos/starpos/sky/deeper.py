@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A deeper catalogue for small fields: all stars of Tycho-2's original files, built once and kept in the user's cache."""
+
+import os
+import threading
+from pathlib import Path
+
+from starpos.instrument.camera import Camera
+from starpos.progress import Progress, quiet
+from starpos.sky.catalogue import Catalogue
+from starpos.sky.depth import Depth
+from starpos.sky.zones import ZONES
+from starpos.table_cache import cache_folder, load_or_build, mapped, rising
+
+# Name of the folder in the cache; the number is that of the format.
+PREFIX = "stars-1-"
+# The variable of the environment that names the original files: a folder, or Debian's archive of them.
+ORIGINALS = "STARPOS_TYCHO2"
+# Fainter than all stars of Tycho-2, and how many it has.
+ALL_MAG, TYCHO2_STARS = 20.0, 2_550_000
+# How to get the deeper catalogue.
+GET_IT = (
+    "type `apt-get source --download-only tycho2` (Debian or Ubuntu, with a deb-src line) and `starpos catalogue deepen "
+    "tycho2_2.orig.tar.xz`"
+)
+
+_lock = threading.Lock()
+_in_use: dict[Path, Catalogue] = {}
+
+
+def for_field(catalogue: Catalogue, camera: Camera, progress: Progress = quiet) -> Catalogue:
+    """The catalogue, or the deeper one where a camera's field holds too few of its stars.
+
+    The deeper one is that in the cache; where STARPOS_TYCHO2 names the original files it is built now.  Raises
+    CatalogueError if these cannot be used.
+    """
+    if Depth.of(camera, catalogue).enough:
+        return catalogue
+    deeper = kept()
+    if deeper is None and (originals := os.environ.get(ORIGINALS)):
+        deeper = build(originals, progress)
+    return catalogue if deeper is None or len(deeper) <= len(catalogue) else deeper
+
+
+def too_thin(catalogue: Catalogue, camera: Camera) -> str:
+    """What a camera's field holds of its catalogue, what it needs and how to get that: '' if it holds enough."""
+    depth = Depth.of(camera, catalogue)
+    if depth.enough:
+        return ""
+    holds = (
+        f"a field of {depth.width_deg:.2g} x {depth.height_deg:.2g} deg holds only {depth.mean:.1f} stars of the "
+        f"catalogue (V < {depth.limit_mag:.1f}) on average and needs one to V = {depth.needed_mag:.1f}"
+    )
+    if len(catalogue) >= TYCHO2_STARS or kept() is not None:
+        return f"{holds}, deeper than Tycho-2: name one in STARPOS_CATALOGUE, or take a wider field"
+    more = depth.mean * TYCHO2_STARS / max(len(catalogue), 1)
+    return f"{holds}; all of Tycho-2 would be {more:.0f}: {GET_IT}"
+
+
+def kept() -> Catalogue | None:
+    """The deeper catalogue, memory-mapped from the cache; None if it was not built."""
+    folder = _folder()
+    with _lock:
+        if folder not in _in_use:
+            if (found := _map(folder)) is None:
+                return None
+            _in_use.clear()
+            _in_use[folder] = found
+        return _in_use[folder]
+
+
+def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = False) -> Catalogue:
+    """Build the deeper catalogue from a folder or an archive of the original files, and keep it in the cache.
+
+    One that was built meanwhile is taken, unless it is wanted anew.  Raises CatalogueError as `tycho2.build` does.
+    """
+    from starpos.sky import tycho2
+
+    folder = _folder()
+    with _lock:
+        _in_use.clear()
+        _in_use[folder] = load_or_build(
+            folder,
+            PREFIX,
+            lambda: None if anew else _map(folder),
+            lambda: tycho2.build(originals, ALL_MAG, progress),
+            "stars of the deeper catalogue",
+        )
+        return _in_use[folder]
+
+
+def _folder() -> Path:
+    return cache_folder() / f"{PREFIX}tycho2"
+
+
+def _map(folder: Path) -> Catalogue | None:
+    """The stored catalogue; None if it is missing or its columns do not fit together."""
+    c = mapped(Catalogue, folder, "uiiiiuuuiii")
+    if c is None:
+        return None
+    stars = len(c.ra_mas)
+    columns = (
+        c.ra_mas,
+        c.dec_mas,
+        c.pm_ra,
+        c.pm_dec,
+        c.vmag_centi,
+        c.sigma_code,
+        c.pm_sigma_code,
+        c.epoch_code,
+        c.hip,
+    )
+    fit = (
+        all(column.shape == (stars,) for column in columns)
+        and c.tyc.shape == (stars, 3)
+        and c.zone_start.shape == (ZONES + 1,)
+        and rising(c.zone_start, stars)
+    )
+    return c if fit else None
