@@ -340,7 +340,7 @@ class Solver:
         return {}
 
     def view(self, width: int, height: int) -> tuple[Camera, Catalogue, TriangleCatalogue]:
-        """The camera for frames of this size in px, the catalogue for its field and its triangles; raises StarposError."""
+        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError."""
         if (width, height) not in self._views:
             camera = self.instrument.camera_for(width, height)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
