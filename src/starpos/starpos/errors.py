@@ -49,6 +49,10 @@ class FixError(StarposError):
     """The stars do not support a fix."""
 
 
+class VoyageError(StarposError):
+    """The record of a voyage (inertial readings, velocities) is missing or broken, or does not go with its stars."""
+
+
 def one_line(error: object) -> str:
     """The message of an error, or any text, on one line and short enough to be quoted in a sentence."""
     said = " ".join(str(error).split())

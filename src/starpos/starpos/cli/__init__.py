@@ -15,6 +15,7 @@ from starpos.parallel import BLAS_THREADS
 
 COMMANDS = {
     "solve": "position and heading of frames with their tilts",
+    "navigate": "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
     "detect": "the stars of frames",
     "identify": "where frames look, lost in space",
     "replay": "recorded nights (rosbag2) by the solver's own code: the same fixes as in the running graph",

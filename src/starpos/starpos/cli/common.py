@@ -158,6 +158,11 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         "error; 0 0 is a global shutter (that of the instrument file, else ROLLSHUT of the frames, else not known, "
         f"{UNKNOWN.readout_s:g} {UNKNOWN.readout_stddev_s:g})",
     )
+    add_clock(parser)
+
+
+def add_clock(parser: argparse.ArgumentParser) -> None:
+    """Add --clock-stddev."""
     parser.add_argument(
         "--clock-stddev",
         type=number(0, 86400),

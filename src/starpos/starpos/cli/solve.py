@@ -267,7 +267,7 @@ def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
     if fix is None:
         return dict.fromkeys(keys)
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
-    covariance = _in_degrees(fix.covariance)
+    covariance = in_degrees(fix.covariance)
     sigma = np.sqrt(np.diag(covariance))
     values = (
         utc_text(fix.utc_unix_s),
@@ -278,7 +278,7 @@ def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
         np.degrees(ground.longitude),
         *sigma,
         covariance,
-        _in_degrees(ground.covariance),
+        in_degrees(ground.covariance),
         ground.deflection.xi_arcsec,
         ground.deflection.eta_arcsec,
         ground.deflection.stddev_arcsec,
@@ -287,7 +287,7 @@ def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
     return dict(zip(keys, values, strict=True))
 
 
-def _in_degrees(covariance: np.ndarray) -> np.ndarray:
+def in_degrees(covariance: np.ndarray) -> np.ndarray:
     """A covariance (3, 3) of east m, north m, heading rad with the heading in deg instead."""
     unit = np.array([1.0, 1.0, np.degrees(1.0)])
     return covariance * np.outer(unit, unit)
@@ -329,7 +329,7 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
 
 
 def place_text(fix: Fix | Average) -> str:
-    east, north, heading = np.sqrt(np.diag(_in_degrees(fix.covariance)))
+    east, north, heading = np.sqrt(np.diag(in_degrees(fix.covariance)))
     facing = f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
     if np.isnan(fix.heading):
         facing = "heading not known: the camera was touched, or nobody knows its roll"

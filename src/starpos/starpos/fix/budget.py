@@ -108,7 +108,7 @@ class Sensitivity:
         about_up = np.stack([np.zeros(3), np.zeros(3), -north_turns])
         return cls(
             *(
-                np.vstack([ground, _heading_row(spin, link_to_enu), spin])
+                np.vstack([ground, heading_row(spin, link_to_enu), spin])
                 for spin in (about_up, about_up + p.local_to_enu)
             )
         )
@@ -119,7 +119,7 @@ def heading_of(link_to_enu: np.ndarray) -> float:
     return rotation.full_turn(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]))
 
 
-def _heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:
+def heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:
     """Change (1, 3) of the heading where three small rotations turn the attitude by spin (3, 3) about east, north, up."""
     east, north, up = link_to_enu[:, 0]
     level = max(east * east + north * north, 1e-12)

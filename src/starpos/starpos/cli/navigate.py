@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos navigate`: place, heading and velocity of a voyage from its frames and an IMU, without standing still."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starpos.cli import common, jobs
+from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
+from starpos.cli.frame_work import Look, Reader, reader_of
+from starpos.cli.solve import in_degrees
+from starpos.earth.orientation import earth_orientation
+from starpos.earth.vertical import Vertical, geodetic
+from starpos.errors import FixError, FrameError, VoyageError
+from starpos.instrument.instrument import Instrument
+from starpos.navigation.imu import ImuModel, read_imu, read_imu_model
+from starpos.navigation.laws import LAWS
+from starpos.navigation.sightings import IdentifiedFrame, sighting_of
+from starpos.navigation.velocity import read_velocity
+from starpos.navigation.vessel import Vessel
+from starpos.navigation.voyage import Voyage, VoyageFix, navigate
+from starpos.sky import catalogue
+
+NO_ANSWER = 1
+MOUNT_STDDEV_DEG = 1.0
+OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
+KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
+        "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
+        "deflection_stddev_arcsec")  # fmt: skip
+
+
+def define(parser: argparse.ArgumentParser) -> None:
+    common.add_frames(parser)
+    parser.add_argument(
+        "--imu",
+        required=True,
+        metavar="CSV",
+        help="utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2): means over the time since the reading before, along the "
+        "body's axes, x forward, y left, z up",
+    )
+    parser.add_argument(
+        "--imu-model",
+        metavar="FILE",
+        help="kalibr's imu.yaml, also with gyroscope_bias_stddev (rad/s), accelerometer_bias_stddev (m/s2), scale_stddev "
+        "and axes_stddev (rad); without it a cheap IMU is assumed",
+    )
+    parser.add_argument(
+        "--velocity",
+        metavar="CSV",
+        help="utc_unix_s, vx, vy, vz, sigma (m/s): over ground, along the body's axes, from wheels or a log",
+    )
+    parser.add_argument(
+        "--vehicle",
+        choices=tuple(LAWS),
+        help="parked: it stands; without --velocity the law by which its speed changes (anything that moves)",
+    )
+    parser.add_argument(
+        "--mount-stddev",
+        type=common.number(1e-4, 20),
+        default=MOUNT_STDDEV_DEG,
+        metavar="DEG",
+        help="how well the camera sits as the instrument says, an axis: z up, the top of the frame forward "
+        f"({MOUNT_STDDEV_DEG:g})",
+    )
+    common.add_stamps(parser)
+    parser.add_argument(
+        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the next two options"
+    )
+    common.add_optics(parser)
+    common.add_clock(parser)
+    common.add_air(parser)
+    add_vertical(parser)
+    jobs.add_jobs(parser)
+    parser.set_defaults(run=run)
+
+
+@dataclass(frozen=True)
+class FrameSeen:
+    """A frame's time, its stars as far as they are identified, and else why not."""
+
+    utc_unix_s: float | None
+    sighting: IdentifiedFrame | None
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """Work of `navigate`: a FrameSeen."""
+
+    read: Reader
+    instrument: Instrument
+
+    def __call__(self, path: str) -> FrameSeen:
+        stars = common.stars_of(self.read(path))
+        try:
+            return FrameSeen(
+                stars.mid_unix_s, sighting_of(stars, self.instrument, catalogue.load_catalogue())
+            )
+        except FrameError as error:
+            return FrameSeen(stars.mid_unix_s, None, str(error))
+
+
+def run(args: argparse.Namespace) -> int:
+    vertical, read, number = vertical_of(args), reader_of(args), len(args.frames)
+    imu = read_imu(args.imu)
+    model = ImuModel() if args.imu_model is None else read_imu_model(Path(args.imu_model))
+    velocity = None if args.velocity is None else read_velocity(args.velocity)
+    with jobs.workers_of(args, number) as workers:
+        (about,) = workers.map([(Look(read), tuple(args.frames))])
+        if about is None:
+            raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
+        instrument = common.instrument_of(args, about)
+        jobs.prepare(instrument, about)
+        answers = jobs.watched(workers.map((Seeing(read, instrument), path) for path in args.frames), number)
+        seen = [FrameSeen(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
+    for frame in seen:
+        if frame.message:
+            common.complain("navigate", frame.message)
+    vessel = Vessel(
+        vehicle=args.vehicle,
+        model=model,
+        camera_to_body=np.asarray(instrument.link_to_camera, float).T,
+        mount_stddev=np.radians(args.mount_stddev),
+        atmosphere=common.atmosphere_of(args),
+        clock_stddev_s=instrument.clock_stddev_s,
+    )
+    times = np.array([np.nan if s.utc_unix_s is None else s.utc_unix_s for s in seen])
+    sightings = [s.sighting for s in seen if s.sighting is not None]
+    try:
+        voyage = navigate(sightings, imu, velocity, vessel, times, common.ProgressBar())
+    except FixError as error:
+        common.complain("navigate", error)
+        return NO_ANSWER
+    return tell(args, seen, voyage, vertical)
+
+
+def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertical: Vertical) -> int:
+    """Print the answer for each frame; returns the exit status."""
+    for fault in voyage.faults:
+        common.complain("navigate", fault)
+    for path, frame, fix in zip(args.frames, seen, voyage.fixes, strict=True):
+        status = _status(frame, fix)
+        if args.json:
+            common.print_json({"file": path} | json_of(fix, vertical) | {"status": status})
+        else:
+            print(f"{path}: {status if fix is None else text_of(fix)}", flush=True)
+    fixes = [fix for fix in voyage.fixes if fix is not None]
+    if not fixes:
+        return NO_ANSWER
+    last = fixes[-1]
+    tell_unknown("navigate", args, vertical.at(last.latitude, last.longitude))
+    beyond = earth_orientation(last.utc_unix_s).extrapolated_days
+    if beyond > 0:
+        common.complain("navigate", f"the Earth's rotation is extrapolated {beyond:.0f} days beyond the IERS table: "
+                        "upgrade astropy-iers-data")  # fmt: skip
+    return common.UNREADABLE if any(frame.utc_unix_s is None for frame in seen) else 0
+
+
+def _status(frame: FrameSeen, fix: VoyageFix | None) -> str:
+    if fix is None:
+        return BAD_INPUT if frame.utc_unix_s is None else NO_READINGS
+    return CARRIED if frame.sighting is None else OK
+
+
+def json_of(fix: VoyageFix | None, vertical: Vertical) -> dict:
+    """The keys of --json that come from a fix; None for each if there is none."""
+    if fix is None:
+        return dict.fromkeys(KEYS)
+    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
+    values = (
+        fix.utc_unix_s,
+        *np.degrees([fix.latitude, fix.longitude, fix.heading]).tolist(),
+        in_degrees(fix.covariance),
+        fix.velocity,
+        fix.gyro_bias,
+        fix.accel_bias,
+        *np.degrees([ground.latitude, ground.longitude]).tolist(),
+        in_degrees(ground.covariance),
+        ground.deflection.xi_arcsec,
+        ground.deflection.eta_arcsec,
+        ground.deflection.stddev_arcsec,
+    )
+    return dict(zip(KEYS, values, strict=True))
+
+
+def text_of(fix: VoyageFix) -> str:
+    """The line of a fix for people."""
+    east, north, turn = np.sqrt(np.diag(in_degrees(fix.covariance)))
+    return (
+        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, heading "
+        f"{np.degrees(fix.heading):.4f} +- {turn:.4f} deg, {np.hypot(*fix.velocity[:2]):.2f} m/s"
+    )

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of a recorded voyage, solved again and again until the place settles.
+
+Equations of a wrong place make a filter sure of it: of each round nothing is kept but the motion that it led to.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from starpos.earth.gravity import zenith_at
+from starpos.errors import FixError, VoyageError
+from starpos.navigation import sanity
+from starpos.navigation.chain import Chain, Smoothed, log_likelihood, smoothed
+from starpos.navigation.links import Links, links_of
+from starpos.navigation.measures import (
+    Beforehand,
+    Lacks,
+    StarAttitudes,
+    first_rows,
+    law_lacks,
+    standing_lacks,
+    star_lacks,
+)
+from starpos.navigation.motion import BY_LAW, CONSTANTS, MEASURED, PLACE, Motion
+from starpos.navigation.odometry import Odometry
+from starpos.navigation.preintegration import Pieces, Sums, summed
+from starpos.navigation.sightings import IdentifiedFrame, rough_attitude, star_attitude
+from starpos.navigation.start import first_motion
+from starpos.navigation.velocity import VelocityLog
+from starpos.navigation.vessel import Vessel
+from starpos.progress import Progress
+
+FEWEST_FRAMES = 3
+# the place has settled where a step is below it, in m and as a share of its sigma
+SETTLED_M, SETTLED_SHARE = 1.0, 0.02
+# equations of a place farther off are wrong by more than the stars' errors: the square of the angle
+NEAR_M = 2000.0
+MOST_ROUNDS = 25
+# stars are seen anew where the zenith has moved by more: 2 m of refraction
+ZENITH_MOVED = 1e-3
+STANDING_SIGMA = 2e-3
+# of a chi-squared of three degrees of freedom: the median, and what one in a million exceeds
+MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
+# steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8
+FACTOR, MOST_FACTORS, UNLIKELY = 2**0.5, 16, 8.0
+
+
+class Adjustment:
+    """The equations of a voyage, and how much more than stated its measurements scatter.
+
+    excess: of the variances of each kind of measurement over those that are stated.  left_out: how many of each kind.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[IdentifiedFrame],
+        nodes: np.ndarray,
+        pieces: Pieces,
+        velocity: VelocityLog | None,
+        vessel: Vessel,
+        vibration: float,
+    ) -> None:
+        self.frames, self.nodes, self.pieces, self.vessel = frames, nodes, pieces, vessel
+        self.vibration = vibration
+        self.odometry = None if velocity is None else Odometry.of(velocity, nodes, pieces)
+        if self.odometry is not None and not len(self.odometry.node):
+            raise VoyageError(
+                "no velocity lies on the voyage: check that its clock and that of the camera agree"
+            )
+        self.law = vessel.law if self.odometry is None and not vessel.parked else None
+        self.unknowns = MEASURED if self.law is None else BY_LAW
+        self.known = Beforehand(mount=vessel.mount_stddev, refraction=vessel.atmosphere.relative_sigma)
+        self.model = vessel.model
+        self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
+        self.left_out = {"frames": 0, "velocities": 0}
+
+    def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
+        """The motion, the solution of the last round, and how many rounds there were.
+
+        VoyageError where the measurements do not go together, FixError where the place does not settle.
+        """
+        stars = self._attitudes(None)
+        zero, none = np.zeros((len(self.nodes) - 1, 3)), np.zeros((3, 3))
+        sums = summed(self.pieces, zero, zero, none, none)
+        believed = self.vessel.camera_to_body
+        sanity.check(stars, self.pieces, sums, self.model, believed)
+        motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
+        solution: Smoothed | None = None
+        zenith, step, sigma = np.zeros(3), np.inf, 1.0
+        weighed = self.law is not None
+        for k in range(MOST_ROUNDS):
+            # equations of another place tell neither how the stars are seen nor which measurements are wrong
+            near = step < min(NEAR_M, sigma)
+            up = zenith_at(motion.place[len(motion) // 2])
+            seen_anew = near and bool(np.linalg.norm(up - zenith) > ZENITH_MOVED)
+            if seen_anew:
+                zenith, stars = up, self._attitudes(up)
+            chain, links = self._chain(motion, stars, solution if near and not seen_anew else None)
+            solution = smoothed(chain)
+            motion = motion.moved(solution.nodes, solution.constants)
+            step = float(np.linalg.norm(solution.nodes[:, PLACE], axis=1).max())
+            variance = np.trace(solution.covariance[:, PLACE, PLACE], axis1=1, axis2=2)
+            sigma = float(np.sqrt(variance.min()))
+            progress("adjusting", min(0.95, (k + 1) / 8))
+            if near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma):
+                if weighed:
+                    progress("adjusting", 1.0)
+                    return motion, solution, k + 1
+                self._weigh(chain, links)
+                weighed = True
+        raise FixError(
+            f"the voyage's place does not settle (the last step was {step:.0f} m): check the IMU's axes and units, "
+            "and what is said of the vehicle"
+        )
+
+    def _weigh(self, chain: Chain, links: Links) -> None:
+        """Raise the accelerometer's noise to what the voyage shows: of vibration some is left in sums."""
+        factors, likely = [1.0], [log_likelihood(chain) - links.log_determinant]
+        while len(factors) < MOST_FACTORS and likely[-1] > max(likely) - UNLIKELY:
+            factors.append(factors[-1] * FACTOR)
+            density = self.model.accelerometer_noise_density * factors[-1]
+            noisy = links.noisier(density**2 - self.model.accelerometer_noise_density**2, self.pieces)
+            likely.append(log_likelihood(replace(chain, links=noisy.whitened())) - noisy.log_determinant)
+        weight = np.exp(np.array(likely) - max(likely))
+        self.excess["forces"] = float(weight @ np.square(factors) / weight.sum())
+        density = self.model.accelerometer_noise_density * np.sqrt(self.excess["forces"])
+        self.model = replace(self.model, accelerometer_noise_density=density)
+
+    def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
+        """Attitudes of all frames whose stars agree, as seen under a zenith, or roughly."""
+        found, used = [], []
+        for frame in self.frames:
+            try:
+                air = self.vessel.atmosphere
+                found.append(rough_attitude(frame) if zenith is None else star_attitude(frame, zenith, air))
+                used.append(frame)
+            except FixError:
+                pass
+        if len(used) < FEWEST_FRAMES:
+            raise VoyageError(f"the stars of {len(used)} frames agree: at least {FEWEST_FRAMES} are needed")
+        return StarAttitudes(
+            index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
+            camera_to_itrs=np.array([a.camera_to_itrs for a in found]),
+            covariance=np.array([a.covariance for a in found]),
+            by_refraction=np.array([a.by_refraction for a in found]),
+            stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
+        )
+
+    def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
+        """The equations about a motion, without measurements that the solution before shows to be wrong."""
+        n, count = self.unknowns, len(motion)
+        sums = summed(
+            self.pieces,
+            motion.gyro_bias[:-1],
+            motion.accel_bias[:-1],
+            motion.gyro_matrix,
+            motion.accel_matrix,
+        )
+        parts = [self._sound(star_lacks(motion, stars, sums, self.pieces, n), before, "frames")]
+        if self.odometry is not None:
+            parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
+        if self.vessel.parked:
+            parts.append(standing_lacks(motion, np.arange(count), STANDING_SIGMA, n))
+        if self.law is not None:
+            parts.append(law_lacks(motion, self.law))
+        links = links_of(motion, sums, self.pieces, self.model, self.law)
+        chain = Chain(
+            first=first_rows(motion, self.model, self.known, self.law),
+            nodes=np.concatenate([part.whitened(count) for part in parts], 1),
+            links=links.whitened(),
+            constants=CONSTANTS,
+        )
+        return chain, links
+
+    def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Lacks:
+        assert self.odometry is not None
+        missed = self.odometry.missed(motion, sums, self.pieces)
+        keep = np.ones(len(missed), bool) if before is None else self.odometry.sound(missed)
+        return self.odometry.lacks(motion, missed, keep, self.vibration, self.unknowns)
+
+    def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
+        """Equations without outliers, with wider errors where most of them scatter by more than is stated."""
+        used = self.excess[kind]
+        lacks = replace(lacks, covariance=lacks.covariance * used)
+        if before is None:
+            return lacks
+        distance2 = lacks.distance2(before.covariance)
+        change = max(1 / used, float(np.median(distance2)) / MEDIAN_OF_CHI2)
+        self.excess[kind] = used * change
+        keep = distance2 < OUTLIER_CHI2 * change
+        self.left_out[kind] = int((~keep).sum())
+        return Lacks(
+            index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * change
+        )

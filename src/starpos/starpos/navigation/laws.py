@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of motion: how fast the speed of a vehicle can change, where nothing measures it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionLaw:
+    """Velocity of a vehicle over ground as a speed along its nose, a drift, and a rest; m/s, 1 sigma.
+
+    speed_stddev, speed_walk: of the speed along the nose, level, at the start, and its change in m/s/sqrt(s)
+    drift_stddev, drift_walk: an axis of what carries the vehicle along (wind, current), level, likewise
+    rest_stddev, climb_stddev: of what is left, level an axis, and of climbing, which is 0 in the mean
+    rest_s: so long either keeps its sign
+    """
+
+    speed_stddev: float
+    speed_walk: float
+    drift_stddev: float
+    drift_walk: float
+    rest_stddev: float
+    climb_stddev: float
+    rest_s: float
+
+
+LAWS = {
+    # a path at a walk, that turns and stops as it likes
+    "rover": MotionLaw(
+        speed_stddev=2.0,
+        speed_walk=0.3,
+        drift_stddev=0.01,
+        drift_walk=1e-4,
+        rest_stddev=0.1,
+        climb_stddev=0.2,
+        rest_s=3.0,
+    ),
+    # under way, in waves of seconds, in a current that is steady over an hour
+    "ship": MotionLaw(
+        speed_stddev=10.0,
+        speed_walk=0.05,
+        drift_stddev=1.0,
+        drift_walk=0.003,
+        rest_stddev=0.7,
+        climb_stddev=0.7,
+        rest_s=3.0,
+    ),
+    # a steady airspeed in a wind that changes by half a metre per second in ten minutes; gusts of seconds
+    "drone": MotionLaw(
+        speed_stddev=50.0,
+        speed_walk=0.1,
+        drift_stddev=15.0,
+        drift_walk=0.02,
+        rest_stddev=0.8,
+        climb_stddev=0.8,
+        rest_s=4.0,
+    ),
+    "parked": MotionLaw(
+        speed_stddev=1e-3,
+        speed_walk=1e-6,
+        drift_stddev=1e-3,
+        drift_walk=1e-6,
+        rest_stddev=2e-3,
+        climb_stddev=2e-3,
+        rest_s=1.0,
+    ),
+}
+# nobody has said what it is: anything that goes on the ground, at sea or in the air
+ANYTHING = MotionLaw(
+    speed_stddev=100.0,
+    speed_walk=1.0,
+    drift_stddev=30.0,
+    drift_walk=0.3,
+    rest_stddev=5.0,
+    climb_stddev=3.0,
+    rest_s=10.0,
+)

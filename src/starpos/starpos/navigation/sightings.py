@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stars of a frame under way, and the attitude of the camera against the Earth that they tell.
+
+No level is needed: only refraction and the diurnal aberration depend on the zenith, and hardly.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.earth.orientation import earth_state, station_velocity
+from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.errors import FixError, FrameError, InstrumentError, TimeError
+from starpos.fix import solver
+from starpos.fix.fix import sound_matches
+from starpos.fix.outliers import expected_extra, judged
+from starpos.fix.unidentified import why_unidentified
+from starpos.frames.reading import why_no_time
+from starpos.frames.stars import Stars
+from starpos.identification import Sky, identify_directions, triangle_cache
+from starpos.identification.pose import Pose, slopes
+from starpos.instrument.instrument import Instrument
+from starpos.sky.catalogue import Catalogue
+from starpos.units import ARCSEC
+
+FEWEST, ROUNDS, STEPS = 4, 6, 3
+# of an attitude without refraction; 1 sigma
+ROUGH = 20 * ARCSEC
+STEP_REFRACTION = 0.01
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IdentifiedFrame:
+    """N identified stars of a frame.
+
+    utc_unix_s, stamp_stddev_s: middle of the exposure, and the error of that stamp.
+    xy (N, 2), covariance_px2 (N, 2, 2): px from the principal point of an ideal camera of focal length focal_px.
+    itrs (N, 3): geocentric apparent directions in ITRS.  camera_to_itrs (3, 3): without refraction, good to ROUGH rad.
+    """
+
+    utc_unix_s: float
+    stamp_stddev_s: float
+    source: str
+    xy: np.ndarray
+    covariance_px2: np.ndarray
+    itrs: np.ndarray
+    focal_px: float
+    camera_to_itrs: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StarAttitude:
+    """Attitude of the camera against the Earth: camera_to_itrs (3, 3).
+
+    covariance (3, 3): rad2, of its small rotation about the camera's axes.
+    by_refraction (3,): rotation, rad, by which the camera is turned further if refraction is stronger by its own size.
+    """
+
+    camera_to_itrs: np.ndarray
+    covariance: np.ndarray
+    by_refraction: np.ndarray
+
+
+def sighting_of(stars: Stars, instrument: Instrument, catalogue: Catalogue) -> IdentifiedFrame:
+    """Identify the stars of a frame wherever it looks; a StarposError says why it cannot be used."""
+    mid_unix_s = stars.mid_unix_s
+    if mid_unix_s is None:
+        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars.source)}")
+    stars = stars.take(np.flatnonzero(stars.on_frame))
+    camera = instrument.camera_for(stars.width, stars.height)
+    state = earth_state(mid_unix_s)
+    triangles = triangle_cache.cached(catalogue, camera.half_diagonal_rad)
+    sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
+    directions = camera.directions(stars.x, stars.y)
+    found = identify_directions(directions, stars.sigma, camera, sky)
+    if found is None:
+        raise FrameError(why_unidentified(stars, camera, catalogue))
+    suspicious, _ = solver.judged(stars, directions, camera, sky, found)
+    if suspicious:
+        raise FrameError(
+            f"{stars.place}: its stars are not those of one sky ({', '.join(suspicious)}): left out"
+        )
+    if found.mirrored:
+        raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
+    use = sound_matches(stars, found, solver.ENOUGH_SOUND)
+    star, index = found.star[use], found.catalogue[use]
+    squeeze = np.array([1.0, camera.fx / camera.fy])
+    catalogue_px = np.hypot(catalogue.sigma(index, state.year) * camera.fx, found.blend_px[use])
+    return IdentifiedFrame(
+        utc_unix_s=mid_unix_s,
+        stamp_stddev_s=stars.stamp_stddev_s,
+        source=stars.place,
+        xy=directions[star, :2] / directions[star, 2:] * camera.fx,
+        covariance_px2=stars.covariance[star] * np.outer(squeeze, squeeze)
+        + np.eye(2) * (catalogue_px**2)[:, None, None],
+        itrs=state.to_itrs(catalogue.directions(index, state.year)),
+        focal_px=camera.fx * found.focal_scale,
+        camera_to_itrs=state.gcrs_to_itrs @ found.attitude.T,
+    )
+
+
+def rough_attitude(frame: IdentifiedFrame) -> StarAttitude:
+    """The attitude as it was when the stars were identified."""
+    return StarAttitude(
+        camera_to_itrs=frame.camera_to_itrs, covariance=np.eye(3) * ROUGH**2, by_refraction=np.zeros(3)
+    )
+
+
+def star_attitude(sighting: IdentifiedFrame, zenith: np.ndarray, atmosphere: Atmosphere) -> StarAttitude:
+    """Fit attitude and plate scale to a frame's stars under a zenith (3,) in ITRS; FixError if they disagree."""
+    seen = _seen(sighting, zenith, atmosphere.refraction())
+    keep, extra = np.ones(len(seen), bool), 0.0
+    v = np.column_stack([sighting.xy, np.full(len(seen), sighting.focal_px)])
+    pose = Pose(rotation.best_rotation(seen, rotation.normalised(v)), sighting.focal_px, False)
+    for _ in range(ROUNDS):
+        if keep.sum() < FEWEST:
+            raise FixError(
+                f"{sighting.source}: only {int(keep.sum())} of its {len(keep)} stars agree: left out"
+            )
+        before = keep
+        pose = _fitted(pose, sighting, seen, keep, extra)
+        residual = pose.project(seen) - sighting.xy
+        share = max(1 - 2 / keep.sum(), 1 / keep.sum())
+        extra, keep = judged(residual, sighting.covariance_px2, keep, share)
+        if np.array_equal(keep, before):
+            break
+    pixel, slope = slopes(pose, seen)
+    slope, covariance = slope[keep], sighting.covariance_px2[keep]
+    wide = covariance + np.eye(2) * expected_extra((pixel - sighting.xy)[keep], covariance, share)
+    weighted = np.linalg.solve(wide, slope)
+    normal = np.linalg.inv(np.einsum("nki,nkj->ij", slope, weighted))
+    stronger = _seen(sighting, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
+    shift = (pose.project(stronger) - pixel)[keep] / STEP_REFRACTION
+    return StarAttitude(
+        camera_to_itrs=pose.attitude.T,
+        covariance=normal[:3, :3],
+        by_refraction=(normal @ np.einsum("nki,nk->i", weighted, shift))[:3],
+    )
+
+
+def _seen(sighting: IdentifiedFrame, zenith: np.ndarray, refraction: Refraction) -> np.ndarray:
+    """Directions (N, 3) along ITRS's axes in which the stars are seen under a zenith."""
+    level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+    apparent = rotation.normalised(sighting.itrs + station_velocity(zenith))
+    return refraction.bend(apparent @ level.T) @ level
+
+
+def _fitted(pose: Pose, sighting: IdentifiedFrame, seen: np.ndarray, keep: np.ndarray, extra: float) -> Pose:
+    covariance = sighting.covariance_px2[keep] + np.eye(2) * extra
+    for _ in range(STEPS):
+        pixel, slope = slopes(pose, seen[keep])
+        weighted = np.linalg.solve(covariance, slope)
+        normal = np.einsum("nki,nkj->ij", slope, weighted)
+        step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, sighting.xy[keep] - pixel))
+        turned = rotation.from_vector(step[:3]) @ pose.attitude
+        pose = replace(pose, attitude=turned, focal_px=float(pose.focal_px * (1 + step[3])))
+    return pose
