@@ -50,7 +50,7 @@ FACTOR, MOST_FACTORS, UNLIKELY = 2**0.5, 16, 8.0
 class Adjustment:
     """The equations of a voyage, and how much more than stated its measurements scatter.
 
-    excess: of the variances of each kind of measurement over those that are stated.  left_out: how many of each kind.
+    excess: of the variances of each kind of measurement over those that are stated.
     """
 
     def __init__(
@@ -74,7 +74,14 @@ class Adjustment:
         self.known = Beforehand(mount=vessel.mount_stddev, refraction=vessel.atmosphere.relative_sigma)
         self.model = vessel.model
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
-        self.left_out = {"frames": 0, "velocities": 0}
+        # nodes whose measurement of a kind is wrong, and velocities that are
+        self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
+        self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How many measurements of each kind are left out."""
+        return {"frames": len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
 
     def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
         """The motion, the solution of the last round, and how many rounds there were.
@@ -149,7 +156,7 @@ class Adjustment:
         )
 
     def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
-        """The equations about a motion, without measurements that the solution before shows to be wrong."""
+        """The equations about a motion, without measurements that the solution before, or an earlier one, shows to be wrong."""
         n, count = self.unknowns, len(motion)
         sums = summed(
             self.pieces,
@@ -177,20 +184,25 @@ class Adjustment:
     def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Lacks:
         assert self.odometry is not None
         missed = self.odometry.missed(motion, sums, self.pieces)
-        keep = np.ones(len(missed), bool) if before is None else self.odometry.sound(missed)
-        return self.odometry.lacks(motion, missed, keep, self.vibration, self.unknowns)
+        if before is not None:
+            self.slipped = ~self.odometry.sound(missed)
+        return self.odometry.lacks(motion, missed, ~self.slipped, self.vibration, self.unknowns)
 
     def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
-        """Equations without outliers, with wider errors where most of them scatter by more than is stated."""
+        """Equations without outliers, with wider errors where most of them scatter by more than is stated.
+
+        Where no solution is near, those that were left out stay so: else the step that their absence makes would bring them
+        back.
+        """
         used = self.excess[kind]
-        lacks = replace(lacks, covariance=lacks.covariance * used)
-        if before is None:
-            return lacks
-        distance2 = lacks.distance2(before.covariance)
-        change = max(1 / used, float(np.median(distance2)) / MEDIAN_OF_CHI2)
-        self.excess[kind] = used * change
-        keep = distance2 < OUTLIER_CHI2 * change
-        self.left_out[kind] = int((~keep).sum())
+        if before is not None and len(lacks.index):
+            left_out = np.isin(lacks.index, self.wrong[kind])
+            stated = replace(lacks, covariance=lacks.covariance * used)
+            distance2 = stated.distance2(before.covariance, left_out)
+            change = max(1 / used, float(np.median(distance2)) / MEDIAN_OF_CHI2)
+            self.wrong[kind] = lacks.index[distance2 > OUTLIER_CHI2 * change]
+            self.excess[kind] = used = used * change
+        keep = ~np.isin(lacks.index, self.wrong[kind])
         return Lacks(
-            index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * change
+            index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * used
         )

@@ -83,17 +83,20 @@ class Lacks:
             all_rows[self.index] = np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
         return all_rows
 
-    def distance2(self, covariance: np.ndarray) -> np.ndarray:
-        """Squared residuals (F,) in units of what they should scatter by, given a solution's covariance (K, n + m, n + m)."""
+    def distance2(self, covariance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+        """Squared residuals (F,) in units of what they should scatter by, given a solution's covariance (K, n + m, n + m).
+
+        left_out (F,): which of them had no part in the solution.
+        """
         slope, short = self.rows[..., :-1], self.rows[..., -1]
         explained = slope @ covariance[self.index] @ slope.transpose(0, 2, 1)
         root = np.linalg.cholesky(self.covariance)
         share = np.linalg.solve(root, np.linalg.solve(root, explained).transpose(0, 2, 1))
-        # what the solution takes from a residual leaves at least a part of it
         size, axes = np.linalg.eigh(share)
-        left = np.sqrt(np.maximum(1 - size, LEAST_LEFT))
+        # a solution takes its own error from the residuals it has seen, at most nearly all, and adds it to others
+        spread = np.where(left_out[:, None], 1 + size, np.maximum(1 - size, LEAST_LEFT))
         seen = np.einsum("kji,kj->ki", axes, np.linalg.solve(root, short[..., None])[..., 0])
-        return np.sum((seen / left) ** 2, 1)
+        return np.sum(seen**2 / spread, 1)
 
 
 LEAST_LEFT = 0.02

@@ -31,7 +31,7 @@ def check(
     sums are those of the readings as they are.
     """
     _check_gravity(pieces, sums, model, camera_to_body)
-    _check_turns(stars, pieces, sums, model, camera_to_body)
+    _check_turns(stars, pieces, model, camera_to_body)
 
 
 def _check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray) -> None:
@@ -60,7 +60,7 @@ def _check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: 
 
 
 def _check_turns(
-    stars: StarAttitudes, pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray
+    stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_to_body: np.ndarray
 ) -> None:
     """Compare the turns between neighbouring frames, by the stars and by the gyro."""
     first = stars.index[:-1][np.diff(stars.index) == 1]
@@ -73,7 +73,8 @@ def _check_turns(
     span = pieces.span_s[first, None]
     back = turned_back(span[:, 0])
     seen = Rotation.from_matrix((back @ body[near]).transpose(0, 2, 1) @ body[near + 1]).as_rotvec() / span
-    felt = Rotation.from_matrix(sums.turn[first]).as_rotvec() / span
+    # the mean and not the turn itself, which in another unit may be more than half of a circle
+    felt = (pieces.gyro * pieces.length_s[..., None]).sum(1)[first] / span
     noise = np.sqrt(np.trace(stars.covariance[near], axis1=1, axis2=2) * 2 / 3) / span[:, 0]
     noise = np.hypot(noise, model.gyroscope_noise_density / np.sqrt(span[:, 0]))
     off = felt - seen

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records with faults: each is told in a sentence, and the claim holds or there is no answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from voyage_calls import navigated, nees, sigma_m
+
+from starpos.errors import VoyageError
+from starpos.navigation.imu import ImuLog
+from starpos.navigation.table import in_order
+from starpos_testing.voyages import made
+
+
+@pytest.fixture(scope="module")
+def record():
+    return made("rover", 100, 11, rate_hz=50)
+
+
+def with_imu(record, gyro=None, force=None, keep=slice(None), shift_s=0.0):
+    imu = record.imu
+    gyro, force = imu.gyro if gyro is None else gyro, imu.force if force is None else force
+    return replace(record, imu=ImuLog.of(imu.utc_unix_s[keep] + shift_s, gyro[keep], force[keep]))
+
+
+def with_velocity(record, change):
+    log = record.velocity
+    return replace(record, velocity=replace(log, velocity=change(log.utc_unix_s - log.utc_unix_s[0], log.velocity.copy())))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda r: with_imu(r, force=r.imu.force / 9.80665), "in g: give m/s2"),
+        (lambda r: with_imu(r, force=r.imu.force * [1, 1, 0]), "no axis is missing"),
+        (lambda r: with_imu(r, force=r.imu.force - [0, 0, 9.8]), "gravity is not taken off"),
+        (lambda r: with_imu(r, force=r.imu.force[:, [2, 1, 0]]), "accelerometer's axes"),
+        (lambda r: with_imu(r, force=-r.imu.force), "accelerometer's axes"),
+        (lambda r: with_imu(r, gyro=np.degrees(r.imu.gyro)), "in deg/s: give rad/s"),
+        (lambda r: with_imu(r, gyro=r.imu.gyro[:, [1, 0, 2]] * [1, -1, 1]), "its x, y, z seem to be -y, .x, .z of the file"),
+        (lambda r: with_imu(r, shift_s=500.0), "clocks of camera and IMU agree"),
+        (lambda r: with_imu(r, shift_s=15.0), "clocks of camera and IMU agree"),
+    ],
+)
+def test_what_no_place_can_come_from_is_refused(record, change, said):
+    with pytest.raises(VoyageError, match=said):
+        navigated(change(record))
+
+
+def test_a_gap_widens_the_claim(record):
+    t = record.imu.utc_unix_s - record.imu.utc_unix_s[0]
+    whole, gap = navigated(record), navigated(with_imu(record, keep=(t < 40) | (t > 46)))
+    assert "1 gaps" in gap.faults[0]
+    assert nees(gap, record) < 16 and sigma_m(gap) > 1.1 * sigma_m(whole)
+
+
+def test_saturated_readings_are_left_out(record):
+    force = record.imu.force.copy()
+    for shock in (1000, 2000, 3000):
+        force[shock : shock + 10, 0] = 19.6
+    clipped = with_imu(record, force=force)
+    assert any("saturated" in fault for fault in clipped.imu.faults)
+    assert nees(navigated(clipped), record) < 16
+
+
+def test_a_wheel_that_slips_is_left_out(record):
+    def slip(t, velocity):
+        velocity[(t > 50) & (t < 56), 0] += 0.6
+        return velocity
+
+    assert nees(navigated(with_velocity(record, slip)), record) < 16
+
+
+def test_velocities_worse_than_stated_widen_the_claim(record, rng):
+    poor = navigated(with_velocity(record, lambda t, v: v + rng.normal(0, 0.2, v.shape)))
+    assert nees(poor, record) < 16 and sigma_m(poor) > 1.2 * sigma_m(navigated(record))
+    assert poor.excess["velocities"] > 10
+
+
+def test_an_accelerometer_noisier_than_stated_widens_the_claim(record, rng):
+    noisy = navigated(with_imu(record, force=record.imu.force + rng.normal(0, 0.02, record.imu.force.shape)))
+    assert noisy.excess["forces"] > 10
+    assert nees(noisy, record) < 16 and sigma_m(noisy) > 1.5 * sigma_m(navigated(record))
+
+
+def test_a_frame_identified_wrongly_is_left_out(record):
+    frames = list(record.frames)
+    turn = np.array([[0.999, -0.0447, 0], [0.0447, 0.999, 0], [0, 0, 1]])
+    frames[30] = replace(frames[30], itrs=frames[30].itrs @ turn, camera_to_itrs=turn.T @ frames[30].camera_to_itrs)
+    voyage = navigated(replace(record, frames=frames))
+    assert voyage.left_out["frames"] == 1 and nees(voyage, record) < 16
+
+
+def test_a_late_camera_is_found(record):
+    """Stamps 20 ms late: the lag is estimated, so that turns do not spoil the place."""
+    late = navigated(with_imu(record, shift_s=-0.004))
+    assert nees(late, record) < 16
+    assert late.motion.lag_s == pytest.approx(-0.004, abs=0.002)
+
+
+def test_rows_that_cannot_be_used_are_told():
+    t = np.array([1e9, 1e9 + 1, 1e9 + 1, 1e9 + 2, 1e9 + 0.5, 1e9 + 3, np.nan])
+    values = np.arange(14.0).reshape(7, 2)
+    values[3, 1] = np.inf
+    record = in_order(t, values, "imu.csv")
+    assert (record.utc_unix_s - 1e9).tolist() == [0, 1, 3]
+    assert len(record.faults) == 2 and "2 rows are without a finite number" in record.faults[0]
+    assert "2 rows are not later than all before" in record.faults[1]

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Voyages of the reference against their truth: exact ones anywhere on Earth, and the claims of those with errors."""
+
+import numpy as np
+import pytest
+from voyage_calls import errors, navigated, nees, sigma_m
+
+from starpos_testing.voyages import INDUSTRIAL, TACTICAL, made
+
+
+@pytest.mark.parametrize(
+    ("latitude_deg", "longitude_deg"),
+    [(48, 11), (89.999, 40), (-90, 0), (0, 180), (-33, -179.999)],
+    ids=["Europe", "pole", "south pole", "equator", "date line"],
+)
+def test_an_exact_voyage_is_found_to_a_metre_from_nothing(latitude_deg, longitude_deg):
+    """The vehicle drives and turns; neither place nor attitude nor level are told, and the height is as expected."""
+    about = dict(latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=500.0)
+    exact = made("rover", 60, 3, rate_hz=100, errors=False, **about)
+    voyage = navigated(exact)
+    off = voyage.motion.place - exact.place
+    assert np.linalg.norm(off, axis=1).max() < 1.0
+    ahead = np.einsum("kij,kij->kj", voyage.motion.attitude, exact.body_to_itrs)
+    assert np.degrees(np.arccos(np.minimum(ahead, 1))).max() * 3600 < 2.0
+    if abs(latitude_deg) < 89:
+        assert np.abs(errors(voyage, exact)).max(0) == pytest.approx(np.zeros(3), abs=1.0)
+
+
+@pytest.mark.parametrize(("kind", "model"), [("rover", INDUSTRIAL), ("ship", TACTICAL)])
+def test_claims_hold(kind, model):
+    """NEES of place and heading, 3 in the mean: of eight voyages between the 0.1 % and the 99.9 % of chi-squared of 24."""
+    scores = []
+    for seed in range(8):
+        record = made(kind, 100, seed, model=model, rate_hz=25, cadence_s=2.0)
+        scores.append(nees(navigated(record, kind, model=model), record))
+    assert 6.9 < sum(scores) < 51.2, scores
+
+
+@pytest.mark.parametrize("kind", ["drone", "parked"])
+def test_without_velocity_the_claim_is_wide_and_holds(kind):
+    record = made(kind, 120, 4, rate_hz=25)
+    voyage = navigated(record, kind, velocity=False)
+    assert nees(voyage, record) < 16 and sigma_m(voyage) > 1000
+
+
+def test_a_vehicle_that_nobody_names_has_a_wider_claim():
+    record = made("rover", 90, 4, rate_hz=25)
+    unnamed, named = (navigated(record, kind, velocity=False) for kind in (None, "rover"))
+    assert sigma_m(unnamed) > 3 * sigma_m(named)
+    assert nees(unnamed, record) < 16 and nees(named, record) < 16
+
+
+def test_the_mount_is_found_on_the_way():
+    record = made("ship", 120, 7, rate_hz=25, mount_deg=1.0)
+    motion = navigated(record, "ship").motion
+    off = np.degrees(np.arccos((np.trace(motion.camera_to_body @ record.mount.T) - 1) / 2))
+    before = np.degrees(np.arccos((np.trace(motion.nominal @ record.mount.T) - 1) / 2))
+    assert before > 0.5 and off < 0.15
