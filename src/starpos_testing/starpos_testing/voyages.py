@@ -4,9 +4,10 @@
 Nothing here is the product's: readings are differences of a path in inertial axes, under a gravity of its own.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from starpos.navigation.imu import ImuLog, ImuModel
@@ -47,7 +48,9 @@ def ellipsoid_place(latitude_deg, longitude_deg, height_m):
     prime = SEMI_AXIS / np.sqrt(1 - e2 * np.sin(phi) ** 2)
     up = np.array([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)])
     east = np.array([-np.sin(lam), np.cos(lam), 0.0])
-    return up * [prime + height_m, prime + height_m, prime * (1 - e2) + height_m], np.array([east, np.cross(up, east), up])
+    return up * [prime + height_m, prime + height_m, prime * (1 - e2) + height_m], np.array(
+        [east, np.cross(up, east), up]
+    )
 
 
 def geodetic_of(place):
@@ -77,12 +80,16 @@ def waves(rng, amplitude, low_s, high_s, number=5):
     return lambda t: amplitude * np.sqrt(2 / number) * np.sin(np.multiply.outer(t, rate) + phase).sum(-1)
 
 
+def carried(wave, begin, rate):
+    """A function of time: a wave about what begins somewhere and grows at a rate."""
+    return lambda t: begin + rate * t + wave(t)
+
+
 def path_of(kind, seconds, rng):
     """Functions of time: displacement (N, 3) in m east, north, up, and roll, pitch, yaw (N, 3) in rad (ROS)."""
     begin = rng.uniform(0, 2 * np.pi)
     grid = np.arange(-1.0, seconds + 1.0, 0.05)
-    still = lambda t: 0.0 * t  # noqa: E731
-    lean, heave = [still] * 2, [still] * 3
+    lean, heave = [np.zeros_like] * 2, [np.zeros_like] * 3
     speed, yaw = 0.0 * grid, begin + 0.0 * grid
     if kind == "rover":
         moving = np.clip((grid - 10) / 10, 0, 1)
@@ -98,14 +105,12 @@ def path_of(kind, seconds, rng):
         yaw = begin + 2 * np.pi * grid / 100 + waves(rng, 0.02, 4, 12)(grid)
         speed = 20.0 + waves(rng, 0.3, 8, 40)(grid)
         bank, wind = np.arctan(20 * 2 * np.pi / 100 / 9.81), rng.normal(0, 3, 2)
-        lean = [lambda t, w=waves(rng, 0.02, 2, 8): w(t) - bank, waves(rng, 0.02, 2, 8)]
-        heave = [lambda t, v=v, w=waves(rng, 0.5, 5, 20): v * t + w(t) for v in (*wind, 0.0)]
+        lean = [carried(waves(rng, 0.02, 2, 8), -bank, 0.0), waves(rng, 0.02, 2, 8)]
+        heave = [carried(waves(rng, 0.5, 5, 20), 0.0, v) for v in (*wind, 0.0)]
     elif kind == "parked":
         lean = [lambda t, a=a: a + 0 * t for a in (0.03, -0.02)]
     else:
         raise ValueError(kind)
-    from scipy.interpolate import CubicSpline
-
     course = CubicSpline(grid, yaw)
     track = [CubicSpline(grid, part).antiderivative() for part in (speed * np.cos(yaw), speed * np.sin(yaw))]
 
@@ -117,7 +122,10 @@ def path_of(kind, seconds, rng):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MadeVoyage:
-    """What was recorded, and the truth at the frames (F,): latitude, longitude, heading in rad; place (F, 3), body_to_itrs."""
+    """What was recorded, and the truth at frames_s (F,), Unix s: latitude, longitude, heading in rad (F,), place (F, 3).
+
+    body_to_itrs (F, 3, 3), mount (3, 3): the camera into the body.
+    """
 
     imu: ImuLog
     velocity: VelocityLog
@@ -128,7 +136,7 @@ class MadeVoyage:
     place: np.ndarray
     body_to_itrs: np.ndarray
     mount: np.ndarray
-    frames_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    frames_s: np.ndarray
 
 
 def made(
@@ -188,7 +196,8 @@ def made(
             utc_unix_s=BEGIN_S + log_s, velocity=ground, sigma=np.full(len(log_s), velocity_sigma)
         ),
         frames=[
-            _frame(BEGIN_S + t, a @ mount, p, rng, on) for t, a, p in zip(frames_s, attitude, places, strict=True)
+            _frame(BEGIN_S + t, a @ mount, p, rng, on)
+            for t, a, p in zip(frames_s, attitude, places, strict=True)
         ],
         latitude=phi,
         longitude=lam,
@@ -205,9 +214,16 @@ def _disturbed(gyro, force, model, dt, rng):
     bent = []
     for values, bias, density, walk in (
         (gyro, model.gyroscope_bias_stddev, model.gyroscope_noise_density, model.gyroscope_random_walk),
-        (force, model.accelerometer_bias_stddev, model.accelerometer_noise_density, model.accelerometer_random_walk),
+        (
+            force,
+            model.accelerometer_bias_stddev,
+            model.accelerometer_noise_density,
+            model.accelerometer_random_walk,
+        ),
     ):
-        matrix = np.where(np.eye(3, dtype=bool), model.scale_stddev, model.axes_stddev) * rng.normal(size=(3, 3))
+        matrix = np.where(np.eye(3, dtype=bool), model.scale_stddev, model.axes_stddev) * rng.normal(
+            size=(3, 3)
+        )
         wander = np.cumsum(rng.normal(0, walk * dt**0.5, values.shape), 0)
         noise = rng.normal(0, density / dt**0.5, values.shape)
         bent.append(values @ (np.eye(3) + matrix).T + rng.normal(0, bias, 3) + wander + noise)

@@ -25,6 +25,8 @@ from starpos.sky import catalogue
 
 NO_ANSWER = 1
 MOUNT_STDDEV_DEG = 1.0
+# of --altitude-m: the geoid, and hills on the way
+GIVEN_HEIGHT_STDDEV_M = 100.0
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
         "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
@@ -125,6 +127,11 @@ def run(args: argparse.Namespace) -> int:
         mount_stddev=np.radians(args.mount_stddev),
         atmosphere=common.atmosphere_of(args),
         clock_stddev_s=instrument.clock_stddev_s,
+        **(
+            {}
+            if args.altitude_m is None
+            else {"height_m": args.altitude_m, "height_stddev_m": GIVEN_HEIGHT_STDDEV_M}
+        ),
     )
     times = np.array([np.nan if s.utc_unix_s is None else s.utc_unix_s for s in seen])
     sightings = [s.sighting for s in seen if s.sighting is not None]

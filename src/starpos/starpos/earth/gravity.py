@@ -37,7 +37,7 @@ def zenith_at(place: np.ndarray) -> np.ndarray:
 
 
 def gravity(place: np.ndarray) -> np.ndarray:
-    """Gravity (..., 3), m/s2, at places (..., 3) in ITRS, m: Somigliana's formula, two terms of height (TR8350.2, 4-3)."""
+    """Gravity (..., 3), m/s2, at places (..., 3) in ITRS, m: Somigliana's formula with two terms of height (TR8350.2)."""
     latitude, longitude, height = geodetic_place(place)
     return -_strength(latitude, height)[..., None] * unit_vector(longitude, latitude)
 

@@ -71,7 +71,12 @@ class Adjustment:
             )
         self.law = vessel.law if self.odometry is None and not vessel.parked else None
         self.unknowns = MEASURED if self.law is None else BY_LAW
-        self.known = Beforehand(mount=vessel.mount_stddev, refraction=vessel.atmosphere.relative_sigma)
+        self.known = Beforehand(
+            mount=vessel.mount_stddev,
+            refraction=vessel.atmosphere.relative_sigma,
+            height_m=vessel.height_m,
+            height_stddev_m=vessel.height_stddev_m,
+        )
         self.model = vessel.model
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
         # nodes whose measurement of a kind is wrong, and velocities that are
@@ -156,7 +161,7 @@ class Adjustment:
         )
 
     def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
-        """The equations about a motion, without measurements that the solution before, or an earlier one, shows to be wrong."""
+        """The equations about a motion, without measurements that a solution has shown to be wrong."""
         n, count = self.unknowns, len(motion)
         sums = summed(
             self.pieces,
@@ -191,8 +196,7 @@ class Adjustment:
     def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
         """Equations without outliers, with wider errors where most of them scatter by more than is stated.
 
-        Where no solution is near, those that were left out stay so: else the step that their absence makes would bring them
-        back.
+        Where no solution is near, those that were left out stay so: the step that their absence makes would bring them back.
         """
         used = self.excess[kind]
         if before is not None and len(lacks.index):
@@ -203,6 +207,4 @@ class Adjustment:
             self.wrong[kind] = lacks.index[distance2 > OUTLIER_CHI2 * change]
             self.excess[kind] = used = used * change
         keep = ~np.isin(lacks.index, self.wrong[kind])
-        return Lacks(
-            index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * used
-        )
+        return Lacks(index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * used)

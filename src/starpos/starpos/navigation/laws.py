@@ -44,12 +44,12 @@ LAWS = {
         climb_stddev=0.7,
         rest_s=3.0,
     ),
-    # a steady airspeed in a wind that changes by half a metre per second in ten minutes; gusts of seconds
+    # a steady airspeed in a wind that changes by 0.3 m/s in ten minutes; gusts of seconds
     "drone": MotionLaw(
         speed_stddev=50.0,
         speed_walk=0.1,
         drift_stddev=15.0,
-        drift_walk=0.02,
+        drift_walk=0.012,
         rest_stddev=0.8,
         climb_stddev=0.8,
         rest_s=4.0,

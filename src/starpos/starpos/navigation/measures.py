@@ -40,15 +40,15 @@ NO_PLACE, NO_VELOCITY, NO_TURN = 2e7, 1e3, 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Beforehand:
-    """What is known before the voyage, 1 sigma: height m, mount rad an axis, share of refraction.
+    """What is known before the voyage, 1 sigma: mount rad an axis, share of refraction, height m.
 
     log_scale, log_axes, lag_s: of the measured velocity (a share; rad an axis) and of the camera's stamps (s).
     """
 
     mount: float
     refraction: float
-    height_m: float = 500.0
-    height_stddev_m: float = 2000.0
+    height_m: float
+    height_stddev_m: float
     log_scale: float = 0.01
     log_axes: float = 0.005
     lag_s: float = 0.005
@@ -84,7 +84,7 @@ class Lacks:
         return all_rows
 
     def distance2(self, covariance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-        """Squared residuals (F,) in units of what they should scatter by, given a solution's covariance (K, n + m, n + m).
+        """Squared residuals (F,) over what they should scatter by, given a solution's covariance (K, n + m, n + m).
 
         left_out (F,): which of them had no part in the solution.
         """

@@ -13,7 +13,7 @@ GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 SPEED, DRIFT = slice(15, 16), slice(16, 19)
 MEASURED, BY_LAW = 15, 19
 # columns of the constants: mount as a small rotation about the camera's axes, matrices of gyro and accelerometer,
-# row-major, scale and axes of the measured velocity, lag of the IMU's stamps behind the camera's in s, share of refraction
+# row-major, scale and axes of the measured velocity, lag of the IMU's stamps behind the camera's, s, share of refraction
 MOUNT, GYRO_MATRIX, ACCEL_MATRIX = slice(0, 3), slice(3, 12), slice(12, 21)
 LOG_SCALE, LOG_AXES, LAG, REFRACTION = slice(21, 22), slice(22, 25), slice(25, 26), slice(26, 27)
 CONSTANTS = 27

@@ -59,9 +59,7 @@ def _check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: 
         )
 
 
-def _check_turns(
-    stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_to_body: np.ndarray
-) -> None:
+def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_to_body: np.ndarray) -> None:
     """Compare the turns between neighbouring frames, by the stars and by the gyro."""
     first = stars.index[:-1][np.diff(stars.index) == 1]
     near = np.flatnonzero(np.diff(stars.index) == 1)

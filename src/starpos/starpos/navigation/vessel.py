@@ -18,6 +18,7 @@ class Vessel:
 
     vehicle: a name in LAWS, or None for anything.  model: of the IMU.
     camera_to_body (3, 3), mount_stddev: as believed, and rad an axis.  clock_stddev_s: of the stamps against UTC.
+    height_m, height_stddev_m: above the ellipsoid; by itself anywhere on land.
     """
 
     vehicle: str | None
@@ -26,6 +27,8 @@ class Vessel:
     mount_stddev: float
     atmosphere: Atmosphere
     clock_stddev_s: float
+    height_m: float = 500.0
+    height_stddev_m: float = 2000.0
 
     @property
     def law(self) -> MotionLaw:

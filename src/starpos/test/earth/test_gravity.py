@@ -22,9 +22,9 @@ def test_it_points_down_and_falls_with_height():
     assert zenith_at(place) == pytest.approx(up, abs=1e-12)
     assert np.cross(gravity(place), up) == pytest.approx(np.zeros(3), abs=1e-12)
     # 0.3086 mGal a metre
-    assert (np.linalg.norm(gravity(place)) - np.linalg.norm(gravity(place + 1000 * up))) / 1000 == pytest.approx(
-        3.085e-6, rel=2e-3
-    )
+    assert (
+        np.linalg.norm(gravity(place)) - np.linalg.norm(gravity(place + 1000 * up))
+    ) / 1000 == pytest.approx(3.085e-6, rel=2e-3)
 
 
 @pytest.mark.parametrize("latitude_deg", [0, 48, 90])

@@ -26,7 +26,10 @@ def with_imu(record, gyro=None, force=None, keep=slice(None), shift_s=0.0):
 
 def with_velocity(record, change):
     log = record.velocity
-    return replace(record, velocity=replace(log, velocity=change(log.utc_unix_s - log.utc_unix_s[0], log.velocity.copy())))
+    return replace(
+        record,
+        velocity=replace(log, velocity=change(log.utc_unix_s - log.utc_unix_s[0], log.velocity.copy())),
+    )
 
 
 @pytest.mark.parametrize(
@@ -38,7 +41,10 @@ def with_velocity(record, change):
         (lambda r: with_imu(r, force=r.imu.force[:, [2, 1, 0]]), "accelerometer's axes"),
         (lambda r: with_imu(r, force=-r.imu.force), "accelerometer's axes"),
         (lambda r: with_imu(r, gyro=np.degrees(r.imu.gyro)), "in deg/s: give rad/s"),
-        (lambda r: with_imu(r, gyro=r.imu.gyro[:, [1, 0, 2]] * [1, -1, 1]), "its x, y, z seem to be -y, .x, .z of the file"),
+        (
+            lambda r: with_imu(r, gyro=r.imu.gyro[:, [1, 0, 2]] * [1, -1, 1]),
+            "its x, y, z seem to be -y, .x, .z of the file",
+        ),
         (lambda r: with_imu(r, shift_s=500.0), "clocks of camera and IMU agree"),
         (lambda r: with_imu(r, shift_s=15.0), "clocks of camera and IMU agree"),
     ],
@@ -87,7 +93,9 @@ def test_an_accelerometer_noisier_than_stated_widens_the_claim(record, rng):
 def test_a_frame_identified_wrongly_is_left_out(record):
     frames = list(record.frames)
     turn = np.array([[0.999, -0.0447, 0], [0.0447, 0.999, 0], [0, 0, 1]])
-    frames[30] = replace(frames[30], itrs=frames[30].itrs @ turn, camera_to_itrs=turn.T @ frames[30].camera_to_itrs)
+    frames[30] = replace(
+        frames[30], itrs=frames[30].itrs @ turn, camera_to_itrs=turn.T @ frames[30].camera_to_itrs
+    )
     voyage = navigated(replace(record, frames=frames))
     assert voyage.left_out["frames"] == 1 and nees(voyage, record) < 16
 

@@ -52,7 +52,7 @@ def test_a_gap_is_told_and_bridged_by_the_next_reading():
 
 def test_slopes_are_those_of_differences(rng):
     t = np.arange(1, 201) * 0.01
-    imu = ImuLog.of(1e9 + t, rng.normal(0, 0.5, (200, 3)), rng.normal(0, 3, (200, 3)) + [0, 0, 9.8])
+    imu = ImuLog.of(1e9 + t, rng.normal(0, 0.5, (200, 3)), rng.normal([0, 0, 9.8], 3, (200, 3)))
     pieces = Pieces.cut(imu, 1e9 + np.array([0.0, 1.0, 2.0]))
     biases, matrices = rng.normal(0, 1e-3, (2, 2, 3)), rng.normal(0, 1e-4, (2, 3, 3))
     here = summed(pieces, *biases, *matrices)
@@ -65,7 +65,9 @@ def test_slopes_are_those_of_differences(rng):
         else:
             changed[2 + kind].flat[k - 3] += step
         there = summed(pieces, *changed)
-        assert (there.speed - here.speed) / step == pytest.approx(here.speed_slope[:, :, error], rel=0.01, abs=0.02)
+        assert (there.speed - here.speed) / step == pytest.approx(
+            here.speed_slope[:, :, error], rel=0.01, abs=0.02
+        )
         assert (there.way - here.way) / step == pytest.approx(here.way_slope[:, :, error], rel=0.01, abs=0.02)
         if kind == 0:
             turned = Rotation.from_matrix(there.turn @ here.turn.transpose(0, 2, 1)).as_rotvec()

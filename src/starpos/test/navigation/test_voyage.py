@@ -15,7 +15,7 @@ from starpos_testing.voyages import INDUSTRIAL, TACTICAL, made
 )
 def test_an_exact_voyage_is_found_to_a_metre_from_nothing(latitude_deg, longitude_deg):
     """The vehicle drives and turns; neither place nor attitude nor level are told, and the height is as expected."""
-    about = dict(latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=500.0)
+    about = {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg, "height_m": 500.0}
     exact = made("rover", 60, 3, rate_hz=100, errors=False, **about)
     voyage = navigated(exact)
     off = voyage.motion.place - exact.place
@@ -31,7 +31,7 @@ def test_an_exact_voyage_is_found_to_a_metre_from_nothing(latitude_deg, longitud
 
 @pytest.mark.parametrize(("kind", "model"), [("rover", INDUSTRIAL), ("ship", TACTICAL)])
 def test_claims_hold(kind, model):
-    """NEES of place and heading, 3 in the mean: of eight voyages between the 0.1 % and the 99.9 % of chi-squared of 24."""
+    """NEES of place and heading, 3 in the mean: the sum of eight lies between 0.1 % and 99.9 % of chi-squared of 24."""
     scores = []
     for seed in range(8):
         record = made(kind, 100, seed, model=model, rate_hz=25, cadence_s=2.0)

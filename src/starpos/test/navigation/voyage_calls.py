@@ -30,7 +30,9 @@ def errors(voyage, made):
             (fix.latitude - phi) * EARTH_M,
             wrapped(fix.heading - heading),
         )
-        for fix, phi, lam, heading in zip(voyage.fixes, made.latitude, made.longitude, made.heading, strict=True)
+        for fix, phi, lam, heading in zip(
+            voyage.fixes, made.latitude, made.longitude, made.heading, strict=True
+        )
     ]
     return np.array(off)
 

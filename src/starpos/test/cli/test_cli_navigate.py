@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos navigate` on a drive of 80 s: star lists under the catalogue's sky, an IMU's table, odometry."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from cli_calls import AIR, WIDE, objects
+
+from starpos.earth.orientation import earth_state
+from starpos.earth.refraction import Atmosphere
+from starpos.frames.star_list import write_star_list
+from starpos.frames.stars import Stars
+from starpos.instrument.camera import Camera
+from starpos.sky.site import Site
+from starpos.utc import utc_text
+from starpos_testing.command_line import run
+from starpos_testing.voyages import INDUSTRIAL, made
+
+KEYS = {"file", "utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
+        "status", "latitude_geodetic", "longitude_geodetic", "covariance_geodetic"}  # fmt: skip
+EXPOSURE_S, SIGMA_PX = 0.02, 0.1
+CAMERA = Camera.from_focal(1000, 700, 29670 / 6.4)
+
+
+@pytest.fixture(scope="module")
+def voyage(tmp_path_factory, catalogue):
+    """The folder of a drive, and its truth."""
+    folder, record, rng = (
+        tmp_path_factory.mktemp("voyage"),
+        made("rover", 80, 2, cadence_s=2.0),
+        np.random.default_rng(1),
+    )
+    air = Atmosphere(pressure_pa=100_000.0, temperature_c=5.0)
+    for k, t in enumerate(record.frames_s):
+        state = earth_state(t)
+        site = Site(*np.degrees([record.latitude[k], record.longitude[k]]), air)
+        camera_to_enu = site.enu @ record.body_to_itrs[k] @ record.mount
+        index = site.overhead(catalogue, state, camera_to_enu[:, 2], CAMERA.half_diagonal_rad, 7.0)
+        xy = CAMERA.project(site.observed(catalogue, index, state) @ camera_to_enu)
+        xy = (xy + rng.normal(0, SIGMA_PX, xy.shape))[((xy > 0) & (xy < [999, 699])).all(1)]
+        stars = Stars(
+            x=xy[:, 0],
+            y=xy[:, 1],
+            flux=np.linspace(1000, 10, len(xy)),
+            snr=np.full(len(xy), 50.0),
+            covariance=np.tile(np.eye(2) * SIGMA_PX**2, (len(xy), 1, 1)),
+            flags=np.zeros(len(xy)),
+            width=1000,
+            height=700,
+            exposure_s=EXPOSURE_S,
+        )
+        write_star_list(folder / f"stars_{k:03d}.csv", stars, utc_text(t - EXPOSURE_S / 2).rstrip("Z"))
+    imu = np.column_stack([record.imu.utc_unix_s, record.imu.gyro, record.imu.force])
+    log = np.column_stack([record.velocity.utc_unix_s, record.velocity.velocity, record.velocity.sigma])
+    for name, columns, table in (
+        ("imu.csv", "utc_unix_s,gx,gy,gz,ax,ay,az", imu),
+        ("velocity.csv", "utc_unix_s,vx,vy,vz,sigma", log),
+    ):
+        np.savetxt(folder / name, table, fmt="%.9f", delimiter=",", header=columns, comments="")
+    (folder / "imu.yaml").write_text(
+        "".join(f"{name}: {value:.6e}\n" for name, value in asdict(INDUSTRIAL).items())
+    )
+    return folder, record
+
+
+def navigate(capsys, folder, *more, velocity=True, imu="imu.csv"):
+    log = ["--velocity", folder / "velocity.csv"] if velocity else []
+    given = [
+        "--imu",
+        folder / imu,
+        "--imu-model",
+        folder / "imu.yaml",
+        *log,
+        "--vehicle",
+        "rover",
+        *WIDE,
+        *AIR,
+    ]
+    return run(
+        capsys, "navigate", *sorted(folder.glob("stars_*.csv")), *given, "--clock-stddev", "0.001", *more
+    )
+
+
+def test_each_frame_has_a_place_whose_claim_holds(voyage, capsys):
+    folder, record = voyage
+    status, out, errors = navigate(capsys, folder, "--json")
+    rows = objects(out)
+    assert (status, errors, len(rows)) == (0, [], 40)
+    assert all(set(row) >= KEYS and row["status"] == "ok" for row in rows)
+    last, phi, lam = rows[-1], record.latitude[-1], record.longitude[-1]
+    off = np.array([
+        (np.radians(last["longitude"]) - lam) * 6.378e6 * np.cos(phi),
+        (np.radians(last["latitude"]) - phi) * 6.37e6,
+        (last["heading"] - np.degrees(record.heading[-1]) + 180) % 360 - 180,
+    ])  # fmt: skip
+    covariance = np.array(last["covariance"])
+    assert off @ np.linalg.solve(covariance, off) < 16
+    assert 20 < np.sqrt(covariance[0, 0]) < 500
+    assert np.hypot(*last["velocity"][:2]) == pytest.approx(
+        np.linalg.norm(record.velocity.velocity[-1]), abs=0.1
+    )
+    # an unknown deflection is in the geodetic place alone
+    assert last["covariance_geodetic"][0][0] > covariance[0, 0] + 180**2
+
+
+def test_a_table_for_people(voyage, capsys):
+    status, out, _ = navigate(capsys, voyage[0], "--xi", "1", "--eta", "2")
+    lines = out.splitlines()
+    assert status == 0 and len(lines) == 40 and " m N " in lines[0] and "m/s" in lines[0]
+
+
+def test_faults_are_told_and_a_frame_without_readings_has_no_answer(voyage, capsys):
+    folder, _ = voyage
+    lines = (folder / "imu.csv").read_text().splitlines()
+    lines[100] = lines[100].replace(lines[100].split(",")[1], "nan", 1)
+    (folder / "cut.csv").write_text("\n".join(lines[:3600]) + "\n" + lines[3000] + "\n")
+    status, out, errors = navigate(capsys, folder, "--json", imu="cut.csv")
+    assert status == 0
+    assert any("1 row is without a finite number" in line for line in errors)
+    assert any("not later than all before" in line for line in errors)
+    assert [row["status"] for row in objects(out)][-1] == "no inertial readings"
+    assert objects(out)[-1]["latitude"] is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("time,gx\n1,2\n", "it has no column utc_unix_s"),
+        ("utc_unix_s,gx,gy,gz,ax,ay,az\n", "has no rows"),
+        ("utc_unix_s,gx,gy,gz,ax,ay,az\n1,2,3,4,5,6,seven\n", "not a readable table of inertial readings"),
+        ("utc_unix_s,gx,gy,gz,ax,ay,az\n1793700000,0,0,0,0,0,9.8\n", "at least 100 are needed"),
+    ],
+)
+def test_a_table_that_is_none(voyage, capsys, text, said):
+    (voyage[0] / "bad.csv").write_text(text)
+    status, _, errors = navigate(capsys, voyage[0], imu="bad.csv")
+    assert status == 2 and len(errors) == 1 and said in errors[0]
+
+
+def test_a_model_that_is_none(voyage, capsys, tmp_path):
+    for text, said in (
+        ("gyroscope_noise_density: 1e-5\n", "needs gyroscope_noise_density, accelerometer_noise_density"),
+        ("".join(f"{name}: 100\n" for name in asdict(INDUSTRIAL)), "it must be above 0 and below"),
+        ("".join(f"{name}: [1]\n" for name in asdict(INDUSTRIAL)), "give a number"),
+    ):
+        (tmp_path / "imu.yaml").write_text(text)
+        status, _, errors = navigate(capsys, voyage[0], "--imu-model", tmp_path / "imu.yaml")
+        assert status == 2 and said in errors[0], json.dumps(errors)
