@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Table of docs/navigation.md: how well `starpos.navigation` knows place and heading under way, and whether its claims hold.
+"""Table of docs/navigation.md: how well place and heading are known under way, and whether their claims hold.
 
-`benchmark_navigation.py [--voyages N] [--seconds S]`.  Voyages of starpos_testing.voyages with odometry or a log (none for
-the drone), a frame every 2 s: mean error of the place over the last quarter, 1 sigma an axis as claimed, NEES of the
-place (2 where claims hold), mean error of the heading, CPU time of a voyage.
+`benchmark_navigation.py [--voyages N] [--seconds S]`.  Voyages of starpos_testing.voyages with odometry or a log (none
+for the drone), a frame every 2 s.  Means of the last quarter: error of the place, 1 sigma an axis as claimed, NEES of the
+place (2 where claims hold), error of the heading; CPU time of a voyage without identification.
 """
 
 import argparse
@@ -60,7 +60,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1200.0)
     args = parser.parse_args()
     print(
-        "| vehicle | IMU | error m | claimed m | NEES | heading arcsec | CPU s |\n| --- | --- | --- | --- | --- | --- | --- |"
+        "| vehicle | IMU | error m | claimed m | NEES | heading arcsec | CPU s |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        sep="\n",
     )
     for vehicle in ("rover", "ship", "drone", "parked"):
         for grade, model in GRADES.items():
@@ -74,7 +76,8 @@ def main() -> None:
                 spent += time.process_time() - begin
             error, claimed, nees, heading = np.mean(found, axis=0)
             print(
-                f"| {vehicle} | {grade} | {error:.0f} | {claimed:.0f} | {nees:.2f} | {heading:.0f} | {spent / args.voyages:.1f} |",
+                f"| {vehicle} | {grade} | {error:.0f} | {claimed:.0f} | {nees:.2f} | {heading:.0f} "
+                f"| {spent / args.voyages:.1f} |",
                 flush=True,
             )
 

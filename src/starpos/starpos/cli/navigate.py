@@ -2,7 +2,7 @@
 """`starpos navigate`: place, heading and velocity of a voyage from its frames and an IMU, without standing still."""
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +66,14 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="how well the camera sits as the instrument says, an axis: z up, the top of the frame forward "
         f"({MOUNT_STDDEV_DEG:g})",
     )
+    parser.add_argument(
+        "--drift-stddev",
+        type=common.number(0, 50),
+        default=0.0,
+        metavar="M_PER_S",
+        help="where --velocity is not over ground but through water or air: 1 sigma of current or wind, an axis; half of "
+        "it may change in an hour (0)",
+    )
     common.add_stamps(parser)
     parser.add_argument(
         "--instrument", metavar="FILE", help="instrument file (YAML) instead of the next two options"
@@ -127,12 +135,10 @@ def run(args: argparse.Namespace) -> int:
         mount_stddev=np.radians(args.mount_stddev),
         atmosphere=common.atmosphere_of(args),
         clock_stddev_s=instrument.clock_stddev_s,
-        **(
-            {}
-            if args.altitude_m is None
-            else {"height_m": args.altitude_m, "height_stddev_m": GIVEN_HEIGHT_STDDEV_M}
-        ),
+        drift_stddev=args.drift_stddev,
     )
+    if args.altitude_m is not None:
+        vessel = replace(vessel, height_m=args.altitude_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
     times = np.array([np.nan if s.utc_unix_s is None else s.utc_unix_s for s in seen])
     sightings = [s.sighting for s in seen if s.sighting is not None]
     try:

@@ -13,6 +13,7 @@ from starpos.earth.gravity import zenith_at
 from starpos.errors import FixError, VoyageError
 from starpos.navigation import sanity
 from starpos.navigation.chain import Chain, Smoothed, log_likelihood, smoothed
+from starpos.navigation.laws import MotionLaw, carried
 from starpos.navigation.links import Links, links_of
 from starpos.navigation.measures import (
     Beforehand,
@@ -69,7 +70,7 @@ class Adjustment:
             raise VoyageError(
                 "no velocity lies on the voyage: check that its clock and that of the camera agree"
             )
-        self.law = vessel.law if self.odometry is None and not vessel.parked else None
+        self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.known = Beforehand(
             mount=vessel.mount_stddev,
@@ -82,6 +83,11 @@ class Adjustment:
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
         self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
+
+    def _law(self, vessel: Vessel) -> MotionLaw | None:
+        if self.odometry is not None:
+            return carried(vessel.drift_stddev) if vessel.drift_stddev > 0 else None
+        return None if vessel.parked else vessel.law
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -101,7 +107,8 @@ class Adjustment:
         motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
         solution: Smoothed | None = None
         zenith, step, sigma = np.zeros(3), np.inf, 1.0
-        weighed = self.law is not None
+        # where a law stands in for velocities, its own errors hide those of the readings
+        weighed = self.odometry is None
         for k in range(MOST_ROUNDS):
             # equations of another place tell neither how the stars are seen nor which measurements are wrong
             near = step < min(NEAR_M, sigma)
@@ -175,7 +182,7 @@ class Adjustment:
             parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
         if self.vessel.parked:
             parts.append(standing_lacks(motion, np.arange(count), STANDING_SIGMA, n))
-        if self.law is not None:
+        if self.law is not None and self.odometry is None:
             parts.append(law_lacks(motion, self.law))
         links = links_of(motion, sums, self.pieces, self.model, self.law)
         chain = Chain(
@@ -196,7 +203,8 @@ class Adjustment:
     def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
         """Equations without outliers, with wider errors where most of them scatter by more than is stated.
 
-        Where no solution is near, those that were left out stay so: the step that their absence makes would bring them back.
+        Where no solution is near, those that were left out stay so: the step that their absence makes would bring them
+        back.
         """
         used = self.excess[kind]
         if before is not None and len(lacks.index):

@@ -57,7 +57,7 @@ class ImuLog:
         clipped = _clipped(np.hstack([gyro, force]))
         if clipped.any():
             said.append(
-                f"{place}: {int(clipped.sum())} readings are their channel's greatest value, as when it is saturated: left "
+                f"{place}: {int(clipped.sum())} readings are their channel's greatest value, as if saturated: left "
                 "out"
             )
         use = ~clipped

@@ -64,6 +64,23 @@ LAWS = {
         rest_s=1.0,
     ),
 }
+# of a drift such a share changes in an hour
+DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
+
+
+def carried(drift_stddev: float) -> MotionLaw:
+    """The law of a vehicle that measures its velocity against water or air; their drift's 1 sigma, m/s an axis."""
+    return MotionLaw(
+        speed_stddev=1e-3,
+        speed_walk=1e-6,
+        drift_stddev=drift_stddev,
+        drift_walk=DRIFT_CHANGE * drift_stddev / DRIFT_CHANGE_S**0.5,
+        rest_stddev=1e-3,
+        climb_stddev=1e-3,
+        rest_s=1.0,
+    )
+
+
 # nobody has said what it is: anything that goes on the ground, at sea or in the air
 ANYTHING = MotionLaw(
     speed_stddev=100.0,

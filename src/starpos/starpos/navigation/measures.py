@@ -131,10 +131,13 @@ def _rates(sums: Sums, pieces: Pieces) -> np.ndarray:
 def velocity_lacks(motion: Motion, index: np.ndarray, missed: np.ndarray, sigma: np.ndarray, n: int) -> Lacks:
     """Equations of nodes (F,) with velocities, missed (F, 3) by so much, measured less predicted, with 1 sigma (F,)."""
     attitude = motion.attitude[index]
-    forward = np.einsum("kji,kj->ki", attitude, motion.velocity[index])
+    through = motion.velocity[index] - motion.drift[index]
+    forward = np.einsum("kji,kj->ki", attitude, through)
     rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
     rows[:, :, VELOCITY] = attitude.transpose(0, 2, 1)
-    rows[:, :, TURN] = attitude.transpose(0, 2, 1) @ crosses(motion.velocity[index])
+    rows[:, :, TURN] = attitude.transpose(0, 2, 1) @ crosses(through)
+    if n == BY_LAW:
+        rows[:, :, DRIFT] = -attitude.transpose(0, 2, 1)
     constants = rows[:, :, n:-1]
     constants[:, :, LOG_SCALE] = forward[..., None]
     constants[:, :, LOG_AXES] = -crosses(forward)

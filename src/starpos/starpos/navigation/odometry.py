@@ -61,7 +61,7 @@ class Odometry:
         falling = gravity(motion.place[k]) - 2 * np.cross(SPIN, motion.velocity[k])
         velocity = np.einsum("kij,kj->ki", motion.attitude[k], speed) + falling * self.offset_s[:, None]
         attitude = motion.attitude[k] @ turned
-        forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity)
+        forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
     def lacks(self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int) -> Lacks:

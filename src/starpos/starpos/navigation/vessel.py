@@ -18,6 +18,7 @@ class Vessel:
 
     vehicle: a name in LAWS, or None for anything.  model: of the IMU.
     camera_to_body (3, 3), mount_stddev: as believed, and rad an axis.  clock_stddev_s: of the stamps against UTC.
+    drift_stddev: m/s an axis, of water or air against the ground, where velocities are measured against these.
     height_m, height_stddev_m: above the ellipsoid; by itself anywhere on land.
     """
 
@@ -27,6 +28,7 @@ class Vessel:
     mount_stddev: float
     atmosphere: Atmosphere
     clock_stddev_s: float
+    drift_stddev: float = 0.0
     height_m: float = 500.0
     height_stddev_m: float = 2000.0
 

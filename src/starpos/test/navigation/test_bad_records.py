@@ -115,3 +115,16 @@ def test_rows_that_cannot_be_used_are_told():
     assert (record.utc_unix_s - 1e9).tolist() == [0, 1, 3]
     assert len(record.faults) == 2 and "2 rows are without a finite number" in record.faults[0]
     assert "2 rows are not later than all before" in record.faults[1]
+
+
+def test_a_current_that_is_stated_widens_the_claim():
+    """A ship's log through water that flows at 0.5 m/s to the east."""
+    record = made("ship", 120, 5, rate_hz=25, cadence_s=2.0)
+    east = np.array([-np.sin(record.longitude[0]), np.cos(record.longitude[0]), 0.0])
+    nearest = np.abs(record.velocity.utc_unix_s[:, None] - record.frames_s).argmin(1)
+    carried = with_velocity(
+        record, lambda t, v: v - 0.5 * np.einsum("kij,i->kj", record.body_to_itrs[nearest], east)
+    )
+    stated = navigated(carried, "ship", drift_stddev=0.5)
+    assert nees(stated, record) < 16 and sigma_m(stated) > 1.3 * sigma_m(navigated(record, "ship"))
+    assert np.linalg.norm(stated.fixes[-1].velocity) == pytest.approx(5.0, abs=1.5)

@@ -11,7 +11,7 @@ from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL
 EARTH_M = 6.37e6
 
 
-def vessel(vehicle="rover", model=INDUSTRIAL, mount_deg=1.0):
+def vessel(vehicle="rover", model=INDUSTRIAL, mount_deg=1.0, **more):
     return Vessel(
         vehicle=vehicle,
         model=model,
@@ -19,6 +19,7 @@ def vessel(vehicle="rover", model=INDUSTRIAL, mount_deg=1.0):
         mount_stddev=np.radians(mount_deg),
         atmosphere=Atmosphere(pressure_pa=0.0),
         clock_stddev_s=1e-4,
+        **more,
     )
 
 
