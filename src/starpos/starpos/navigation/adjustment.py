@@ -38,7 +38,8 @@ FEWEST_FRAMES = 3
 SETTLED_M, SETTLED_SHARE = 1.0, 0.02
 # equations of a place farther off are wrong by more than the stars' errors: the square of the angle
 NEAR_M = 2000.0
-MOST_ROUNDS = 25
+# no step on the Earth is longer
+FARTHEST_M, MOST_ROUNDS = 2e7, 25
 # stars are seen anew where the zenith has moved by more: 2 m of refraction
 ZENITH_MOVED = 1e-3
 STANDING_SIGMA = 2e-3
@@ -82,6 +83,7 @@ class Adjustment:
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
+        self.strays = 0
         self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
 
     def _law(self, vessel: Vessel) -> MotionLaw | None:
@@ -92,7 +94,7 @@ class Adjustment:
     @property
     def left_out(self) -> dict[str, int]:
         """How many measurements of each kind are left out."""
-        return {"frames": len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
+        return {"frames": self.strays + len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
 
     def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
         """The motion, the solution of the last round, and how many rounds there were.
@@ -104,6 +106,11 @@ class Adjustment:
         sums = summed(self.pieces, zero, zero, none, none)
         believed = self.vessel.camera_to_body
         sanity.check(stars, self.pieces, sums, self.model, believed)
+        stray = sanity.strays(stars, self.pieces, sums, self.model, believed)
+        if stray.any():
+            self.strays = int(stray.sum())
+            self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
+            stars = self._attitudes(None)
         motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
         solution: Smoothed | None = None
         zenith, step, sigma = np.zeros(3), np.inf, 1.0
@@ -120,6 +127,9 @@ class Adjustment:
             solution = smoothed(chain)
             motion = motion.moved(solution.nodes, solution.constants)
             step = float(np.linalg.norm(solution.nodes[:, PLACE], axis=1).max())
+            # true for NaN too
+            if not step < FARTHEST_M:
+                break
             variance = np.trace(solution.covariance[:, PLACE, PLACE], axis1=1, axis2=2)
             sigma = float(np.sqrt(variance.min()))
             progress("adjusting", min(0.95, (k + 1) / 8))

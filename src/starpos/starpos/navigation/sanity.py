@@ -19,7 +19,9 @@ MOST_OFF, SIGMAS = 0.5, 6.0
 LOWEST_DEG = 88.0
 # turns that are seen so far above their noise show the gyro's axes; and what part of them may be off
 CLEARLY, MOST_SHARE = 20.0, 0.3
-# unit vectors and counts of other units
+# a frame strays whose turn is so much off, rad, and so many in a row at most
+STRAY, MOST_STRAYS = np.radians(3.0), 5
+# rad/s in other units
 UNITS = {"deg/s": np.degrees(1.0), "rev/min": 30 / np.pi}
 
 
@@ -92,6 +94,29 @@ def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_t
             f"the gyro turns by {np.degrees(np.abs(bias).max()):.3g} deg/s more than the stars, its model allows "
             f"{np.degrees(allowed):.2g}: check its unit (rad/s) and the model of the IMU"
         )
+
+
+def strays(
+    stars: StarAttitudes, pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray
+) -> np.ndarray:
+    """Mask (F,) of a few frames whose attitude the gyro contradicts before and after them.
+
+    Such frames are identified wrongly or have another's time, and are too far off for an adjustment to begin with.
+    """
+    body, back = stars.camera_to_itrs @ camera_to_body.T, turned_back(pieces.span_s)
+    begin = np.append(0.0, np.cumsum(pieces.span_s))
+    lost = np.append(0.0, np.cumsum(pieces.missing_s))
+    breaks = [0]
+    for k, (first, last) in enumerate(zip(stars.index[:-1], stars.index[1:], strict=True), 1):
+        turned = body[k - 1]
+        for node in range(first, last):
+            turned = back[node] @ turned @ sums.turn[node]
+        off = np.arccos(np.clip((np.trace(turned.T @ body[k]) - 1) / 2, -1, 1))
+        most = STRAY + SIGMAS * model.gyroscope_bias_stddev * (begin[last] - begin[first])
+        if off > most and lost[last] == lost[first]:
+            breaks.append(k)
+    size = np.diff([*breaks, len(body)])
+    return np.repeat(size <= MOST_STRAYS, size) if len(breaks) > 1 else np.zeros(len(body), bool)
 
 
 def _cause(seen: np.ndarray, felt: np.ndarray) -> str:
