@@ -38,6 +38,8 @@ FEWEST_FRAMES = 3
 SETTLED_M, SETTLED_SHARE = 1.0, 0.02
 # equations of a place farther off are wrong by more than the stars' errors: the square of the angle
 NEAR_M = 2000.0
+# variances so many times those stated are told
+NOTABLE = 4.0
 # no step on the Earth is longer
 FARTHEST_M, MOST_ROUNDS = 2e7, 25
 # stars are seen anew where the zenith has moved by more: 2 m of refraction
@@ -96,22 +98,27 @@ class Adjustment:
         """How many measurements of each kind are left out."""
         return {"frames": self.strays + len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What of the record does not go with the rest, in sentences."""
+        said = [
+            f"{number} {kind} do not go with the rest: left out"
+            for kind, number in self.left_out.items()
+            if number
+        ]
+        said += [
+            f"the {kind} scatter {excess**0.5:.1f} times as much as stated: their errors are widened by that"
+            for kind, excess in self.excess.items()
+            if excess > NOTABLE
+        ]
+        return tuple(said)
+
     def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
         """The motion, the solution of the last round, and how many rounds there were.
 
         VoyageError where the measurements do not go together, FixError where the place does not settle.
         """
-        stars = self._attitudes(None)
-        zero, none = np.zeros((len(self.nodes) - 1, 3)), np.zeros((3, 3))
-        sums = summed(self.pieces, zero, zero, none, none)
-        believed = self.vessel.camera_to_body
-        sanity.check(stars, self.pieces, sums, self.model, believed)
-        stray = sanity.strays(stars, self.pieces, sums, self.model, believed)
-        if stray.any():
-            self.strays = int(stray.sum())
-            self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
-            stars = self._attitudes(None)
-        motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
+        stars, motion = self._begin()
         solution: Smoothed | None = None
         zenith, step, sigma = np.zeros(3), np.inf, 1.0
         # where a law stands in for velocities, its own errors hide those of the readings
@@ -144,14 +151,32 @@ class Adjustment:
             "and what is said of the vehicle"
         )
 
+    def _begin(self) -> tuple[StarAttitudes, Motion]:
+        """Rough attitudes of the frames that go with the gyro, and a first motion from them."""
+        stars = self._attitudes(None)
+        zero, none = np.zeros((len(self.nodes) - 1, 3)), np.zeros((3, 3))
+        sums = summed(self.pieces, zero, zero, none, none)
+        believed = self.vessel.camera_to_body
+        sanity.check(stars, self.pieces, sums, self.model, believed)
+        stray = sanity.strays(stars, self.pieces, sums, self.model, believed)
+        if stray.any():
+            self.strays = int(stray.sum())
+            self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
+            stars = self._attitudes(None)
+        motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
+        return stars, motion
+
     def _weigh(self, chain: Chain, links: Links) -> None:
         """Raise the accelerometer's noise to what the voyage shows: of vibration some is left in sums."""
-        factors, likely = [1.0], [log_likelihood(chain) - links.log_determinant]
+        factors = [1.0]
+        likely = [log_likelihood(chain) - links.log_determinant]
         while len(factors) < MOST_FACTORS and likely[-1] > max(likely) - UNLIKELY:
             factors.append(factors[-1] * FACTOR)
             density = self.model.accelerometer_noise_density * factors[-1]
             noisy = links.noisier(density**2 - self.model.accelerometer_noise_density**2, self.pieces)
             likely.append(log_likelihood(replace(chain, links=noisy.whitened())) - noisy.log_determinant)
+            # what is stated is believed within a factor of e, where the record says nothing
+            likely[-1] -= np.log(factors[-1]) ** 2 / 2
         weight = np.exp(np.array(likely) - max(likely))
         self.excess["forces"] = float(weight @ np.square(factors) / weight.sum())
         density = self.model.accelerometer_noise_density * np.sqrt(self.excess["forces"])

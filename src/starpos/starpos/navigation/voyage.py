@@ -91,7 +91,7 @@ def navigate(
             fix_at(motion, solution, k, vessel.clock_stddev_s, stamp_s) if there else None
             for k, there in zip(np.searchsorted(nodes, times), inside, strict=True)
         ),
-        faults=(*imu.faults, *(() if velocity is None else velocity.faults)),
+        faults=(*imu.faults, *(() if velocity is None else velocity.faults), *adjustment.faults),
         excess=adjustment.excess,
         left_out=adjustment.left_out,
         rounds=rounds,

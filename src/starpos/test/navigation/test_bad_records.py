@@ -76,13 +76,17 @@ def test_a_wheel_that_slips_is_left_out(record):
         velocity[(t > 50) & (t < 56), 0] += 0.6
         return velocity
 
-    assert nees(navigated(with_velocity(record, slip)), record) < 16
+    slipped = navigated(with_velocity(record, slip))
+    assert nees(slipped, record) < 16
+    assert (
+        50 < slipped.left_out["velocities"] < 70 and "velocities do not go with the rest" in slipped.faults[0]
+    )
 
 
 def test_velocities_worse_than_stated_widen_the_claim(record, rng):
     poor = navigated(with_velocity(record, lambda t, v: v + rng.normal(0, 0.2, v.shape)))
     assert nees(poor, record) < 16 and sigma_m(poor) > 1.2 * sigma_m(navigated(record))
-    assert poor.excess["velocities"] > 10
+    assert poor.excess["velocities"] > 10 and "the velocities scatter" in poor.faults[0]
 
 
 def test_an_accelerometer_noisier_than_stated_widens_the_claim(record, rng):
