@@ -27,6 +27,8 @@ BRACKET_S = 1.5
 AGREE_SIGMA = 5.0
 # readings that come at their usual rate may leave out one of them
 USUAL_GAPS = 2.5
+# an end of the exposure longer than this share of it is open if the reading beyond disagrees
+OPEN_END = 0.25
 # So many equal readings in a row are a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at 0.1
 # chance makes one such row in 10^9 readings.
 STUCK_READINGS, RARE = 10, 0.1
@@ -282,24 +284,26 @@ class TiltLog:
     def _check_cover(
         self, index: np.ndarray, first: int, end: int, mid_unix_s: float, exposure_s: float
     ) -> None:
-        """TiltError if a part of the exposure is without readings that is longer than half of it, and than is usual."""
+        """TiltError if no readings tell whether the instrument was at rest in a part of the exposure.
+
+        Such a part is longer than half of the exposure, and than is usual. It is also an end of the exposure longer than
+        OPEN_END of it where the reading beyond disagrees: nobody knows when the turn began.
+        """
         t = self.utc_unix_s[index]
         begin, over = mid_unix_s - exposure_s / 2, mid_unix_s + exposure_s / 2
-        most = max(exposure_s / 2, USUAL_GAPS * self.period_s) + TOUCH_S
-        # a reading just outside covers an end as well, if it agrees with the one inside
-        before = (
-            first > 0 and t[first] - t[first - 1] <= BRACKET_S and self._agree(*index[first - 1 : first + 1])
-        )
-        after = end < len(t) and t[end] - t[end - 1] <= BRACKET_S and self._agree(*index[end - 1 : end + 1])
-        gaps = [
-            *np.diff(t[first:end]),
-            0.0 if before else t[first] - begin,
-            0.0 if after else over - t[end - 1],
-        ]
-        if max(gaps) > most:
+        usual = max(exposure_s / 2, USUAL_GAPS * self.period_s)
+        gaps = [(float(gap), usual) for gap in np.diff(t[first:end])]
+        for gap, one in ((t[first] - begin, first - 1), (over - t[end - 1], end - 1)):
+            beyond = 0 <= one < len(t) - 1 and t[one + 1] - t[one] <= BRACKET_S
+            if not beyond:
+                gaps.append((gap, usual))
+            elif not self._agree(index[one], index[one + 1]):
+                gaps.append((gap, OPEN_END * exposure_s))
+        open_s = [gap for gap, most in gaps if gap > most + TOUCH_S]
+        if open_s:
             raise TiltError(
-                f"the tilt readings leave {max(gaps):.2f} s of the exposure of {exposure_s:g} s uncovered: readings were "
-                "lost, check the inclinometer and its link"
+                f"the tilt readings leave {max(open_s):.2f} s of the exposure of {exposure_s:g} s uncovered: readings "
+                "were lost, or the instrument moved: check the inclinometer and its link"
             )
 
     @cached_property

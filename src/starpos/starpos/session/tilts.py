@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import BRACKET_S, NEIGHBOURS_S, TOUCH_S, TiltLog, noise_excess
+from starpos.instrument.tilt_log import BRACKET_S, NEIGHBOURS_S, OPEN_END, TOUCH_S, TiltLog, noise_excess
 from starpos.recording.messages import (
     OUT_OF_RANGE,
     SATURATED,
@@ -81,14 +81,14 @@ class TiltBuffer:
             self._steps = deque((s for s in self._steps if s[0] <= unix_s), maxlen=NOISE_CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
-        """Whether all samples of an exposure have arrived: the last one leaves no time for another."""
+        """Whether all samples that an exposure needs have arrived: none that may still come lies in it or bounds it."""
         times = [s.utc_unix_s for s in self._near(mid_unix_s, span_s)]
         end = mid_unix_s + span_s / 2
         if not times or times[-1] >= end:
             return bool(times)
         period = float(np.median(np.diff(times))) if len(times) > 2 else USUAL_PERIOD_S
-        # a sample that comes after an exposure without any of its own is needed to bracket it
-        return times[-1] >= max(end - JITTER * period, end - span_s)
+        # a sample that comes after an exposure is needed where the last one in it leaves much of it open
+        return times[-1] >= max(end - JITTER * period, end - OPEN_END * span_s)
 
     def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
         """The samples near an exposure in order of time, however they came; none counts twice.
@@ -114,8 +114,9 @@ class TiltBuffer:
         if not inside:
             self._explain(mid_unix_s, span_s, bool(near))
         else:
-            # Later samples must not count, because it is chance how many have arrived by now.
-            near = near[max(inside[0] - 1, 0) : inside[-1] + 1]
+            # Later samples must not count, because it is chance how many have arrived by now; one may be waited for.
+            open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > OPEN_END * span_s
+            near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
         excess = self._excess(mid_unix_s + span_s / 2)
         return TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
 

@@ -147,6 +147,16 @@ def test_one_reading_in_the_exposure_is_enough_where_more_are_not_usual():
     assert once.average(1060.0, 0.5).samples == 1
 
 
+@pytest.mark.parametrize("mid", [1004.249, 1004.751])
+def test_a_turn_beside_the_only_reading_of_an_exposure_gives_no_tilt(mid):
+    """A sensor that reads once a second: 111 km off with 402 m claimed."""
+    t = 1000.0 + np.arange(10)
+    turned = 5.0 * (t > 1004.5) * DEG
+    assert TiltLog.of(t, np.zeros(10), np.zeros(10), np.zeros(10)).average(mid, 0.5).samples == 1
+    with pytest.raises(TiltError, match=r"0\.50 s of the exposure of 0\.5 s uncovered"):
+        TiltLog.of(t, turned, np.zeros(10), np.zeros(10)).average(mid, 0.5)
+
+
 @pytest.mark.parametrize("mid", [990.0, 1020.0, float("nan"), float("inf")])
 def test_no_reading_near_the_exposure(mid):
     with pytest.raises(TiltError, match="no tilt reading in the exposure"):

@@ -130,6 +130,15 @@ def test_complete_once_a_sample_of_the_exposures_end_is_here():
     assert buffer.complete(T0, 0.5)
 
 
+def test_the_sample_after_an_exposure_is_waited_for_where_the_last_one_in_it_leaves_its_end_open():
+    buffer = buffer_of(sample(k - 0.2) for k in range(-3, 1))
+    assert not buffer.complete(T0, 0.5)
+    buffer.add(sample(0.8, 5.0), NOISE)
+    assert buffer.complete(T0, 0.5)
+    with pytest.raises(TiltError, match="uncovered"):
+        buffer.average(T0, 0.5)
+
+
 def test_days_of_samples_stay_bounded():
     buffer = buffer_of(sample(k / 10) for k in range(CAPACITY + 500))
     assert len(buffer) == CAPACITY
