@@ -8,7 +8,12 @@ package = "starpos"
 # the compiled core: a module is a .pyx; what several of them share is in .pxd
 SHARED = sorted(glob("starpos/core/*.pxd"))
 CORE = [
-    Extension(f"starpos.core.{Path(source).stem}", [source], depends=SHARED, extra_compile_args=["-O3"])
+    Extension(
+        f"starpos.core.{Path(source).stem}",
+        [source],
+        depends=SHARED,
+        extra_compile_args=["-O3", "-fno-math-errno"],
+    )
     for source in sorted(glob("starpos/core/*.pyx"))
 ]
 

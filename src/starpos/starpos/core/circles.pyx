@@ -15,7 +15,7 @@ cdef enum:
 
 
 cdef class Cells:
-    """Stars in cells about as wide as a circle: zones of declination, each parted in right ascension."""
+    """Stars in cells of a width (rad): zones of declination, each parted in right ascension; and a radius about points."""
 
     cdef const double[:, ::1] v
     cdef double radius, chord2
@@ -25,12 +25,12 @@ cdef class Cells:
     cdef int[::1] start
     cdef int[::1] row
 
-    def __init__(self, const double[:, ::1] v, double radius):
-        cdef int k, n = v.shape[0], place
+    def __init__(self, const double[:, ::1] v, double radius, double width):
+        cdef int k, n = v.shape[0]
         self.v, self.radius, self.chord2 = v, radius, (2 * sin(radius / 2)) ** 2
-        self.zones = max(1, <int>(M_PI / radius))
+        self.zones = max(1, <int>(M_PI / width))
         middles = (np.arange(self.zones) + 0.5) * np.pi / self.zones - np.pi / 2
-        parts = np.maximum(1, (2 * np.pi * np.cos(middles) / radius).astype(np.int32))
+        parts = np.maximum(1, (2 * np.pi * np.cos(middles) / width).astype(np.int32))
         self.zone = np.concatenate([[0], np.cumsum(parts)]).astype(np.int32)
         of = np.empty(n, np.int32)
         cdef int[::1] cell = of
@@ -83,9 +83,28 @@ cdef inline int _inserted(int *rows, int count, int most, int row) noexcept nogi
     return min(count + 1, most)
 
 
+def well_apart(const double[:, ::1] v, double nearest):
+    """Rows of the stars v (N, 3), brightest first, that have no brighter star within `nearest` rad.
+
+    Close groups make no triangles among themselves, but would use up the stars of a circle.
+    """
+    # a few stars in a cell
+    cdef Cells cells = Cells(v, nearest, max(nearest, 2.0 / sqrt(max(len(v), 4))))
+    cdef int k, first = 0
+    rows = np.empty(len(v), np.intp)
+    cdef Py_ssize_t[::1] row = rows
+    cdef int kept = 0
+    for k in range(v.shape[0]):
+        cells.brightest(&v[k, 0], 1, &first)
+        if first == k:
+            row[kept] = k
+            kept += 1
+    return rows[:kept]
+
+
 def triples_of_circles(const double[:, ::1] v, const double[:, ::1] centres, double radius, int most):
     """Keys of all triples among the `most` first of the stars v (n, 3) in each circle: (a n + b) n + c, a < b < c."""
-    cdef Cells cells = Cells(v, radius)
+    cdef Cells cells = Cells(v, radius, radius)
     cdef long long n = v.shape[0]
     cdef int[MOST_TAKEN] taken
     cdef int circle, count, a, b, c
@@ -114,8 +133,8 @@ def binned(
 
     Returns corners (T, 3), counter_clockwise (T,), shape (T, 3) and bin_start, as `TriangleCatalogue` has them.
     """
-    cdef long long n = rows.shape[0]
-    cdef Py_ssize_t k, place, kept = 0
+    cdef long long n = rows.shape[0], rest, a, b
+    cdef Py_ssize_t k, kept = 0
     cdef int i, j
     cdef int[3] corner
     cdef double[3] side
@@ -133,9 +152,9 @@ def binned(
     cdef int[::1] start = starts
     with nogil:
         for k in range(keys.shape[0]):
-            corner[0] = rows[keys[k] // (n * n)]
-            corner[1] = rows[keys[k] // n % n]
-            corner[2] = rows[keys[k] % n]
+            rest, a = keys[k] % (n * n), keys[k] // (n * n)
+            b = rest // n
+            corner[0], corner[1], corner[2] = rows[a], rows[b], rows[rest - b * n]
             for i in range(3):
                 side[i] = _side(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
             # the largest angle lies opposite the longest side

@@ -11,7 +11,7 @@ from math import comb
 
 import numpy as np
 
-from starpos.core.circles import binned, triples_of_circles
+from starpos.core.circles import binned, triples_of_circles, well_apart
 from starpos.core.triangles import TriangleTable
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -148,19 +148,6 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         longest_allowed=np.array([longest]),
         bin_start=bin_start,
     )
-
-
-def well_apart(v: np.ndarray, nearest: float) -> np.ndarray:
-    """Rows of the stars v (N, 3), brightest first, that have no brighter star within `nearest` rad.
-
-    Close groups make no triangles among themselves, but would use up the stars of a circle.
-    """
-    from scipy.spatial import cKDTree
-
-    pair = cKDTree(v).query_pairs(2 * np.sin(nearest / 2), output_type="ndarray")
-    alone = np.ones(len(v), bool)
-    alone[pair.max(1, initial=0)] = False
-    return np.flatnonzero(alone)
 
 
 def affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
