@@ -11,7 +11,7 @@ CORE = [
     Extension(
         f"starpos.core.{Path(source).stem}",
         [source],
-        depends=SHARED,
+        depends=[*SHARED, "setup.py"],
         extra_compile_args=["-O3", "-fno-math-errno"],
     )
     for source in sorted(glob("starpos/core/*.pyx"))
