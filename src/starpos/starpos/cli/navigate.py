@@ -14,6 +14,7 @@ from starpos.cli.solve import in_degrees
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, VoyageError
+from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument
 from starpos.navigation.imu import ImuModel, read_imu, read_imu_model
 from starpos.navigation.laws import LAWS
@@ -106,7 +107,7 @@ class Seeing:
         stars = common.stars_of(self.read(path))
         try:
             return FrameSeen(
-                stars.mid_unix_s, sighting_of(stars, self.instrument, catalogue.load_catalogue())
+                stars.mid_unix_s, sighting_of(stars, Solver(self.instrument, catalogue.load_catalogue()))
             )
         except FrameError as error:
             return FrameSeen(stars.mid_unix_s, None, str(error))
@@ -122,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
         instrument = common.instrument_of(args, about)
-        jobs.prepare(instrument, about)
+        jobs.prepare("navigate", instrument, about)
         answers = jobs.watched(workers.map((Seeing(read, instrument), path) for path in args.frames), number)
         seen = [FrameSeen(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
     for frame in seen:

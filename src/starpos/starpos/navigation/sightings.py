@@ -18,10 +18,9 @@ from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.unidentified import why_unidentified
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
-from starpos.identification import Sky, identify_directions, triangle_cache
-from starpos.identification.pose import Pose, slopes
-from starpos.instrument.instrument import Instrument
-from starpos.sky.catalogue import Catalogue
+from starpos.identification import Sky
+from starpos.identification.pose import Pose
+from starpos.identification.search import frame_stars, identify_frame
 from starpos.units import ARCSEC
 
 FEWEST, ROUNDS, STEPS = 4, 6, 3
@@ -62,21 +61,21 @@ class StarAttitude:
     by_refraction: np.ndarray
 
 
-def sighting_of(stars: Stars, instrument: Instrument, catalogue: Catalogue) -> IdentifiedFrame:
+def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     """Identify the stars of a frame wherever it looks; a StarposError says why it cannot be used."""
     mid_unix_s = stars.mid_unix_s
     if mid_unix_s is None:
         raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars.source)}")
     stars = stars.take(np.flatnonzero(stars.on_frame))
-    camera = instrument.camera_for(stars.width, stars.height)
+    camera, catalogue, triangles = eye.view(stars.width, stars.height)
     state = earth_state(mid_unix_s)
-    triangles = triangle_cache.cached(catalogue, camera.half_diagonal_rad)
     sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
     directions = camera.directions(stars.x, stars.y)
-    found = identify_directions(directions, stars.sigma, camera, sky)
+    field = frame_stars(directions, stars.sigma, camera)
+    found = identify_frame(field, sky)
     if found is None:
         raise FrameError(why_unidentified(stars, camera, catalogue))
-    suspicious, _ = solver.judged(stars, directions, camera, sky, found)
+    suspicious, _ = solver.judged(stars, field, sky, found)
     if suspicious:
         raise FrameError(
             f"{stars.place}: its stars are not those of one sky ({', '.join(suspicious)}): left out"
@@ -125,7 +124,7 @@ def star_attitude(sighting: IdentifiedFrame, zenith: np.ndarray, atmosphere: Atm
         extra, keep = judged(residual, sighting.covariance_px2, keep, share)
         if np.array_equal(keep, before):
             break
-    pixel, slope = slopes(pose, seen)
+    pixel, slope = _slopes(pose, seen)
     slope, covariance = slope[keep], sighting.covariance_px2[keep]
     wide = covariance + np.eye(2) * expected_extra((pixel - sighting.xy)[keep], covariance, share)
     weighted = np.linalg.solve(wide, slope)
@@ -149,10 +148,24 @@ def _seen(sighting: IdentifiedFrame, zenith: np.ndarray, refraction: Refraction)
 def _fitted(pose: Pose, sighting: IdentifiedFrame, seen: np.ndarray, keep: np.ndarray, extra: float) -> Pose:
     covariance = sighting.covariance_px2[keep] + np.eye(2) * extra
     for _ in range(STEPS):
-        pixel, slope = slopes(pose, seen[keep])
+        pixel, slope = _slopes(pose, seen[keep])
         weighted = np.linalg.solve(covariance, slope)
         normal = np.einsum("nki,nkj->ij", slope, weighted)
         step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, sighting.xy[keep] - pixel))
         turned = rotation.from_vector(step[:3]) @ pose.attitude
         pose = replace(pose, attitude=turned, focal_px=float(pose.focal_px * (1 + step[3])))
     return pose
+
+
+def _slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) of directions w (N, 3), and their derivatives (N, 2, 4).
+
+    The derivatives are by small rotations (rad) about C's axes and by the logarithm of the focal length.
+    """
+    u = w @ pose.attitude.T
+    x, y = (u[:, :2] / u[:, 2:]).T
+    slope = np.empty((len(w), 2, 4))
+    slope[:, 0, 0], slope[:, 0, 1], slope[:, 0, 2], slope[:, 0, 3] = -x * y, 1 + x * x, -y, x
+    slope[:, 1, 0], slope[:, 1, 1], slope[:, 1, 2], slope[:, 1, 3] = -1 - y * y, x * y, x, y
+    slope *= pose.focal_px
+    return slope[:, :, 3].copy(), slope
