@@ -45,6 +45,8 @@ EXCLUDED_SIGMA = 6.0
 # directions further off are left out, of so many or more, up to this share; and so often are they judged
 OUTLIER_SIGMA, FEWEST_JUDGED, MOST_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
+# three directions that contradict each other by more sigma err by nobody knows how much
+CONTRADICT_SIGMA = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,7 +338,13 @@ def _average(part: _Directions, answer: _Answer, frames: int) -> Average:
     stamp_s = max(c.stamp_stddev_s for c in every)
     for t in time_terms(latitude, worst.earth, worst.clock_stddev_s, stamp_s):
         terms.append(term(t.name, t.covariance[:2, :2], ALWAYS))
-    excess = _excess(answer.chi2, len(part.circles) - 2)
+    free = len(part.circles) - 2
+    if free == 1 and answer.chi2 > CONTRADICT_SIGMA**2:
+        raise FixError(
+            f"the elevations of three directions contradict each other by {np.sqrt(answer.chi2):.0f} sigma: one is "
+            "wrong, or all err by more than is stated: add directions, or state larger errors"
+        )
+    excess = _excess(answer.chi2, free)
     terms.append(term(SCATTER, excess * metres @ part.covariance @ metres.T))
     times = [c.utc_unix_s for c in every]
     return Average(
