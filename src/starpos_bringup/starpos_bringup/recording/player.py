@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes the messages of a bag at the wanted pace, each frame when the one before is worked off."""
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -29,6 +30,8 @@ BURST_REST_S = 0.05
 BEGIN_S = 30.0
 # Who is never found must not stop it.
 FOUND_S = 10.0
+# A listener that takes no part is found within so long of another, mostly within a tenth of that.
+SETTLED_S = 1.0
 
 
 class Player:
@@ -60,6 +63,8 @@ class Player:
         # those of star lists, which a solver answers
         self._star_topics = {t.name for t in topics if t.type_name == STARS}
         self._participants = Participants(self._node, say)
+        self._listeners: list[int] = []
+        self._unchanged_since_s = -math.inf
         self._now_ns: int | None = None
         self._show = sys.stderr.isatty()
         self._shown_s = 0.0
@@ -89,7 +94,7 @@ class Player:
         """
         self._spin(at_most_s, lambda: self._all_listen() and (not for_solver or self._chain()))
         # who takes part may not be heard yet, and who listens not be found
-        self._spin(min(at_most_s, FOUND_S), self._all_found)
+        self._spin(min(at_most_s, FOUND_S), self._settled)
         heard = [n for n in self._frame_topics if self._publishers[n].get_subscription_count()]
         if self._frame_topics and not heard and not self._stopped:
             self._say(
@@ -122,6 +127,13 @@ class Player:
         return self._participants.all_here() and all(
             p.get_subscription_count() >= self._could_hear(name, p) for name, p in self._publishers.items()
         )
+
+    def _settled(self) -> bool:
+        """Whether all who listen are found, and nobody new has come for SETTLED_S: strangers do not say they will."""
+        listeners = [self._node.count_subscribers(name) for name in self._publishers]
+        if listeners != self._listeners:
+            self._listeners, self._unchanged_since_s = listeners, time.monotonic()
+        return self._all_found() and time.monotonic() - self._unchanged_since_s >= SETTLED_S
 
     def _could_hear(self, name: str, publisher: Publisher) -> int:
         """How many subscriptions accept the publisher's quality of service."""
