@@ -12,6 +12,7 @@ from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file, instrument_file
 from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.navigation.table import read_record
 from starpos.recording.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 
@@ -54,6 +55,7 @@ READS_WHOLE = {
     "starpos/identification/paper.py": "of the package",
     "starpos/recording/bag.py": "installed messages",
     "starpos/instrument/tilt_table.py": "MAX_CSV_BYTES",
+    "starpos/navigation/table.py": "MOST_BYTES",
     "starpos_bringup/recording/bag.py": "installed messages",
     "starpos_bringup/recording/bag_writer.py": "installed messages",
     "starpos_dashboard/server.py": "of the package",
@@ -149,6 +151,7 @@ def test_the_search_covers_the_product_and_would_find(monkeypatch):
         ("frame.png", b"\x89PNG\r\n\x1a\n", 1 << 40, read_frame),
         ("frame.cr2", b"II*\0", 1 << 40, read_frame),
         ("tilt.csv", b"utc_unix_s,theta_x_deg,theta_y_deg\n", 1 << 40, read_tilt_csv),
+        ("imu.csv", b"utc_unix_s,wx\n", 1 << 40, lambda path: read_record(path, ["wx"], "readings")),
         ("instrument.yaml", b"starpos_instrument: 1\n", 1 << 40, instrument_file.read),
         ("camera.yaml", b"image_width: 1\n", 1 << 40, camera_file.read),
         ("geoid.tif", b"II*\0", 1 << 40, geoid_file.read_grid),
