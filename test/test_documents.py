@@ -25,7 +25,8 @@ OF_NODES = {
 }
 ROOMS = (ROOT / "docs", ROOT / "test", ROOT / "tools", *PACKAGES)
 FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglob("*"))) if f.is_file())
-SOURCES = [f for f in FILES if f.suffix in (".py", ".c", ".h")]
+# but what Cython has written
+SOURCES = [f for f in FILES if f.suffix in (".py", ".c", ".h") and not f.with_suffix(".pyx").exists()]
 MODULES = {p.name: p / p.name for p in PACKAGES}
 FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
 FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}  # of the C library, of ERFA, of avr-libc
