@@ -43,6 +43,7 @@ setup(
     extras_require={
         "picture": ["matplotlib"],
         "raw": ["rawpy", "exifread>=3"],
+        "heif": ["pillow-heif", "exifread>=3"],
         "report": ["matplotlib", "rosbags>=0.11"],
         "cluster": ["distributed"],
         "test": ["pytest"],

@@ -19,7 +19,7 @@ from starpos.sky.catalogue import Catalogue
 
 @dataclass(frozen=True)
 class BlindSolver:
-    """Identifies frames of any scale; `stages` are those of the search, fewer to be quick."""
+    """Identifies frames of any scale, first near that of their EXIF; `stages` of the search are fewer to be quick."""
 
     catalogue: Catalogue
     progress: Progress = quiet
@@ -46,7 +46,8 @@ class BlindSolver:
             return Solution.failed(stars, status_of(stars, e), str(e))
         quads = quad_cache.cached(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
-        answer = identify_blind(xy, seen.sigma, stars.width, stars.height, sky, quads, self.stages)
+        near_px = stars.rough_focal_px
+        answer = identify_blind(xy, seen.sigma, stars.width, stars.height, sky, quads, self.stages, near_px)
         if answer is None:
             message = (
                 f"{stars.place}: none of the sky fits its {len(seen)} stars at any scale (fields of {SMALLEST_DEG:g} to "

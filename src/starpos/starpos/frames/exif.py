@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time and exposure that a camera writes into its own files (EXIF 2.31), and how well they are known.
+"""What a camera writes into its own files (EXIF 2.31): time, exposure, focal length, and how well they are known.
 
 A camera's clock is set by hand to the time of some zone, and often shows whole seconds only. So its time is used only if
 a person has said how good the clock is (CameraClock).
@@ -24,6 +24,12 @@ UNTENDED_STDDEV_S = 60.0
 ZONES_H = 14.0
 # EXIF began then: a clock that shows an earlier year was never set.
 FIRST_YEAR = 1996
+# Diagonal of a 35 mm film's frame of 36 x 24 mm.
+FILM_MM = 43.267
+# Units of FocalPlaneResolutionUnit in mm: inch, cm, mm, um.
+UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+# A focal length over the frame's diagonal that no lens has lies beyond these.
+SHORTEST, LONGEST = 0.1, 1000.0
 
 
 @dataclass(frozen=True)
@@ -46,11 +52,13 @@ class CameraClock:
             raise TimeError(f"a camera's clock is known to {self.stddev_s:g} s: give 0 to 86400 s")
 
 
-def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, Any]:
+def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, ...]) -> dict[str, Any]:
     """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
 
-    exposure_s comes from ExposureTime. With a clock also mid_unix_s, stamp_stddev_s and clock_stddev_s: DateTimeOriginal
-    and SubSecTimeOriginal are the start of the exposure, rounded down; when the shutter opened is known less well.
+    shape is that of the pixels, rows first. exposure_s comes from ExposureTime, rough_focal_px from
+    FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution. With a clock also mid_unix_s, stamp_stddev_s
+    and clock_stddev_s: DateTimeOriginal and SubSecTimeOriginal are the start of the exposure, rounded down; when the
+    shutter opened is known less well.
     FrameError if these exist but are not a time.
     """
     try:
@@ -68,6 +76,7 @@ def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, Any]:
         tags = {}
     exposure_s = _exposure_s(tags)
     known: dict[str, Any] = {} if exposure_s is None else {"exposure_s": exposure_s}
+    known["rough_focal_px"] = _focal_px(tags, shape[1], shape[0])
     if clock is None or exposure_s is None or "EXIF DateTimeOriginal" not in tags:
         return known
     start_unix_s, step_s = _start(tags, place, clock)
@@ -80,12 +89,36 @@ def told(data: bytes, place: str, clock: CameraClock | None) -> dict[str, Any]:
 
 def _exposure_s(tags: Mapping) -> float | None:
     """ExposureTime in s; None if it is missing or impossible."""
-    try:
-        ratio = tags["EXIF ExposureTime"].values[0]
-        seconds = ratio.num / ratio.den
-    except (LookupError, TypeError, AttributeError, ArithmeticError):
+    seconds = _number(tags, "ExposureTime")
+    return seconds if seconds is not None and seconds <= MAX_EXPOSURE_S else None
+
+
+def _focal_px(tags: Mapping, width: int, height: int) -> float | None:
+    """About the focal length in px of a picture of this size, as the whole sensor makes one; None if nothing tells it."""
+    film_mm, focal_mm = _number(tags, "FocalLengthIn35mmFilm"), _number(tags, "FocalLength")
+    per_unit, unit = (_number(tags, f"FocalPlane{name}") for name in ("XResolution", "ResolutionUnit"))
+    diagonal_px = math.hypot(width, height)
+    focal_px = None
+    if film_mm is not None:
+        focal_px = film_mm / FILM_MM * diagonal_px
+    elif focal_mm is not None and per_unit is not None:
+        # the resolution is that of the picture as the camera made it, which may have been reduced since
+        made = max(_number(tags, name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
+        reduced = max(width, height) / made if made else 1.0
+        focal_px = focal_mm * per_unit / UNITS_MM.get(int(unit or 2), UNITS_MM[2]) * reduced
+    if focal_px is None or not SHORTEST * diagonal_px < focal_px < LONGEST * diagonal_px:
         return None
-    return seconds if 0 < seconds <= MAX_EXPOSURE_S else None
+    return focal_px
+
+
+def _number(tags: Mapping, name: str) -> float | None:
+    """The positive number that is a tag's first value; None if it is missing or another thing."""
+    try:
+        value = tags[f"EXIF {name}"].values[0]
+        number = value.num / value.den if hasattr(value, "den") else float(value)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+        return None
+    return number if 0 < number < math.inf else None
 
 
 def _start(tags: Mapping, place: str, clock: CameraClock) -> tuple[float, float]:

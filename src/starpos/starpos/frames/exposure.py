@@ -24,6 +24,7 @@ class Exposure:
     exposure_s      None: unknown
     source          where it came from, for messages: a path or a topic
     focal_px        focal length by the file's header (FOCALLEN / XPIXSZ), px; only a hint; None: unknown
+    rough_focal_px  focal length by the camera's EXIF, px: where a search for it begins; None: unknown
     stamp_stddev_s  standard deviation of mid_unix_s against the clock it was read from; 0: unknown
     clock_stddev_s  standard deviation of that clock against UTC, an error that all frames share; 0: unknown
     shutter         times of the rows; None: nobody has said
@@ -38,6 +39,7 @@ class Exposure:
     stamp_stddev_s: float = 0.0
     clock_stddev_s: float = 0.0
     shutter: Shutter | None = None
+    rough_focal_px: float | None = None
 
     def __post_init__(self) -> None:
         place = self.place
@@ -56,10 +58,11 @@ class Exposure:
                 raise FrameError(
                     f"{place}: {name} is {value}; it must be from 0 (unknown) to {MOST_STDDEV_S:g} s."
                 )
-        if self.focal_px is not None and not (np.isfinite(self.focal_px) and self.focal_px > 0):
-            raise FrameError(
-                f"{place}: the focal length is {self.focal_px} px; give a positive number or None."
-            )
+        for focal_px in (self.focal_px, self.rough_focal_px):
+            if focal_px is not None and not (np.isfinite(focal_px) and focal_px > 0):
+                raise FrameError(
+                    f"{place}: the focal length is {focal_px} px; give a positive number or None."
+                )
 
     @property
     def place(self) -> str:

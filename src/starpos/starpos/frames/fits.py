@@ -8,6 +8,7 @@ import warnings
 import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -29,12 +30,12 @@ STEP = 1 << 20
 GZIP_BITS = 31
 
 
-def read_fits(file: BinaryIO, place: str) -> Frame:
+def read_fits(file: BinaryIO, place: str, part: str = "") -> Frame:
     """Read an open FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame.
 
-    place says where it is, for messages.
+    place says where it is, for messages; part is the number or the name of the image to take; "": the first one.
     """
-    return _read(file, place)[0]
+    return _read(file, place, part)[0]
 
 
 def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
@@ -42,10 +43,10 @@ def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
 
     source says where the bytes came from. FrameError if they are not a whole frame.
     """
-    return _read(io.BytesIO(data), source)
+    return _read(io.BytesIO(data), source, "")
 
 
-def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
+def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]:
     from astropy.io import fits
 
     try:
@@ -53,7 +54,8 @@ def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
             warnings.simplefilter("ignore")
             plain = _plain(file, place)
             with fits.open(plain, memmap=False, lazy_load_hdus=True) as hdus:
-                header, values = _first_image(plain, hdus, place)
+                image = _image(hdus, place, part)
+                header, values = _content(plain, image, place)
     except FrameError:
         raise
     # damaged bytes make astropy, zlib and CFITSIO raise any kind of exception
@@ -61,6 +63,12 @@ def _read(file: BinaryIO, place: str) -> tuple[Frame, dict[str, Any]]:
         raise FrameError(
             f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
         ) from e
+    if image.others:
+        warnings.warn(
+            f"{place}: its HDU {image.number} is taken, of {1 + len(image.others)} images; to take another name it, "
+            f"like '{place}[{image.others[0]}]'",
+            stacklevel=3,
+        )
     mid, exposure, rounding = times(header, place)
     frame = Frame(
         to_unsigned(values, place),
@@ -99,25 +107,80 @@ def _check_unpacked(size: int, place: str) -> None:
         raise FrameError(f"{place}: it unpacks to over {MAX_BYTES // 10**6} MB, too many for a frame.")
 
 
-def _first_image(file: BinaryIO, hdus: Iterable, place: str) -> tuple[dict[str, Any], np.ndarray]:
-    """Header (a dict of KEYS) and data (h, w) of the first HDU, of those in a file, that holds an image."""
+@dataclass(frozen=True)
+class _Image:
+    """The HDU of a frame, its number, the primary header, and the numbers of other images that might be meant."""
+
+    hdu: Any
+    number: int
+    primary: Mapping
+    others: tuple[int, ...]
+
+
+def _image(hdus: Iterable, place: str, part: str) -> _Image:
+    """The image that is the part, a number or a name, of a file's HDUs; the first plane if that is empty."""
+    parts = _parts(hdus)
+    primary = parts[0].header if parts else {}
+    if part:
+        for number, hdu in enumerate(parts):
+            if part.upper() in (str(number), str(hdu.name).upper(), f"{hdu.name},{hdu.ver}".upper()):
+                _check_plane(hdu, place)
+                return _Image(hdu, number, primary, ())
+        names = ", ".join(f"{n} {hdu.name}".strip() for n, hdu in enumerate(parts) if _axes(hdu))
+        raise FrameError(f"{place}: there is no such HDU; its images are {one_line(names) or 'none'}.")
+    images = [number for number, hdu in enumerate(parts) if _axes(hdu)]
+    if not images:
+        raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
+    planes = [number for number in images if _is_plane(_axes(parts[number]))]
+    if not planes:
+        _check_plane(parts[images[0]], place)
+    return _Image(parts[planes[0]], planes[0], primary, tuple(planes[1:]))
+
+
+def _parts(hdus: Iterable) -> list[Any]:
+    """The first HDUs of a file, up to MOST_PARTS; damage behind an image is passed over."""
+    parts: list[Any] = []
+    try:
+        parts.extend(itertools.islice(hdus, MOST_PARTS))
+    # damaged bytes make astropy raise any kind of exception
+    except Exception:
+        if not any(_axes(hdu) for hdu in parts):
+            raise
+    return parts
+
+
+def _axes(hdu: Any) -> list[int]:
+    """The axes of an HDU's image, the rows before the columns; empty if it is none."""
+    return [int(n) for n in hdu.shape] if hdu.is_image else []
+
+
+def _is_plane(axes: list[int]) -> bool:
+    return len(axes) == 2 or (len(axes) > 2 and max(axes[:-2]) == 1)
+
+
+def _check_plane(hdu: Any, place: str) -> None:
+    """Raise FrameError unless an HDU is an image of one plane."""
+    axes = _axes(hdu)
+    if not axes:
+        raise FrameError(f"{place}: this HDU is no image; give one that is.")
+    if not _is_plane(axes):
+        size = " x ".join(map(str, reversed(axes)))
+        raise FrameError(
+            f"{place}: the image has {len(axes)} axes ({size}); give one monochrome plane a file."
+        )
+
+
+def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any], np.ndarray]:
+    """Header (a dict of KEYS) and data (h, w) of an image; what its header lacks is that of the primary one."""
     from astropy.io import fits
 
-    for number, hdu in enumerate(itertools.islice(hdus, MOST_PARTS)):
-        shape = [int(n) for n in hdu.shape] if hdu.is_image else []
-        if not shape:
-            continue
-        if len(shape) != 2 and not (len(shape) > 2 and max(shape[:-2]) == 1):
-            size = " x ".join(map(str, reversed(shape)))
-            raise FrameError(
-                f"{place}: the image has {len(shape)} axes ({size}); give one monochrome plane a file."
-            )
-        check_pixels(shape[-1], shape[-2], abs(int(hdu.header["BITPIX"])) / 8, place)
-        if isinstance(hdu, fits.CompImageHDU):
-            _check_tiles(file, number, place)
-        header = {key: hdu.header[key] for key in KEYS if key in hdu.header}
-        return header, np.asarray(hdu.data).reshape(shape[-2:])
-    raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
+    hdu, shape = image.hdu, _axes(image.hdu)
+    check_pixels(shape[-1], shape[-2], abs(int(hdu.header["BITPIX"])) / 8, place)
+    if isinstance(hdu, fits.CompImageHDU):
+        _check_tiles(file, image.number, place)
+    headers = (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
+    known = {key: header[key] for header in headers for key in KEYS if key in header}
+    return known, np.asarray(hdu.data).reshape(shape[-2:])
 
 
 def _check_tiles(file: BinaryIO, number: int, place: str) -> None:

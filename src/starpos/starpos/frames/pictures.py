@@ -35,17 +35,23 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
     pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else data)
     if pixels is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; take or copy it again.")
+    pixels = frame_pixels(pixels, place)
+    return Frame(pixels, source=place, **exif.told(data, place, clock, pixels.shape))
+
+
+def frame_pixels(pixels: np.ndarray, place: str) -> np.ndarray:
+    """Pixels (h, w) or (h, w, channels) of a picture in the form that a Frame has; FrameError if they are no numbers."""
+    import cv2
+
     if pixels.ndim == 3:
         # without the alpha channel
-        pixels = pixels[:, :, :3]
-        if pixels.shape[2] < 3:
-            pixels = np.ascontiguousarray(pixels[:, :, 0])
-        elif pixels.dtype == np.uint16:
-            pixels = (pixels >> 8).astype(np.uint8)
-        pixels = np.ascontiguousarray(pixels)
-    if pixels.ndim == 2:
-        pixels = to_unsigned(pixels, place)
-    return Frame(pixels, source=place, **exif.told(data, place, clock))
+        pixels = pixels[:, :, : 3 if pixels.shape[2] >= 3 else 1]
+        if pixels.shape[2] == 3 and pixels.dtype == np.uint8:
+            return np.ascontiguousarray(pixels)
+        # the faint stars of deep colours would be lost in 8 bits
+        channels = pixels.shape[2]
+        pixels = cv2.transform(np.ascontiguousarray(pixels), np.full((1, channels), 1 / channels))
+    return to_unsigned(pixels, place)
 
 
 def decode_picture(data: bytes) -> np.ndarray | None:

@@ -52,7 +52,8 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
         raise FrameError(
             f"{place}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
         )
-    return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **exif.told(data, place, clock))
+    about = exif.told(data, place, clock, pixels.shape)
+    return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **about)
 
 
 def _words(error: Exception) -> str:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read frames from files: FITS, TIFF, PNG, JPEG, BMP, camera raw; and stars from a CSV of centroids."""
+"""Read frames from files: FITS, TIFF, PNG, JPEG, BMP, HEIF, camera raw; and stars from a CSV of centroids."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -11,6 +12,7 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.files import MAX_BYTES, opened
 from starpos.frames.fits import read_fits
 from starpos.frames.frame import Frame
+from starpos.frames.heif import heif_frame
 from starpos.frames.pictures import JPEG_START, PNG_START, picture_frame
 from starpos.frames.raw import raw_frame
 from starpos.frames.star_list import read_star_list
@@ -19,6 +21,7 @@ from starpos.frames.stars import Stars
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff", ".bmp")
 JPEG = (".jpg", ".jpeg")  # beside raw files usually a copy of them
+HEIF = (".heic", ".heif", ".hif")
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 
 
@@ -32,11 +35,13 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     mosaic; FOCALLEN (mm) and XPIXSZ (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits
     are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range is wider than that
     or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
-    light (frame.LOUDEST) are clipped.
-    TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour. 16-bit colour is scaled down to bgr8.
+    light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken, with a warning; `a.fits[2]` or
+    `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header lacks is that of the primary one.
+    TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour; TIFF also of floats, by the rule above. Colours of more than 8
+    bits become the mean of the three. HEIF: the same, through pillow-heif.
     Camera raw: the mosaic as the sensor gave it, through rawpy.
-    The exposure of pictures and raw files comes from EXIF if exifread is installed; their time too, but only with a
-    clock.
+    The exposure of pictures and raw files, and about their focal length, come from EXIF if exifread is installed; their
+    time too, but only with a clock.
     CSV: a first line `# {"NAXIS1": ..., "NAXIS2": ..., "DATE-OBS": ..., "EXPTIME": ...}`, in which the NAXIS pair is
     required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, that
     of a star image whose standard deviation is 1 px.
@@ -44,26 +49,35 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     Without a time or an exposure mid_unix_s is None. FrameError for everything that is not as described here.
     """
     path = Path(path)
+    file_path, part = _part_of(path)
     try:
-        with opened(path) as file:
-            return _reader_of(path)(file, clock)
+        with opened(file_path) as file:
+            return _reader_of(path, file_path.suffix.lower(), part)(file, clock)
     except OSError as e:
         reason = e.strerror or one_line(e)
         raise FrameError(f"{path}: it cannot be read ({reason}); check its permissions and the disk.") from e
 
 
-def _reader_of(path: Path) -> Callable[[BinaryIO, CameraClock | None], Frame | Stars]:
+def _part_of(path: Path) -> tuple[Path, str]:
+    """The file that a path names, and the part of it: of `a.fits[2]` a.fits and 2."""
+    parts = re.fullmatch(r"(.+)\[([\w ,.-]+)\]", str(path))
+    if parts is None or Path(parts[1]).suffix.lower() not in FITS or path.exists():
+        return path, ""
+    return Path(parts[1]), parts[2].strip()
+
+
+def _reader_of(path: Path, suffix: str, part: str) -> Callable[[BinaryIO, CameraClock | None], Frame | Stars]:
     """The function of the open file and the clock that reads files with this suffix."""
-    suffix = path.suffix.lower()
     for suffixes, reader in (
-        (FITS, lambda file, _: read_fits(file, str(path))),
+        (FITS, lambda file, _: read_fits(file, str(path), part)),
         (PICTURE + JPEG, lambda file, clock: picture_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
+        (HEIF, lambda file, clock: heif_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
         (RAW, lambda file, clock: raw_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
         ((".csv",), lambda file, _: read_star_list(file, str(path))),
     ):
         if suffix in suffixes:
             return reader
-    known = " ".join(FITS + PICTURE + JPEG + RAW + (".csv",))
+    known = " ".join(FITS + PICTURE + JPEG + HEIF + RAW + (".csv",))
     raise FrameError(f"{path}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
 
 
@@ -79,8 +93,8 @@ def decode_frame(data: bytes, source: str) -> Frame:
 
 def why_no_time(source: str) -> str:
     """Explain why a frame has no time (mid_unix_s is None) and what to do, by the suffix of its source."""
-    suffix = Path(source).suffix.lower()
-    if suffix in PICTURE + JPEG + RAW:
+    suffix = _part_of(Path(source))[0].suffix.lower()
+    if suffix in PICTURE + JPEG + HEIF + RAW:
         vouch = "vouch for its camera's clock (--exif-utc-offset)"
         return f"a {suffix} file carries none in UTC: give FITS, a CSV of centroids, or {vouch}"
     if suffix in (*FITS, ".csv"):

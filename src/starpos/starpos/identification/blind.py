@@ -3,9 +3,10 @@
 
 Scales are tried in steps so small that a pinhole's projection shows in no shape. Quads of the frame that look like
 quads of the sky give poses. Those on which most agree are judged by the same evidence as any other, but every scale was
-possible before.
+possible before. Where the focal length is roughly known, scales near it come first, which is quick.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -23,6 +24,8 @@ from starpos.instrument.camera import Camera
 
 # Fields from corner to corner that are tried, deg.
 SMALLEST_DEG, LARGEST_DEG = 0.6, 100.0
+# A focal length that is roughly known may be off by this factor.
+ROUGHLY = 1.2
 # (number of brightest stars, their error in px)
 STAGES = (10, 0.4), (15, 0.4), (21, 0.4), (12, 2.0)
 # A step of the focal length is at most this; and so small that it changes the shape of no quad by more than that.
@@ -58,8 +61,11 @@ def identify_blind(
     sky: Sky,
     quads: QuadCatalogue,
     stages: Sequence[tuple[int, float]] = STAGES,
+    near_px: float | None = None,
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, of a pinhole camera of unknown focal length.
+
+    near_px: a focal length that it may have, with which the search begins; half of the probability is for it.
 
     Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None if there is
     none beyond doubt.
@@ -68,13 +74,17 @@ def identify_blind(
         return None
     half_diagonal_px = np.hypot(width, height) / 2
     shortest, longest = (half_diagonal_px / np.tan(np.radians(d / 2)) for d in (LARGEST_DEG, SMALLEST_DEG))
-    prior = any_scale(shortest, longest)
+    spans = [(shortest, longest)]
+    if near_px is not None and shortest < near_px < longest:
+        spans.insert(0, (max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
     field = FrameStars.of(xy, sigma_px, Camera.from_focal(width, height, shortest))
-    for pose, radius_px in _poses(field, sky, quads, (shortest, longest), stages):
-        camera = Camera.from_focal(width, height, pose.focal_px)
-        found = identified(FrameStars.of(xy, sigma_px, camera), sky, pose, radius_px, prior)
-        if found:
-            return camera, found
+    for span in spans:
+        prior = any_scale(*span, log_share=-math.log(len(spans)))
+        for pose, radius_px in _poses(field, sky, quads, span, stages):
+            camera = Camera.from_focal(width, height, pose.focal_px)
+            found = identified(FrameStars.of(xy, sigma_px, camera), sky, pose, radius_px, prior)
+            if found:
+                return camera, found
     return None
 
 

@@ -60,14 +60,14 @@ def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
     return Prior(log_density, WIDTH)
 
 
-def any_scale(shortest_px: float, longest_px: float) -> Prior:
+def any_scale(shortest_px: float, longest_px: float, log_share: float = 0.0) -> Prior:
     """The Prior of a frame lost in space of which only a range of focal lengths (px) is known, all sizes alike."""
     logarithms = math.log(longest_px / shortest_px)
 
     def log_density(pose: Pose) -> float:
         parity = MIRRORED if pose.mirrored else 1 - MIRRORED
         known = shortest_px <= pose.focal_px <= longest_px
-        return math.log(parity / (8 * math.pi**2 * logarithms)) if known else -math.inf
+        return log_share + math.log(parity / (8 * math.pi**2 * logarithms)) if known else -math.inf
 
     return Prior(log_density, np.append(WIDTH[:3], logarithms))
 

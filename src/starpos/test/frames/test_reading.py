@@ -129,7 +129,7 @@ def test_pictures_keep_their_depth_and_have_no_time(tmp_path, suffix):
         assert np.array_equal(frame.pixels, pixels) and frame.pixels.dtype == pixels.dtype
         assert frame.mid_unix_s is None
     assert cv2.imwrite(path, np.dstack([PIXELS, PIXELS, PIXELS]))
-    assert np.array_equal(read_frame(path).pixels[:, :, 0], PIXELS >> 8)
+    assert np.abs(read_frame(path).pixels.astype(int) - PIXELS).max() <= 1
 
 
 CSV = '# {"DATE-OBS": "2026-11-02T18:00:00", "EXPTIME": 0.5, "NAXIS1": 640, "NAXIS2": 480}\n'

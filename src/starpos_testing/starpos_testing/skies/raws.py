@@ -14,9 +14,28 @@ COLOURS = {"r": 0, "g": 1, "b": 2}
 START = "2026:11:02 18:00:00"
 
 
-def exif_tags(start=START, subsec=None, offset=None, exposure=(1, 2)):
-    """The tags of an Exif IFD; None leaves one out."""
+def exif_tags(
+    start=START,
+    subsec=None,
+    offset=None,
+    exposure=(1, 2),
+    film_mm=None,
+    focal=None,
+    plane=None,
+    unit=None,
+    size=None,
+):
+    """The tags of an Exif IFD; None leaves one out.
+
+    film_mm, focal (ratio of mm), plane (ratio of px per unit), unit, size (px) are those of the focal length.
+    """
     tags = {
+        0x920A: None if focal is None else (RATIONAL, focal),
+        0xA002: None if size is None else (LONG, [size[0]]),
+        0xA003: None if size is None else (LONG, [size[1]]),
+        0xA20E: None if plane is None else (RATIONAL, plane),
+        0xA210: None if unit is None else (SHORT, [unit]),
+        0xA405: None if film_mm is None else (SHORT, [film_mm]),
         0x829A: None if exposure is None else (RATIONAL, exposure),
         0x9003: None if start is None else (ASCII, start),
         0x9291: None if subsec is None else (ASCII, subsec),

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FITS files of several images: which is taken, how another one is named, and what damage to the others costs."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from starpos.errors import FrameError
+from starpos.frames.reading import read_frame, why_no_time
+
+SKY = np.random.default_rng(7).normal(1000, 30, (60, 80)).astype(np.int16)
+
+
+@pytest.fixture
+def several(tmp_path):
+    """A file of an empty first part with the time, a table, SCI, a cube, a packed image and a second SCI."""
+    primary = fits.PrimaryHDU()
+    primary.header["DATE-OBS"], primary.header["EXPTIME"] = "2026-11-02T18:00:00", 2.0
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "I", array=[1])], name="LOG")
+    packed = fits.CompImageHDU(SKY + 2, name="DQ", compression_type="RICE_1")
+    packed.header["EXPTIME"] = 4.0
+    parts = [table, fits.ImageHDU(SKY, name="SCI"), fits.ImageHDU(np.zeros((3, 4, 5)), name="CUBE"), packed]
+    again = fits.ImageHDU(SKY + 5, name="SCI")
+    again.ver, again.header["INHERIT"] = 2, False
+    path = tmp_path / "a.fits"
+    fits.HDUList([primary, *parts, again]).writeto(path)
+    return path
+
+
+def test_the_first_image_is_taken_and_that_is_said(several):
+    with pytest.warns(
+        UserWarning, match=r"a\.fits: its HDU 2 is taken, of 3 images; .* like '.*a\.fits\[4\]'"
+    ):
+        frame = read_frame(several)
+    assert np.array_equal(frame.pixels, SKY) and frame.exposure_s == 2.0
+    assert frame.mid_unix_s is not None
+
+
+@pytest.mark.parametrize(
+    ("part", "more", "exposure_s"),
+    [("2", 0, 2.0), ("SCI", 0, 2.0), ("sci,1", 0, 2.0), ("4", 2, 4.0), ("DQ", 2, 4.0), ("SCI,2", 5, None),
+     ("5", 5, None)],
+)  # fmt: skip
+def test_another_image_is_named_by_its_number_or_its_name(several, part, more, exposure_s):
+    frame = read_frame(f"{several}[{part}]")
+    assert np.array_equal(frame.pixels, SKY + more)
+    # what an image does not say itself the first part says, unless it forbids that
+    assert frame.exposure_s == exposure_s
+    assert frame.source == f"{several}[{part}]" and "DATE-OBS" in why_no_time(frame.source)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [("9", "its images are 2 SCI, 3 CUBE, 4 DQ, 5 SCI"), ("NO", "no such HDU"), ("LOG", "this HDU is no image"),
+     ("0", "this HDU is no image"), ("CUBE", "the image has 3 axes")],
+)  # fmt: skip
+def test_a_part_that_is_no_frame_is_refused(several, part, words):
+    with pytest.raises(FrameError, match=words):
+        read_frame(f"{several}[{part}]")
+
+
+def test_a_file_whose_name_ends_in_brackets_is_itself(tmp_path):
+    fits.PrimaryHDU(SKY).writeto(tmp_path / "a.fits")
+    fits.PrimaryHDU(SKY + 3).writeto(tmp_path / "x.fits")
+    (tmp_path / "x.fits").rename(tmp_path / "a.fits[1]")
+    with pytest.raises(FrameError, match="suffix"):
+        read_frame(tmp_path / "a.fits[1]")
+    assert np.array_equal(read_frame(tmp_path / "a.fits[0]").pixels, SKY)
+
+
+def test_damage_behind_the_image_costs_nothing(several, tmp_path):
+    whole = several.read_bytes()
+    end = whole.index(b"XTENSION", whole.index(b"'SCI") + 2880)
+    for rest in (b"", whole[end : end + 1000], b"\xff" * 2880):
+        (tmp_path / "b.fits").write_bytes(whole[:end] + rest)
+        assert np.array_equal(read_frame(tmp_path / "b.fits[SCI]").pixels, SKY)
+
+
+def test_a_part_that_claims_gigabytes_is_refused(tmp_path):
+    fits.HDUList([fits.PrimaryHDU(SKY), fits.ImageHDU(SKY, name="BIG")]).writeto(tmp_path / "a.fits")
+    data = bytearray((tmp_path / "a.fits").read_bytes())
+    for key in (b"NAXIS1  =", b"NAXIS2  ="):
+        at = data.index(key, data.index(b"XTENSION"))
+        data[at + 10 : at + 30] = b"999999999".rjust(20)
+    (tmp_path / "a.fits").write_bytes(data)
+    with pytest.raises(FrameError, match="claims"):
+        read_frame(f"{tmp_path / 'a.fits'}[1]")
