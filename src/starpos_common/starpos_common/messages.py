@@ -86,13 +86,13 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
 
 
 def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None) -> CameraInfo:
-    """Convert a camera to a CameraInfo with the plumb_bob model and no rectification."""
+    """Convert a camera to a CameraInfo without rectification."""
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     return CameraInfo(
         header=Header(stamp=unix_to_stamp(unix_s), frame_id=frame_id),
         width=int(camera.width),
         height=int(camera.height),
-        distortion_model="plumb_bob",
+        distortion_model=camera.model,
         d=[float(v) for v in camera.distortion],
         k=[float(v) for v in (fx, 0, cx, 0, fy, cy, 0, 0, 1)],
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],

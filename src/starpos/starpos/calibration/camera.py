@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.calibration.camera_adjustment import PARAMETERS, Sighting, unbent
+from starpos.calibration.camera_adjustment import Sighting, parameters, unbent
 from starpos.calibration.intrinsics import (
     Intrinsics,
     check_invertible,
@@ -21,9 +21,16 @@ from starpos.calibration.intrinsics import (
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.fix import sound_matches
-from starpos.fix.solver import ENOUGH_SOUND
+from starpos.fix.solver import ENOUGH_SOUND, LEAST_ALTITUDE_RAD
 from starpos.frames.stars import Stars
-from starpos.identification import Identification, PointingPrior, Sky, identify_directions, triangle_cache
+from starpos.identification import (
+    Identification,
+    PointingPrior,
+    Sky,
+    identify_directions,
+    triangle_cache,
+    wide,
+)
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
@@ -31,9 +38,9 @@ from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 
 # the first rounds have coarse matches and fit few terms: with more, wrong matches in the corners would confirm themselves
-FREE = (("fx", "fy", "k1"), ("fx", "fy", "cx", "cy", "k1"), ("fx", "fy", "cx", "cy", "k1", "k2"))
-# of fewer stars than this nearly all must fit, because a wrong lens leaves some over
-FEW, NEARLY_ALL = 2 * fewest_stars(), 0.9
+FIRST_FREE = (("fx", "fy", "k1"), ("fx", "fy", "cx", "cy", "k1"), ("fx", "fy", "cx", "cy", "k1", "k2"))
+# of fewer stars than so many times the fewest nearly all must fit, because a wrong lens leaves some over
+FEW, NEARLY_ALL = 2, 0.9
 # most rounds in which all terms are fitted
 ROUNDS = 5
 # a round that finds no more than this share of new stars is the last
@@ -59,7 +66,8 @@ def calibrate_camera(
     """One camera from frames of any attitudes.
 
     levels: for each frame the rotation (3, 3) of C into the local level L, None if unknown.
-    given: a camera that is right to 3 % of the focal length and a few px of distortion.
+    given: a camera that is right to 3 % of the focal length and a few px of distortion; a fisheye to 5 px within 30 deg
+    of its axis.
     Frames that are not identified are left out.  Raises CalibrationError if no camera can be found, InstrumentError for
     a mirrored frame, TimeError for an impossible time.
     """
@@ -69,17 +77,22 @@ def calibrate_camera(
                 f"{stars.source}: the frame is {stars.width} x {stars.height} px but the first or the instrument has "
                 f"{given.width} x {given.height}: give frames of one size"
             )
+    if wide.is_wide(given) and any(level is None for level in levels):
+        raise CalibrationError(
+            "what refraction does to the stars of a fisheye would be taken for its lens: give the --tilt of its frames"
+        )
     catalogue = deeper.for_field(catalogue, given, progress)
-    table = triangle_cache.cached(catalogue, given.half_diagonal_rad, progress)
+    table = triangle_cache.cached(catalogue, wide.field_rad(given), progress)
+    every = parameters(given)
     skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
     camera, before = given, 0
     attitudes: dict[int, np.ndarray] = {}
-    for k, free in enumerate((*FREE, *[PARAMETERS] * ROUNDS)):
+    for k, free in enumerate((*FIRST_FREE, *[every] * ROUNDS)):
         sightings = {}
         for n, frame in enumerate(skies):
             if sighting := frame.sighting(camera, atmosphere, attitudes.get(n)):
                 sightings[n] = sighting
-            progress("camera", (k + (n + 1) / len(skies)) / (len(FREE) + ROUNDS))
+            progress("camera", (k + (n + 1) / len(skies)) / (len(FIRST_FREE) + ROUNDS))
         if not sightings:
             raise CalibrationError(
                 f"none of the sky fits any of the {len(frames)} frames: check the focal length ({given.fx:.0f} px given, "
@@ -89,13 +102,14 @@ def calibrate_camera(
         check_invertible(fit.camera)
         camera, attitudes = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
         count = sum(len(s.xy) for s in sightings.values())
-        if k >= len(FREE) and abs(count - before) <= SETTLED_SHARE * count:
+        if k >= len(FIRST_FREE) and abs(count - before) <= SETTLED_SHARE * count:
             break
         before = count
     there = sum(len(skies[n].stars) for n in sightings)
-    if count < FEW and len(fit.xy) < NEARLY_ALL * there:
+    few = FEW * fewest_stars(every)
+    if count < few and len(fit.xy) < NEARLY_ALL * there:
         raise CalibrationError(
-            f"{len(fit.xy)} of {there} stars fit one camera, too few to be sure of it: give frames with {FEW} or more"
+            f"{len(fit.xy)} of {there} stars fit one camera, too few to be sure of it: give frames with {few} or more"
         )
     check_sound(fit, given)
     progress("camera", 1.0)
@@ -127,23 +141,26 @@ class _Frame:
 
         Raises InstrumentError for a mirrored frame.
         """
-        seen = unbent(camera.directions(self.stars.x, self.stars.y), self.level, atmosphere)
+        stars = self.stars.take(camera.sees(self.stars.x, self.stars.y))
+        seen = unbent(camera.directions(stars.x, stars.y), self.level, atmosphere)
         priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
-        found = identify_directions(seen, self.stars.sigma, camera, self.sky, priors)
+        found = identify_directions(seen, stars.sigma, camera, self.sky, priors)
         if found is None:
             return None
         if found.mirrored:
             raise InstrumentError(
                 f"{self.stars.source}: the frame is mirrored (its rows run bottom-up): flip it"
             )
-        return self._sighting(found, camera)
+        return self._sighting(stars, seen, found, camera)
 
-    def _sighting(self, found: Identification, camera: Camera) -> Sighting:
-        use = sound_matches(self.stars, found, ENOUGH_SOUND)
+    def _sighting(self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera) -> Sighting:
+        use = sound_matches(stars, found, ENOUGH_SOUND)
+        if wide.is_wide(camera) and self.level is not None:
+            use &= seen[found.star] @ self.level[2] > np.sin(LEAST_ALTITUDE_RAD)
         star, index = found.star[use], found.catalogue[use]
         return Sighting(
-            xy=np.stack([self.stars.x, self.stars.y], -1)[star],
-            covariance_px2=self.stars.covariance[star],
+            xy=np.stack([stars.x, stars.y], -1)[star],
+            covariance_px2=stars.covariance[star],
             directions=self.sky.directions(index),
             direction_sigma=np.hypot(
                 self.sky.catalogue.sigma(index, self.sky.year), found.blend_px[use] / camera.fx

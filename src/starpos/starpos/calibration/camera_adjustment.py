@@ -15,13 +15,15 @@ from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.fix.outliers import distance2, judged
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import COEFFICIENTS, EQUIDISTANT, Camera
 
-PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 # 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
 # side), and the shift of a corner by k1, k2, p1, p2, k3 (share of half the diagonal)
 FOCAL, SQUARE, PRINCIPAL = 0.03, 0.005, 0.03
 CORNER = (0.02, 0.01, 0.003, 0.003, 0.005)
+# The same of a fisheye's k1, k2, k3, k4, whose picture's end may be shifted by a quarter (a stereographic lens); it is
+# at most so far off the axis, rad.
+FISHEYE_EDGE, FISHEYE_MOST_RAD = (0.15, 0.08, 0.04, 0.02), 1.6
 # Refraction shrinks the field: across the vertical as at the zenith, along it twice as much at 45 deg.  For a frame of
 # unknown level: the shrinking that is assumed, and its sigma per axis, in units of that at the zenith
 UNLEVELLED = 1.25, 0.3
@@ -64,21 +66,30 @@ def _shrinking(atmosphere: Atmosphere) -> float:
     return 1 - UNLEVELLED[0] * atmosphere.refraction().a
 
 
+def parameters(camera: Camera) -> tuple[str, ...]:
+    """Names (P,) of the parameters of a camera, which depend on the model of its lens."""
+    return ("fx", "fy", "cx", "cy", *COEFFICIENTS[camera.model])
+
+
 def camera_values(camera: Camera) -> np.ndarray:
-    """Values (9,) of PARAMETERS."""
+    """Values (P,) of a camera's parameters."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
 def with_values(camera: Camera, values: np.ndarray) -> Camera:
-    """A camera of the same size with other values (9,) of PARAMETERS."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = values.tolist()
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2, k3))
+    """A camera of the same size and model with other values (P,) of its parameters."""
+    fx, fy, cx, cy, *distortion = values.tolist()
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 
-# The unknowns q, in sigma of their priors: scale, squareness, seven parameters of the camera, the strength of the
-# refraction relative to the model, and the shrinking of the field along x and y where the level is not known
-UNKNOWNS = ("scale", "square", *PARAMETERS[2:], "refraction", "shrink_x", "shrink_y")
-CAMERA_UNKNOWNS = 9
+# The unknowns q, in sigma of their priors: scale, squareness, the camera's other parameters, and these: the strength of
+# the refraction relative to the model, and the shrinking of the field along x and y where the level is not known
+OF_THE_AIR = ("refraction", "shrink_x", "shrink_y")
+
+
+def unknowns(camera: Camera) -> tuple[str, ...]:
+    """Names (U,) of the unknowns of a camera's fit."""
+    return ("scale", "square", *parameters(camera)[2:], *OF_THE_AIR)
 
 
 @dataclass(frozen=True)
@@ -103,7 +114,7 @@ class SettledCamera:
 class CameraAdjustment:
     """The least-squares problem: all N stars of all F frames, frame by frame.
 
-    sigma (U,): of the priors of UNKNOWNS, 0 for one that is held.
+    sigma (U,): of the priors of `unknowns`, 0 for one that is held.
     xy (N, 2) px, stated (N, 2, 2) px2, places (N, 3): seen place, its covariance and direction of each star.
     frame (N,): the frame of each star; first (F,): the row where each frame begins.
     start (F, 3, 3): approximate attitudes.  level (F, 3, 3): C into L, 0 if unknown.
@@ -129,12 +140,9 @@ class CameraAdjustment:
         direction2 = np.square(np.concatenate([s.direction_sigma for s in sightings]) * given.fx)
         untimed = any(not s.timed for s in sightings)
         shrink = np.hypot(UNLEVELLED[1] * atmosphere.refraction().a, UNTIMED * untimed)
-        half = np.hypot(given.width, given.height) / 2
-        r = half / np.sqrt(given.fx * given.fy)
-        shift = np.array(CORNER) / np.array([r**2, r**4, 3 * r, 3 * r, r**6])
         side = PRINCIPAL * max(given.width, given.height)
-        held = np.array([name in free for name in PARAMETERS])
-        camera = np.array([FOCAL, SQUARE, side, side, *shift]) * held
+        held = np.array([name in free for name in parameters(given)])
+        camera = np.array([FOCAL, SQUARE, side, side, *_lens_sigma(given)]) * held
         return cls(
             given=given,
             sigma=np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
@@ -150,8 +158,8 @@ class CameraAdjustment:
         )
 
     def with_free(self, name: str) -> "CameraAdjustment":
-        """The problem with one of UNKNOWNS free and all others held."""
-        return replace(self, sigma=self.sigma * np.array([u == name for u in UNKNOWNS]))
+        """The problem with one of the unknowns free and all others held."""
+        return replace(self, sigma=self.sigma * np.array([u == name for u in unknowns(self.given)]))
 
     @cached_property
     def levelled(self) -> np.ndarray:
@@ -159,10 +167,9 @@ class CameraAdjustment:
         return np.any(self.level != 0, axis=(1, 2))[self.frame]
 
     def named_per_unit(self) -> np.ndarray:
-        """Derivatives (9, U) of PARAMETERS with respect to the unknowns."""
-        m = np.zeros((len(PARAMETERS), len(UNKNOWNS)))
+        """Derivatives (P, U) of the camera's parameters with respect to the unknowns."""
+        m = np.eye(len(parameters(self.given)), len(self.sigma))
         m[0, :2], m[1, :2] = np.array([1, 0.5]) * self.given.fx, np.array([1, -0.5]) * self.given.fy
-        m[range(2, 9), range(2, 9)] = 1.0
         return m * self.sigma
 
     def camera(self, q: np.ndarray) -> Camera:
@@ -172,7 +179,7 @@ class CameraAdjustment:
     def seen(self, state: CameraEstimate) -> np.ndarray:
         """Directions (N, 3) in C from which the light of the stars comes."""
         u = np.einsum("nij,nj->ni", state.attitudes[self.frame], self.places)
-        strength, *shrink = (state.q * self.sigma)[CAMERA_UNKNOWNS:]
+        strength, *shrink = (state.q * self.sigma)[-len(OF_THE_AIR) :]
         model = self.atmosphere.refraction(1 + strength)
         if self.levelled.all():
             g = self.level[self.frame]
@@ -196,12 +203,13 @@ class CameraAdjustment:
         """Derivatives of the predicted pixels with respect to q (N, 2, U) and to a turn of their own frame (N, 2, 3)."""
         seen, camera = self.seen(state), self.camera(state.q)
         here = camera.project(seen)
-        of_q = np.zeros((len(here), 2, len(UNKNOWNS)))
+        of_q = np.zeros((len(here), 2, len(self.sigma)))
+        of_camera = len(self.sigma) - len(OF_THE_AIR)
         for k in np.flatnonzero(self.sigma):
             q = state.q.copy()
-            q[k] += 1.0 if k < CAMERA_UNKNOWNS else 1e-3
+            q[k] += 1.0 if k < of_camera else 1e-3
             # the projection is linear in each parameter of the camera, so a difference is the derivative
-            if k < CAMERA_UNKNOWNS:
+            if k < of_camera:
                 of_q[..., k] = self.camera(q).project(seen) - here
             else:
                 of_q[..., k] = (camera.project(self.seen(replace(state, q=q))) - here) * 1e3
@@ -228,8 +236,8 @@ class CameraAdjustment:
         turns = sum_per_frame(jt, jt) + np.eye(3)
         mixed, pull = sum_per_frame(jt, jq), sum_per_frame(jt, r[..., None])[..., 0]
         solved, pulled = np.linalg.solve(turns, mixed), np.linalg.solve(turns, pull[..., None])[..., 0]
-        flat = jq.reshape(-1, len(UNKNOWNS))
-        normal = np.eye(len(UNKNOWNS)) + flat.T @ flat - np.einsum("fki,fkj->ij", mixed, solved)
+        flat = jq.reshape(-1, len(self.sigma))
+        normal = np.eye(len(self.sigma)) + flat.T @ flat - np.einsum("fki,fkj->ij", mixed, solved)
         right = flat.T @ r.ravel() - state.q - np.einsum("fki,fk->i", mixed, pulled)
         inverse = np.linalg.inv(normal)
         dq = inverse @ right
@@ -270,9 +278,9 @@ class CameraAdjustment:
 
 def settled(problem: CameraAdjustment) -> SettledCamera:
     """The fit without outliers, with the stars' errors widened to their scatter; raises CalibrationError."""
-    state = CameraEstimate(np.zeros(len(UNKNOWNS)), problem.start)
+    state = CameraEstimate(np.zeros(len(problem.sigma)), problem.start)
     keep, jitter2, stable = np.ones(len(problem.xy), bool), 0.0, False
-    unknowns = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
+    fitted = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
     for _ in range(MAX_ROUNDS):
         if keep.sum() < 0.5 * len(keep):
             raise CalibrationError(
@@ -283,10 +291,19 @@ def settled(problem: CameraAdjustment) -> SettledCamera:
         if stable:
             break
         residual, before = problem.residual(state), (keep, jitter2)
-        freedom = max(1 - unknowns / (2 * keep.sum()), 0.05)
+        freedom = max(1 - fitted / (2 * keep.sum()), 0.05)
         jitter2, keep = judged(residual, problem.stated, keep, freedom)
         stable = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
     return SettledCamera(state, covariance, keep, jitter2)
+
+
+def _lens_sigma(given: Camera) -> np.ndarray:
+    """1 sigma of the priors of the lens's coefficients."""
+    if given.model == EQUIDISTANT:
+        edge = min(given.half_diagonal_rad, FISHEYE_MOST_RAD)
+        return np.array(FISHEYE_EDGE) / edge ** np.array([2, 4, 6, 8])
+    r = np.hypot(given.width, given.height) / 2 / np.sqrt(given.fx * given.fy)
+    return np.array(CORNER) / np.array([r**2, r**4, 3 * r, 3 * r, r**6])
 
 
 def _inverse(covariance: np.ndarray) -> np.ndarray:

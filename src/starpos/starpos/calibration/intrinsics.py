@@ -11,19 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.calibration.camera_adjustment import (
-    PARAMETERS,
     STEP_RAD,
-    UNKNOWNS,
     CameraAdjustment,
     CameraEstimate,
     Sighting,
     camera_values,
+    parameters,
     settled,
     with_values,
 )
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import EQUIDISTANT, Camera
 
 # the sky has told a parameter if its sigma is below this share of the prior's
 TOLD = 0.5
@@ -40,7 +39,8 @@ BORDER = 25
 class Intrinsics:
     """A camera that was fitted to stars.
 
-    covariance (9, 9): of PARAMETERS, with the scatter beyond the stars' own errors; prior_sigma (9,): of the priors.
+    covariance (P, P): of the camera's `parameters`, with the scatter beyond the stars' own errors; prior_sigma (P,): of
+    the priors.
     attitudes (F, 3, 3): of the frames.
     xy (N, 2) in px: the stars that were kept, frame by frame; frame (N,): the frame of each.
     residual (N, 2) in px: measured minus predicted; before (N, 2): with the given camera, of which only the focal length
@@ -61,17 +61,17 @@ class Intrinsics:
 
     @property
     def values(self) -> np.ndarray:
-        """Values (9,) of PARAMETERS."""
+        """Values (P,) of the camera's parameters."""
         return camera_values(self.camera)
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviations (9,) of PARAMETERS."""
+        """Standard deviations (P,) of the camera's parameters."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def told(self) -> np.ndarray:
-        """Mask (9,) of those PARAMETERS that the sky determines; the others are held by their priors."""
+        """Mask (P,) of those parameters that the sky determines; the others are held by their priors."""
         return self.sigma < TOLD * self.prior_sigma
 
     @property
@@ -84,8 +84,9 @@ class Intrinsics:
 
         Every use of the camera fits these two, so their part of the covariance does not matter.
         """
-        grid = _grid(self.camera, BORDER)
-        j, free = (_derivatives(self.camera, np.concatenate([grid, xy]), k) for k in (PARAMETERS, ()))
+        grid = self._grid
+        both = np.concatenate([grid, xy])
+        j, free = (_derivatives(self.camera, both, k) for k in (parameters(self.camera), ()))
         n = 2 * len(grid)
         fitted = np.linalg.lstsq(free[:n], j[:n], rcond=None)[0]
         left = (j - free @ fitted)[n:]
@@ -93,8 +94,16 @@ class Intrinsics:
 
     @property
     def worst_sigma_px(self) -> float:
-        """The largest of `sigma_px` over the frame."""
-        return float(self.sigma_px(_grid(self.camera, BORDER)).max())
+        """The largest of `sigma_px` over the frame; of a fisheye where it has shown stars."""
+        return float(self.sigma_px(self._grid).max())
+
+    @property
+    def _grid(self) -> np.ndarray:
+        """Pixels (G, 2) all over the frame; of a fisheye where it has shown stars."""
+        grid, middle = _grid(self.camera, BORDER), [self.camera.cx, self.camera.cy]
+        if self.camera.model != EQUIDISTANT:
+            return grid
+        return grid[np.hypot(*(grid - middle).T) <= np.hypot(*(self.xy - middle).T).max()]
 
 
 def rms(residual: np.ndarray) -> float:
@@ -103,12 +112,14 @@ def rms(residual: np.ndarray) -> float:
 
 
 def fit_camera(
-    sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str] = PARAMETERS
+    sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str] = ()
 ) -> Intrinsics:
     """Fit a camera near the `given` one to all sightings; parameters that are not in `free` keep their values.
 
-    Raises CalibrationError if the stars are too few or do not agree.  `check_sound` tells whether the fit is good.
+    Without `free` all are fitted. Raises CalibrationError if the stars are too few or do not agree.  `check_sound` tells
+    whether the fit is good.
     """
+    free = free or parameters(given)
     count, fewest = sum(len(s.xy) for s in sightings), fewest_stars(free)
     if count < fewest:
         raise CalibrationError(
@@ -121,7 +132,7 @@ def fit_camera(
     keep = fitted.keep
     held = problem.with_free("scale")
     before, _ = held.refined(
-        CameraEstimate(np.zeros(len(UNKNOWNS)), problem.start), problem.stated + np.eye(2), keep
+        CameraEstimate(np.zeros(len(problem.sigma)), problem.start), problem.stated + np.eye(2), keep
     )
     return Intrinsics(
         camera=camera,
@@ -137,7 +148,7 @@ def fit_camera(
     )
 
 
-def fewest_stars(free: Sequence[str] = PARAMETERS) -> int:
+def fewest_stars(free: Sequence[str]) -> int:
     """Number of stars that a camera with these free parameters needs; an attitude counts as one parameter."""
     return STARS_EACH * (len(free) + 1)
 
@@ -174,12 +185,14 @@ def _grid(camera: Camera, side: int) -> np.ndarray:
 
 
 def _derivatives(camera: Camera, xy: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Derivatives (2 N, 9) of pixels by the parameters; without names, by attitude and scale (2 N, 4)."""
+    """Derivatives (2 N, P) of pixels by the parameters named; without names, by attitude and scale (2 N, 4)."""
     v = camera.directions(*xy.T)
     here = camera.project(v)
     if not names:
         turned = [camera.project(v + np.cross(t, v)) - here for t in np.eye(3) * STEP_RAD]
         turned.append(camera.scaled(1 + STEP_RAD).project(v) - here)
         return np.stack(turned, -1).reshape(-1, 4) / STEP_RAD
-    moved = [with_values(camera, camera_values(camera) + step).project(v) - here for step in np.eye(9)]
-    return np.stack(moved, -1).reshape(-1, 9)
+    moved = [
+        with_values(camera, camera_values(camera) + step).project(v) - here for step in np.eye(len(names))
+    ]
+    return np.stack(moved, -1).reshape(-1, len(names))

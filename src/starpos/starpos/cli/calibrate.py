@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.calibration.camera import FromSky, calibrate_camera
-from starpos.calibration.camera_adjustment import PARAMETERS, UNLEVELLED, UNTIMED
+from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
 from starpos.cli.frame_work import NO_CAMERA, reader_of
@@ -189,7 +189,7 @@ def _about(found: FromSky) -> str:
         f"{len(found.used)} frames, {len(fit.xy)} stars ({fit.rejected} left out): {fit.rms_px:.3f} px rms an axis, "
         f"of the given camera, its scale fitted, {rms(fit.before):.3f} px"
     ]
-    for name, value, sigma, told in zip(PARAMETERS, fit.values, fit.sigma, fit.told, strict=True):
+    for name, value, sigma, told in zip(parameters(fit.camera), fit.values, fit.sigma, fit.told, strict=True):
         digits = max(0, 1 - int(np.floor(np.log10(sigma))))
         by = "told by the sky" if told else "held by the prior"
         lines.append(f"  {name:<4} {value:>16.{digits}f} +- {sigma:<12.{digits}f} {by}")
@@ -201,7 +201,7 @@ def _about(found: FromSky) -> str:
 
 def _covariance_text(fit: Intrinsics) -> str:
     rows = "\n".join(" ".join(f"{v:.6e}" for v in row) for row in fit.covariance)
-    return f"covariance of {' '.join(PARAMETERS)}, row by row:\n{rows}\n"
+    return f"covariance of {' '.join(parameters(fit.camera))}, row by row:\n{rows}\n"
 
 
 def _draw(path: str, found: FromSky) -> None:
@@ -231,10 +231,11 @@ def _json_of(found: FromSky, path: str) -> dict:
         "fy": c.fy,
         "cx": c.cx,
         "cy": c.cy,
+        "model": c.model,
         "distortion": c.distortion,
-        "sigma": dict(zip(PARAMETERS, fit.sigma, strict=True)),
+        "sigma": dict(zip(parameters(c), fit.sigma, strict=True)),
         "covariance": fit.covariance,
-        "told": [name for name, told in zip(PARAMETERS, fit.told, strict=True) if told],
+        "told": [name for name, told in zip(parameters(c), fit.told, strict=True) if told],
         "rms_px": fit.rms_px,
         "rms_before_px": rms(fit.before),
         "scatter_px": fit.scatter_px,

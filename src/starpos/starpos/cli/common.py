@@ -20,7 +20,7 @@ from starpos.frames.frame import Frame
 from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument, instrument_file, sensors
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 
 
@@ -34,7 +34,8 @@ def add_frames(
         "frames",
         nargs="*" if pointings else "+",
         metavar="FRAME",
-        help="FITS, TIFF, PNG, raw, or a CSV of centroids",
+        help="FITS (an HDU of several: 'a.fits[2]' or 'a.fits[SCI]'), TIFF, PNG, JPEG, BMP, HEIF, raw, or a CSV of "
+        "centroids",
     )
     if pointings:
         parser.add_argument(
@@ -124,12 +125,23 @@ def add_optics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pixel-um", type=float, metavar="UM", help="pixel size")
 
 
+def add_lens(parser: argparse.ArgumentParser) -> None:
+    """Add --lens, the model of a lens that is not calibrated yet."""
+    parser.add_argument(
+        "--lens",
+        choices=tuple(COEFFICIENTS),
+        default=PLUMB_BOB,
+        help="model of a lens whose calibration is not known (plumb_bob: a pinhole; equidistant: a fisheye)",
+    )
+
+
 def add_instrument(parser: argparse.ArgumentParser) -> None:
     """Add the options that `instrument_of` reads."""
     parser.add_argument(
-        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the five options below"
+        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the six options below"
     )
     add_optics(parser)
+    add_lens(parser)
     parser.add_argument(
         "--misalignment",
         type=float,
@@ -266,13 +278,14 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
     misalignment = getattr(args, "misalignment", None)
     stddev = getattr(args, "misalignment_stddev", None)
     model = getattr(args, "inclinometer", None)
-    flat = (args.focal_mm, args.pixel_um, misalignment, stddev, model) != (None,) * 5
+    lens = getattr(args, "lens", PLUMB_BOB)
+    flat = (args.focal_mm, args.pixel_um, misalignment, stddev, model) != (None,) * 5 or lens != PLUMB_BOB
     if stddev is not None and misalignment is None:
         raise InstrumentError("--misalignment-stddev is the error of --misalignment: give both")
     if path is not None:
         if flat:
             raise InstrumentError(
-                "--instrument holds focal length, misalignment and the inclinometer: give either it or the options"
+                "--instrument holds focal length, lens, misalignment and the inclinometer: give either it or the options"
             )
         return _with_times(instrument_file.read(path), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
@@ -289,6 +302,7 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
     model, errors = sensors.find(model or "")
     made = instrument.Instrument(
         focal_px,
+        model=lens,
         calibration=instrument.Calibration.of(misalignment or (0.0, 0.0, 0.0), *known),
         inclinometer=errors,
         inclinometer_model=model,

@@ -141,7 +141,7 @@ class Identifying:
 
 @dataclass(frozen=True)
 class IdentifyingBlind:
-    """Work of `identify` without a focal length: the Solution of a frame, and the CPU time in ms."""
+    """Work of `identify` without a focal length, or with a rough one of EXIF: the Solution, and the CPU time in ms."""
 
     read: Reader
 

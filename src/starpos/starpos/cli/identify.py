@@ -11,13 +11,20 @@ from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import FrameError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solver import Solution, Status
+from starpos.instrument.camera import PLUMB_BOB
 from starpos.sky.catalogue import load_catalogue
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
     common.add_stamps(parser)
+    parser.add_argument(
+        "--instrument",
+        metavar="FILE",
+        help="instrument file (YAML), whose camera is taken, instead of the next three",
+    )
     common.add_optics(parser)
+    common.add_lens(parser)
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
@@ -30,7 +37,8 @@ def run(args: argparse.Namespace) -> int:
         (about,) = workers.map([(Look(read), tuple(args.frames))])
         # without a frame that can be read, each one reports why it cannot
         work: Listing | Identifying | IdentifyingBlind = Listing(read)
-        if about is not None and args.focal_mm is None and args.pixel_um is None and about.focal_px is None:
+        untold = (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
+        if about is not None and untold and about.focal_px is None:
             work = IdentifyingBlind(read)
             BlindSolver(load_catalogue(), common.ProgressBar()).prepare()
         elif about is not None:

@@ -39,6 +39,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--focal-mm", type=float, default=600.0)
     parser.add_argument("--pixel-um", type=float, default=6.4)
+    common.add_lens(parser)
     parser.add_argument(
         "--size",
         type=common.number(16, 12000, int),
@@ -91,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         tilt_noise_deg=args.tilt_noise,
         tilt_zero_deg=tuple(args.tilt_zero),
         readout_s=args.readout,
+        lens=args.lens,
     )
     write_night(
         args.out,

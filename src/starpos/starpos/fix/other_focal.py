@@ -15,14 +15,15 @@ def focal_that_fits(solver: Solver, stars: Stars) -> float | None:
 
     Triangles are found by their angles, which hardly depend on the focal length, so those of the given field serve.
     """
-    seen = stars.take(stars.on_frame.nonzero()[0])
-    if len(seen) < FEWEST_STARS:
+    on = stars.take(stars.on_frame.nonzero()[0])
+    if len(on) < FEWEST_STARS:
         return None
     try:
-        given, catalogue, triangles = solver.view(seen.width, seen.height)
-        sky = Sky.at(catalogue, triangles, seen.mid_unix_s)
+        given, catalogue, triangles = solver.view(on.width, on.height)
+        sky = Sky.at(catalogue, triangles, on.mid_unix_s)
         for k in sorted(range(-TRIES, TRIES + 1), key=abs):
             camera = given.scaled(STEP**k)
+            seen = on.take(camera.sees(on.x, on.y).nonzero()[0])
             found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
             if found is not None:
                 return camera.fx * found.focal_scale

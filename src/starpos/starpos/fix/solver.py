@@ -23,14 +23,14 @@ from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.frames.stars import EDGE_PX, Stars
-from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache
+from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache, wide
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
 from starpos.identification.pose import FrameStars
-from starpos.identification.search import frame_stars, identify_frame
+from starpos.identification.search import field_of, identify_frame
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.camera_vertical import own_level
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
@@ -42,6 +42,8 @@ from starpos.units import ARCSEC
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
+# Lower stars of a fisheye make no fix.
+LEAST_ALTITUDE_RAD = math.radians(10)
 # Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
 # not identified, nor are the bright stars there that should be.
 TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
@@ -143,13 +145,13 @@ class Solver:
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars and pointing of the camera.  Stars without a time: J2000 places, no aberration."""
-        if (inside := _inside(stars)) is not None:
+        if (inside := self._inside(stars)) is not None:
             return _for_all(stars, inside, self.identify(stars.take(inside)))
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
-            field = frame_stars(directions_of(camera, stars), mean_sigma(stars.covariance), camera)
+            field = field_of(directions_of(camera, stars), mean_sigma(stars.covariance), camera)
             found = identify_frame(field, sky)
         except StarposError as e:
             return _failure(stars, e)
@@ -183,7 +185,7 @@ class Solver:
         """
         if isinstance(stars, Pointing):
             return self._solve_pointing(stars, tilt)
-        if (inside := _inside(stars)) is not None:
+        if (inside := self._inside(stars)) is not None:
             return _for_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
         try:
             state, tilt = self.levelled(stars, tilt)
@@ -194,7 +196,7 @@ class Solver:
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             priors = hint.priors(state, g[2]) if hint else ()
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
-            field = frame_stars(directions, mean_sigma(stars.covariance), camera)
+            field = field_of(directions, mean_sigma(stars.covariance), camera)
             found = identify_frame(field, sky, priors)
         except StarposError as e:
             return _failure(stars, e)
@@ -299,6 +301,12 @@ class Solver:
                 "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
             )
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
+        if wide.is_wide(camera):
+            # what refraction does near the horizon no model tells
+            mounting = self.instrument.mounting
+            up = (level_of(mounting.up(tilt)) @ mounting.a3)[2]
+            seen = camera.directions(stars.x[found.star], stars.y[found.star])
+            use &= seen @ up > math.sin(LEAST_ALTITUDE_RAD)
         star, index = found.star[use], found.catalogue[use]
         matched = MatchedStars(
             np.stack([stars.x, stars.y], -1)[star],
@@ -344,17 +352,30 @@ class Solver:
         if (width, height) not in self._views:
             camera = self.instrument.camera_for(width, height)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
-            if not SMALLEST_FIELD_DEG <= field_deg <= LARGEST_FIELD_DEG:
+            if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
                 raise InstrumentError(
                     f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
-                    f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size"
+                    f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
+                    "whether the lens is a fisheye (equidistant)"
                 )
             catalogue = deeper.for_field(self.catalogue, camera, self.progress)
-            triangles = triangle_cache.cached(catalogue, camera.half_diagonal_rad, self.progress)
+            triangles = triangle_cache.cached(catalogue, wide.field_rad(camera), self.progress)
             # one size is usual
             self._views.clear()
             self._views[width, height] = camera, catalogue, triangles
         return self._views[width, height]
+
+    def _inside(self, stars: Stars) -> np.ndarray | None:
+        """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
+        try:
+            camera = self.instrument.camera_for(stars.width, stars.height)
+        # who asks for the camera next reports the error
+        except InstrumentError:
+            return None
+        if camera.model == PLUMB_BOB and all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
+            return None
+        on = stars.on_frame & camera.sees(stars.x, stars.y)
+        return None if on.all() else np.flatnonzero(on)
 
 
 def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
@@ -362,16 +383,9 @@ def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
     return Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
 
 
-def _inside(stars: Stars) -> np.ndarray | None:
-    """Rows of the stars that lie on their frame; None if all do, as is usual."""
-    if all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
-        return None
-    return np.flatnonzero(stars.on_frame)
-
-
 def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
     """Unit vectors (N, 3) in C of the stars' pixels."""
-    if any(camera.distortion):
+    if not camera.is_ideal:
         return camera.directions(stars.x, stars.y)
     return unit_vectors(stars.x, stars.y, camera.fx, camera.fy, camera.cx, camera.cy)
 
@@ -398,11 +412,18 @@ def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
 
 
 def judged(
-    stars: Stars, field: FrameStars, sky: Sky, found: Identification
+    stars: Stars, field: FrameStars | wide.WideField, sky: Sky, found: Identification
 ) -> tuple[tuple[str, ...], Explained]:
-    """Names, sorted, of what is suspicious about the stars' identification, and what it explains."""
+    """Names, sorted, of what is suspicious about the stars' identification, and what it explains.
+
+    Of a fisheye the part with most identified stars is judged.
+    """
+    flux = stars.flux
+    if isinstance(field, wide.WideField):
+        part, found = wide.part_of(field, sky, found)
+        field, flux = part.field, flux[part.row]
     explained = explained_by(found, field)
-    names = (TWO_SKIES,) * two_skies(field, stars.flux, sky, found) + (UNEXPLAINED,) * (not explained.enough)
+    names = (TWO_SKIES,) * two_skies(field, flux, sky, found) + (UNEXPLAINED,) * (not explained.enough)
     return names, explained
 
 
@@ -410,7 +431,7 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
     fx, fy = camera.fx * found.focal_scale, camera.fy * found.focal_scale
     x, y = camera.centre_px
-    if any(camera.distortion):
+    if not camera.is_ideal:
         v = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
     else:
         across, down = (x - camera.cx) / fx, (y - camera.cy) / fy

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from starpos.core.frame import projected
+from starpos.identification import wide
 from starpos.identification.evidence import anywhere
 from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.lookup import Candidates, Lookup
@@ -55,7 +56,14 @@ def identify_directions(
     priors: Sequence[PointingPrior | PlumbPrior] = (),
 ) -> Identification | None:
     """Identify stars as `identify` does, from unit vectors (N, 3) in C, with refraction removed, of any camera."""
-    return identify_frame(frame_stars(directions, sigma_px, camera), sky, priors)
+    return identify_frame(field_of(directions, sigma_px, camera), sky, priors)
+
+
+def field_of(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars | wide.WideField:
+    """The stars in directions (N, 3) in C, errors (N,) px, as `identify_frame` takes them from this camera."""
+    if wide.is_wide(camera):
+        return wide.WideField(directions, sigma_px, camera)
+    return frame_stars(directions, sigma_px, camera)
 
 
 def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars:
@@ -77,8 +85,12 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
     )
 
 
-def identify_frame(field: FrameStars, sky: Sky, priors: Priors = ()) -> Identification | None:
-    """Identify stars as `identify` does, from FrameStars."""
+def identify_frame(
+    field: FrameStars | wide.WideField, sky: Sky, priors: Priors = ()
+) -> Identification | None:
+    """Identify stars as `identify` does, from FrameStars, or from those of a fisheye."""
+    if isinstance(field, wide.WideField):
+        return _by_parts(field, sky, priors)
     if len(field) < FEWEST_STARS:
         return None
     for pose, radius_px, prior in attempts(field, sky, priors, STAGES):
@@ -88,6 +100,16 @@ def identify_frame(field: FrameStars, sky: Sky, priors: Priors = ()) -> Identifi
     for pose, radius_px, prior in crowded_attempts(field, sky, priors):
         if found := identified(field, sky, pose, radius_px, prior):
             return found
+    return None
+
+
+def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification | None:
+    """Identify a part of a fisheye's frame, then all of it."""
+    parts = wide.parts(field)
+    for part in parts:
+        found = identify_frame(part.field, sky, part.turned(priors))
+        if found and found.log_odds >= wide.enough(len(parts)):
+            return wide.everywhere(field, sky, part, found)
     return None
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import COEFFICIENTS, Camera
 
 LARGEST_SIDE = 1_000_000  # px of a frame
 
@@ -19,19 +19,21 @@ def read(path: Path) -> Camera:
         model = content.get("distortion_model", "plumb_bob")
         width, height = content["image_width"], content["image_height"]
         k = _numbers(content["camera_matrix"], 9)
+        count = len(COEFFICIENTS.get(model, ())) if isinstance(model, str) else 0
         d = (
-            _numbers(content["distortion_coefficients"], 5)
-            if "distortion_coefficients" in content
-            else (0.0,) * 5
+            _numbers(content["distortion_coefficients"], count)
+            if count and "distortion_coefficients" in content
+            else ()
         )
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InstrumentError(
             f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
             "it needs image_width, image_height, camera_matrix, distortion_coefficients."
         ) from None
-    if model != "plumb_bob":
+    if not count:
+        known = " and ".join(COEFFICIENTS)
         raise InstrumentError(
-            f"{path}: the distortion model is {reprlib.repr(model)}; only 'plumb_bob' is understood: calibrate with it."
+            f"{path}: the distortion model is {reprlib.repr(model)}; {known} are understood: calibrate with one of them."
         )
     if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
         raise InstrumentError(f"{path}: image_width and image_height must be whole numbers of px.")
@@ -40,7 +42,9 @@ def read(path: Path) -> Camera:
             f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
         )
     try:
-        return Camera(width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=d)
+        return Camera(
+            width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=d, model=model
+        )
     except InstrumentError as error:
         raise InstrumentError(f"{path}: {error}") from None
 
@@ -63,8 +67,8 @@ def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
         "image_height": camera.height,
         "camera_name": name,
         "camera_matrix": _matrix(3, 3, (fx, 0, cx, 0, fy, cy, 0, 0, 1)),
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": _matrix(1, 5, camera.distortion),
+        "distortion_model": camera.model,
+        "distortion_coefficients": _matrix(1, len(camera.distortion), camera.distortion),
         "rectification_matrix": _matrix(3, 3, (1, 0, 0, 0, 1, 0, 0, 0, 1)),
         "projection_matrix": _matrix(3, 4, (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)),
     }

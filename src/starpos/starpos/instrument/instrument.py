@@ -9,7 +9,7 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError
 from starpos.frames.shutter import Shutter
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.camera_vertical import CameraVertical
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.mounting import Mounting
@@ -177,6 +177,7 @@ class Instrument:
 
     focal_px            focal length, px
     camera              full intrinsics; None: an ideal camera of any size
+    model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration         A3 and its errors
     link_to_camera      (3, 3): base link into C
     inclinometer        its errors
@@ -189,6 +190,7 @@ class Instrument:
     focal_px: float
     _: KW_ONLY
     camera: Camera | None = None
+    model: str = PLUMB_BOB
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
     inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
@@ -231,7 +233,7 @@ class Instrument:
     def camera_for(self, width: int, height: int) -> Camera:
         """The camera for a frame of this size; InstrumentError if the intrinsics are for another size."""
         if self.camera is None:
-            return Camera.from_focal(width, height, self.focal_px)
+            return Camera.from_focal(width, height, self.focal_px, self.model)
         if (self.camera.width, self.camera.height) != (width, height):
             raise InstrumentError(
                 f"the frame is {width} x {height} px but the camera's intrinsics are of {self.camera.width} x "

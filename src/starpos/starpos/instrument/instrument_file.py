@@ -12,7 +12,7 @@ import numpy as np
 from starpos.errors import FrameError, InstrumentError, TimeError
 from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file, sensors, yaml_file
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
 from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, CameraVertical, level_errors
 from starpos.instrument.inclinometer import InclinometerErrors
@@ -64,7 +64,8 @@ def read(path: Path | str) -> Instrument:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
-            or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path
+            or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path; each of the
+            first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4]
     misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
@@ -107,10 +108,13 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
         "starpos_instrument": FORMAT,
         "camera": {"focal_px": float(instrument.focal_px)},
     }
+    model = instrument.model if camera is None else camera.model
     if camera is not None:
         content["camera"] = {"width": camera.width, "height": camera.height}
         content["camera"] |= {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
         content["camera"]["distortion"] = [float(d) for d in camera.distortion]
+    if model != PLUMB_BOB:
+        content["camera"]["model"] = model
     content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
     content["calibration_covariance_arcsec2"] = np.asarray(c.covariance_arcsec2, float).tolist()
     if not math.isnan(c.utc_unix_s):
@@ -142,16 +146,16 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
 
 def _from_mapping(content: dict, folder: Path) -> Instrument:
     _refuse_others(content, KEYS)
-    camera, focal_px = _camera(content.get("camera"), folder)
-    instrument = Instrument(focal_px, camera=camera, calibration=_calibration(content))
+    camera, focal_px, model = _camera(content.get("camera"), folder)
+    instrument = Instrument(focal_px, camera=camera, model=model, calibration=_calibration(content))
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
-    model, errors = _sensor(content)
+    sensor, errors = _sensor(content)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
-    instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=model)
+    instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=sensor)
     if "vertical" in content:
-        if given or model:
+        if given or sensor:
             raise InstrumentError(
                 "vertical is of a camera without an inclinometer: leave out inclinometer and the tilt_ keys"
             )
@@ -187,18 +191,21 @@ def _with_vertical(instrument: Instrument, about: object) -> Instrument:
     return replace(instrument, vertical=vertical, inclinometer=level_errors(sag))
 
 
-def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:
-    """Intrinsics (None if only the focal length is given) and focal length (px)."""
+def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
+    """Intrinsics (None if only the focal length is given), focal length (px), and the lens of a camera without them."""
     if not isinstance(camera, dict):
         raise InstrumentError(
             f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"
         )
+    model = camera.get("model", PLUMB_BOB)
+    if model not in tuple(COEFFICIENTS):
+        raise InstrumentError(f"the camera's model is {_short(model)}: give {' or '.join(COEFFICIENTS)}")
     if "focal_mm" in camera:
-        _refuse_others(camera, ("focal_mm", "pixel_um"))
-        return None, focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um"))
+        _refuse_others(camera, ("focal_mm", "pixel_um", "model"))
+        return None, focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um")), model
     if "focal_px" in camera:
-        _refuse_others(camera, ("focal_px",))
-        return None, _number(camera, "focal_px")
+        _refuse_others(camera, ("focal_px", "model"))
+        return None, _number(camera, "focal_px"), model
     if "calibration" in camera:
         _refuse_others(camera, ("calibration",))
         if not isinstance(camera["calibration"], str):
@@ -206,8 +213,8 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:
                 f"the camera's calibration is {_short(camera['calibration'])}: give the name of a file"
             )
         full = camera_file.read(folder / camera["calibration"])
-        return full, full.fx
-    _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion"))
+        return full, full.fx, PLUMB_BOB
+    _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion", "model"))
     for side in ("width", "height"):
         if type(camera.get(side)) is not int or not 1 <= camera[side] <= LARGEST_SIDE:
             raise InstrumentError(
@@ -220,9 +227,10 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float]:
         fy=_number(camera, "fy"),
         cx=_number(camera, "cx"),
         cy=_number(camera, "cy"),
-        distortion=_row(camera.get("distortion", [0.0] * 5), "distortion"),
+        distortion=_row(camera.get("distortion", []), "distortion"),
+        model=model,
     )
-    return full, full.fx
+    return full, full.fx, PLUMB_BOB
 
 
 def _calibration(content: dict) -> Calibration:

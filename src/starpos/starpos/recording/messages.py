@@ -13,7 +13,7 @@ from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
 
 # bits of Tilt.flags, as starpos_interfaces defines them
@@ -132,7 +132,10 @@ def _third_axis(message: Any) -> tuple[float, float]:
 
 
 def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
-    """Camera from a CameraInfo; raises InstrumentError unless it is a calibrated plumb_bob camera of the whole frame."""
+    """Camera from a CameraInfo; raises InstrumentError unless it is a calibrated camera of the whole frame.
+
+    Its model is plumb_bob, also where none is named, or equidistant.
+    """
     k = np.array(message.k, float)
     d = np.array(message.d, float)
     if not np.isfinite(k).all() or not np.isfinite(d).all():
@@ -141,10 +144,12 @@ def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
         raise InstrumentError(
             f"{source}: the camera is not calibrated (its focal length is 0); give it a calibration file."
         )
-    if message.distortion_model not in ("plumb_bob", "") or len(d) not in (0, 5):
+    model = message.distortion_model or PLUMB_BOB
+    if model not in COEFFICIENTS or len(d) not in (0, len(COEFFICIENTS[model])):
+        known = " and ".join(f"{name!r} with {len(terms)}" for name, terms in COEFFICIENTS.items())
         raise InstrumentError(
-            f"{source}: the distortion model is {message.distortion_model!r} with {len(d)} terms; "
-            "only 'plumb_bob' with 5 is understood: calibrate with it."
+            f"{source}: the distortion model is {message.distortion_model!r} with {len(d)} terms; {known} are "
+            "understood: calibrate with one of them."
         )
     if np.any(k[[1, 3, 6, 7]]) or k[8] != 1:
         raise InstrumentError(
@@ -158,10 +163,16 @@ def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
         raise InstrumentError(
             f"{source}: the frame is binned or cropped; send whole frames, or calibrate it as it is sent."
         )
-    distortion = tuple(d.tolist()) or (0.0,) * 5
     fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
     return Camera(
-        width=message.width, height=message.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion
+        width=message.width,
+        height=message.height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=tuple(d.tolist()),
+        model=model,
     )
 
 

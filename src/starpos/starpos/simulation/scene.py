@@ -15,7 +15,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site, camera_to_enu
@@ -108,19 +108,20 @@ def expose(
 ) -> Exposed:
     """Pixels where the light of each star falls, while the sky turns over the camera at rest."""
     camera, optics = scene.camera, scene.optics
-    reach = camera.half_diagonal_rad * 1.02
+    reach = min(camera.half_diagonal_rad * 1.02, np.pi)
     middle_state = earth_state(start_unix_s + exposure_s / 2)
     index = scene.site.overhead(catalogue, middle_state, scene.attitude[:, 2], reach, optics.limit_mag)
     moments = []
     for t in (start_unix_s, start_unix_s + exposure_s / 2, start_unix_s + exposure_s):
         state = middle_state if t == middle_state.utc_unix_s else earth_state(t)
-        moments.append(camera.project(scene.site.observed(catalogue, index, state) @ scene.attitude))
+        above = scene.site.observed(catalogue, index, state)
+        pixels = camera.project(above @ scene.attitude)
+        # the ground hides the others
+        pixels[above[:, 2] < 0] = np.nan
+        moments.append(pixels)
     px = np.stack(moments) + rng.normal(0, optics.seeing_arcsec / camera.scale_arcsec, (len(index), 2))
-    on = (
-        np.isfinite(px).all((0, 2))
-        & (px[1] > -6).all(1)
-        & (px[1] < [camera.width + 5, camera.height + 5]).all(1)
-    )
+    on = np.asarray(np.isfinite(px).all((0, 2)))
+    on[on] = ((px[1, on] > -6) & (px[1, on] < [camera.width + 5, camera.height + 5])).all(1)
     electrons = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * catalogue.vmag(index))
     later_s = scene.shutter.later_s(px[1, :, 1], camera.height)
     # the trail is as good as straight
@@ -208,12 +209,15 @@ def scene_of(
     tilt_noise_deg: float = 0.0035,
     tilt_zero_deg: tuple[float, float] = (0.0, 0.0),
     readout_s: float = 0.0,
+    lens: str = PLUMB_BOB,
 ) -> Scene:
     """The paper's instrument at a place; plain numbers for what is usually varied."""
     azimuth_deg, altitude_deg, roll_deg = pointing_deg
     return Scene(
-        camera=Camera.from_focal(size[0], size[1], focal_px),
-        instrument=Instrument(focal_px, calibration=Calibration.of(misalignment_deg, STATED_ARCSEC)),
+        camera=Camera.from_focal(size[0], size[1], focal_px, lens),
+        instrument=Instrument(
+            focal_px, model=lens, calibration=Calibration.of(misalignment_deg, STATED_ARCSEC)
+        ),
         site=Site(latitude_deg, longitude_deg, atmosphere),
         azimuth_deg=azimuth_deg,
         altitude_deg=altitude_deg,

@@ -8,9 +8,8 @@ from pathlib import Path
 import erfa
 import numpy as np
 import pytest
-from solved_night import refused
+from solved_night import off_by_sigma, refused
 
-from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state, station_velocity
 from starpos.errors import TiltError
 from starpos.fix.solver import Solver, Status
@@ -32,17 +31,6 @@ from starpos_testing.skies.scenes import (
     wide_scene,
     with_false_stars,
 )
-
-
-def off_by_sigma(fix, scene):
-    """Position error over the claimed sigma (Mahalanobis), heading error over its sigma."""
-    phi = np.radians(scene.site.latitude_deg)
-    prime, meridian = curvature_radii_m(phi)
-    east = (fix.longitude - np.radians(scene.site.longitude_deg) + np.pi) % (2 * np.pi) - np.pi
-    moved = np.array([east * prime * np.cos(phi), (fix.latitude - phi) * meridian])
-    turned = (fix.heading - scene.heading + np.pi) % (2 * np.pi) - np.pi
-    c = fix.covariance
-    return np.sqrt(moved @ np.linalg.solve(c[:2, :2], moved)), abs(turned) / np.sqrt(c[2, 2])
 
 
 def test_a_fix(night):

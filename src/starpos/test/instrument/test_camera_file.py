@@ -3,6 +3,7 @@
 
 import os
 import threading
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -52,6 +53,16 @@ def test_reads_what_ros_writes(tmp_path):
     assert camera_file.read(path) == CAMERA
 
 
+def test_reads_and_writes_a_fisheye(tmp_path):
+    path, four = tmp_path / "camera.yaml", "[-0.04, 0.0005, 0.00001, -0.000002]"
+    written = WRITTEN_BY_ROS.replace("plumb_bob", "equidistant").replace("cols: 5", "cols: 4")
+    path.write_text(written.replace("[0.1, -0.2, 0.0001, -0.0002, 0.05]", four))
+    fisheye = replace(CAMERA, model="equidistant", distortion=(-0.04, 5e-4, 1e-5, -2e-6))
+    assert camera_file.read(path) == fisheye
+    camera_file.write(path, fisheye, "camera")
+    assert camera_file.read(path) == fisheye and "cols: 4" in path.read_text()
+
+
 def test_reads_what_it_writes_even_into_a_new_folder(tmp_path):
     path = tmp_path / "new" / "camera.yaml"
     camera_file.write(path, CAMERA, "camera")
@@ -62,7 +73,8 @@ def test_reads_what_it_writes_even_into_a_new_folder(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("plumb_bob", "equidistant", "equidistant"),
+        ("plumb_bob", "omni", "plumb_bob and equidistant"),
+        ("plumb_bob", "equidistant", "5 values for 4"),
         ("image_width: 640", "image_width: 640.5", "whole numbers"),
         ("image_width: 640", "image_width: 0", "at least 1"),
         ("camera_matrix", "matrix", "camera_matrix"),

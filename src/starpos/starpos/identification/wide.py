@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identify the stars of a fisheye, whose field no plane can hold.
+
+A part of the field is taken as a pinhole would see it, first the middle, then others in case that is covered, and
+identified like any frame. Then all stars are matched, with the lens itself.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.identification.full import (
+    BENT_PX,
+    BLEND_PX,
+    EDGE_PX,
+    ENOUGH,
+    FAINTEST_FIT,
+    FEWEST_STARS,
+    FLOOR_PX,
+    GATE_PX,
+    GATE_SIGMA,
+    INSIDE_PX,
+    LEAST_SPREAD_PX,
+    Identification,
+    OnFrame,
+)
+from starpos.identification.pairs import close_pairs, mutual_nearest
+from starpos.identification.pose import FrameStars, Pose
+from starpos.identification.prior import PlumbPrior, PointingPrior
+from starpos.identification.sky import Sky
+from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.normal import SIGMA_PER_MAD
+from starpos.sky.catalogue import Catalogue
+from starpos.sky.zones import rows_near
+
+# A fisheye whose corners are farther off the middle than this is worked by parts.
+WIDE_RAD = math.radians(25)
+# Half the sides of a part; how far off the axis the middles of the other parts lie, and in how many directions.
+HALF_RAD, OFF_RAD, AROUND = math.radians(30), math.radians(45), 4
+# Rounds of matching, steps of a fit, its numerical derivative (rad), and the step that ends it.
+ROUNDS, STEPS, STEP_RAD, SETTLED = 6, 8, 1e-6, 1e-10
+# A coordinate where no star is.
+FAR_PX = -1e7
+# The rows of a mirrored frame run bottom-up.
+FLIP = np.diag([1.0, -1.0, 1.0])
+
+
+def is_wide(camera: Camera) -> bool:
+    """Whether the frames of a camera are worked by parts."""
+    return camera.model == EQUIDISTANT and camera.half_diagonal_rad > WIDE_RAD
+
+
+def field_rad(camera: Camera) -> float:
+    """Half the diagonal, rad, of what is identified at once: of the frame, or of a part of it."""
+    return _pinhole(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
+
+
+@dataclass(frozen=True)
+class WideField:
+    """N stars of a fisheye's frame, brightest first.
+
+    directions  (N, 3) in C
+    sigma_px    (N,): their errors along one axis
+    """
+
+    directions: np.ndarray
+    sigma_px: np.ndarray
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Part:
+    """The stars of a part of a frame, as an ideal camera that looks there sees them.
+
+    turn        (3, 3): C into that camera
+    row         (n,): which of the frame's stars they are
+    directions  (n, 3): in that camera
+    sigma_px    (n,): their errors on its frame
+    """
+
+    camera: Camera
+    turn: np.ndarray
+    row: np.ndarray
+    directions: np.ndarray
+    sigma_px: np.ndarray
+
+    @property
+    def field(self) -> FrameStars:
+        """The stars on the frame of the part's camera."""
+        return FrameStars.of(self.camera.project(self.directions), self.sigma_px, self.camera)
+
+    def turned(self, priors: Sequence[PointingPrior | PlumbPrior]) -> tuple[PointingPrior | PlumbPrior, ...]:
+        """Priors of the frame as those of this part."""
+        return tuple(
+            replace(p, attitude=self.turn @ p.attitude)
+            if isinstance(p, PointingPrior)
+            else replace(p, zenith_camera=self.turn @ p.zenith_camera)
+            for p in priors
+        )
+
+
+def parts(field: WideField) -> list[Part]:
+    """The parts of a frame: first its middle."""
+    pinhole = _pinhole(field.camera)
+    made = []
+    for turn in _turns(field.camera, pinhole):
+        seen = field.directions @ turn.T
+        xy = pinhole.project(seen)
+        with np.errstate(invalid="ignore"):
+            row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
+        # a pinhole's picture is stretched away from its middle
+        made.append(Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2))
+    return made
+
+
+def _pinhole(camera: Camera) -> Camera:
+    """The ideal camera of a part: as wide as the frame, but at most HALF_RAD to each side."""
+    across = np.minimum(
+        [camera.cx, camera.cy], np.array([camera.width, camera.height]) - 1 - [camera.cx, camera.cy]
+    )
+    half = np.minimum(np.maximum(across, 1) / [camera.fx, camera.fy], HALF_RAD)
+    width, height = (2 * max(1, round(camera.fx * math.tan(angle))) for angle in half)
+    return Camera.from_focal(width, height, camera.fx)
+
+
+def _turns(camera: Camera, pinhole: Camera) -> list[np.ndarray]:
+    """Rotations (3, 3) of C into the cameras of the parts: all but the first lie wholly on the frame."""
+    turns = [np.eye(3)]
+    x, y = np.meshgrid(np.linspace(0, pinhole.width - 1, 5), np.linspace(0, pinhole.height - 1, 5))
+    grid = pinhole.directions(x.ravel(), y.ravel())
+    for angle in 2 * np.pi * np.arange(AROUND) / AROUND:
+        turn = rotation.from_vector(OFF_RAD * np.array([math.cos(angle), math.sin(angle), 0.0]))
+        xy = camera.project(grid @ turn)
+        if ((xy >= 0) & (xy <= [camera.width - 1, camera.height - 1])).all():
+            turns.append(turn)
+    return turns
+
+
+def enough(part_count: int) -> float:
+    """Log-odds that one of so many parts needs, so that all together are as safe as a frame."""
+    return float(ENOUGH) + math.log(part_count)
+
+
+def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Identification]:
+    """The part with most identified stars of a frame, and the identification as that of the part."""
+    best = max(parts(field), key=lambda p: np.isin(found.star, p.row).sum())
+    inside = np.isin(found.star, best.row)
+    star, catalogue = np.searchsorted(best.row, found.star[inside]), found.catalogue[inside]
+    flip = FLIP if found.mirrored else np.eye(3)
+    stars = best.field
+    pose = Pose(flip @ best.turn @ flip @ found.attitude, stars.focal_px * found.focal_scale, found.mirrored)
+    residual = stars.xy[int(found.mirrored)][star] - pose.project(sky.directions(catalogue))
+    from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle)
+    return best, replace(
+        found,
+        star=star,
+        catalogue=catalogue,
+        blend_px=found.blend_px[inside],
+        attitude=pose.attitude,
+        mean_square_px2=_mean_square(residual),
+        expected=found.expected[(from_middle < stars.half - INSIDE_PX).all(1)],
+    )
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A pose of the fisheye among the stars: attitude (3, 3), `Sky`'s directions into C."""
+
+    camera: Camera
+    attitude: np.ndarray
+    mirrored: bool
+
+    def project(self, w: np.ndarray) -> np.ndarray:
+        """Pixels (n, 2) of directions w (n, 3); NaN outside the lens's picture."""
+        u = w @ self.attitude.T
+        return self.camera.project(u @ FLIP if self.mirrored else u)
+
+    def moved(self, turn: np.ndarray, scale: float) -> "_Lens":
+        """The pose turned by turn (3,) rad about C's axes, its focal length longer by the share `scale`."""
+        return replace(
+            self, camera=self.camera.scaled(1 + scale), attitude=rotation.from_vector(turn) @ self.attitude
+        )
+
+    def fitted(self, xy: np.ndarray, w: np.ndarray, error_px: np.ndarray) -> "_Lens":
+        """Fit attitude and focal length to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3)."""
+        pose = self
+        for _ in range(STEPS):
+            here = pose.project(w)
+            ahead = [pose.moved(turn, 0.0).project(w) for turn in np.eye(3) * STEP_RAD]
+            ahead.append(pose.moved(np.zeros(3), STEP_RAD).project(w))
+            slope = (np.stack(ahead, -1) - here[..., None]) / STEP_RAD
+            on = np.isfinite(slope).all((1, 2))
+            weight = 1 / error_px[on]
+            j = (slope[on] * weight[:, None, None]).reshape(-1, 4)
+            step = np.linalg.lstsq(j, ((xy - here)[on] * weight[:, None]).ravel(), rcond=None)[0]
+            pose = pose.moved(step[:3], float(step[3]))
+            if np.abs(step).max() < SETTLED:
+                break
+        return pose
+
+
+def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
+    """The identification of all stars of a frame from that of a part.
+
+    None if the lens does not have in their places the stars that were identified.
+    """
+    flip = FLIP if found.mirrored else np.eye(3)
+    attitude = flip @ part.turn.T @ flip @ found.attitude
+    pose = _Lens(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
+    # what lies beyond the picture once refraction is undone is beside all stars
+    xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
+    sigma = field.sigma_px[:FAINTEST_FIT]
+    star, index = part.row[found.star], found.catalogue
+    star, index = star[star < len(xy)], index[star < len(xy)]
+    w, beyond = sky.directions(index), ~np.isin(np.arange(len(xy)), part.row)
+    for _ in range(ROUNDS):
+        pose = pose.fitted(xy[star], w, np.hypot(sigma[star], _error_px(xy[star] - pose.project(w))))
+        residual = xy[star] - pose.project(w)
+        there = _on_frame(pose, sky, len(xy))
+        gate = _gate_px(residual, sigma)
+        # a lens that is not known well has other stars than its own in their places farther out
+        if _spread_px(residual) > BENT_PX:
+            gate[beyond] = 0.0
+        predicted = pose.project(there.directions)
+        pair = mutual_nearest(xy, predicted, gate)
+        if len(pair[0]) < FEWEST_STARS:
+            return None
+        same = np.array_equal(pair[0], star) and np.array_equal(there.index[pair[1]], index)
+        star, index, w = pair[0], there.index[pair[1]], there.directions[pair[1]]
+        if same:
+            break
+    residual = xy[star] - pose.project(w)
+    return Identification(
+        star=star,
+        catalogue=index,
+        blend_px=there.blend_px[pair[1]],
+        attitude=pose.attitude,
+        focal_scale=pose.camera.fx / field.camera.fx,
+        residual_px=_rms_px(residual, np.hypot(sigma[star], FLOOR_PX)),
+        mean_square_px2=_mean_square(residual),
+        log_odds=found.log_odds,
+        expected=there.index[_within(predicted, field.camera, -INSIDE_PX)],
+        mirrored=found.mirrored,
+    )
+
+
+def _error_px(residual: np.ndarray) -> float:
+    """Error beside the centroids' own: where the lens is not known well all stars count alike."""
+    spread = _spread_px(residual[np.isfinite(residual).all(1)])
+    return spread if spread > BENT_PX else FLOOR_PX
+
+
+def _gate_px(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
+    return GATE_SIGMA * np.hypot(max(_spread_px(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
+
+
+def _spread_px(residual: np.ndarray) -> float:
+    """Standard deviation (px) that the median of residuals (M, 2) shows."""
+    return SIGMA_PER_MAD * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
+
+
+def _rms_px(residual: np.ndarray, sigma_px: np.ndarray) -> float:
+    """Root mean square of residuals (M, 2) along one axis, with the weights of the fit."""
+    weight = 1 / np.square(sigma_px)
+    return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
+
+
+def _mean_square(residual: np.ndarray) -> float:
+    """Mean square (px2) of residuals (M, 2) along one axis, all alike."""
+    return float(np.square(residual).mean())
+
+
+def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:
+    """Whether pixels (n, 2) lie on the frame or so far beyond it; those that are NaN do not."""
+    least, most = -0.5 - margin_px, np.array([camera.width, camera.height]) - 0.5 + margin_px
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((pixel > least) & (pixel < most)).all(1))
+
+
+def _on_frame(pose: _Lens, sky: Sky, stars: int) -> OnFrame:
+    """The catalogue stars that so many detections may be."""
+    camera, catalogue = pose.camera, sky.catalogue
+    axis = (FLIP[2] if pose.mirrored else np.array([0.0, 0.0, 1.0])) @ pose.attitude
+    index = rows_near(catalogue.cell_start, axis, min(1.05 * camera.half_diagonal_rad + 0.02, math.pi))
+    light = catalogue.vmag_centi[index]
+    # more than are on a frame of the widest field
+    most = 24 * stars + 600
+    if len(index) > most:
+        brightest = np.argpartition(light, most)[:most]
+        index, light = index[brightest], light[brightest]
+    index = index[np.argsort(light, kind="stable")]
+    w = sky.directions(index)
+    pixel = pose.project(w)
+    on = np.flatnonzero(_within(pixel, camera, EDGE_PX))[: 3 * stars + 50]
+    single, drawn = _resolved(catalogue, index[on], pixel[on], w[on], camera.fx)
+    on = on[single]
+    return OnFrame(index[on], w[on], drawn[single])
+
+
+def _resolved(
+    catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which stars (N,), brightest first, are not blended with a brighter one; how far fainter ones move them (px)."""
+    single, drawn = np.ones(len(index), bool), np.zeros(len(index))
+    brighter, fainter = close_pairs(pixel, BLEND_PX)
+    ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
+    # from directions and rounded, so that it does not depend on the pose
+    apart = np.round(focal_px * np.linalg.norm(w[fainter] - w[brighter], axis=1), 6)
+    np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
+    single[fainter] = False
+    return single, drawn

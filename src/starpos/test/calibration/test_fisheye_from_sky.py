@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fisheyes from the sky: their coefficients within what is claimed, and a fix with the camera that was found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from starpos.calibration.camera import calibrate_camera
+from starpos.calibration.camera_adjustment import parameters
+from starpos.calibration.intrinsics import fit_camera, rms
+from starpos.errors import CalibrationError
+from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos_testing.skies.lenses import AIR, VACUUM, night, sightings, values
+
+IDEAL = Camera.from_focal(2000, 2000, 600.0, EQUIDISTANT)
+# of a lens that is nearly equisolid, one that is nearly stereographic, one whose picture ends at 100 deg
+LENSES = {
+    "equisolid": (-0.0417, 5e-4, 1e-5, -2e-6),
+    "stereographic": (0.083, 0.0083, 8e-4, 1e-4),
+    "short": (-0.1, -0.0015, 0.0, 0.0),
+}
+
+
+def random_fisheye(lens, rng):
+    cx, cy = (np.array(IDEAL.centre_px) + rng.normal(0, 15, 2)).tolist()
+    f = IDEAL.fx * (1 + rng.uniform(-0.015, 0.015))
+    return replace(IDEAL, fx=f, fy=f * (1 + rng.normal(0, 1e-3)), cx=cx, cy=cy, distortion=lens)
+
+
+def nights(true, catalogue, rng, frames=4):
+    return night(true, frames, catalogue, rng, 5.5, altitude=(70, 90))
+
+
+def picture_errors(true, fitted, most_deg=80):
+    """Errors (N, 2) px of a fitted camera where stars are seen, after the best turn of its axis."""
+    theta, around = np.meshgrid(np.radians(np.linspace(2, most_deg, 14)), np.linspace(0, 6, 20))
+    v = np.stack([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)], -1).reshape(
+        -1, 3
+    )
+    off = fitted.project(v) - true.project(v)
+    turned = [(fitted.project(v + 1e-6 * np.cross(t, v)) - fitted.project(v)) / 1e-6 for t in np.eye(3)]
+    design = np.stack(turned, -1).reshape(-1, 3)
+    return (off.ravel() - design @ np.linalg.lstsq(design, off.ravel(), rcond=None)[0]).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_coefficients_are_found_within_what_is_claimed(lens, catalogue, rng):
+    true = random_fisheye(LENSES[lens], rng)
+    lists, levels = nights(true, catalogue, rng)
+    found = calibrate_camera(lists, levels, IDEAL, catalogue, AIR)
+    fit = found.fit
+    assert found.used == tuple(range(4)) and fit.camera.model == EQUIDISTANT
+    assert np.abs((fit.values - values(true)) / fit.sigma).max() < 4
+    assert fit.told.all()
+    assert rms(picture_errors(true, fit.camera)) < 0.03
+    assert np.abs(picture_errors(true, fit.camera)).max() < max(0.05, 4 * fit.worst_sigma_px)
+    assert fit.rms_px < 0.1
+
+
+@pytest.mark.montecarlo
+def test_over_many_fisheyes_the_errors_are_those_claimed(rng):
+    z, given = [], Camera.from_focal(1300, 1300, 600.0, EQUIDISTANT)
+    for _ in range(30):
+        lens = (rng.uniform(-0.03, 0.08), *rng.normal(0, [2e-3, 1e-4, 1e-5]).tolist())
+        cx, cy = (np.array(given.centre_px) + rng.normal(0, 15, 2)).tolist()
+        true = replace(random_fisheye(lens, rng), width=1300, height=1300, cx=cx, cy=cy)
+        fit = fit_camera(sightings(true, 6, 150, rng), given, VACUUM)
+        z.append((fit.values - values(true)) / fit.sigma)
+    z2 = np.square(z)
+    assert 0.6 < z2.mean() < 1.5
+    assert (z2.mean(0) < 2.2).all() and (z2.mean(0) > 0.3).all()
+
+
+def test_without_tilts_refraction_would_pass_for_the_lens(catalogue, rng):
+    true = random_fisheye(LENSES["equisolid"], rng)
+    lists, _ = nights(true, catalogue, rng, 1)
+    with pytest.raises(CalibrationError, match="--tilt"):
+        calibrate_camera(lists, [None], IDEAL, catalogue, AIR)
+
+
+def test_names_of_the_parameters():
+    assert parameters(IDEAL) == ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")

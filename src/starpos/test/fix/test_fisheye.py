@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fisheyes of up to the whole sky: identified by their middle or, where that is covered, beside it; a true fix."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from solved_night import off_by_sigma
+
+from starpos.fix.solver import Status
+from starpos.identification import wide
+from starpos.identification.triangle_cache import cached
+from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.simulation.scene import Optics
+from starpos_testing.skies.scenes import (
+    random_stars,
+    solver_of,
+    stars_of,
+    tilt_of,
+    wide_scene,
+    with_false_stars,
+)
+
+SIDE, FOCAL_PX = 2000, 600.0
+# k1 .. k4 of a lens that is nearly equisolid: its picture ends 1.5 % nearer than that of an ideal one
+LENS = (-0.0417, 5e-4, 1e-5, -2e-6)
+
+
+def fisheye(width=SIDE, height=SIDE, focal_px=FOCAL_PX, distortion=LENS):
+    c = Camera.from_focal(width, height, focal_px, EQUIDISTANT)
+    return replace(c, cx=c.cx + 4.2, cy=c.cy - 3.1, fy=c.fy * 1.001, distortion=distortion)
+
+
+def scene_of_lens(camera, pointing=(40.0, 88.0, 15.0), limit_mag=5.0, **more):
+    """An instrument with a fisheye, to the stars that the naked eye sees."""
+    scene = wide_scene(pointing_deg=pointing, **more)
+    return replace(
+        scene,
+        camera=camera,
+        instrument=replace(scene.instrument, camera=camera, focal_px=camera.fx),
+        optics=Optics(limit_mag=limit_mag, fwhm_px=2.2, sky_mag_arcsec2=21.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def night(catalogue):
+    """A scene of the whole sky, the stars of one exposure, its tilt, and the solver of its instrument."""
+    rng = np.random.default_rng(8)
+    scene = scene_of_lens(fisheye())
+    return scene, stars_of(scene, catalogue, rng), tilt_of(scene, rng), solver_of(scene, catalogue)
+
+
+def test_the_whole_sky_gives_a_place_within_its_claim(night):
+    scene, stars, tilt, solver = night
+    s = solver.solve(stars, tilt)
+    assert s.ok, s.message
+    assert s.warnings == ()
+    position, heading = off_by_sigma(s.fix, scene)
+    assert position < 4 and abs(heading) < 4
+    # all stars above 10 deg take part, to 80 deg off the zenith
+    high = stars_above(scene, stars, np.radians(10.5))
+    assert len(s.names) > 0.95 * high.sum()
+    off = np.hypot(stars.x[s.star] - scene.camera.cx, stars.y[s.star] - scene.camera.cy)
+    assert off.max() > 1.2 * FOCAL_PX
+    assert s.attitude.residual_arcsec < 0.1 * scene.camera.scale_arcsec
+
+
+def stars_above(scene, stars, altitude_rad):
+    up = scene.camera.directions(stars.x, stars.y) @ scene.attitude[2]
+    return up > np.sin(altitude_rad)
+
+
+@pytest.mark.parametrize(
+    ("camera", "pointing"),
+    [
+        (fisheye(1500, 1000, 500.0), (40.0, 60.0, 15.0)),
+        (fisheye(3000, 2000, 1000.0, (0.083, 0.0083, 8e-4, 1e-4)), (200.0, 45.0, 100.0)),
+        (fisheye(2400, 2400, 600.0, (-0.1, -0.0015, 0.0, 0.0)), (300.0, 80.0, -50.0)),
+        (fisheye(900, 600, 900.0), (120.0, 70.0, 0.0)),
+    ],
+    ids=["103 deg", "stereographic", "beyond 180 deg", "62 deg"],
+)
+def test_other_lenses_and_leaning_ones(camera, pointing, catalogue, rng):
+    scene = scene_of_lens(camera, pointing, limit_mag=5.5)
+    s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
+    assert s.ok, s.message
+    position, heading = off_by_sigma(s.fix, scene)
+    assert position < 4 and abs(heading) < 4
+
+
+@pytest.mark.montecarlo
+def test_over_many_nights_the_errors_are_those_claimed(catalogue, rng):
+    places, headings = [], []
+    for _ in range(25):
+        pointing = rng.uniform([0, 60, -180], [360, 90, 180])
+        scene = scene_of_lens(fisheye(), tuple(pointing.tolist()))
+        s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
+        assert s.ok, s.message
+        position, heading = off_by_sigma(s.fix, scene)
+        places.append(position**2 / 2)
+        headings.append(heading**2)
+    assert np.mean(places) == pytest.approx(1, abs=4 / np.sqrt(25))
+    assert np.mean(headings) < 1 + 4 * np.sqrt(2 / 25)
+
+
+def test_where_the_middle_is_covered_another_part_tells(night):
+    scene, stars, tilt, solver = night
+    off = np.hypot(stars.x - scene.camera.cx, stars.y - scene.camera.cy)
+    s = solver.solve(stars.take(off > 0.4 * FOCAL_PX), tilt)
+    assert s.ok, s.message
+    assert off_by_sigma(s.fix, scene)[0] < 4
+
+
+def test_lights_at_the_horizon_and_beyond_the_picture_do_not_matter(night, rng):
+    scene, stars, tilt, solver = night
+    corner = rng.uniform(0, 40, (6, 2))
+    low = np.array([scene.camera.cx, scene.camera.cy]) + 0.999 * 1.5 * FOCAL_PX * np.array(
+        [[0.6, 0.8], [-1, 0]]
+    )
+    s = solver.solve(with_false_stars(stars, np.concatenate([corner, low])), tilt)
+    assert s.ok, s.message
+    assert s.star.min() >= 8 and off_by_sigma(s.fix, scene)[0] < 4
+
+
+def test_an_uncalibrated_lens_is_identified(night, catalogue):
+    """An ideal fisheye of that focal length, whose edge is 60 px off."""
+    scene, stars, _, _ = night
+    ideal = replace(scene.instrument, camera=None, model=EQUIDISTANT, focal_px=1.02 * FOCAL_PX)
+    s = replace(solver_of(scene, catalogue), instrument=ideal).identify(stars)
+    assert s.ok, s.message
+    true = replace(solver_of(scene, catalogue)).identify(stars).attitude
+    assert (s.attitude.ra, s.attitude.dec) == pytest.approx((true.ra, true.dec), abs=np.radians(0.3))
+
+
+def test_a_mirrored_frame_is_said(night):
+    scene, stars, tilt, solver = night
+    flipped = replace(stars, y=2 * scene.camera.cy - stars.y)
+    s = solver.identify(flipped)
+    assert s.ok and s.attitude.mirrored
+    # what stands low is raised by refraction, of which `identify` knows nothing
+    assert len(s.names) > 0.8 * len(stars)
+    assert "mirrored" in solver.solve(flipped, tilt).message
+
+
+def test_random_points_are_no_sky(night, rng):
+    _, _, _, solver = night
+    for n in (0, 3, 60, 400):
+        s = solver.identify(random_stars(n, rng, SIDE, SIDE))
+        assert s.status in (Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED)
+
+
+def test_a_pinhole_of_that_field_is_refused_and_the_fisheye_named(night, catalogue):
+    scene, stars, tilt, _ = night
+    pinhole = replace(scene.instrument, camera=None, focal_px=FOCAL_PX)
+    s = replace(solver_of(scene, catalogue), instrument=pinhole).solve(stars, tilt)
+    assert "fisheye (equidistant)" in s.message
+
+
+def test_a_hint_of_the_frame_before_serves(night):
+    _, stars, tilt, solver = night
+    first = solver.solve(stars, tilt)
+    again = solver.solve(stars, tilt, first.hint)
+    assert again.ok and again.names == first.names
+    assert again.attitude.log_odds > first.attitude.log_odds
+
+
+def test_parts_look_at_the_frame_where_they_say(catalogue):
+    camera = fisheye()
+    x, y = np.meshgrid(np.linspace(300, 1700, 30), np.linspace(300, 1700, 30))
+    directions = camera.directions(x.ravel(), y.ravel())
+    made = wide.parts(wide.WideField(directions, np.full(900, 0.1), camera))
+    assert len(made) == 5
+    for part in made:
+        np.testing.assert_allclose(part.directions @ part.turn, directions[part.row], atol=1e-12)
+        assert len(part.row) > 50
+    assert cached(catalogue, wide.field_rad(camera)).longest_allowed[0] == pytest.approx(1.37, rel=0.06)
