@@ -26,8 +26,8 @@ def heif_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -
         ) from None
     try:
         picture = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
-        width, height = picture.size
         # it is unpacked only after this
+        width, height = picture.size
         check_pixels(width, height, 8.0 if ";16" in picture.mode else 4.0, place)
         pixels = np.array(picture)
         # a TIFF, behind its name

@@ -9,7 +9,7 @@ possible before. Where the focal length is roughly known, scales near it come fi
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -78,9 +78,10 @@ def identify_blind(
     if near_px is not None and shortest < near_px < longest:
         spans.insert(0, (max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
     field = FrameStars.of(xy, sigma_px, Camera.from_focal(width, height, shortest))
-    for span in spans:
+    different = dict.fromkeys((min(stars, len(field)), error_px) for stars, error_px in stages)
+    for (stars, error_px), span in product(different, spans):
         prior = any_scale(*span, log_share=-math.log(len(spans)))
-        for pose, radius_px in _poses(field, sky, quads, span, stages):
+        for pose, radius_px in _poses(field, sky, quads, span, stars, error_px):
             camera = Camera.from_focal(width, height, pose.focal_px)
             found = identified(FrameStars.of(xy, sigma_px, camera), sky, pose, radius_px, prior)
             if found:
@@ -93,30 +94,28 @@ def _poses(
     sky: Sky,
     quads: QuadCatalogue,
     focal_range: tuple[float, float],
-    stages: Sequence[tuple[int, float]],
+    stars: int,
+    error_px: float,
 ) -> Iterator[tuple[Pose, np.ndarray]]:
     """Yield poses, those first on which most quads agree, and the distance (N,) px by which each star may be off."""
     half_diagonal_px, (shortest, longest) = float(np.hypot(*field.half)), focal_range
-    for stars, error_px in dict.fromkeys((min(n, len(field)), e) for n, e in stages):
-        parts = [
-            _matches(field, quads, stars, error_px, focal, step)
-            for focal, step in _focal_lengths(half_diagonal_px, shortest, longest)
-        ]
-        star, corner, focal = (
-            np.concatenate([getattr(m, name) for m in parts]) for name in ("star", "corner", "focal_px")
-        )
-        if not len(star):
-            continue
-        poses, off_px = _fitted(field, Matches(star, corner, focal), sky)
-        error = np.hypot(error_px, field.sigma[star].max(1))
-        good = (
-            (off_px < QUAD_SIGMA * error)
-            & (poses.focal_px > 0.9 * shortest)
-            & (poses.focal_px < 1.1 * longest)
-        )
-        poses, star = Poses(poses.attitude[good], poses.focal_px[good], poses.mirrored[good]), star[good]
-        for k in _most_agreed(poses, half_diagonal_px):
-            yield poses[k], _radius(field, poses[k], star[k], error_px)
+    parts = [
+        _matches(field, quads, stars, error_px, focal, step)
+        for focal, step in _focal_lengths(half_diagonal_px, shortest, longest)
+    ]
+    star, corner, focal = (
+        np.concatenate([getattr(m, name) for m in parts]) for name in ("star", "corner", "focal_px")
+    )
+    if not len(star):
+        return
+    poses, off_px = _fitted(field, Matches(star, corner, focal), sky)
+    error = np.hypot(error_px, field.sigma[star].max(1))
+    good = (
+        (off_px < QUAD_SIGMA * error) & (poses.focal_px > 0.9 * shortest) & (poses.focal_px < 1.1 * longest)
+    )
+    poses, star = Poses(poses.attitude[good], poses.focal_px[good], poses.mirrored[good]), star[good]
+    for k in _most_agreed(poses, half_diagonal_px):
+        yield poses[k], _radius(field, poses[k], star[k], error_px)
 
 
 def _focal_lengths(half_diagonal_px: float, shortest: float, longest: float) -> Iterator[tuple[float, float]]:

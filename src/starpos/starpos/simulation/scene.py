@@ -120,8 +120,9 @@ def expose(
         pixels[above[:, 2] < 0] = np.nan
         moments.append(pixels)
     px = np.stack(moments) + rng.normal(0, optics.seeing_arcsec / camera.scale_arcsec, (len(index), 2))
-    on = np.asarray(np.isfinite(px).all((0, 2)))
-    on[on] = ((px[1, on] > -6) & (px[1, on] < [camera.width + 5, camera.height + 5])).all(1)
+    with np.errstate(invalid="ignore"):
+        on = ((px[1] > -6) & (px[1] < [camera.width + 5, camera.height + 5])).all(1)
+    on &= np.isfinite(px).all((0, 2))
     electrons = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * catalogue.vmag(index))
     later_s = scene.shutter.later_s(px[1, :, 1], camera.height)
     # the trail is as good as straight

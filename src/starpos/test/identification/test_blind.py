@@ -3,6 +3,7 @@
 
 import csv
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from starpos.fix.blind import BlindSolver
 from starpos.fix.solver import Solver, Status
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.identification import quad_cache, quads
+from starpos.identification import blind, quad_cache, quads
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 
@@ -71,6 +72,30 @@ def test_frames_of_any_scale_are_found(field_deg, limit_mag, solver, catalogue, 
             assert s.warnings == ()
             found += 1
     assert found >= 3
+
+
+@pytest.mark.parametrize("off", [0.85, 1.0, 1.15])
+def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue, rng, monkeypatch):
+    """EXIF's: rounded, or of a lens that breathes. Where a frame is found near it no other scale is searched."""
+    tried, all_of = [], blind._focal_lengths
+    monkeypatch.setattr(blind, "_focal_lengths", lambda *span: tried.append(span[1:]) or all_of(*span))
+    for field_deg, limit_mag in FIELDS[2:]:
+        xy, axis, focal_px = seen(catalogue, field_deg, limit_mag, rng)
+        free = solver.identify(listed(xy))
+        tried.clear()
+        s = solver.identify(replace(listed(xy), rough_focal_px=off * focal_px))
+        if free.ok:
+            assert s.ok and looks(s, axis) > 1 - 1e-6
+            assert s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
+            assert s.attitude.log_odds > free.attitude.log_odds
+            assert all(longest < 1.5 * shortest for shortest, longest in tried)
+
+
+@pytest.mark.parametrize("off", [0.1, 0.5, 3.0, 1e6])
+def test_a_wrong_focal_length_of_exif_costs_time_only(off, solver, catalogue, rng):
+    xy, axis, focal_px = seen(catalogue, 13.0, 7.5, rng)
+    s = solver.identify(replace(listed(xy), rough_focal_px=off * focal_px))
+    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
 
 
 def test_a_mirrored_frame_is_found_and_said(solver, catalogue, rng):
