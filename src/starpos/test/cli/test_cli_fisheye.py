@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fisheye from the command line: simulated, identified, solved, calibrated, and used by its calibration."""
+
+import json
+
+import pytest
+from cli_calls import AIR, PLACE, objects
+
+from starpos.cli import main
+from starpos.instrument import camera_file
+
+OPTICS = ("--focal-mm", "2.25", "--pixel-um", "4.5")  # 500 px
+LENS = (*OPTICS, "--lens", "equidistant")
+A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+
+
+@pytest.fixture(scope="module")
+def skies(tmp_path_factory):
+    """Two lists of stars of nearly the whole sky, and their tilts."""
+    folder = tmp_path_factory.mktemp("skies")
+    place = [f"--{k}={v}" for k, v in PLACE.items()]
+    shot = (
+        "--stars-only",
+        "-n",
+        "2",
+        "--turn",
+        "90",
+        "--size",
+        "1400",
+        "1400",
+        "--altitude",
+        "85",
+        "--exposure",
+        "0.02",
+    )
+    assert main(["simulate", str(folder), *shot, *LENS, *place, *AIR]) == 0
+    return folder
+
+
+def test_a_night_of_the_whole_sky_is_solved(skies, run):
+    lists = sorted(skies.glob("stars_*.csv"))
+    status, out, err = run("solve", *lists, "--tilt", skies / "tilt.csv", *LENS, *A3, *AIR, "--json")
+    *_, together = objects(out)
+    assert status == 0, err
+    for found, true, sigma in (
+        (together["latitude"], PLACE["latitude"], together["sigma_north_m"] / 111_000),
+        (together["longitude"], PLACE["longitude"], together["sigma_east_m"] / 75_000),
+    ):
+        assert abs(found - true) < 4 * sigma < 0.02
+    assert together["status"] == "ok"
+
+
+def test_its_camera_is_found_and_serves(skies, run, tmp_path):
+    lists, camera = sorted(skies.glob("stars_*.csv")), tmp_path / "camera.yaml"
+    status, out, err = run(
+        "calibrate", *lists, "--tilt", skies / "tilt.csv", *LENS, *AIR, "--camera", camera, "--json"
+    )
+    assert status == 0, err
+    (answer,) = objects(out)
+    assert answer["model"] == "equidistant" and list(answer["sigma"])[4:] == ["k1", "k2", "k3", "k4"]
+    assert all(
+        abs(k) < 5 * answer["sigma"][name]
+        for name, k in zip(("k1", "k2", "k3", "k4"), answer["distortion"], strict=True)
+    )
+    assert camera_file.read(camera).model == "equidistant"
+    (tmp_path / "mine.yaml").write_text("starpos_instrument: 1\ncamera: {calibration: camera.yaml}\n")
+    status, out, _ = run("identify", lists[0], "--instrument", tmp_path / "mine.yaml", "--json")
+    assert status == 0 and json.loads(out)["status"] == "ok"
+
+
+def test_without_its_tilts_it_is_not_calibrated(skies, run, tmp_path):
+    status, _, err = run("calibrate", *skies.glob("stars_*.csv"), *LENS, "--camera", tmp_path / "camera.yaml")
+    assert status == 1 and "--tilt" in err[-1]
+
+
+def test_a_pinhole_is_told_to_be_none(skies, run):
+    status, _, err = run("identify", sorted(skies.glob("stars_*.csv"))[0], *OPTICS)
+    assert status == 1 and "fisheye (equidistant)" in err[-1]
+
+
+def test_a_lens_goes_with_a_focal_length_and_not_with_an_instrument_file(skies, run, tmp_path):
+    frame = sorted(skies.glob("stars_*.csv"))[0]
+    (tmp_path / "mine.yaml").write_text(
+        "starpos_instrument: 1\ncamera: {focal_px: 500, model: equidistant}\n"
+    )
+    assert run("identify", frame, "--instrument", tmp_path / "mine.yaml")[0] == 0
+    status, _, err = run("identify", frame, "--instrument", tmp_path / "mine.yaml", "--lens", "equidistant")
+    assert status == 2 and "either it or the options" in err[-1]
+    status, _, err = run("identify", frame, "--lens", "equidistant")
+    assert status == 2 and "no focal length" in err[-1]
