@@ -29,8 +29,8 @@ KEYS = {  # rosdep's, of modules that are no ROS package
 # Only PyPI has them, or brings them with these, and the code says so where one is absent; a module of ours that
 # cannot do without is one of them
 OPTIONAL = {
-    "alpaca", "alpaca_simulators", "dask", "distributed", "exifread", "gphoto2", "indipyclient", "lz4", "rawpy",
-    "requests", "rosbags", "selenium", "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "urllib3",
+    "alpaca", "alpaca_simulators", "dask", "distributed", "exifread", "gphoto2", "indipyclient", "lz4",
+    "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "urllib3",
 }  # fmt: skip
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}  # modules beside the tests
 HELPERS |= {"late_starpos"}  # a test writes it

@@ -234,6 +234,16 @@ def test_camera_round_trip(heard):
     assert message_to_camera(heard(message)).distortion == (0.0,) * 5
 
 
+def test_a_fisheye_round_trip(heard):
+    lens = (-0.04, 5e-4, 1e-5, -2e-6)
+    camera = Camera(
+        width=2000, height=1900, fx=600.0, fy=601.0, cx=1003.5, cy=950.5, distortion=lens, model="equidistant"
+    )
+    message = messages.camera_to_message(camera, "c", MID)
+    assert message.distortion_model == "equidistant" and len(message.d) == 4
+    assert message_to_camera(heard(message)) == camera
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [

@@ -6,7 +6,8 @@ from importlib.util import find_spec
 
 import pytest
 
-PYPI = {"alpaca": "alpyca", "alpaca_simulators": "alpaca-simulators"}  # packages not named as their modules
+# packages not named as their modules
+PYPI = {"alpaca": "alpyca", "alpaca_simulators": "alpaca-simulators", "pillow_heif": "pillow-heif"}
 
 
 def lacks(package: str, install: str = "sudo apt-get install") -> None:
