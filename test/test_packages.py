@@ -30,7 +30,8 @@ KEYS = {  # rosdep's, of modules that are no ROS package
 # cannot do without is one of them
 OPTIONAL = {
     "alpaca", "alpaca_simulators", "dask", "distributed", "exifread", "gphoto2", "indipyclient", "lz4",
-    "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "urllib3",
+    "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "starpos_camera.sources.alpaca_http",
+    "starpos_testing.skies.bags", "urllib3",
 }  # fmt: skip
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}  # modules beside the tests
 HELPERS |= {"late_starpos"}  # a test writes it

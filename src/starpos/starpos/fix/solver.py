@@ -67,7 +67,10 @@ class Status(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Attitude:
-    """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad)."""
+    """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
+
+    model: of its lens.
+    """
 
     ra: float
     dec: float
@@ -76,6 +79,7 @@ class Attitude:
     residual_arcsec: float
     log_odds: float
     mirrored: bool
+    model: str = PLUMB_BOB
 
 
 @dataclass(frozen=True)
@@ -445,4 +449,5 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
         residual_arcsec=found.residual_px / math.sqrt(fx * fy) / ARCSEC,
         log_odds=found.log_odds,
         mirrored=found.mirrored,
+        model=camera.model,
     )

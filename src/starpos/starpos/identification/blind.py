@@ -79,9 +79,9 @@ def identify_blind(
         spans.insert(0, (max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
     field = FrameStars.of(xy, sigma_px, Camera.from_focal(width, height, shortest))
     different = dict.fromkeys((min(stars, len(field)), error_px) for stars, error_px in stages)
-    for (stars, error_px), span in product(different, spans):
-        prior = any_scale(*span, log_share=-math.log(len(spans)))
-        for pose, radius_px in _poses(field, sky, quads, span, stars, error_px):
+    for (stars, error_px), (low, high) in product(different, spans):
+        prior = any_scale(low, high, -math.log(len(spans)))
+        for pose, radius_px in _poses(field, sky, quads, (low, high), stars, error_px):
             camera = Camera.from_focal(width, height, pose.focal_px)
             found = identified(FrameStars.of(xy, sigma_px, camera), sky, pose, radius_px, prior)
             if found:

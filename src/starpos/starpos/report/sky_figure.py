@@ -10,9 +10,9 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.fix.solver import Attitude
+from starpos.instrument.camera import Camera
 from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE
-from starpos.rotation import normalised
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site
 
@@ -38,8 +38,8 @@ class View:
 
     def directions(self, xy: np.ndarray) -> np.ndarray:
         """ICRS directions (N, 3) of pixels xy (N, 2), without distortion."""
-        plane = (xy - (np.array(self.size) - 1) / 2) / self.pointing.focal_px
-        return normalised(np.column_stack([plane, np.ones(len(plane))]) @ _axes(self.pointing))
+        camera = Camera.from_focal(*self.size, self.pointing.focal_px, self.pointing.model)
+        return camera.directions(*xy.T) @ _axes(self.pointing)
 
 
 def views(night: Night) -> list[View]:
