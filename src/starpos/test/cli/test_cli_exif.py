@@ -90,3 +90,14 @@ def test_a_bad_call(night, capsys, options, words):
     except SystemExit as e:
         status, said = e.code, capsys.readouterr().err
     assert status == 2 and words in said
+
+
+@pytest.mark.parametrize("film_mm", [164, 50, None])
+def test_a_photo_is_identified_with_no_option_whatever_its_exif_says_of_the_lens(
+    night, capsys, tmp_path, film_mm
+):
+    (frame, *_) = sorted(night.glob("*.fits"))
+    (tmp_path / "a.dng").write_bytes(raws.dng(read_frame(frame).pixels, film_mm=film_mm))
+    assert main(["identify", str(tmp_path / "a.dng"), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["focal_px"] == pytest.approx(4636, rel=2e-3) and answer["warnings"] == []

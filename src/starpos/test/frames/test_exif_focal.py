@@ -23,6 +23,13 @@ def focal_px(tmp_path, width=300, height=200, **exif):
     return frame.rough_focal_px
 
 
+@needs("rawpy")
+def test_a_dng_tells_it_too(tmp_path):
+    (tmp_path / "a.dng").write_bytes(raws.dng(raws.mosaic(96, 128), film_mm=50))
+    frame = read_frame(tmp_path / "a.dng")
+    assert frame.rough_focal_px == pytest.approx(50 / 43.27 * np.hypot(128, 96), rel=1e-3)
+
+
 @pytest.mark.parametrize(("film_mm", "field_deg"), [(50, 46.8), (24, 84.1), (400, 6.2)])
 def test_the_equivalent_of_35_mm_film_gives_the_field_of_film(tmp_path, film_mm, field_deg):
     f = focal_px(tmp_path, film_mm=film_mm)
