@@ -11,8 +11,8 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solver import Status
-from starpos.instrument.camera import Camera
+from starpos.fix.solver import Attitude, Status
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.report import folder, measures, sky_figure
@@ -175,3 +175,21 @@ def test_a_night_at_two_places_is_averaged_at_the_last_and_says_so(tmp_path, cat
     n = work(first, catalogue)
     assert np.degrees(n.combined.latitude) == pytest.approx(47.9, abs=0.02)
     assert any("was moved" in remark and "2026-11-02T19:00:00" in remark for remark in n.remarks)
+
+
+def test_a_fisheye_sees_to_the_horizon_on_the_map():
+    looking = Attitude(
+        ra=1.0,
+        dec=0.5,
+        roll=2.0,
+        focal_px=600.0,
+        residual_arcsec=1.0,
+        log_odds=99.0,
+        mirrored=False,
+        model=EQUIDISTANT,
+    )
+    shot = Shot(name="a", status=Status.OK, message="", pointing=looking, size=(2001, 2001))
+    view = sky_figure.View(shot, looking, (2001, 2001))
+    middle, edge = view.directions(np.array([[1000.0, 1000.0], [1000.0 + 300 * np.pi, 1000.0]]))
+    assert abs(middle @ edge) < 1e-12
+    assert np.arctan2(middle[1], middle[0]) == pytest.approx(1.0)
