@@ -21,7 +21,8 @@ from starpos.calibration.intrinsics import (
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.fix import sound_matches
-from starpos.fix.solver import ENOUGH_SOUND, LEAST_ALTITUDE_RAD
+from starpos.fix.seen import high_enough
+from starpos.fix.solver import ENOUGH_SOUND
 from starpos.frames.stars import Stars
 from starpos.identification import (
     Identification,
@@ -156,7 +157,7 @@ class _Frame:
     def _sighting(self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera) -> Sighting:
         use = sound_matches(stars, found, ENOUGH_SOUND)
         if wide.is_wide(camera) and self.level is not None:
-            use &= seen[found.star] @ self.level[2] > np.sin(LEAST_ALTITUDE_RAD)
+            use &= high_enough(seen[found.star], self.level[2])
         star, index = found.star[use], found.catalogue[use]
         return Sighting(
             xy=np.stack([stars.x, stars.y], -1)[star],

@@ -10,19 +10,20 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.frame import all_within, mean_sigma, place_of, unit_vectors
+from starpos.core.frame import mean_sigma, place_of
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.fix.horizon import check_above_horizon
 from starpos.fix.pointing import IDEAL, pointing_fix
+from starpos.fix.seen import directions_of, high_enough, inside
 from starpos.fix.unidentified import why_unidentified
 from starpos.fix.unmoved import check_unmoved
 from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
-from starpos.frames.stars import EDGE_PX, Stars
+from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache, wide
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
@@ -42,8 +43,6 @@ from starpos.units import ARCSEC
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
-# Lower stars of a fisheye make no fix.
-LEAST_ALTITUDE_RAD = math.radians(10)
 # Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
 # not identified, nor are the bright stars there that should be.
 TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
@@ -149,8 +148,8 @@ class Solver:
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars and pointing of the camera.  Stars without a time: J2000 places, no aberration."""
-        if (inside := self._inside(stars)) is not None:
-            return _for_all(stars, inside, self.identify(stars.take(inside)))
+        if (rows := self._inside(stars)) is not None:
+            return _for_all(stars, rows, self.identify(stars.take(rows)))
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
@@ -189,8 +188,8 @@ class Solver:
         """
         if isinstance(stars, Pointing):
             return self._solve_pointing(stars, tilt)
-        if (inside := self._inside(stars)) is not None:
-            return _for_all(stars, inside, self.solve(stars.take(inside), tilt, hint))
+        if (rows := self._inside(stars)) is not None:
+            return _for_all(stars, rows, self.solve(stars.take(rows), tilt, hint))
         try:
             state, tilt = self.levelled(stars, tilt)
             camera, catalogue, triangles = self.view(stars.width, stars.height)
@@ -306,11 +305,9 @@ class Solver:
             )
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
         if wide.is_wide(camera):
-            # what refraction does near the horizon no model tells
             mounting = self.instrument.mounting
             up = (level_of(mounting.up(tilt)) @ mounting.a3)[2]
-            seen = camera.directions(stars.x[found.star], stars.y[found.star])
-            use &= seen @ up > math.sin(LEAST_ALTITUDE_RAD)
+            use &= high_enough(directions_of(camera, stars)[found.star], up)
         star, index = found.star[use], found.catalogue[use]
         matched = MatchedStars(
             np.stack([stars.x, stars.y], -1)[star],
@@ -372,26 +369,15 @@ class Solver:
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
         try:
-            camera = self.instrument.camera_for(stars.width, stars.height)
+            return inside(stars, self.instrument.camera_for(stars.width, stars.height))
         # who asks for the camera next reports the error
         except InstrumentError:
             return None
-        if camera.model == PLUMB_BOB and all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
-            return None
-        on = stars.on_frame & camera.sees(stars.x, stars.y)
-        return None if on.all() else np.flatnonzero(on)
 
 
 def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
     status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
     return Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
-
-
-def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
-    """Unit vectors (N, 3) in C of the stars' pixels."""
-    if not camera.is_ideal:
-        return camera.directions(stars.x, stars.y)
-    return unit_vectors(stars.x, stars.y, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:

@@ -18,7 +18,7 @@ from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.unidentified import why_unidentified
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
-from starpos.identification import Sky
+from starpos.identification import Sky, wide
 from starpos.identification.pose import Pose
 from starpos.identification.search import frame_stars, identify_frame
 from starpos.units import ARCSEC
@@ -66,8 +66,12 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     mid_unix_s = stars.mid_unix_s
     if mid_unix_s is None:
         raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars.source)}")
-    stars = stars.take(np.flatnonzero(stars.on_frame))
     camera, catalogue, triangles = eye.view(stars.width, stars.height)
+    if wide.is_wide(camera):
+        raise InstrumentError(
+            f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"
+        )
+    stars = stars.take(np.flatnonzero(stars.on_frame & camera.sees(stars.x, stars.y)))
     state = earth_state(mid_unix_s)
     sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
     directions = camera.directions(stars.x, stars.y)

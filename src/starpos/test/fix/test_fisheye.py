@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from solved_night import off_by_sigma
 
+from starpos.errors import InstrumentError
+from starpos.fix.other_focal import focal_that_fits
 from starpos.fix.solver import Status
 from starpos.identification import wide
 from starpos.identification.triangle_cache import cached
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.navigation.sightings import sighting_of
 from starpos.simulation.scene import Optics
 from starpos_testing.skies.scenes import (
     random_stars,
@@ -162,6 +165,20 @@ def test_a_hint_of_the_frame_before_serves(night):
     again = solver.solve(stars, tilt, first.hint)
     assert again.ok and again.names == first.names
     assert again.attitude.log_odds > first.attitude.log_odds
+
+
+def test_under_way_a_fisheye_is_refused(night):
+    _, stars, _, solver = night
+    with pytest.raises(InstrumentError, match="fisheye"):
+        sighting_of(stars, solver)
+
+
+def test_the_focal_length_that_fits_is_found(night, catalogue):
+    scene, stars, _, _ = night
+    off = scene.camera.scaled(0.93)
+    instrument = replace(scene.instrument, camera=off, focal_px=off.fx)
+    fits = focal_that_fits(replace(solver_of(scene, catalogue), instrument=instrument), stars)
+    assert fits == pytest.approx(scene.camera.fx, rel=0.002)
 
 
 def test_parts_look_at_the_frame_where_they_say(catalogue):

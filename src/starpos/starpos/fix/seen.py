@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which of a frame's stars its lens shows, in which directions, and which of them are high enough for a fix."""
+
+import math
+
+import numpy as np
+
+from starpos.core.frame import all_within, unit_vectors
+from starpos.frames.stars import EDGE_PX, Stars
+from starpos.instrument.camera import PLUMB_BOB, Camera
+
+# Lower stars of a fisheye make no fix: what refraction does near the horizon no model tells.
+LEAST_ALTITUDE_RAD = math.radians(10)
+
+
+def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
+    """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
+    if camera.model == PLUMB_BOB and all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
+        return None
+    on = stars.on_frame & camera.sees(stars.x, stars.y)
+    return None if on.all() else np.flatnonzero(on)
+
+
+def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
+    """Unit vectors (N, 3) in C of the stars' pixels."""
+    if not camera.is_ideal:
+        return camera.directions(stars.x, stars.y)
+    return unit_vectors(stars.x, stars.y, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def high_enough(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Whether stars in the directions (N, 3) in C, where up (3,) is the zenith, are above the worst of the air."""
+    return directions @ up > math.sin(LEAST_ALTITUDE_RAD)
