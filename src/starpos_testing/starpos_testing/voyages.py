@@ -65,7 +65,7 @@ def geodetic_of(place):
 
 
 def attraction(place):
-    """Gravitational attraction (N, 3) of WGS 84 at places (N, 3) that turn with the Earth, m/s2."""
+    """WGS 84's gravitational attraction, (N, 3) in m/s2, at (N, 3) places that turn with the Earth."""
     phi, lam, height = geodetic_of(place)
     sin2 = np.sin(phi) ** 2
     normal = 9.7803253359 * (1 + 1.931852652e-3 * sin2) / np.sqrt(1 - FLATTENING * (2 - FLATTENING) * sin2)
