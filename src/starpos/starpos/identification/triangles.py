@@ -118,8 +118,8 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     """
     by_light = np.argsort(catalogue.vmag_centi, kind="stable")
     smallest_circle = min(radius for radius, _, _ in CIRCLES) * half_diagonal
-    # so many circles have the area of the sphere
-    pool = np.sort(by_light[: int(POOL_PER_CIRCLE * 4 / smallest_circle**2) + 1000])
+    circles_on_sphere = 4 / smallest_circle**2
+    pool = np.sort(by_light[: int(POOL_PER_CIRCLE * circles_on_sphere) + 1000])
     rank = np.argsort(np.argsort(catalogue.vmag_centi[pool], kind="stable"))
     v = catalogue.directions(pool)
     brightest_first = np.argsort(rank)
