@@ -157,7 +157,7 @@ class _Frame:
     def _sighting(self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera) -> Sighting:
         use = sound_matches(stars, found, ENOUGH_SOUND)
         if wide.is_wide(camera) and self.level is not None:
-            use &= high_enough(seen[found.star], self.level[2])
+            use &= high_enough(seen[found.star] @ self.level[2])
         star, index = found.star[use], found.catalogue[use]
         return Sighting(
             xy=np.stack([stars.x, stars.y], -1)[star],

@@ -28,6 +28,6 @@ def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
     return unit_vectors(stars.x, stars.y, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def high_enough(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Whether stars in the directions (N, 3) in C, where up (3,) is the zenith, are above the worst of the air."""
-    return directions @ up > math.sin(LEAST_ALTITUDE_RAD)
+def high_enough(sines: np.ndarray) -> np.ndarray:
+    """Whether stars are above the worst of the air, by the sines (N,) of their altitudes."""
+    return sines > math.sin(LEAST_ALTITUDE_RAD)

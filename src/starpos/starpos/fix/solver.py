@@ -277,7 +277,8 @@ class Solver:
             fix = pointing_fix(
                 pointing, camera, tilt, self.instrument.mounting, self.atmosphere, state, clock_s
             )
-            self._check(fix, clock_s)
+            check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
+            check_unmoved(fix, self.instrument, clock_s)
         except StarposError as e:
             return _failure(pointing, e)
         return replace(
@@ -306,8 +307,9 @@ class Solver:
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
         if wide.is_wide(camera):
             mounting = self.instrument.mounting
-            up = (level_of(mounting.up(tilt)) @ mounting.a3)[2]
-            use &= high_enough(directions_of(camera, stars)[found.star], up)
+            sines = directions_of(camera, stars)[found.star] @ (level_of(mounting.up(tilt)) @ mounting.a3)[2]
+            check_above_horizon(float(sines.mean()), self.instrument.calibration)
+            use &= high_enough(sines)
         star, index = found.star[use], found.catalogue[use]
         matched = MatchedStars(
             np.stack([stars.x, stars.y], -1)[star],
@@ -327,13 +329,10 @@ class Solver:
             stars.stamp_stddev_s,
             self.shutter(stars),
         )
-        self._check(fix, self.clock_stddev_s(stars))
+        if not wide.is_wide(camera):
+            check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
+        check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
         return replace(fix, used=np.flatnonzero(use)[fix.used])
-
-    def _check(self, fix: Fix, clock_stddev_s: float) -> None:
-        """Raise FixError if the instrument cannot have stood as a fix has it."""
-        check_above_horizon(fix, self.instrument.calibration)
-        check_unmoved(fix, self.instrument, clock_stddev_s)
 
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
         """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""

@@ -13,6 +13,7 @@ from starpos.fix.solver import Status
 from starpos.identification import wide
 from starpos.identification.triangle_cache import cached
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.inclinometer import Tilt
 from starpos.navigation.sightings import sighting_of
 from starpos.simulation.scene import Optics
 from starpos_testing.skies.scenes import (
@@ -89,6 +90,22 @@ def test_other_lenses_and_leaning_ones(camera, pointing, catalogue, rng):
     assert s.ok, s.message
     position, heading = off_by_sigma(s.fix, scene)
     assert position < 4 and abs(heading) < 4
+
+
+def test_a_fisheye_that_looks_level_sees_half_a_sky_and_none_through_the_ground(catalogue, rng):
+    scene = scene_of_lens(fisheye(), (40.0, 2.0, 15.0))
+    stars, tilt, solver = stars_of(scene, catalogue, rng), tilt_of(scene, rng), solver_of(scene, catalogue)
+    s = solver.solve(stars, tilt)
+    assert s.ok, s.message
+    assert off_by_sigma(s.fix, scene)[0] < 4
+    assert "below the horizon" in solver.solve(stars, turned_over(tilt)).message
+
+
+def turned_over(tilt):
+    """A tilt whose axes all point the other way."""
+    return Tilt(
+        -tilt.theta_x, -tilt.theta_y, tilt.covariance, utc_unix_s=tilt.utc_unix_s, theta_z=-tilt.theta_z
+    )
 
 
 @pytest.mark.montecarlo
