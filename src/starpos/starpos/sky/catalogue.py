@@ -18,6 +18,7 @@ from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
 from starpos.sky.zones import ZONES, cell_starts, rows_near
+from starpos.table_cache import rising
 from starpos.units import MAS, MAS_DEG
 
 EPOCH = 2000.0  # Julian year of ra and dec
@@ -67,6 +68,31 @@ class Catalogue:
         for column in (self.ra_mas, self.dec_mas, self.vmag_centi):
             digest.update(np.ascontiguousarray(column).data)
         return digest.hexdigest()[:16]
+
+    def check(self) -> None:
+        """Raise ValueError if the columns do not fit together, or a place is none: the compiled loops trust both."""
+        n = len(self)
+        columns = (
+            self.dec_mas,
+            self.pm_ra,
+            self.pm_dec,
+            self.vmag_centi,
+            self.sigma_code,
+            self.pm_sigma_code,
+        )
+        if (
+            any(column.shape != (n,) for column in (self.ra_mas, *columns, self.epoch_code, self.hip))
+            or self.tyc.shape != (n, 3)
+            or self.zone_start.shape != (ZONES + 1,)
+            or not rising(self.zone_start, n)
+        ):
+            raise ValueError("its columns do not fit together")
+        if n and not (
+            self.ra_mas.max() * MAS_DEG < 360 and np.abs(self.dec_mas.astype(float)).max() * MAS_DEG <= 90
+        ):
+            raise ValueError(
+                "some of its places are beyond 360 deg of right ascension or 90 deg of declination"
+            )
 
     @cached_property
     def cell_start(self) -> np.ndarray:
@@ -216,7 +242,7 @@ def read(path: Path | str) -> Catalogue:
             hip = np.zeros(len(zone), np.int32)
             hip[np.cumsum(_join(f["hip_step"], np.uint16), dtype=np.int64)] = _join(f["hip"], np.int32)
             tyc1 = np.cumsum(_join(f["tyc1"], np.int16), dtype=np.int16)
-            return Catalogue(
+            found = Catalogue(
                 ra_mas=np.cumsum(_join(f["ra_step"], np.uint32), dtype=np.uint32),
                 dec_mas=_join(f["dec_within"], np.uint32).astype(np.int32) + (zone - 90) * 3_600_000,
                 pm_ra=_join(f["pm_ra"], np.int16),
@@ -229,6 +255,8 @@ def read(path: Path | str) -> Catalogue:
                 hip=hip,
                 zone_start=zone_start,
             )
+            found.check()
+            return found
     except FileNotFoundError:
         raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None
     except CatalogueError:

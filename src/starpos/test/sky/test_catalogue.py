@@ -196,7 +196,20 @@ def test_size_of_the_committed_catalogue(catalogue):
 
 
 @pytest.mark.parametrize(
-    "kind", ["missing", "folder", "empty", "text", "truncated", "flipped", "another npz", "format"]
+    "kind",
+    [
+        "missing",
+        "folder",
+        "empty",
+        "text",
+        "truncated",
+        "flipped",
+        "another npz",
+        "format",
+        "a short column",
+        "beyond 360 deg",
+        "beyond the pole",
+    ],
 )
 def test_a_bad_file_gives_one_sentence_with_its_path(kind, tmp_path, rng):
     path = tmp_path / "c.npz"
@@ -219,6 +232,16 @@ def test_a_bad_file_gives_one_sentence_with_its_path(kind, tmp_path, rng):
     elif kind == "format":
         with np.load(path) as f:
             np.savez(path, **{**f, "format": 99})
+    elif kind == "a short column":
+        with np.load(path) as f:
+            np.savez(path, **{**f, "pm_ra": f["pm_ra"][:, :-1]})
+    else:
+        # the highest byte of the last step in right ascension, or of the last declination
+        column = "ra_step" if kind == "beyond 360 deg" else "dec_within"
+        with np.load(path) as f:
+            planes = f[column].copy()
+            planes[3, -1] = 127
+            np.savez(path, **{**f, column: planes})
     with pytest.raises(CatalogueError) as e:
         read(path)
     assert str(path) in str(e.value)
