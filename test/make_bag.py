@@ -24,24 +24,27 @@ from starpos_common.messages import camera_to_message, frame_to_message, stars_t
 from starpos_interfaces.msg import Capture
 
 SEED = 20261102
-START_S = 1793642400.0  # 2026-11-02T18:00:00Z
-LATITUDE_DEG, LONGITUDE_DEG = 46.5475, 7.9852  # astronomic
+# 2026-11-02T18:00:00Z
+START_S = 1793642400.0
+# Astronomic
+LATITUDE_DEG, LONGITUDE_DEG = 46.5475, 7.9852
 AIR = {"pressure_pa": 66000.0, "temperature_c": -4.0, "humidity": 0.4}
 MISALIGNMENT_DEG = (0.31, -0.22, 0.53)
-TILT_NOISE_DEG = 0.0002  # a better sensor than the paper's: 0.7 arcsec, so that the test is sharp
+# A better sensor than the paper's: 0.7 arcsec, so that the test is sharp.
+TILT_NOISE_DEG = 0.0002
 EXPOSURE_S, CADENCE_S, TILT_PERIOD_S = 0.5, 5.0, 0.1
 FULL_SIZE, FULL_FOCAL_PX, FULL_FRAMES = (5616, 3744), 93750.0, 10
 SMALL_SIZE, SMALL_FRAMES = (1000, 700), 3
-SMALL_FOCAL_PX = (
-    FULL_FOCAL_PX * np.hypot(*SMALL_SIZE) / np.hypot(*FULL_SIZE)
-)  # the same field, the same triangles
+# The same field, the same triangles.
+SMALL_FOCAL_PX = FULL_FOCAL_PX * np.hypot(*SMALL_SIZE) / np.hypot(*FULL_SIZE)
 # Coarse grey levels: a camera's noise is what does not compress.
 SMALL_OPTICS = Optics(zero_point_e_s=2.0e6, gain_e_dn=8.0, bias_dn=64.0, seeing_arcsec=0.5)
 SMALL_START_S = START_S + 60.0
 END_S = SMALL_START_S + SMALL_FRAMES * CADENCE_S
 TURN_DEG = 36.0
 CAMERA_FRAME, TILT_FRAME = "starpos_camera_optical_frame", "starpos_inclinometer_frame"
-SLOW_S = 0.3  # from the end of an exposure to its stars
+# From the end of an exposure to its stars.
+SLOW_S = 0.3
 
 
 class Bag:
@@ -96,7 +99,8 @@ def make(folder: Path) -> None:
             bag.add(end + 0.01, "/camera/capture", capture)
             bag.add(end + SLOW_S, "/camera/image_raw", image)
         truth.append({"kind": kind, "mid_unix_s": mid, "heading_deg": float(np.degrees(scene.heading))})
-    still = scene  # it turns about the vertical: the tilt stays
+    # It turns about the vertical: the tilt stays.
+    still = scene
     for n in range(round((END_S - START_S) / TILT_PERIOD_S)):
         moment = START_S + 0.05 + n * TILT_PERIOD_S + rng.uniform(-0.004, 0.004)
         x, y = read_tilt(still, 0.0, rng)
@@ -121,7 +125,8 @@ def main() -> None:
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).parent / "data" / "night")
     folder = parser.parse_args().folder
-    if (folder / "metadata.yaml").is_file():  # a bag, not whatever else was named
+    # A bag, not whatever else was named.
+    if (folder / "metadata.yaml").is_file():
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     make(folder)

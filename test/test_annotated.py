@@ -17,9 +17,8 @@ def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, sol
     run("starpos_camera", "detector")
     graph.wait_for_detector(photograph)
     stars = graph.hear(StarArray, "stars")
-    assert (
-        graph.node.count_subscribers("solver/solution") == 1
-    )  # this test: the detector has nobody to draw for
+    # This test: the detector has nobody to draw for.
+    assert graph.node.count_subscribers("solver/solution") == 1
     images = graph.hear(Image, "detector/image_annotated", 1)
     graph.wait(
         lambda: (
@@ -45,7 +44,8 @@ def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, sol
                     )
         return bool(shown)
 
-    for _ in range(20):  # the first ones go before detector and solver have met once more
+    # The first ones go before detector and solver have met once more.
+    for _ in range(20):
         shot, image, capture = photograph()
         graph.send(shot, image, capture)
         if graph.comes(identified, 2.5):

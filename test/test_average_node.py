@@ -25,7 +25,8 @@ from starpos_testing.graph.shots import (
 )
 
 SITE = scene_at().site
-TILT_DEG = 0.002  # of one reading: it is what averages
+# The noise of one reading: it is what averages.
+TILT_DEG = 0.002
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +135,8 @@ def test_a_burst_of_bad_tilts_does_not_move_it(graph, solver, averaged, rng):
     check_place(after)
     moved = moved_m(SITE, after.latitude, after.longitude) - moved_m(SITE, before.latitude, before.longitude)
     assert np.hypot(*moved) < sigma_m(before.position_covariance)
-    assert {stamp_of(m) for m in averaged}.isdisjoint(shot.stamp for shot in bad)  # it is not of these frames
+    # It is not of these frames.
+    assert {stamp_of(m) for m in averaged}.isdisjoint(shot.stamp for shot in bad)
     assert average_state(graph, "of all frames here")["frames"] == "10"
 
 
@@ -191,7 +193,8 @@ def test_another_instrument_or_other_air_begins_it_anew(graph, solver, averaged,
     shots = [noisy(rng) for _ in range(3)]
     average_after(graph, averaged, *shots)
     assert graph.set("solver", **parameters)[0]
-    graph.send(shots[-1])  # the same frame tells nothing new, and does no harm
+    # The same frame tells nothing new, and does no harm.
+    graph.send(shots[-1])
     average_after(graph, averaged, noisy(rng))
     assert average_state(graph, "of all")["frames"] == "1"
 
@@ -200,10 +203,12 @@ def test_reset_and_a_bag_played_again_begin_it_anew(graph, solver, averaged, rng
     shots = [noisy(rng) for _ in range(4)]
     average_after(graph, averaged, *shots)
     assert average_state(graph, "of all")["frames"] == "4"
-    graph.send(shots[-1])  # the same frame twice counts once
+    # The same frame twice counts once.
+    graph.send(shots[-1])
     for shot in shots:
         graph.solutions.pop(shot.stamp)
-    for shot in shots:  # frames that come late are like this: not before the third are they known for others
+    # Frames that come late are like this: not before the third are they known for others.
+    for shot in shots:
         assert graph.answer(shot)[0].status == Solution.OK
     graph.wait(lambda: average_state(graph, "of all")["frames"] == "2")
     assert graph.call(Trigger, "solver/reset", Trigger.Request()).success

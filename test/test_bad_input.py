@@ -43,7 +43,8 @@ def check_good(graph):
     assert abs(shot.error_m(solution)).max() < 60
 
 
-def test_without_intrinsics(graph, run):  # before the fixture `solver`: there may be one at a time
+# Before the fixture `solver`: there may be one at a time.
+def test_without_intrinsics(graph, run):
     process = run("starpos_solver", "solver", *SOLVER)
     graph.wait_for_solver()
     shot = shoot()
@@ -100,7 +101,8 @@ def swap(shot):
 
 
 def into_2037(shot):
-    seconds = 2114380800 - shot.stars.header.stamp.sec  # 2037-01-01
+    # 2037-01-01
+    seconds = 2114380800 - shot.stars.header.stamp.sec
     shot.stars.header.stamp.nanosec = 0
     later([shot.stars, *shot.tilts], seconds)
 
@@ -110,7 +112,8 @@ def other_size(shot):
 
 
 def other_focal(shot):
-    shot.info.k[0] = shot.info.k[4] = FULL_FOCAL_PX * 1.042  # beyond 3 %, but no other catalogue of triangles
+    # Beyond 3 %, but no other catalogue of triangles.
+    shot.info.k[0] = shot.info.k[4] = FULL_FOCAL_PX * 1.042
 
 
 BAD = Solution.BAD_INPUT

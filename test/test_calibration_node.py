@@ -29,7 +29,8 @@ from starpos_testing.graph.shots import (
 )
 
 HERE = {"latitude": LATITUDE_DEG, "longitude": LONGITUDE_DEG}
-WRONG = misaligned()  # where the solver is told zeros
+# Where the solver is told zeros.
+WRONG = misaligned()
 SITE = scene_at().site
 
 
@@ -101,7 +102,8 @@ def test_frames_are_solved_while_a_calibration_is_worked_out_and_a_second_one_is
     client = graph.node.create_client(Calibrate, "solver/calibrate")
     graph.wait(client.service_is_ready)
     first, second = (client.call_async(Calibrate.Request(**HERE)) for _ in range(2))
-    graph.wait(lambda: first.done() or second.done())  # the refusal: the other one is at work
+    # The refusal: the other one is at work.
+    graph.wait(lambda: first.done() or second.done())
     shot = shoot(40.0, instrument=WRONG)
     graph.send(shot)
     graph.wait(lambda: shot.stamp in graph.solutions)
@@ -119,7 +121,8 @@ def test_what_is_set_while_a_calibration_is_worked_out_holds(graph, solver):
     setter = graph.node.create_client(SetParametersAtomically, "/solver/set_parameters_atomically")
     graph.wait(lambda: client.service_is_ready() and setter.service_is_ready())
     first, second = (client.call_async(Calibrate.Request(**HERE)) for _ in range(2))
-    graph.wait(lambda: first.done() or second.done())  # the refusal: the other one is at work
+    # The refusal: the other one is at work.
+    graph.wait(lambda: first.done() or second.done())
     change = Parameter("misalignment", value=[0.1, 0.1, 0.1]).to_parameter_msg()
     done = setter.call_async(SetParametersAtomically.Request(parameters=[change]))
     graph.wait(lambda: done.done() and first.done() and second.done())
@@ -143,7 +146,8 @@ def test_headings_on_the_spot_tell_place_and_a3(graph, solver):
     claimed = np.reshape(average.position_covariance, (3, 3))[:2, :2].ravel()
     assert list(claimed) == pytest.approx(list(answer.covariance), rel=1e-12)
     assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
-    check_fix(graph, 60, within_m=100)  # a reset does not lose it
+    # A reset does not lose it.
+    check_fix(graph, 60, within_m=100)
     assert graph.set("solver", misalignment=[0, 0, 0])[0]
     lost = graph.answer(shoot(60, instrument=WRONG))[0]
     assert np.hypot(*moved_m(SITE, lost.latitude, lost.longitude)) > 10e3
@@ -238,7 +242,8 @@ def test_a_calibration_is_saved_where_calibration_url_says_and_used_on(graph, so
     assert calibrate(graph).success
     assert save(graph).success
     assert instrument_file.read(path).calibration.frames == 2
-    assert graph.set("solver", misalignment=[5.0, 5.0, 5.0])[0]  # the file, now the saved one, wins
+    # The file, now the saved one, wins.
+    assert graph.set("solver", misalignment=[5.0, 5.0, 5.0])[0]
     check_fix(graph, 250, within_m=100)
 
 
@@ -296,7 +301,8 @@ def test_a_solver_started_with_the_file_of_another_camera_says_so_until_it_is_gi
     solution = graph.answer(shot)[0]
     assert solution.status == Solution.BAD_INPUT and "another camera" in solution.status_text
     right = instrument_at(tmp_path / "right.yaml")
-    assert graph.set("solver", refraction__pressure=0.0)[0]  # the file in use holds up nothing else
+    # The file in use holds up nothing else.
+    assert graph.set("solver", refraction__pressure=0.0)[0]
     assert graph.set("solver", calibration_url=right, refraction__pressure=PRESSURE_PA)[0]
     graph.wait(lambda: graph.answer(shoot(instrument=WRONG))[0].status == Solution.OK)
 

@@ -146,13 +146,15 @@ def test_frames_and_tilts_from_the_future_are_refused(graph, solver):
     assert solution.status == Solution.BAD_INPUT and "before its time" in solution.status_text
     answer = graph.call(Solve, "solver/solve", Solve.Request())
     assert not answer.success and "before its time" in answer.message
-    shot = shoot()  # but what the clock's stated error allows is used
+    # What the clock's stated error allows is used.
+    shot = shoot()
     late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
     shot.tilts.clear()
     shot.stars.clock_stddev = 60.0
     graph.send(shot)
     assert graph.result(stamp_of(shot.stars))[0].status == Solution.NO_TILT
-    shot = shoot()  # a night that is played, of another time
+    # A night that is played, of another time.
+    shot = shoot()
     assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
     late(shot, time.time() + 30 * 86400 - stamp_to_unix(shot.stars.header.stamp))
     graph.send(shot)

@@ -41,7 +41,8 @@ def test_its_tilts_are_not_those_of_a_frame_whose_stars_come_first(graph, clock)
         return shot
 
     answered(shown(0.0))
-    answered(shown(0.8, ahead_s=AHEAD_S))  # its tilts are of 3.15 to 3.55 s
+    # Its tilts are of 3.15 to 3.55 s.
+    answered(shown(0.8, ahead_s=AHEAD_S))
     answered(shown(1.6))
     turned = replace(scene, altitude_deg=scene.altitude_deg + 3.0)
     shot = shown(3.12, turned)

@@ -29,7 +29,8 @@ FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglo
 SOURCES = [f for f in FILES if f.suffix in (".py", ".c", ".h") and not f.with_suffix(".pyx").exists()]
 MODULES = {p.name: p / p.name for p in PACKAGES}
 FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
-FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}  # of the C library, of ERFA, of avr-libc
+# Names of the C library, of ERFA, of avr-libc.
+FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}
 SHOUTED = r"\b(?:ARCHITECTURE|CONTRIBUTING|DESIGN|ERRATA|PROTOCOL|README|TUTORIAL)\b(?:\.md)?"
 NAMED = re.compile(rf"{SHOUTED}|(?<![\w./-])[\w./-]*\w\.(?:md|rst|py|c|h|svg)\b(?:#[\w-]+)?")
 DOTTED = re.compile(r"(?<![\w./-])(starpos(?:_[a-z]+)?)((?:\.[A-Za-z]\w*)+)")
@@ -173,7 +174,8 @@ def is_module(package: str, names: str) -> bool:
         place = place / parts.pop(0)
     if parts and (place / f"{parts[0]}.py").is_file():
         place = place / f"{parts.pop(0)}.py"
-    if place.is_dir():  # what a package offers it may have from elsewhere
+    # What a package offers it may have from elsewhere.
+    if place.is_dir():
         return all(re.search(rf"\b{part}\b", (place / "__init__.py").read_text()) for part in parts)
     made = r"(?m)^ *(?:(?:def|class) {0}\b|{0}:|[\w, ]*\b{0}\b[\w, ]*(?::[^=\n]+)?=)"
     return all(re.search(made.format(part), place.read_text()) for part in parts)

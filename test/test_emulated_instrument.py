@@ -24,7 +24,8 @@ def test_firmware_indi_camera_detector_and_solver_find_a_place_nobody_told_them(
         try:
             out, error = tool.communicate(timeout=4 * WAIT_S)
         except subprocess.TimeoutExpired:
-            tool.send_signal(signal.SIGINT)  # it ends what it has started
+            # It ends what it has started.
+            tool.send_signal(signal.SIGINT)
             out, error = tool.communicate()
     if tool.returncode == 2 and (lack := re.search("(sudo apt-get install|pip install) (.+)", error)):
         lacks(lack[2], lack[1])
@@ -32,4 +33,5 @@ def test_firmware_indi_camera_detector_and_solver_find_a_place_nobody_told_them(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"] == FRAMES
     assert summary["sigmas_off"] < 4
-    assert max(summary["sigma_east_m"], summary["sigma_north_m"]) < 300  # it claims something
+    # It claims something.
+    assert max(summary["sigma_east_m"], summary["sigma_north_m"]) < 300

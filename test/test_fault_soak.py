@@ -21,7 +21,8 @@ def test_random_faults_make_no_wrong_fix_and_no_crash():
         try:
             out, _ = tool.communicate(timeout=4 * WAIT_S)
         except subprocess.TimeoutExpired:
-            tool.send_signal(signal.SIGINT)  # it ends what it has started
+            # It ends what it has started.
+            tool.send_signal(signal.SIGINT)
             out, _ = tool.communicate()
     assert tool.returncode == 0, out
     assert f"{FAULTS} faults" in out and "wrong: 0; crashes and defects: 0; without recovery: 0" in out

@@ -44,7 +44,8 @@ def test_the_attitude_is_the_whole_one(graph, solver):
     )
     truth = shot.scene.attitude @ np.asarray(shot.scene.instrument.link_to_camera)
     np.testing.assert_allclose(axes, truth, atol=np.radians(10 / 3600))
-    assert axes[2, 2] > 0.97  # z up, as REP-103 has it
+    # Z up, as REP-103 has it.
+    assert axes[2, 2] > 0.97
 
 
 def test_covariances_and_stamps(graph, solver):
@@ -74,4 +75,5 @@ def test_covariances_and_stamps(graph, solver):
     error = shot.error_m(solution)
     claimed = np.linalg.inv(np.reshape(solution.covariance, (3, 3))[:2, :2])
     assert error @ claimed @ error < 4**2
-    assert np.abs(error).max() < 60  # 2 arcsec
+    # 2 arcsec.
+    assert np.abs(error).max() < 60

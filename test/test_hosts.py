@@ -18,7 +18,8 @@ from starpos_testing.patience import WAIT_S
 NIGHT = Path(__file__).parent / "data" / "night"
 LOSSY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "config" / "lossy_link.xml"
 PATIENCE_S = 2 * WAIT_S
-LEASE_S = 6  # 20 by default
+# 20 by default.
+LEASE_S = 6
 IMPATIENT = f"""<dds xmlns="http://www.eprosima.com"><profiles>
 <participant profile_name="impatient" is_default_profile="true"><rtps><builtin><discovery_config>
 <leaseDuration><sec>{LEASE_S}</sec></leaseDuration><leaseAnnouncement><sec>1</sec></leaseAnnouncement>
@@ -70,19 +71,22 @@ def test_two_computers_give_the_fixes_of_one_to_the_last_bit(tmp_path):
         other, other_fix = two[stamp]
         for name in ("latitude", "longitude", "heading", "covariance", "stars_matched"):
             assert np.array_equal(getattr(solution, name), getattr(other, name)), (stamp, name)
-        assert repr(solution) == repr(other) and repr(fix) == repr(other_fix)  # repr: NaN equals NaN
+        # Repr: NaN equals NaN.
+        assert repr(solution) == repr(other) and repr(fix) == repr(other_fix)
 
 
 def test_only_stars_and_tilts_cross_the_cable(tmp_path):
     seen = traffic(tmp_path, frames=5, cadence_s=1.0, quiet_s=4.0)
     print(seen)
-    star_bytes, tilt_bytes = 80 * seen.stars, 80 * TILT_RATE_HZ  # of the messages alone
+    # Bytes of the messages alone.
+    star_bytes, tilt_bytes = 80 * seen.stars, 80 * TILT_RATE_HZ
     # on a busy machine lists of stars are under way that have no solution yet, at the begin or at the end
     assert star_bytes / 4 < seen.bytes_per_frame < FULL_FRAME_BYTES / 400
     assert tilt_bytes < seen.bytes_per_second < 10_000
 
 
-@pytest.mark.parametrize("away_s", [5.0, 8.0])  # beyond the lease DDS gives up the other host
+# Beyond the lease DDS gives up the other host.
+@pytest.mark.parametrize("away_s", [5.0, 8.0])
 def test_a_cable_that_is_pulled_and_plugged_in_again(tmp_path, away_s):
     profile = tmp_path / "impatient.xml"
     profile.write_text(IMPATIENT)
@@ -115,14 +119,16 @@ def test_a_link_that_loses_a_fifth_of_the_packets_costs_time_but_no_fix_is_wrong
         ear = instrument.ear
         instrument.cable.loss, instrument.cable.delay_s = 0.2, 0.1
         start(instrument, tmp_path, SMALL, cadence_s, "tilt_timeout:=10.0")
-        instrument.wait(lambda: len(ear.fixed) > 1, seconds=PATIENCE_S)  # they have met
+        # They have met.
+        instrument.wait(lambda: len(ear.fixed) > 1, seconds=PATIENCE_S)
         before = set(ear.solutions)
         instrument.wait(lambda: len(set(ear.solutions) - before) >= 15, seconds=PATIENCE_S)
         later = sorted(set(ear.solutions) - before)
         taken = 1 + round((seconds_of(later[-1]) - seconds_of(later[0])) / cadence_s)
         fixed = [s for s in later if s in ear.fixed]
         print(f"{taken} frames, {len(later)} came, {len(fixed)} fixes")
-        assert len(fixed) > taken / 4  # without the profile a twelfth
+        # Without the profile a twelfth.
+        assert len(fixed) > taken / 4
         for solution in (ear.solutions[stamp] for stamp in ear.fixed):
             off_m = (solution.latitude - scene_of().site.latitude_deg) * 111e3
             assert abs(off_m) < 5 * solution.covariance[4] ** 0.5

@@ -16,7 +16,8 @@ from starpos_interfaces.srv import SaveCalibration
 from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
 KILLS, KILLED_NODES = 100, 2
-CALLS = 8  # that a service keeps
+# That a service keeps.
+CALLS = 8
 # Forks a child that saves two contents in turn, kills it at a random moment, looks at the file; says how often which.
 KILLER = """
 import os, random, signal, sys, time

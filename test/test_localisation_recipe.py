@@ -11,8 +11,10 @@ from ament_index_python.packages import get_package_share_directory
 from starpos_testing.graph.shots import LATITUDE_DEG, shoot
 
 RECIPE = Path(get_package_share_directory("starpos_bringup")) / "config" / "robot_localization.yaml"
-X, Y, YAW = 0, 1, 5  # of robot_localization's 15 state variables
-WIDEST_FIX_M = 1e6  # self_calibration's first
+# Which of robot_localization's 15 state variables.
+X, Y, YAW = 0, 1, 5
+# self_calibration's first.
+WIDEST_FIX_M = 1e6
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,8 @@ def test_a_fix_that_becomes_better_is_not_shut_out(recipe):
     assert not [name for name in ekf if name.endswith("rejection_threshold")]
     start = ekf["initial_estimate_covariance"]
     assert len(start) == 15 and start[X] == start[Y] >= WIDEST_FIX_M**2 and start[YAW] >= math.pi**2
-    assert sum(variance > 1e-9 for variance in start) == 3  # of what is measured only
+    # Only what is measured has a variance.
+    assert sum(variance > 1e-9 for variance in start) == 3
 
 
 def test_a_lagging_fix_is_put_where_it_belongs(graph, solver, recipe):
@@ -69,5 +72,6 @@ def test_a_lagging_fix_is_put_where_it_belongs(graph, solver, recipe):
     shot = shoot()
     _, fix, imu = graph.answer(shot)
     stamps = {(m.header.stamp.sec, m.header.stamp.nanosec) for m in (fix, imu, shot.stars)}
-    assert len(stamps) == 1  # the middle of the exposure
+    # The middle of the exposure.
+    assert len(stamps) == 1
     assert abs(fix.latitude - LATITUDE_DEG) < 0.01

@@ -66,4 +66,5 @@ def test_a_latched_camera_info_is_taken_once(graph, run, latched):
         return int({v.key: v.value for v in state.values}["refused"])
 
     graph.wait(lambda: refused() >= 3)
-    assert refused() == 3  # a second later too
+    # A second later too.
+    assert refused() == 3

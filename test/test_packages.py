@@ -13,7 +13,8 @@ from catkin_pkg.package import parse_package
 ROOT = Path(__file__).parents[1]
 FOLDERS = sorted(p.parent for folder in (ROOT, ROOT / "src") for p in folder.glob("*/package.xml"))
 PYTHON = [f for f in FOLDERS if (f / "setup.py").is_file()]
-KEYS = {  # rosdep's, of modules that are no ROS package
+# rosdep's, of modules that are no ROS package.
+KEYS = {
     "astropy": "python3-astropy",
     "astropy_iers_data": "python3-astropy",
     "cv2": "python3-opencv",
@@ -33,11 +34,14 @@ OPTIONAL = {
     "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "starpos_camera.sources.alpaca_http",
     "starpos_testing.skies.bags", "urllib3",
 }  # fmt: skip
-HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}  # modules beside the tests
-HELPERS |= {"late_starpos"}  # a test writes it
+# Modules beside the tests.
+HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}
+# A test writes it.
+HELPERS |= {"late_starpos"}
 # starpos_testing stands on these, so they cannot name it: colcon would find a circle
 BELOW_TESTING = {"starpos", "starpos_common"}
-RUN_BY_COMMAND = {"libxml2-utils", "ros2launch", "xacro"}  # programs, which nothing imports
+# Programs, which nothing imports.
+RUN_BY_COMMAND = {"libxml2-utils", "ros2launch", "xacro"}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

@@ -84,23 +84,27 @@ def test_deflection_and_altitude(graph, solver):
     cos_phi = math.cos(math.radians(fix.latitude))
     assert (solution.longitude - fix.longitude) * 3600 * cos_phi == pytest.approx(-5, abs=1e-3)
     assert (fix.altitude, fix.position_covariance[8]) == (2410.0, 9.0)
-    assert graph.set("solver", deflection__xi=0, deflection__eta=0, altitude=math.nan)[0]  # whole numbers do
+    # Whole numbers do.
+    assert graph.set("solver", deflection__xi=0, deflection__eta=0, altitude=math.nan)[0]
 
 
 def test_a_geoid_tells_the_deflection_of_the_place_and_its_error(graph, solver, tmp_path):
     path = tmp_path / "slope.gtx"
-    heights = np.broadcast_to(np.arange(176)[:, None], (176, 360))  # 1 m a degree to the north
+    # 1 m a degree to the north.
+    heights = np.broadcast_to(np.arange(176)[:, None], (176, 360))
     path.write_bytes(struct.pack(">4d2i", -88, -180, 1, 1, 176, 360) + heights.astype(">f4").tobytes())
     # where the height is known, plumb lines' curvature adds nothing
     assert graph.set("solver", deflection__geoid=str(path), altitude=0.0) == (True, "")
-    path.unlink()  # it is read once
+    # It is read once.
+    path.unlink()
     done, reason = graph.set("solver", deflection__xi=10.0)
     assert not done and "deflection.geoid" in reason
     solution, fix, _ = graph.answer(shoot())
     assert solution.xi == pytest.approx(-1.86, abs=0.02) and abs(solution.eta) < 1e-3
     assert (solution.latitude - fix.latitude) * 3600 == pytest.approx(solution.xi, abs=1e-4)
     widened = fix.position_covariance[4] - solution.covariance[4]
-    assert widened == pytest.approx((0.5 * 30.85) ** 2, rel=0.02)  # its least error, in m
+    # Its least error, in m.
+    assert widened == pytest.approx((0.5 * 30.85) ** 2, rel=0.02)
     assert graph.set("solver", deflection__geoid="", altitude=math.nan)[0]
     assert graph.call(Solve, "solver/solve", Solve.Request()).solution.xi == 0
 

@@ -53,7 +53,8 @@ def allowed() -> dict[str, set]:
                 assert verdict == "ALLOW" and (rules.tag, action) in RULES
                 for rule in rules:
                     name = only(rule, rules.tag[:-1]).text
-                    assert "*" not in name and "?" not in name  # of any length, to DDS
+                    # To DDS these mean a text of any length.
+                    assert "*" not in name and "?" not in name
                     found[path].add(
                         (full_name(node, namespace, ""), action, full_name(name, namespace, node))
                     )
@@ -150,4 +151,5 @@ def test_every_executable_has_an_enclave():
         "starpos_solver",
     )
     made = {e.name for e in entry_points(group="console_scripts") if e.module.split(".")[0] in packages}
-    assert {f"/starpos/{name}" for name in made - {"emulator"}} == set(allowed())  # a device, no node
+    # A device, no node.
+    assert {f"/starpos/{name}" for name in made - {"emulator"}} == set(allowed())

@@ -57,13 +57,15 @@ def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
     _, image, capture = photograph()
     first = shoot()
     names = ("stars", "tilt", "camera/capture", "camera/image_raw", "solver/solution")
-    for _ in range(20):  # a publisher may know the recorder before the recorder knows it
+    # A publisher may know the recorder before the recorder knows it.
+    for _ in range(20):
         graph.send(first)
         graph.capture.publish(capture)
         graph.image.publish(image)
         if graph.comes(lambda: all(int(counts_of(graph)[name]) for name in names), 2.0):
             break
-    graph.comes(lambda: False, 2.5)  # what is under way arrives
+    # What is under way arrives.
+    graph.comes(lambda: False, 2.5)
     begun = counts_of(graph)
     shots = [shoot() for _ in range(3)]
     answers = [graph.answer(shot)[0] for shot in shots]
@@ -88,7 +90,8 @@ def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
         np.testing.assert_equal(got, wanted, topic)
     assert len(kept["/solver/solution"]) == len(kept["/fix"]) and kept["/diagnostics"]
     size = sum(f.stat().st_size for f in (tmp_path / "bag").iterdir())
-    assert size < 0.7 * sum(len(m) for sent in kept.values() for m in sent)  # noise is what does not compress
+    # Noise is what does not compress.
+    assert size < 0.7 * sum(len(m) for sent in kept.values() for m in sent)
 
     graph.solutions.clear()
     again = run(
@@ -106,7 +109,8 @@ def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
 
 def test_a_full_disk_ends_the_recording_with_a_sentence(graph, solver, recorded):
     process = recorded()
-    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (4096, 4096))  # as a disk with no more room
+    # As a disk with no more room.
+    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (4096, 4096))
     shot = shoot()
     while process.process.poll() is None:
         for _ in range(10):

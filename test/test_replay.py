@@ -34,7 +34,8 @@ def truth():
     return json.loads(NIGHT.with_suffix(".json").read_text())
 
 
-def test_a_replay_that_nobody_hears_says_so(graph, run):  # before there is an instrument
+# Before there is an instrument.
+def test_a_replay_that_nobody_hears_says_so(graph, run):
     replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
     assert replay.wait() == 1
     assert "13 frames, 0 answers, 0 fixes" in replay.output, replay.output
@@ -113,7 +114,8 @@ def test_the_bag_gives_its_place_twice_the_same(graph, run, instrument, truth):
     assert list(first) == list(second)
     for stamp, (solution, imu) in first.items():
         other, other_imu = second[stamp]
-        assert repr(solution) == repr(other) and imu == other_imu  # repr: NaN equals NaN
+        # Repr: NaN equals NaN.
+        assert repr(solution) == repr(other) and imu == other_imu
 
 
 def test_the_kept_script_makes_this_bag(tmp_path, truth):
@@ -166,7 +168,8 @@ def test_latched_topics_reach_latecomers_and_a_signal_ends_it(graph, run, tmp_pa
     replay = run("starpos_bringup", "replay", arguments=(str(bag), "--wait", "0"))
     graph.wait(lambda: graph.node.count_publishers("/words"))
     clock = graph.hear(Clock, "/clock")
-    graph.wait(lambda: len(clock) > 10)  # it is past its first message
+    # It is past its first message.
+    graph.wait(lambda: len(clock) > 10)
     times = [m.clock.sec * S + m.clock.nanosec for m in clock]
     assert times == sorted(set(times)) and S <= times[0] < times[-1] < 1000 * S
     heard = graph.hear(String, "/words", LATCHED)

@@ -11,7 +11,8 @@ from starpos_interfaces.msg import Solution
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import SMALL, focal_of
 
-LATITUDE_DEG, LONGITUDE_DEG = 35.7046, 51.4106  # the simulated sky's
+# The simulated sky's.
+LATITUDE_DEG, LONGITUDE_DEG = 35.7046, 51.4106
 AIR = ("101325.0", "15.0", "0.5")
 CADENCE_S, FOCAL_MM = 0.5, focal_of(SMALL) * 6.4e-3
 NODES = {

@@ -74,9 +74,8 @@ def test_the_graph_and_the_command_line_agree(graph, run, night):
     for want, solution, frame in zip(expected, got, truth["frames"], strict=True):
         assert (solution.status, want["status"]) == (msg.Solution.OK, "ok"), solution.status_text
         for name in ("latitude", "longitude", "heading"):
-            assert getattr(solution, name) == pytest.approx(want[name], abs=1e-8), (
-                name
-            )  # a millimetre: the solver starts from its last fix
+            # A millimetre: the solver starts from its last fix.
+            assert getattr(solution, name) == pytest.approx(want[name], abs=1e-8), name
         assert list(solution.covariance) == pytest.approx(
             [v for row in want["covariance"] for v in row], rel=1e-6
         )

@@ -162,7 +162,8 @@ def test_a_file_of_a_terabyte_is_refused_unread(tmp_path, name, head, size, read
     path = tmp_path / name
     with path.open("wb") as file:
         file.write(head)
-        file.truncate(size)  # no disk holds that: a hole
+        # No disk holds that: a hole.
+        file.truncate(size)
     with pytest.raises(StarposError, match=name):
         read(path)
 

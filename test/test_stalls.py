@@ -20,7 +20,8 @@ def test_a_stalled_inclinometer_makes_no_wrong_tilt_and_no_wrong_fix():
         try:
             out, _ = tool.communicate(timeout=3 * WAIT_S)
         except subprocess.TimeoutExpired:
-            tool.send_signal(signal.SIGINT)  # it ends what it has started
+            # It ends what it has started.
+            tool.send_signal(signal.SIGINT)
             out, _ = tool.communicate()
     assert tool.returncode == 0, out
     assert "4 stalls" in out and " 0 wrong fixes" in out and " 0 wrong tilts" in out

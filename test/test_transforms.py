@@ -66,7 +66,8 @@ def test_who_listens_later_hears_how_camera_and_inclinometer_are_turned(graph, r
     camera, inclinometer = shot.info.header.frame_id, shot.tilts[0].header.frame_id
     transforms = heard()
     assert set(transforms) == {("rover/mount", camera), (camera, inclinometer)}
-    axis = turned(transforms["rover/mount", camera], (0, 0, 1))  # the optical axis, as the link sees it
+    # The optical axis, as the link sees it.
+    axis = turned(transforms["rover/mount", camera], (0, 0, 1))
     np.testing.assert_allclose(axis, (1, 0, 0), atol=1e-12)
     # A3 takes the camera into the inclinometer, tf the child into the parent
     back = turned(transforms[camera, inclinometer], calibration.a3 @ (0.1, 0.2, 0.9))

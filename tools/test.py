@@ -29,9 +29,12 @@ LINTERS = [
     "mypy",
     f"{sys.executable} tools/walls.py",
 ]
-NO_TESTS = 5  # pytest's exit status where a -k left none
-SHOWN = 20  # of the slowest tests
-LANES = 4  # at once: on two cores, because tests of nodes mostly wait
+# pytest's exit status where a -k left none.
+NO_TESTS = 5
+# How many of the slowest tests are printed.
+SHOWN = 20
+# At once: on two cores, because tests of nodes mostly wait.
+LANES = 4
 # a folder's files in so many parts, which run as lanes are free
 PARTS = {"graph": 5, "starpos": 6, "starpos_camera": 3, "starpos_inclinometer": 2}
 # for so many at once: a thread that has no processor of its own makes the others wait for it
@@ -67,7 +70,8 @@ class Outcome:
         return Outcome(self.counts + other.counts, self.seconds + other.seconds, self.skipped + other.skipped)
 
 
-Tests = dict[str, Callable]  # by name: what runs them, given a file for their output; an Outcome
+# By name: what runs them, given a file for their output; an Outcome.
+Tests = dict[str, Callable]
 
 
 def run(command: list[str], out=None, environment: dict[str, str] | None = None) -> int:
@@ -201,7 +205,8 @@ def older(files: list[str], report: str, pytest_args: list[str], out) -> Outcome
         return Outcome(Counter(failed=1))
     python = ubuntu / "bin" / "python"
     with tempfile.TemporaryDirectory() as programs:
-        os.chmod(programs, 0o755)  # some tests become another user
+        # Some tests become another user.
+        os.chmod(programs, 0o755)
         environment = bare_environment(python, Path(programs))
         chosen = ["-m", "not montecarlo", *pytest_args]
         return pytest(files, report, chosen, out, python=str(python), environment=environment)

@@ -29,7 +29,8 @@ MESSAGES = re.compile(r"\w+_(msgs|srvs|interfaces)$")
 USUAL = {("numpy", "np"), ("xml.etree.ElementTree", "ET"), ("matplotlib.pyplot", "plt")}
 DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
 MOST_LINES = 450
-KEYWORD_FIELDS = 6  # a dataclass of so many is made by keyword, after three fields at most
+# A dataclass of so many is made by keyword, after three fields at most.
+KEYWORD_FIELDS = 6
 
 
 @dataclass(frozen=True)

@@ -97,10 +97,13 @@ class CameraNode(Node):
         self._source: FrameSource = SOURCES[self._values["source"]](self._values, self._now_s)
 
         self._frames = self._failed = self._skipped = 0
-        self._skipped_before = 0  # at the last report
-        self._last: Capture | None = None  # of the last frame
+        # How many were skipped at the last report.
+        self._skipped_before = 0
+        # What was said of the last frame.
+        self._last: Capture | None = None
         self._last_took_s = 0.0
-        self._size: tuple[int, int] | None = None  # of the frames
+        # Columns and rows of the frames.
+        self._size: tuple[int, int] | None = None
         self._takers: list[Taker] = []
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")

@@ -75,7 +75,8 @@ class DetectorNode(Node):
         super().__init__("detector", **options)
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = self._detection_settings()
-        self._captures: dict[tuple[int, int], Capture] = {}  # by stamp, oldest first
+        # By stamp, the oldest first.
+        self._captures: dict[tuple[int, int], Capture] = {}
         # what holds for a frame whose Capture is lost
         self._usual = Capture()
         # frames until their Captures come, oldest first, and how long they wait for them, s of the clock below
@@ -85,13 +86,17 @@ class DetectorNode(Node):
         self._sequence: int | None = None
         self._replayed: Replayed | None = None
         self._troubles = Troubles(self)
-        self._complaint = ""  # about a frame since the last report
+        # What was wrong with a frame since the last report.
+        self._complaint = ""
         self._last: DetectedFrame | None = None
-        self._size = ""  # of the last frame, in words
-        self._last_frame_s: float | None = None  # monotonic
+        # Size of the last frame, in words.
+        self._size = ""
+        # In monotonic time.
+        self._last_frame_s: float | None = None
         self._interval_s: float | None = None
         self._publisher = publisher(self, StarArray, "stars", 10)
-        self._where = ""  # where frames come from, for messages
+        # Where frames come from, for messages.
+        self._where = ""
         self._annotator = Annotator(self)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")

@@ -19,7 +19,8 @@ import yaml
 from starpos_testing.lacking import require
 
 WIDTH, HEIGHT = 64, 48
-TOP_ROW, LEFT_COLUMN = 1.0, 0.25  # of the light of an asymmetric picture, black elsewhere
+# Where an asymmetric picture has its light; it is black elsewhere.
+TOP_ROW, LEFT_COLUMN = 1.0, 0.25
 
 
 def free_port() -> int:
@@ -55,8 +56,10 @@ class Simulator:
             }
         }
         config["devices"]["telescope"][0] |= {"declination": 89.0, "focallength": 0.05, "tracking": False}
-        config["tap_source"] = str(folder / "sky.sqlite")  # Gaia is asked over the network otherwise
-        with sqlite3.connect(config["tap_source"]) as sky:  # without a star the simulator's sky has no light
+        # Gaia is asked over the network otherwise.
+        config["tap_source"] = str(folder / "sky.sqlite")
+        # Without a star the simulator's sky has no light.
+        with sqlite3.connect(config["tap_source"]) as sky:
             sky.execute("CREATE TABLE gaia_sources (ra REAL, dec REAL, phot_g_mean_mag REAL)")
             places = ((float(ra), 87.0 + ra % 3) for ra in range(360))
             sky.executemany("INSERT INTO gaia_sources VALUES (?, ?, 12.0)", places)
@@ -78,7 +81,8 @@ class Simulator:
         while not log or "Uvicorn running" not in log[-1]:
             log.append(self._process.stderr.readline())
             assert log[-1], "".join(log)
-        self._reader = threading.Thread(target=self._process.stderr.read)  # a full pipe would stop it
+        # A full pipe would stop it.
+        self._reader = threading.Thread(target=self._process.stderr.read)
         self._reader.start()
 
     def kill(self):
@@ -131,7 +135,8 @@ class Liar:
 
         class Handler(BaseHTTPRequestHandler):
             protocol_version = "HTTP/1.1"
-            wbufsize = -1  # header and body in one packet: the second waits for an acknowledgement
+            # Header and body in one packet: the second waits for an acknowledgement.
+            wbufsize = -1
 
             def log_message(self, *_):
                 """Not on standard error."""
@@ -173,7 +178,8 @@ class Liar:
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
-        self._server.handle_error = lambda *_: None  # its client hangs up on it
+        # Its client hangs up on it.
+        self._server.handle_error = lambda *_: None
         self.address = f"127.0.0.1:{self._server.server_port}"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
         self._thread.start()

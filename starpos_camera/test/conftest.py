@@ -10,8 +10,10 @@ from starpos.sky.catalogue import load_catalogue
 from starpos_testing.nodes import Listener, Process, take_domain
 
 SIZE = (640, 480)
-FOCAL_PX = 7812.5  # 50 mm on 6.4 um
-START_S = 1793642400.0  # 2026-11-02T18:00:00Z
+# 50 mm on 6.4 um.
+FOCAL_PX = 7812.5
+# 2026-11-02T18:00:00Z
+START_S = 1793642400.0
 EXPOSURE_S = 0.5
 
 

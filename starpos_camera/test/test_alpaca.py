@@ -83,7 +83,8 @@ def test_exposure_and_gain_are_set_at_run_time_and_what_cannot_be_is_refused(sim
     source = make(simulator)
     exposure = source.capture(CaptureSettings(0.2, 6.0, 5.0))
     assert exposure.frame.exposure_s == 0.2
-    assert simulator.client().Gain == 7  # the simulator's Gain is one more than the index that was set
+    # The simulator's Gain is one more than the index that was set.
+    assert simulator.client().Gain == 7
     assert "its gain is 7, though 6 was set" in exposure.remark
     assert "out of range" in attempt(source, CaptureSettings(0.1, 99.0, 5.0))
     assert "too long" in attempt(source, CaptureSettings(4000.0, None, 5000.0))

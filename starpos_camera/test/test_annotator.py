@@ -98,7 +98,8 @@ def test_the_solution_of_the_frame_names_its_stars(viewer):
     assert has(plain[:480], stars[row], DETECTED) and has(named[:480], stars[row], IDENTIFIED)
     rows, columns = np.nonzero((named[:480] != plain[:480]).any(2))
     away = np.hypot(columns - stars[row].x, rows - stars[row].y)
-    assert 30 < away.max() < 150  # a text beside it, and nothing elsewhere
+    # A text beside it, and nothing elsewhere.
+    assert 30 < away.max() < 150
 
 
 def test_a_solution_that_does_not_hold_together_or_is_of_another_frame_names_nobody(viewer):
@@ -194,7 +195,8 @@ def test_one_frame_waits_for_its_solution_and_none_once_the_viewer_has_gone(insi
     eye = inside.viewer.create_subscription(Image, TOPIC, inside.images.append, 10)
     inside.wait(lambda: inside.show() or inside.images)
     inside.wait(solver.get_subscription_count)
-    inside.wait(lambda: inside.show() or inside.kept() == 1)  # it waits, the others pass by
+    # It waits, the others pass by.
+    inside.wait(lambda: inside.show() or inside.kept() == 1)
     for _ in range(5):
         inside.show()
         assert inside.kept() <= 1

@@ -73,7 +73,8 @@ def test_plays_files_and_says_which_one_is_broken(start, listener, folder):
     assert state["shutter"] == "global"
 
     later = listener.hear(CameraInfo, "camera/camera_info", LATCHED)
-    listener.wait(lambda: infos[-1] in later)  # though no frame comes any more
+    # Though no frame comes any more.
+    listener.wait(lambda: infos[-1] in later)
 
     assert "own exposure" in set_capture(listener, exposure=1.0).message
     assert "own gain" in set_capture(listener, gain=3.0).message

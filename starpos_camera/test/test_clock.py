@@ -59,7 +59,8 @@ def test_a_step_is_said_and_the_next_frames_are_in_the_new_time(
     state = listener.wait_for_state("camera: Clock", WARN, "clock was set")
     assert float(state["last step (s)"]) == pytest.approx(step, abs=0.05)
     seen = len(captures)
-    listener.wait(lambda: len(captures) > seen + 3)  # the cadence does not hang on this clock
+    # The cadence does not hang on this clock.
+    listener.wait(lambda: len(captures) > seen + 3)
     assert node.end(signal.SIGINT)[1].count("longitudes before and after") == 1
     record_property("fault", f"system clock stepped by {step:+g} s (camera)")
     record_property(
@@ -80,7 +81,8 @@ def test_a_frame_during_which_the_clock_was_set_is_left_out_unless_its_time_is_i
     def take(source):
         def capture():
             go(0.3, step)
-            for _ in range(int(exposure_s)):  # the diagnostics ask once a second
+            # The diagnostics ask once a second.
+            for _ in range(int(exposure_s)):
                 watch.step_s()
                 go(1.0)
             return CapturedFrame(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)

@@ -71,7 +71,8 @@ def test_stars_are_those_of_starpos_under_the_header_of_the_image(feed, frame):
     def show():
         message = feed.message(frame)
         feed.images.publish(message)
-        feed.captures.publish(  # two topics keep no order
+        # Two topics keep no order.
+        feed.captures.publish(
             Capture(
                 header=message.header,
                 exposure=0.75,
@@ -117,9 +118,8 @@ def test_diagnostics_tell_what_the_frame_was_like(feed, scene, frame):
     electrons = (sky - scene.optics.bias_dn) * scene.optics.gain_e_dn
     photons_dn = math.sqrt(electrons + scene.optics.read_noise_e**2) / scene.optics.gain_e_dn
     assert float(state["noise (DN)"]) == pytest.approx(photons_dn, rel=0.06)
-    assert float(state["fwhm (px)"]) == pytest.approx(
-        scene.optics.fwhm_px, abs=0.25
-    )  # and the pixel's own width
+    # The pixel's own width adds to it.
+    assert float(state["fwhm (px)"]) == pytest.approx(scene.optics.fwhm_px, abs=0.25)
     assert 0 < float(state["cpu_ms"]) <= 1.01e3 * float(state["seconds"])
 
 
@@ -228,7 +228,8 @@ def test_exposure_is_the_parameter_where_no_capture_says_it(listener, start, fra
 
 @pytest.mark.parametrize("told", ["exposure", "stamp_stddev", "clock_stddev"])
 def test_a_capture_that_no_frame_can_have_costs_its_frame_only(feed, frame, told):
-    def absurd():  # the first Captures go before the detector has found who sends them
+    # The first Captures go before the detector has found who sends them.
+    def absurd():
         message = feed.message(frame)
         feed.captures.publish(Capture(header=message.header, **{told: 1e300}))
         feed.images.publish(message)

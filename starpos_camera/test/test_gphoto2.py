@@ -26,7 +26,8 @@ AS_IT_IS = CaptureSettings(None, None, 5.0)
 MOSAIC = raws.mosaic()
 GREY = (MOSAIC >> 8).astype(np.uint8)
 JPEG = cv2.imencode(".jpg", GREY, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
-FULL_AFTER = 26  # frames the virtual camera has room for
+# Frames the virtual camera has room for.
+FULL_AFTER = 26
 OK, ERROR = 0, 2
 
 
@@ -38,8 +39,10 @@ class Folder:
         self._patch = monkeypatch
         (self._path / "DCIM" / "100TEST").mkdir(parents=True)
         self.put(JPEG)
-        monkeypatch.setenv("VCAMERADIR", str(self._path))  # before gphoto2 is imported
-        monkeypatch.setenv("HOME", str(path))  # libgphoto2 keeps settings there
+        # Before gphoto2 is imported.
+        monkeypatch.setenv("VCAMERADIR", str(self._path))
+        # libgphoto2 keeps settings there.
+        monkeypatch.setenv("HOME", str(path))
         import gphoto2
 
         self._libraries = Path(gphoto2.__file__).parent / "libgphoto2"
@@ -166,7 +169,8 @@ def test_a_longer_exposure_is_held_open_which_this_camera_cannot(make):
 
 def test_the_gain_is_a_setting_the_camera_has(make):
     assert "no setting 'iso'" in attempt(make(), CaptureSettings(0.1, 400.0, 5.0))
-    source = make(gphoto2__iso_setting="exposurecompensation")  # the only one of numbers that it has
+    # The only one of numbers that it has.
+    source = make(gphoto2__iso_setting="exposurecompensation")
     assert source.capture(CaptureSettings(0.1, 2.0, 5.0)).frame is not None
     assert "nearest are 2 and 2.5" in attempt(source, CaptureSettings(0.1, 2.2, 5.0))
     assert "no setting 'speed'" in attempt(make(gphoto2__shutter_setting="speed"))

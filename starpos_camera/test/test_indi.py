@@ -22,7 +22,8 @@ from starpos_testing.patience import WAIT_S
 
 SHORT = CaptureSettings(0.1, None, 5.0)
 LONG = CaptureSettings(60.0, None, 60.0)
-SIZE = (1024, 1280)  # of the simulator
+# The simulator's own.
+SIZE = (1024, 1280)
 
 
 def make(server, **changes):
@@ -116,7 +117,8 @@ def test_the_pixels_are_the_sensors_first_row_on_top(source, other, tmp_path, co
     if compressed:
         other.tell("Switch", "CCD_COMPRESSION", INDI_ENABLED="On", INDI_DISABLED="Off")
         other.hear("CCD_COMPRESSION", "Ok")
-    source.capture(SHORT)  # the simulator learns the size of its sensor as it loads
+    # The simulator learns the size of its sensor as it loads.
+    source.capture(SHORT)
     frame = source.capture(SHORT).frame
     assert np.array_equal(frame.pixels, pixels)
     assert frame.pattern == (pattern or "").lower()
@@ -141,7 +143,8 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     other.tell("Number", "CCD_FRAME", X=10, Y=20, WIDTH=300, HEIGHT=200)
     server = source._server
     heard = server.until(lambda: server.device(DEVICE).number("CCD_FRAME", "X") == 10, WAIT_S)
-    assert server.run(heard)  # and all that was set before
+    # All that was set before is there.
+    assert server.run(heard)
     assert source.capture(SHORT).frame.pixels.shape == SIZE
     source.update({p.name: p.default for p in PARAMETERS} | {"indi.binning": 2})
     assert source.capture(SHORT).frame.pixels.shape == (SIZE[0] // 2, SIZE[1] // 2)
@@ -239,7 +242,8 @@ def test_a_frame_that_does_not_come_in_time_is_given_up(server, source, other):
     other.hear("CCD_EXPOSURE", "Busy")
     (driver,) = server.drivers()
     os.kill(driver, signal.SIGSTOP)
-    text, _ = attempt.end()  # as of one that hangs
+    # As of one that hangs.
+    text, _ = attempt.end()
     os.kill(driver, signal.SIGCONT)
     assert "gave no frame in time" in text
     impatient.capture(SHORT)

@@ -152,7 +152,8 @@ def raw_files(folder, **exif):
 
 def test_a_cameras_clock_counts_only_where_somebody_vouches_for_it(tmp_path):
     require("rawpy", "exifread")
-    path = raw_files(tmp_path, subsec="25", offset="+01:00")  # of 18:00:00
+    # The second is 18:00:00.
+    path = raw_files(tmp_path, subsec="25", offset="+01:00")
     (refused,) = play(make(files__path=path), 1)
     assert "a.dng" in str(refused) and "files.exif" in str(refused)
     (taken,) = play(make(files__path=path, files__exif=True), 1)

@@ -20,7 +20,8 @@ from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S
 
 HERE = Path(__file__).parent
-PERIOD_S, TRANSFER_S = 0.04, 0.01  # of the emulated camera
+# The emulated camera's.
+PERIOD_S, TRANSFER_S = 0.04, 0.01
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,8 @@ def test_the_sensors_pixels_in_every_format(session, letters, kind, pattern):
     (shot,) = session("frames", video__format=letters, video__width=64, video__height=48)
     assert shot["pixels_good"]
     assert (shot["size"], shot["type"], shot["pattern"]) == ([64, 48], kind, pattern)
-    assert shot["exposure_s"] is None  # it is automatic, and no longer than the period
+    # It is automatic, and no longer than the period.
+    assert shot["exposure_s"] is None
     assert shot["stddev_s"] == pytest.approx(2 * PERIOD_S / math.sqrt(12))
     # its rows are read within a period, from either end
     assert shot["readout_stddev_s"] == pytest.approx(PERIOD_S / math.sqrt(3))
@@ -97,7 +99,8 @@ def test_without_stamps_the_time_of_the_read_counts(session):
 def test_a_camera_that_is_slower_in_the_dark_than_it_says(session, stamps):
     for shot in session("frames", "dark", "automatic", *stamps, options={"settings": [[None, None]] * 2}):
         assert shot["began_s"] >= 0 and shot["exposure_s"] is None
-        assert 0.9 * 2 * 0.12 / math.sqrt(12) < shot["stddev_s"] < 0.5  # a busy machine makes it slower still
+        # A busy machine makes it slower still.
+        assert 0.9 * 2 * 0.12 / math.sqrt(12) < shot["stddev_s"] < 0.5
         assert abs(shot["mid_s"] - shot["began_s"] - 0.06) < math.sqrt(3) * shot["stddev_s"]
 
 
@@ -139,7 +142,8 @@ def test_the_camera_is_unplugged_and_comes_back(session, record_property):
 
 
 def test_a_camera_that_gives_nothing_is_given_up_in_time(session, monkeypatch):
-    monkeypatch.setenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")  # s; 10 by default
+    # In seconds; 10 by default.
+    monkeypatch.setenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
     (shot,) = session("frames", "frozen")
     assert "no frame" in shot["error"]
 

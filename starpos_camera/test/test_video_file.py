@@ -90,7 +90,8 @@ def test_sixteen_bits_stay_sixteen(tmp_path):
 
 def test_colour_and_motion_jpeg(tmp_path):
     pictures = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
-    pictures[:, : HEIGHT // 2] = 20, 120, 220  # blue, green, red, above black
+    # Blue, green, red, above black.
+    pictures[:, : HEIGHT // 2] = 20, 120, 220
     frame = play(make(write(tmp_path / "colour.avi", "MJPG", pictures)), 1)[0].frame
     assert abs(frame.pixels.astype(int) - pictures[0]).mean() < 3
 
@@ -149,8 +150,10 @@ def test_a_playlist_leads_to_no_other_file_and_no_network(tmp_path, film):
 def test_an_absurd_header_is_refused(tmp_path):
     path = write(tmp_path / "huge.avi", "FFV1", (PICTURES >> 8).astype(np.uint8))
     data = bytearray(path.read_bytes())
-    at = data.index(b"strf") + 8  # BITMAPINFOHEADER
-    struct.pack_into("<ii", data, at + 4, 15000, 14000)  # FFmpeg itself refuses more
+    # BITMAPINFOHEADER
+    at = data.index(b"strf") + 8
+    # FFmpeg itself refuses more.
+    struct.pack_into("<ii", data, at + 4, 15000, 14000)
     path.write_bytes(data)
     (error,) = play(make(path), 1)
     assert "15000 x 14000 px" in str(error) and "are no video" in str(error)

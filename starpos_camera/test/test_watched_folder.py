@@ -78,7 +78,8 @@ def put(path, age_s=0.0, content=b"x"):
 def test_what_was_there_is_not_new_and_what_comes_is_taken_once(watch):
     put(watch.path / "a.fits")
     put(watch.path / "a.txt")
-    assert watch.look() is None  # not at rest yet
+    # Not at rest yet.
+    assert watch.look() is None
     assert watch.take() == ["a.fits"]
     assert watch.take() == watch.take(IDLE_S) == []
 
@@ -121,7 +122,8 @@ def test_one_that_could_not_be_read_is_given_again_when_it_has_changed_and_at_la
     assert not last
     watch.folder.try_again(path)
     put(watch.path / "b.fits")
-    assert watch.take() == ["b.fits"]  # it keeps no other from coming
+    # It keeps no other from coming.
+    assert watch.take() == ["b.fits"]
     put(path, content=b"more")
     watch.look()
     assert watch.look(REST_S) == "a.fits"
@@ -174,7 +176,8 @@ def test_a_disk_that_is_unmounted_and_mounted_again_is_not_taken_for_new(watch, 
     put(watch.path / "a.fits")
     assert watch.take() == ["a.fits"]
     watch.path.rename(tmp_path / "disk")
-    watch.path.mkdir()  # the empty folder a disk is mounted on
+    # The empty folder a disk is mounted on.
+    watch.path.mkdir()
     assert watch.take() == []
     put(tmp_path / "disk" / "b.fits", age_s=-1.0)
     watch.path.rmdir()
@@ -187,7 +190,8 @@ def test_a_disk_that_is_unmounted_and_mounted_again_is_not_taken_for_new(watch, 
 def test_a_folder_at_rest_is_not_listed(watch, monkeypatch):
     listed, real = [], os.listdir
     monkeypatch.setattr(os, "listdir", lambda path: listed.append(path) or real(path))
-    watch.look(10.0)  # the last doubt about what came in the folder's last tick
+    # The last doubt about what came in the folder's last tick.
+    watch.look(10.0)
     listed.clear()
     for _ in range(50):
         watch.look(1.0)
@@ -241,7 +245,8 @@ def test_of_a_file_that_came_and_went_nothing_is_kept(watch):
             (watch.path / f"{k}.fits").unlink()
             if k in (100, 599):
                 sizes[k] = kept_by_the_folder()
-        assert (sizes[599] - sizes[100]) / 500 < 80  # a size is 40
+        # A size is 40.
+        assert (sizes[599] - sizes[100]) / 500 < 80
     finally:
         tracemalloc.stop()
 

@@ -72,7 +72,8 @@ def unplugged(source):
     out.append(told(source))
     pull = threading.Timer(0.1, plug.unlink)
     pull.start()
-    out.append(told(source, CaptureSettings(0.08, None, 5.0)))  # it settles for four frames first
+    # It settles for four frames first.
+    out.append(told(source, CaptureSettings(0.08, None, 5.0)))
     pull.join()
     plug.touch()
     return [*out, told(source)]

@@ -93,7 +93,8 @@ class Mcu:
         self.tilt = tilt
         self.noise_rad = noise_rad
         self.temperature_c = temperature_c
-        self.frozen = False  # the ADC repeats its last codes
+        # The ADC repeats its last codes.
+        self.frozen = False
         self._power_up_rate = rate_hz
         self._tick = 1.0 + drift_ppm * 1e-6
         self._rng = random.Random(seed)

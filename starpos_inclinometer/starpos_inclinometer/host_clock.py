@@ -42,11 +42,13 @@ class HostClock:
         simulated: Callable[[], bool] = lambda: False,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.step: Step | None = None  # the last step
+        # The last step.
+        self.step: Step | None = None
         self.now_ns = now_ns
         self._monotonic_ns = monotonic_ns
         self._simulated = simulated
-        self._moment = Moment(0.0, 0)  # the last moment
+        # The last moment.
+        self._moment = Moment(0.0, 0)
         # Finds steps between the moments; None while the clock is simulated.
         self._watch: StepWatch | None = None
 

@@ -73,7 +73,8 @@ def test_all_that_a_line_may_tell():
     first, second = Feeder(FULL).send("$TILT,7,1000,1.25,-2.5,21.5", "$TILT,8,1100,1.26,-2.5,")
     assert (first.sequence, first.milliseconds, first.temperature_c) == (7, 1000, 21.5)
     assert math.isnan(second.temperature_c) and second.lost == 0
-    assert math.degrees(first.step) == pytest.approx(0.1)  # the coarser of both
+    # The coarser of both.
+    assert math.degrees(first.step) == pytest.approx(0.1)
     seconds = Feeder(rf"(?P<seconds>{NUMBER}) {PLAIN}").send("1700000000.25 1,2", "1700000000.35 1,2")
     assert [s.milliseconds for s in seconds] == [(1700000000_250 + k) & 0xFFFFFFFF for k in (0, 100)]
 
@@ -185,9 +186,8 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
     said = {(k, 100 * k, f"1.25{k % 10}", f"-2.50{k % 7}") for k in range(20_000)}
     decoder, believed = LineDecoder(FULL, "deg"), 0
     for k, line in enumerate(lines):
-        if (
-            rng.random() < 0.1
-        ):  # something of the line is lost: the pattern knows where numbers begin, not where they end
+        # Something of the line is lost: the pattern knows where numbers begin, not where they end.
+        if rng.random() < 0.1:
             cut = rng.randrange(1, len(line) - 3)
             line = line[:cut]
         for a in decoder.feed(line, Moment(0.1 * k, 0)):
@@ -315,7 +315,8 @@ def test_a_device_clock_takes_the_jitter_out(meter):
     assert health.counts.lost == 0 and abs(got[-1].temperature_c - 20) < 1e-9
     numbers = np.rint(np.degrees([r.y for r in got]) * 1e4).astype(int)
     late = (np.array([r.stamp_ns * 1e-9 for r in got]) - np.array(taken)[numbers])[50:]
-    assert np.median(np.abs(late - np.median(late))) < 0.002  # of the lines' lateness it is 3.7 ms
+    # The lines themselves scatter by 3.7 ms.
+    assert np.median(np.abs(late - np.median(late))) < 0.002
 
 
 def test_stuck_and_steep_and_reopened(meter):

@@ -12,7 +12,8 @@ LATENCY_S = 0.031
 def stamps(ms, arrivals, clock=None):
     clock = clock or ArrivalFilter()
     late = [clock.delay(int(m), float(a)) for m, a in zip(ms, arrivals, strict=True)]
-    return np.asarray(arrivals) - np.array(late, float) - LATENCY_S, clock  # NaN where it is not known
+    # NaN where it is not known.
+    return np.asarray(arrivals) - np.array(late, float) - LATENCY_S, clock
 
 
 def jittery(rng, n, rate_hz=10.0, drift_ppm=0.0, boot_ms=0):
@@ -71,7 +72,8 @@ def test_a_backlog_keeps_the_times_it_was_sampled_at(stall_s, rate_hz):
     """The process stands still: 17 of 16 such stalls gave a wrong fix when a backlog was taken for a reset."""
     true, ms, arrivals = jittery(np.random.default_rng(8), int(100 * rate_hz), rate_hz)
     stalled = np.maximum(arrivals, np.where((true > 1030) & (true < 1030 + stall_s), 1030 + stall_s, 0))
-    stalled[1:] += 2e-5 * np.cumsum(np.diff(stalled) <= 0)  # reading takes its time
+    # Reading takes its time.
+    stalled[1:] += 2e-5 * np.cumsum(np.diff(stalled) <= 0)
     estimate, clock = stamps(ms, np.maximum.accumulate(stalled))
     error = np.abs(estimate - true)
     assert clock.restarts == 0
@@ -109,7 +111,8 @@ def test_a_reset_within_a_stall_is_not_dated_before_the_clocks_have_kept_their_r
     clock = ArrivalFilter()
     for i in range(150):
         clock.delay(100 * i, 10 + 0.1 * i)
-    backlog = [clock.delay(100 * i, 30.0 + 1e-4 * i) for i in range(50)]  # booted at 25, read at 30
+    # Booted at 25, read at 30.
+    backlog = [clock.delay(100 * i, 30.0 + 1e-4 * i) for i in range(50)]
     assert backlog == [None] * 50
     live = [clock.delay(5000 + 100 * i, 30.1 + 0.1 * i) for i in range(20)]
     assert None in live[:10] and live[11:] == pytest.approx([0.0] * 9, abs=0.01)
@@ -148,7 +151,8 @@ def test_slow_and_uneven_lines_are_on_time():
     rng = np.random.default_rng(9)
     slow, chunked = PaceWatch(), PaceWatch()
     assert all(slow.on_time(t) for t in np.cumsum(1 + 0.05 * rng.normal(size=50)))
-    arrivals = np.repeat(np.arange(0, 4, 0.04), 2)  # two lines at a time, as some adapters hand them over
+    # Two lines at a time, as some adapters hand them over.
+    arrivals = np.repeat(np.arange(0, 4, 0.04), 2)
     assert all(chunked.on_time(t) for t in arrivals)
 
 

@@ -30,7 +30,8 @@ from starpos_testing.nodes import Listener, Process, take_domain
 from starpos_testing.patience import WAIT_S
 
 TILT_DEG = (3.0, -11.0)
-NEAR_DEG = 0.03  # eight times the noise
+# Eight times the noise.
+NEAR_DEG = 0.03
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -285,7 +286,8 @@ def test_converter_frozen(board, wire, node, ears, tell):
     frozen = time.monotonic()
     told_s = ears.told(frozen, 2, "stuck")
 
-    def flagged():  # which of the two topics comes first is chance
+    # It is chance which of the two topics comes first.
+    def flagged():
         return [at for at, t in zip(ears.times[n:], ears.tilts[n:], strict=False) if t.flags & Tilt.STUCK]
 
     ears.wait(flagged)
@@ -357,7 +359,8 @@ def test_two_processes_on_one_port(wire, node, ears, read, tell):
 
 def test_the_sensor_does_not_answer(board, wire, tell):
     """Without its temperature the tilt of a compensated sensor is less well known, and says so."""
-    volts_per_c = 2e-3  # so much that its age outweighs the noise, which is estimated anew meanwhile
+    # So much that its age outweighs the noise, which is estimated anew meanwhile.
+    volts_per_c = 2e-3
     compensated = {"temperature.offset_x": (volts_per_c, 0.0, 0.0)}
     taken = Taken(wire.path, rate=50, **compensated)
     try:

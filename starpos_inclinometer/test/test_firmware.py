@@ -27,8 +27,10 @@ from starpos_inclinometer.sources.mcu_protocol import (
 )
 from starpos_inclinometer.sources.sca100t import DIVIDER, Sensor
 
-BOOT_MS = 1000  # reset, calibration and a first sample
-ADC_NOISE_RAD = math.radians(0.0006)  # of one sample at 50 Hz, the sensor itself being still
+# Reset, calibration and a first sample.
+BOOT_MS = 1000
+# Noise of one sample at 50 Hz, the sensor itself being still.
+ADC_NOISE_RAD = math.radians(0.0006)
 FLASH_BYTES, RAM_BYTES, STACK_BYTES = 8192, 1024, 256
 
 
@@ -104,7 +106,8 @@ def test_a_unit_without_serial_number_says_0(board):
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 3, 7, 10, 16, 17, 30, 33, 49, 50])
 def test_takes_the_samples_of_its_rate(board, rate_hz):
-    at_rate(board, 49)  # fractions of milliseconds are its business alone
+    # Fractions of milliseconds are its business alone.
+    at_rate(board, 49)
     identity = at_rate(board, rate_hz)
     assert identity.rate_hz == rate_hz
     seconds = 6
@@ -161,7 +164,8 @@ def test_the_milliseconds_are_the_middle_of_both_axes(board, rate_hz):
     got = samples(board.messages(1500))[2:]
     times = begin + 100 * (angles(got) * [1, -1] + 10)
     apart = times[:, 0] - times[:, 1]
-    assert abs(apart.mean()) < 0.05 and np.abs(apart).max() < 0.5  # the noise of one is 0.085
+    # The noise of one is 0.085.
+    assert abs(apart.mean()) < 0.05 and np.abs(apart).max() < 0.5
     assert np.abs(times.mean(1) - [s.milliseconds for s in got]).max() < 0.7
 
 
@@ -196,7 +200,8 @@ def test_a_stuck_converter_is_flagged_reset_and_calibrated_again(board, rate_hz)
     again = samples(board.messages(2000))
     assert again[-1].status == 0 and board.tell("state")["calibrated"]
     good = [s for s in again if not s.status]
-    assert np.abs(angles(good) - [5, -5]).max() < 0.004  # before the calibration it is 0.1 deg off
+    # Before the calibration it is 0.1 deg off.
+    assert np.abs(angles(good) - [5, -5]).max() < 0.004
 
 
 def test_a_converter_that_a_spike_has_reset_never_sends_an_uncalibrated_code_unflagged(board):
@@ -214,7 +219,8 @@ def test_an_interface_out_of_step_is_noticed_before_a_wrong_code_is_sent(board):
     board.tell("tilt 20 -20")
     at_rate(board, 50)
     got = []
-    for after in range(1, 50):  # bytes: a burst has less
+    # Bytes: a burst has less.
+    for after in range(1, 50):
         got += board.messages(500)
         assert samples(got)[-1].status == 0
         board.tell(f"slip {after}")
@@ -249,7 +255,8 @@ def test_without_reference_it_says_so_and_calibrates_when_it_is_back(board, from
 )
 def test_a_reset_in_the_middle_tells_its_cause(board, cause, status):
     at_rate(board, 50)
-    board.messages(507)  # and 7 ms into a line
+    # It is 7 ms into a line.
+    board.messages(507)
     board.tell(cause)
     messages = board.messages(2000)
     identity, first, *rest = messages[next(i for i, m in enumerate(messages) if isinstance(m, Identity)) :]

@@ -16,7 +16,8 @@ from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 
 VALUES = {p.name: p.default for p in PARAMETERS}
-PART = 340_000  # bytes of each kind
+# Bytes of each kind.
+PART = 340_000
 
 
 class Host:

@@ -120,10 +120,12 @@ def test_gaps_and_a_clock_that_was_set_break_the_sequence():
     averaged(averager, [k * PERIOD_NS for k in range(12)])
     assert averager.breaks == 0
     assert len(averaged(averager, [5 * 10**9 + k * PERIOD_NS for k in range(12)])) == 1
-    assert averager.breaks == 2  # the silence, and what had begun before it
+    # The silence, and what had begun before it.
+    assert averager.breaks == 2
     assert len(averaged(averager, [k * PERIOD_NS for k in range(12)])) == 1
     assert averager.breaks == 3 and averager.disordered == 0
-    assert averaged(averager, [10 * 10**9 + k * 90_000_000 for k in range(5)]) == []  # too few for a scatter
+    # Too few for a scatter.
+    assert averaged(averager, [10 * 10**9 + k * 90_000_000 for k in range(5)]) == []
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -207,9 +209,8 @@ def test_the_node_reads_an_imu(listener):
             29.8, abs=1
         )
         send_until(lambda: tilts[-1].flags == Tilt.STUCK, noise=0.0)
-        send_until(
-            lambda: not tilts[-1].flags & Tilt.OUT_OF_RANGE and tilts[-1].z < 0, scale=-1.0
-        )  # upside down
+        # Upside down.
+        send_until(lambda: not tilts[-1].flags & Tilt.OUT_OF_RANGE and tilts[-1].z < 0, scale=-1.0)
         assert tilts[-1].z_variance > 0
 
         def unusable():

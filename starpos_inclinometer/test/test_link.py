@@ -92,7 +92,8 @@ def test_nobody_else_opens_the_port(bench, read, monkeypatch, pseudo_terminal):
     read().wait(lambda state, samples: samples)
     port = os.path.realpath(bench.path)
     os.chmod(port, 0o666)
-    other = {"user": NOBODY} if os.geteuid() == 0 else {}  # root may always
+    # Root may always.
+    other = {"user": NOBODY} if os.geteuid() == 0 else {}
     opened = subprocess.run(["sh", "-c", f": < {port}"], capture_output=True, text=True, check=False, **other)
     assert (opened.returncode == 0) == pseudo_terminal, opened.stderr
     assert pseudo_terminal or "busy" in opened.stderr

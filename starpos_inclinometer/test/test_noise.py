@@ -117,4 +117,5 @@ def test_few_samples_an_interruption_and_another_rate_tell_nothing():
         tracker.interrupt()
         tracker.add(k / 10, x + k, y)
     assert tracker.sigma is None
-    assert tracked(white(100), 0.2).sigma is None  # each 5 s: what they differ by is drift
+    # Each 5 s: what they differ by is drift.
+    assert tracked(white(100), 0.2).sigma is None

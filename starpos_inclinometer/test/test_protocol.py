@@ -31,10 +31,10 @@ def crc_as_avr_libc_documents_it(data, crc=0):
 
 
 def test_checksum_gives_the_published_check_values():
-    assert mcu_protocol.checksum(b"123456789") == 0x31C3  # CRC-16/XMODEM
-    assert (
-        crc_hqx(b"123456789", 0xFFFF) == 0x29B1
-    )  # CRC-16/CCITT-FALSE (IBM-3740): same polynomial, other start
+    # CRC-16/XMODEM
+    assert mcu_protocol.checksum(b"123456789") == 0x31C3
+    # CRC-16/CCITT-FALSE (IBM-3740): same polynomial, other start.
+    assert crc_hqx(b"123456789", 0xFFFF) == 0x29B1
     for text in (b"", b"T", b"T,0012,0000070A,800000,A8C9C5,AF,00", bytes(range(256))):
         assert mcu_protocol.checksum(text) == crc_as_avr_libc_documents_it(text)
 
@@ -106,10 +106,13 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
 @pytest.mark.parametrize(
     "body",
     [
-        b"T,0001,0000070A,800000,A8C9C5,AF,08",  # the first sample has number 0
-        b"I,01,0100,00000000,00,0014",  # no such rate
+        # The first sample has number 0.
+        b"T,0001,0000070A,800000,A8C9C5,AF,08",
+        # No such rate.
+        b"I,01,0100,00000000,00,0014",
         b"I,01,0100,00000000,33,0014",
-        b"I,01,0100,00000000,32,0100",  # at 50 Hz a line is not 256 ms late
+        # At 50 Hz a line is not 256 ms late.
+        b"I,01,0100,00000000,32,0100",
     ],
 )
 def test_right_checksum_but_impossible_fields_are_no_message(body):

@@ -36,7 +36,8 @@ def nav_sat_fix(
 ) -> NavSatFix:
     """Make a NavSatFix on WGS 84; without a position NO_FIX with NaN, so that consumers see the instrument at work."""
     message = NavSatFix(header=header)
-    message.status.service = 0  # no satellites
+    # No satellites.
+    message.status.service = 0
     if ground is None:
         message.status.status = NavSatStatus.STATUS_NO_FIX
         message.latitude = message.longitude = message.altitude = NAN

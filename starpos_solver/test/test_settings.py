@@ -48,7 +48,8 @@ def test_a_file_is_read_again_when_it_is_set_again_and_a_broken_one_changes_noth
 
     assert clock_s() == 0.5
     path.write_text("broken: [")
-    assert change(node, min_stars=6).successful and clock_s() == 0.5  # it is not looked at
+    # It is not looked at.
+    assert change(node, min_stars=6).successful and clock_s() == 0.5
     result = change(node, calibration_url=str(path))
     assert not result.successful and "instrument.yaml" in result.reason and clock_s() == 0.5
     instrument_file.write(path, Instrument(2000.0, clock_stddev_s=0.25))
@@ -56,7 +57,8 @@ def test_a_file_is_read_again_when_it_is_set_again_and_a_broken_one_changes_noth
     assert applied == [{"min_stars"}, {"calibration_url"}]
     path.unlink()
     result = change(node, calibration_url=str(path), min_stars=7)
-    assert not result.successful and clock_s() == 0.25 and settings.values["min_stars"] == 6  # all or none
+    # All or none.
+    assert not result.successful and clock_s() == 0.25 and settings.values["min_stars"] == 6
 
 
 def test_the_model_of_the_inclinometer_is_its_noise_until_one_is_stated(make):

@@ -21,15 +21,17 @@ import numpy as np
 from starpos.detection import detect
 from starpos.frames.frame import Frame
 
+# Mpx: columns, rows.
 SIZES = {
     0.5: (866, 577),
     2: (1732, 1155),
     8: (3464, 2309),
     21: (5616, 3744),
     60: (9488, 6324),
-}  # Mpx: columns, rows
+}
 STARS_PER_MPX, STAR_COUNTS, HOT = 15, (10, 100, 1000, 5000), (0.0001, 0.001, 0.003)
-SKY, SIGMA, TRAIL = 600, 1.02, np.array([2.6, -2.2])  # DN; px; px: half a second of the sky
+# DN; px; px: half a second of the sky.
+SKY, SIGMA, TRAIL = 600, 1.02, np.array([2.6, -2.2])
 
 
 def exposure(size, count, rng, hot=0.0):

@@ -28,7 +28,8 @@ from starpos.instrument.instrument import Instrument
 from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue
 
-CAMERA = Camera.from_focal(5616, 3744, 93750.0)  # the paper's
+# The paper's camera.
+CAMERA = Camera.from_focal(5616, 3744, 93750.0)
 # A peer's catalogue is deeper by this much, because of the scatter of brightness.
 LIMIT_MAG, DEEPER_MAG = 9.0, 0.5
 SCALE_ERROR = 0.03

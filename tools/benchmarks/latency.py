@@ -23,7 +23,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 QUICK_START = ROOT / "src" / "starpos_bringup" / "config" / "quick_start.xml"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
-FIRST_FIX_S, SOLVER_S, FRAME_S, STARS_S = 3.0, 1.0, 0.6, 0.02  # targets, median
+# Targets of the medians.
+FIRST_FIX_S, SOLVER_S, FRAME_S, STARS_S = 3.0, 1.0, 0.6, 0.02
 # Frames of 42 MB on disk, played again and again.
 FILES = 8
 CADENCE_S = 1.0

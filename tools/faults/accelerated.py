@@ -107,14 +107,16 @@ class World:
         self.graph, self.rng = graph, np.random.default_rng(seed)
         self._parameters = {name.replace(".", "__"): value for name, value in parameters.items()}
         self.now_s = START_S
-        self.clock_off_s = 0.0  # of /clock
+        # How far /clock is off.
+        self.clock_off_s = 0.0
         self._clock = graph.node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
         self._averaged: list[NavSatFix] = []
         graph.node.create_subscription(
             NavSatFix, "fix_averaged", self._averaged.append, QoSProfile(depth=100)
         )
         self._truths: dict[tuple[int, int], Truth] = {}
-        self.right = Counter()  # by topic
+        # Counts by topic.
+        self.right = Counter()
         # By topic: the error of every fix, in its own sigmas.
         self.sigmas: dict[str, list[float]] = {}
         self.wrong: list[str] = []

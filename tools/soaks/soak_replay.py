@@ -36,7 +36,6 @@ OUTPUTS = {
     "solver/solution": "starpos_interfaces/msg/Solution",
     "fix_averaged": "sensor_msgs/msg/NavSatFix",
 }
-LISTENED = (*OUTPUTS, "stars", "tilt")
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import math
 
 ARCSEC = math.radians(1 / 3600)
 MAS = ARCSEC / 1000
-MAS_DEG = 1 / 3.6e6  # a milliarcsecond in degrees
+# A milliarcsecond in degrees.
+MAS_DEG = 1 / 3.6e6
 DAY_S = 86400.0
 HOUR_S = 3600.0

@@ -6,7 +6,8 @@ import pytest
 
 from starpos.parallel import BLAS_THREADS
 
-os.environ |= dict.fromkeys(BLAS_THREADS, "1")  # before numpy is loaded, as the command does
+# Before numpy is loaded, as the command does.
+os.environ |= dict.fromkeys(BLAS_THREADS, "1")
 
 import numpy as np
 

@@ -46,7 +46,8 @@ def test_a_recording_that_was_killed_says_how_to_get_it_back(tmp_path):
     writer = BagWriter(tmp_path / "night")
     writer.add_topic("/tilt", "starpos_interfaces/msg/Tilt")
     for k in range(20000):
-        writer.write("/tilt", k, bytes(120))  # what is in the file now is there after kill -9 too
+        # What is in the file now is there after kill -9 too.
+        writer.write("/tilt", k, bytes(120))
     for path in (tmp_path / "night", tmp_path / "night" / "night.mcap"):
         with pytest.raises(BagError, match=r"mcap recover night\.mcap"), Bag(path):
             pass

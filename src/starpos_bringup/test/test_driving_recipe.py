@@ -96,8 +96,10 @@ def driven(recipe) -> Driven:
 
 @pytest.mark.montecarlo
 def test_the_place_is_within_its_claim_though_fixes_share_their_errors(driven):
-    assert driven.chi2.mean() < 2.5  # 2 where claims are true
-    assert np.mean(driven.chi2 < 9.21) > 0.98  # 99 % of two numbers
+    # 2 where claims are true.
+    assert driven.chi2.mean() < 2.5
+    # 99 % of two numbers.
+    assert np.mean(driven.chi2 < 9.21) > 0.98
     # and no wider than between two fixes that stand alone
     fix_m = np.sqrt(A3_M**2 + DEFLECTION_M**2 + TILT_M**2)
     assert np.sqrt(driven.place_covariance[:, :, 0, 0]).max() < 1.5 * fix_m

@@ -63,7 +63,8 @@ def started(name, **given):
             continue
         files = [
             launch.utilities.perform_substitutions(context, f.param_file)
-            for f in action._Node__parameters  # launch_ros has no public way to them
+            # launch_ros has no public way to them.
+            for f in action._Node__parameters
         ]
         over = yaml.safe_load(Path(files[-1]).read_text()) if len(files) > 1 else {}
         words = [w for w in action._Node__arguments if isinstance(w, str)]
@@ -77,7 +78,8 @@ def test_the_instrument_takes_the_arguments_it_names():
     }  # fmt: skip
     silent = started("starpos")
     assert list(silent) == ["camera_detector", "inclinometer", "solver"]
-    assert all(over == {} for over, _ in silent.values())  # what is not given, the file says
+    # What is not given, the file says.
+    assert all(over == {} for over, _ in silent.values())
     told = started(
         "starpos", port="/dev/x", use_sim_time="true", camera="indi", log_level="warn", dashboard="true"
     )
@@ -143,7 +145,8 @@ def test_two_instruments_have_frames_and_enclaves_of_their_own_and_one_file(tmp_
         defaults, file = (
             launch.utilities.perform_substitutions(context, f.param_file) for f in solver._Node__parameters
         )
-        assert file == given["params_file"]  # which counts more, as it comes later
+        # A later one counts more.
+        assert file == given["params_file"]
         frames = yaml.safe_load(Path(defaults).read_text())
         assert frames == {"/**/solver": {"ros__parameters": {"frame_id": f"{side}_starpos_link"}}}
         assert f"/starpos/{side}/solver" in solver._Node__arguments
@@ -171,7 +174,8 @@ def run():
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
-                start_new_session=True,  # a process group of its own, with its nodes
+                # A process group of its own, with its nodes.
+                start_new_session=True,
             )
         )
         return processes[-1]

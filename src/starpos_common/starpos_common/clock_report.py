@@ -12,7 +12,8 @@ from starpos_common.diagnostics import Diagnosis, Level
 
 # How long a step stays in the report.
 TOLD_S = 30.0
-ARCSEC_PER_S = 15.041  # of longitude
+# How far longitude turns.
+ARCSEC_PER_S = 15.041
 
 
 def time_is_simulated(node: Node) -> bool:
@@ -33,7 +34,8 @@ class ClockReport:
         self._matters = matters
         self.watch = system_clock.StepWatch()
         self._set_s = self._step_s = 0.0
-        self._stepped_at = -TOLD_S  # monotonic, s
+        # In seconds of monotonic time.
+        self._stepped_at = -TOLD_S
 
     def __call__(self) -> Diagnosis:
         if time_is_simulated(self._node):

@@ -19,7 +19,8 @@ from starpos.instrument.inclinometer import Tilt
 from starpos_interfaces import msg
 
 HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
-MAX_UNIX_S = 2**31 - 1e-6  # the end of Time.sec, in January 2038
+# The end of Time.sec, in January 2038.
+MAX_UNIX_S = 2**31 - 1e-6
 
 
 def unix_to_stamp(unix_s: float | None) -> Time:

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from starpos.units import DAY_S
 
 STA_UNSYNC = 0x0040
-TIME_ERROR = 5  # adjtimex's answer if the clock is not synchronised
+# adjtimex's answer if the clock is not synchronised.
+TIME_ERROR = 5
 # Ratio of the bound to the standard deviation of a uniform distribution.
 UNIFORM = math.sqrt(3)
 STEP_S = 0.1

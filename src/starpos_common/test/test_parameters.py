@@ -139,7 +139,8 @@ def test_what_is_meant_for_another_node_of_the_process_is_no_mistyped_name(conte
     declare(nodes[0], TABLE[1:2])
     declare(nodes[1], (Parameter("depth", 1, "Of another."),))
     warn_of_unknown(nodes)
-    assert capfd.readouterr().err == ""  # a -p reaches both
+    # A -p reaches both.
+    assert capfd.readouterr().err == ""
     misplaced = rclpy.create_node(
         "second", context=context, cli_args=["--ros-args", "--params-file", str(file)]
     )
@@ -247,7 +248,8 @@ def test_values_must_fit_together(make):
     node, _ = make(check=check)
     assert change(node, noise=2.0).reason == "noise must not exceed cadence."
     assert change(node, noise=2.0, cadence=3.0).successful
-    assert told[-1] == {"noise", "cadence"}  # those that are set: what a file held may be read again for them
+    # Those that are set: what a file held may be read again for them.
+    assert told[-1] == {"noise", "cadence"}
 
 
 def test_a_check_that_fails_refuses_the_change_and_the_node_lives(make):

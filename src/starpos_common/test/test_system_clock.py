@@ -19,7 +19,8 @@ def test_the_kernels_word_is_what_the_system_tool_reads():
         pytest.skip("this system does not tell")
     assert state.est_error_s >= 0 and 0 <= state.max_error_s < 100
     if state.synchronised:
-        assert state.max_error_s <= 16.001  # NTP_PHASE_LIMIT: beyond it the kernel takes the clock for lost
+        # NTP_PHASE_LIMIT: beyond it the kernel takes the clock for lost.
+        assert state.max_error_s <= 16.001
     tool = shutil.which("adjtimex") or shutil.which("ntptime")
     if tool is None:
         return
@@ -33,13 +34,16 @@ def test_the_kernels_word_is_what_the_system_tool_reads():
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "aarch64"), reason="another layout")
 def test_the_kernels_structure_has_its_size():
-    assert ctypes.sizeof(system_clock._Timex) == 208  # sizeof (struct timex) of glibc and musl
+    # sizeof(struct timex) of glibc and musl.
+    assert ctypes.sizeof(system_clock._Timex) == 208
 
 
 def test_what_is_claimed_of_a_clock():
     assert SystemClock(True, 0.03, 0.002).stddev_s == pytest.approx(0.03 / math.sqrt(3))
-    assert SystemClock(True, 0.001, 0.02).stddev_s == 0.02  # the kernel's own estimate, where that is larger
-    assert SystemClock(False, 16.0, 16.0).stddev_s > 20000  # nobody knows the hour
+    # The kernel's own estimate, where that is larger.
+    assert SystemClock(True, 0.001, 0.02).stddev_s == 0.02
+    # Nobody knows the hour.
+    assert SystemClock(False, 16.0, 16.0).stddev_s > 20000
     assert "not synchronised" in SystemClock(False, 16.0, 16.0).sentence
     assert "0.03 s" in SystemClock(True, 0.03, 0.002).sentence
 

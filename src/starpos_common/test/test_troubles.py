@@ -31,10 +31,12 @@ def test_one_line_when_it_begins_and_one_when_it_is_over(told, clock, capfd):
     for k in range(1000):
         clock[0] += 0.1
         told.wrong("tilt", f"a tilt is {k}.5 s early")
-        told.right("tilt")  # every other one
+        # Every other one.
+        told.right("tilt")
     assert capfd.readouterr().err.count("\n") == 1
     assert told.lately(5.0) == ["a tilt is 999.5 s early"]
-    told.wrong("tilt", "a tilt has no stamp")  # another reason
+    # Another reason.
+    told.wrong("tilt", "a tilt has no stamp")
     assert "has no stamp" in capfd.readouterr().err
     clock[0] += QUIET_S + 0.1
     assert told.lately(5.0) == []

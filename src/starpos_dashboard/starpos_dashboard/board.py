@@ -15,8 +15,10 @@ from starpos_interfaces.msg import Solution, Tilt
 
 # Messages that come at 1 Hz or faster are old after so long.
 FAST_S = 5.0
-LIGHTS = 64  # diagnostics kept
-STATUSES = 256  # looked at in one message
+# Diagnostics kept.
+LIGHTS = 64
+# Looked at in one message.
+STATUSES = 256
 
 
 class Board:
@@ -36,7 +38,8 @@ class Board:
         self._namespace = namespace
         self._nodes = self._seen(nodes)
         self._clock, self._since = clock, clock()
-        self._heard: dict[str, tuple[float, dict[str, Any]]] = {}  # (when, what)
+        # By topic: when it was heard, and what it said.
+        self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
         self._lights: dict[str, tuple[float, dict[str, Any]]] = {}
         self._track: deque[tuple[int, float, float]] = deque(maxlen=track)
         self._count = 0

@@ -40,11 +40,14 @@ class DashboardNode(Node):
             access.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
             self._values["clients"],
         )
-        self._image: Image | None = None  # the newest that is not shown yet
+        # The newest that is not shown yet.
+        self._image: Image | None = None
         # The subscription, while a page shows the frame.
         self._images: Subscription | None = None
-        self._shown = 0  # frames
-        self._shown_at = self._told_at = 0.0  # monotonic, s
+        # How many frames were shown.
+        self._shown = 0
+        # In seconds of monotonic time.
+        self._shown_at = self._told_at = 0.0
         self._pages = 0
         self._connect()
         self._server.start()

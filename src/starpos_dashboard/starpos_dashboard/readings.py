@@ -19,7 +19,8 @@ from starpos_interfaces.msg import Solution, Tilt
 NAME_LETTERS, SENTENCE_LETTERS = 80, 300
 # Most terms of an error budget, and warnings of an identification.
 TERMS, WARNINGS = 16, 4
-STALE, ERROR = 3, 2  # levels of DiagnosticStatus
+# Levels of DiagnosticStatus.
+STALE, ERROR = 3, 2
 # By so much the length of a quaternion may differ from 1.
 UNIT = 1e-3
 TILT_FLAGS = (

@@ -99,7 +99,8 @@ class DashboardServer:
 
     def __init__(self, sockets: list[socket], names: frozenset[str], clients: int) -> None:
         self.clients = clients
-        self.refused = 0  # pages for which there was no place
+        # Pages for which there was no place.
+        self.refused = 0
         self.files = files()
         self.names = names
         self.frame: bytes | None = None

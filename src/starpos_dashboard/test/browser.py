@@ -126,7 +126,8 @@ class Page:
         try:
             self.until(come)
         except AssertionError:
-            assert seen == texts  # says which
+            # It says which.
+            assert seen == texts
             raise
 
     def is_dressed(self, kind: str) -> list[str]:

@@ -112,7 +112,8 @@ def test_the_flags_of_a_tilt_are_said_in_words():
 def test_texts_are_short_and_cannot_rearrange_the_page():
     assert readings.text("a\nb\x00c\u202ed\u2066e") == "a b c d e"
     assert len(readings.text("x" * 10**6)) == readings.SENTENCE_LETTERS
-    assert readings.text("<b>&amp;") == "<b>&amp;"  # the page shows it as it is
+    # The page shows it as it is.
+    assert readings.text("<b>&amp;") == "<b>&amp;"
 
 
 def test_lights_are_the_newest_of_their_name_and_bounded():

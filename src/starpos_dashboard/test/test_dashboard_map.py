@@ -57,7 +57,8 @@ def test_the_track_has_a_dot_for_every_fix_before(page):
         page.instrument.works(fix=said.fix(48.1373 + 1e-4 * k))
         page.shows(decimal=f"{48.1373 + 1e-4 * k:.4f}° 11.575°")
     dots = "return document.querySelector('.dots').getAttribute('d')"
-    page.until(lambda: len(set(page.run(dots).split("M")[1:])) >= 3)  # the map is drawn after the texts
+    # The map is drawn after the texts.
+    page.until(lambda: len(set(page.run(dots).split("M")[1:])) >= 3)
     assert "NaN" not in page.run(dots)
 
 

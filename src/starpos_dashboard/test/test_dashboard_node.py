@@ -122,10 +122,12 @@ def test_the_solver_of_another_instrument_on_the_graph_is_not_its_own(start, lis
     start(executable="solver", module="starpos_solver.main", namespace="/b")
     listener.wait(lambda: "/b/solver: Solution" in listener.states)
     assert listener.set("a/dashboard", lights="/b/solver").successful
-    listener.wait(lambda: "/b/solver: Solution" in names_shown())  # it hears the other one
+    # It hears the other one.
+    listener.wait(lambda: "/b/solver: Solution" in names_shown())
     assert listener.set("a/dashboard", lights="solver").successful
     listener.wait_for_state("/b/solver: Solution", WARN)
-    assert names_shown() == {"solver"}  # silent
+    # It has fallen silent.
+    assert names_shown() == {"solver"}
     start(executable="solver", module="starpos_solver.main", namespace="/a")
     listener.wait(lambda: "solver: Solution" in names_shown())
 

@@ -59,7 +59,8 @@ def test_the_bubble_is_at_its_place_and_red_where_a_flag_is_set(page):
     """
     page.until(lambda: page.run(place) == pytest.approx([12.0, -6.0], abs=0.6))
     page.instrument.works(tilt=said.tilt(40.0, 0.0, flags=Tilt.OUT_OF_RANGE))
-    page.until(lambda: page.run(place) == pytest.approx([40.0 / 3, 0.0], abs=0.6))  # the rim is at 90 deg now
+    # The rim is at 90 deg now.
+    page.until(lambda: page.run(place) == pytest.approx([40.0 / 3, 0.0], abs=0.6))
     assert "90°" in page.run("return document.querySelector('#bubble').textContent")
     page.shows(tilt_flags="beyond the sensor's range")
     assert page.run("return document.querySelector('#bubble-dot.out') !== null")
@@ -91,7 +92,8 @@ def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_te
     assert amber[0] > 200 and amber[1] > amber[2] + 80
     clocks = page.run("return [...document.querySelectorAll('#clocks .name')].map((e) => e.textContent)")
     assert clocks == ["camera: Clock", "solver: Clock"]
-    assert page.run("return document.images.length") == 2  # the icon and the frame
+    # The icon and the frame.
+    assert page.run("return document.images.length") == 2
     assert page.run("return document.querySelectorAll('#lights img, #lights script').length") == 0
 
 
@@ -210,9 +212,8 @@ def test_everything_grows_old_when_the_instrument_falls_silent_and_lives_again(p
         return page.run("""return [...document.querySelectorAll("#clocks li")].flatMap((li) =>
           [".name", ".sentence"].map((part) => li.querySelector(part).getBoundingClientRect().top))""")
 
-    page.until(
-        lambda: len(tops()) == 4 and min(tops()) > 0
-    )  # each is old and has its sentence, which else is not shown
+    # Each is old and has its sentence, which else is not shown.
+    page.until(lambda: len(tops()) == 4 and min(tops()) > 0)
     assert tops() == sorted(tops()), "each clock's sentence stands under its name"
     lamps = page.until(lambda: all(lamp[1] == "SILENT" for lamp in page.run(LAMPS)) and page.run(LAMPS))
     for *_, colour in lamps:
@@ -231,7 +232,8 @@ def test_a_page_one_too_many_says_so(page, listener):
     page.driver.switch_to.new_window("tab")
     second = page.driver.current_window_handle
 
-    def refused():  # whichever came last: a page whose connection broke on a busy machine comes again
+    # Whichever came last: a page whose connection broke on a busy machine comes again.
+    def refused():
         for window in (second, first):
             page.driver.switch_to.window(window)
             if page.text("status-word") == "No place":

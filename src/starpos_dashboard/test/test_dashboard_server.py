@@ -215,7 +215,8 @@ def test_a_hung_page_holds_nobody_up_and_takes_no_memory(server):
         for n in range(1000):
             server.show(json.dumps({"n": n, "x": filler}), ())
         assert any(data["n"] == 999 for _, data in events)
-        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # kB
+        # In kB.
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000
 
 
 def test_a_page_that_takes_nothing_is_closed(server, monkeypatch):
@@ -233,7 +234,8 @@ def test_connections_have_a_limit_and_places_come_free_again(server):
         for _ in range(limit):
             stack.enter_context(closing(socket.create_connection(("127.0.0.1", server.port), timeout=WAIT_S)))
         with closing(socket.create_connection(("127.0.0.1", server.port), timeout=WAIT_S)) as one_more:
-            assert one_more.recv(1) == b""  # closed at once
+            # Closed at once.
+            assert one_more.recv(1) == b""
     until(lambda: served(server))
 
 
@@ -285,7 +287,8 @@ def test_it_ends_while_pages_are_open(server):
         wait(server, lambda: server.pages == 1)
         server.stop()
         assert not server.alive
-        assert viewer.lines.read().startswith("HTTP/1.1 200")  # to its end
+        # To its end.
+        assert viewer.lines.read().startswith("HTTP/1.1 200")
 
 
 def test_only_loopback_addresses_are_loopback():

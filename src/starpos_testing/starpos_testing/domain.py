@@ -7,9 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-DOMAINS = range(1, 101)  # above 101 the ports of DDS meet those that Linux hands out
-LOCK_PORT = 32768  # of domain 0; the lock of ROS's domain_coordinator, whose users keep clear of ours so
-FIRST_PORT, PORTS = 7400, 250  # of UDP: DDS's of domain 0, and how many each domain has (RTPS 2.5, 9.6.2.3)
+# Above 101 the ports of DDS meet those that Linux hands out.
+DOMAINS = range(1, 101)
+# The lock of ROS's domain_coordinator, for domain 0: its users keep clear of ours so.
+LOCK_PORT = 32768
+# UDP ports: DDS's of domain 0, and how many each domain has (RTPS 2.5, 9.6.2.3).
+FIRST_PORT, PORTS = 7400, 250
 
 
 def _inhabited() -> set[int]:

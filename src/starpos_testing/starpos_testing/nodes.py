@@ -115,4 +115,5 @@ class Process:
         """Kill the program if a test has left it running."""
         if self._process.poll() is None:
             self._process.kill()
-        self._process.communicate()  # which closes the pipe
+        # This closes the pipe.
+        self._process.communicate()

@@ -14,7 +14,8 @@ from starpos.navigation.imu import ImuLog, ImuModel
 from starpos.navigation.sightings import IdentifiedFrame
 from starpos.navigation.velocity import VelocityLog
 
-BEGIN_S = 1.7937e9  # Unix, in November 2026
+# Unix, in November 2026.
+BEGIN_S = 1.7937e9
 SPIN, SEMI_AXIS, FLATTENING = 7.292115e-5, 6378137.0, 1 / 298.257223563
 CAMERA_TO_BODY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 FOCAL_PX, HALF_PX, STARS, STAR_SIGMA_PX = 4266.0, (968.0, 608.0), 30, 0.2

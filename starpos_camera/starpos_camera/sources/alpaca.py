@@ -24,9 +24,12 @@ READOUT_S = 20.0
 POLL_S = 0.02
 # Interval of looks at the server during an exposure, so that a dead server is noticed.
 WATCH_S = 0.5
-MONOCHROME, RGGB = 0, 2  # ASCOM's sensor types
-PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}  # by BayerOffsetX, BayerOffsetY
-IDLE, ERROR = 0, 5  # ASCOM's camera states
+# ASCOM's sensor types.
+MONOCHROME, RGGB = 0, 2
+# Patterns by BayerOffsetX and BayerOffsetY.
+PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}
+# ASCOM's camera states.
+IDLE, ERROR = 0, 5
 PARAMETERS = (
     Parameter(
         "alpaca.address",
@@ -74,7 +77,8 @@ class Alpaca(FrameSource):
         self._camera: Camera | None = None
         self._size = (0, 0)
         self._pattern = ""
-        self._gain: float | None = None  # the gain that was set last
+        # The gain that was set last.
+        self._gain: float | None = None
 
     def lacking(self) -> None:
         """Return None, because only a call to the server would tell."""

@@ -19,10 +19,14 @@ from urllib3.connection import HTTPConnection
 
 from starpos_camera.sources.source import CaptureError
 
-CALL_S = 5.0  # alpyca's own timeout, for everything but pictures
-STALL_S = 5.0  # between two pieces of a picture
-PICTURE_S = 60.0  # for a whole picture: 40 MB at 0.7 MB/s
-MAX_REPLY = 1_000_000  # bytes, of everything but pictures
+# alpyca's own timeout, for everything but pictures.
+CALL_S = 5.0
+# The longest time between two pieces of a picture.
+STALL_S = 5.0
+# The longest time for a whole picture: 40 MB at 0.7 MB/s.
+PICTURE_S = 60.0
+# Most bytes of everything but pictures.
+MAX_REPLY = 1_000_000
 MAX_METADATA = 65536
 CHUNK = 1 << 20
 METADATA = struct.Struct("<4i7i")

@@ -15,7 +15,8 @@ from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, se
 from starpos_common.parameters import Parameter
 
 DEFAULT_EXPOSURE_S = 0.5
-BLOB_MAX = 4 * MAX_PIXELS  # bytes
+# In bytes.
+BLOB_MAX = 4 * MAX_PIXELS
 PARAMETERS = (
     Parameter(
         "indi.host",

@@ -45,7 +45,8 @@ class IndiServer:
         self._client.timeout_enable = False
         self._client.rxevent = self._on_event
         self.lost = False
-        self.blob: Blob | None = None  # the newest one
+        # The newest one.
+        self.blob: Blob | None = None
         # How often each device has defined CONNECTION since it came or was disconnected.
         self.definitions: dict[str, int] = {}
         # The thread sets the loop before `started`.

@@ -63,7 +63,8 @@ class FrameSource(Protocol):
     library of its devices only inside the functions that use it, because every node imports every source.
     """
 
-    parameters: Sequence[Parameter]  # each named `source.something`
+    # Each named `source.something`.
+    parameters: Sequence[Parameter]
     hardware_id: str
     # True: nothing is captured before somebody subscribes to the images.
     waits_for_listener: bool

@@ -28,12 +28,15 @@ BEGINNINGS = {
     ".mp4": (4, BOXES),
 }
 SUFFIXES = tuple(BEGINNINGS)
-MAX_RATE = 1000.0  # frames a second
-MAX_GAP_S = 3600.0  # between frames
+# In frames a second.
+MAX_RATE = 1000.0
+# The longest time between two frames.
+MAX_GAP_S = 3600.0
 # Cut-off or damaged frames are dropped, and a file must not lead to the network.
 OPTIONS = "fflags;discardcorrupt|err_detect;explode|protocol_whitelist;file"
 OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-GREY_8, GREY_16 = 0x30303859, 0x10003159  # FFmpeg's tags of pixel formats: Y800, and Y1 of 16 bits
+# FFmpeg's tags of pixel formats: Y800, and Y1 of 16 bits.
+GREY_8, GREY_16 = 0x30303859, 0x10003159
 
 
 class Film:
@@ -52,7 +55,8 @@ class Film:
         self._grey = False
         self._period_s = 0.0
         self._taken = 0
-        self._first_s = self._last_s = -math.inf  # in the file's time
+        # In the file's own time.
+        self._first_s = self._last_s = -math.inf
         self._ended = ""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:

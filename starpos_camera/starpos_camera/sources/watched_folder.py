@@ -53,8 +53,10 @@ class WatchedFolder:
         """Watch a folder; wanted: whether a name is that of a frame; rest_s: a file unchanged for so long is complete."""
         self._folder, self._wanted, self._rest_s, self._clock = folder, wanted, rest_s, clock
         self._arrivals: dict[str, NewFile] = {}
-        self._known = np.zeros(0, np.int64)  # hashes of the names of the last listing
-        self._is: tuple[int, int] | None = None  # the folder's device and inode
+        # Hashes of the names of the last listing.
+        self._known = np.zeros(0, np.int64)
+        # The folder's device and inode.
+        self._is: tuple[int, int] | None = None
         # The folder's time, and when it was seen to change.
         self._modified_ns = 0
         self._changed_s = -np.inf

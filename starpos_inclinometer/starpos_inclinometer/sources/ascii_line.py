@@ -30,7 +30,8 @@ from starpos_inclinometer.sources.reading import (
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
-MAX_LINE = 256  # bytes
+# In bytes.
+MAX_LINE = 256
 NEAR_RAD = math.radians(0.05)
 AXES = ("x", "y", "z")
 NEEDED = {"x", "y"}
@@ -121,11 +122,14 @@ class Line:
     # NaN if the line does not tell it; not compared, because NaN is not equal to itself.
     temperature_c: float = field(compare=False)
     sequence: int | None
-    milliseconds: int | None  # of the device's clock, 32 bits
+    # Time of the device's clock, 32 bits.
+    milliseconds: int | None
     # Distinguishes two equal lines of a device without sequence and clock from a line that came twice.
     number: int = 0
-    lost: int = 0  # samples lost just before this one
-    broken: bool = False  # true: it does not continue the lines before
+    # Samples lost just before this one.
+    lost: int = 0
+    # True: it does not continue the lines before.
+    broken: bool = False
 
 
 def pattern_error(pattern: str) -> str | None:

@@ -30,7 +30,8 @@ FUTURE_S = 0.1
 NEW_TIME_S = 1.0
 # A floor, for a simulated accelerometer may have no noise.
 LEAST_STDDEV_RAD = 1e-6
-MAX_MESSAGES = 10_000  # of an average
+# Most messages in an average.
+MAX_MESSAGES = 10_000
 QUEUE = 512
 RATE_WINDOW_S = 5.0
 # Silence is reported within 2 s, with a report every second.
@@ -71,9 +72,12 @@ class Felt:
     """Content of one message, at rest or not."""
 
     stamp_ns: int
-    force: tuple[float, float, float]  # specific force, m/s2
-    rotation: float  # rad/s; 0 if it is not measured
-    variance: tuple[float, float, float]  # m2/s4 of each axis; 0: not stated
+    # Specific force, m/s2.
+    force: tuple[float, float, float]
+    # rad/s; 0 if it is not measured.
+    rotation: float
+    # In m2/s4, of each axis; 0 where it is not stated.
+    variance: tuple[float, float, float]
 
 
 class BadMessage(ValueError):
@@ -104,8 +108,10 @@ class MeanForce:
 
     forces: np.ndarray
     mid_ns: int
-    rotation: float  # rms, rad/s
-    variance: np.ndarray  # (3,) m2/s4, as stated for one message
+    # Root mean square, rad/s.
+    rotation: float
+    # (3,) m2/s4, as stated for one message.
+    variance: np.ndarray
 
     @classmethod
     def of(cls, messages: list[Felt]) -> "MeanForce":

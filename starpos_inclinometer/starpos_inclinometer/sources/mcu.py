@@ -17,8 +17,10 @@ from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
-BITS_PER_BYTE = 10  # 8N1
-NEAR_CODES = 11_000  # 0.05 deg, ten times the noise
+# 8N1: a start bit, eight of data, a stop bit.
+BITS_PER_BYTE = 10
+# 0.05 deg, ten times the noise.
+NEAR_CODES = 11_000
 # The firmware's delay at its default rate, used until the firmware tells its own.
 DEFAULT_DELAY_MS = 54
 # Below this determinant of the cross-axis matrix the two axes are not independent.
@@ -129,7 +131,8 @@ def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
 class McuDecoder:
     """Turns the MCU's bytes into the samples that are believed, and asks the MCU for the wanted rate."""
 
-    command_period_s = 1.0  # PROTOCOL.md
+    # As PROTOCOL.md says.
+    command_period_s = 1.0
     hint = "check the baud rate, and that this is the inclinometer."
 
     def __init__(self, rate_hz: int) -> None:

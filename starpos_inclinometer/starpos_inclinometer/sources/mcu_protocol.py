@@ -9,8 +9,10 @@ from enum import IntEnum, IntFlag
 VERSION = 1
 BAUD = 38400
 MIN_RATE_HZ, MAX_RATE_HZ = 1, 50
-MAX_LINE = 48  # bytes with '$' and CR LF, in both directions
-SAMPLE_LINE = 43  # bytes of a `$T` line
+# Bytes with '$' and CR LF, in both directions.
+MAX_LINE = 48
+# Bytes of a `$T` line.
+SAMPLE_LINE = 43
 # A line is sent within the period of its sample and this time.
 MAX_SENDING_MS = 50
 
@@ -26,12 +28,17 @@ _RATE = re.compile(rb"R,([0-9A-F]{2})")
 class SampleStatus(IntFlag):
     """Status bits of a sample; unknown bits belong to later versions and are ignored."""
 
-    ADC_TIMEOUT = 0x01  # a channel did not convert in time: its code is that of the sample before
-    NO_REFERENCE = 0x02  # the AD7730's NOREF bit: the codes mean nothing
+    # A channel did not convert in time: its code is that of the sample before.
+    ADC_TIMEOUT = 0x01
+    # The AD7730's NOREF bit: the codes mean nothing.
+    NO_REFERENCE = 0x02
     NO_TEMPERATURE = 0x04
-    FIRST = 0x08  # the first sample since the reset
-    WATCHDOG = 0x10  # the watchdog made that reset
-    OVERRUN = 0x20  # at least one sample before this one was not sent
+    # The first sample since the reset.
+    FIRST = 0x08
+    # The watchdog made that reset.
+    WATCHDOG = 0x10
+    # At least one sample before this one was not sent.
+    OVERRUN = 0x20
 
 
 class Reason(IntEnum):
@@ -48,30 +55,42 @@ class Sample:
 
     # 16 bits as sent. `Continuity` continues it over wraps and resets: a jump of n + 1 means n lost samples.
     sequence: int
-    milliseconds: int  # the MCU's clock at the middle of the conversions, 32 bits
-    x: int  # AD7730 codes, 24-bit offset binary: 0x800000 is no input
+    # The MCU's clock at the middle of the conversions, 32 bits.
+    milliseconds: int
+    # AD7730 codes, 24-bit offset binary: 0x800000 is no input.
+    x: int
     y: int
-    temperature: int  # the SCA100T's temperature counts, 8 bits
-    status: int  # of SampleStatus
-    lost: int = 0  # samples lost just before this one
-    restarted: bool = False  # the MCU was reset since the sample before
-    resumed: bool = False  # the first sample after the connection was opened again
+    # The SCA100T's temperature counts, 8 bits.
+    temperature: int
+    # Bits of SampleStatus.
+    status: int
+    # Samples lost just before this one.
+    lost: int = 0
+    # The MCU was reset since the sample before.
+    restarted: bool = False
+    # The first sample after the connection was opened again.
+    resumed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
     """The MCU's answer to both commands."""
 
-    version: int  # of the protocol
-    firmware: int  # 0x0102 is 1.2
-    unit: int  # serial number, 0 for none
+    # Version of the protocol.
+    version: int
+    # 0x0102 is 1.2.
+    firmware: int
+    # Serial number, 0 for none.
+    unit: int
     rate_hz: int
-    delay_ms: int  # from the time of a sample to the first byte of its line
+    # The time from a sample to the first byte of its line.
+    delay_ms: int
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    reason: int  # of Reason
+    # One of Reason.
+    reason: int
 
 
 def checksum(body: bytes) -> int:

@@ -20,10 +20,14 @@ TIME_UNKNOWN = 16
 class Phase(Enum):
     """State of a source."""
 
-    ABSENT = "absent"  # the port cannot be opened, or it went away; nobody publishes
-    SILENT = "silent"  # open, but nothing comes
-    GARBLED = "garbled"  # bytes come, but no samples
-    MOVING = "moving"  # samples come, but the instrument moves and they give no tilt
+    # The port cannot be opened, or it went away; nobody publishes.
+    ABSENT = "absent"
+    # Open, but nothing comes.
+    SILENT = "silent"
+    # Bytes come, but no samples.
+    GARBLED = "garbled"
+    # Samples come, but the instrument moves and they give no tilt.
+    MOVING = "moving"
     RECEIVING = "receiving"
 
 
@@ -31,14 +35,22 @@ class Phase(Enum):
 class Counts:
     """Numbers of the lines, or of the messages of a topic, since the source was made."""
 
-    good: int = 0  # with the right checksum and form
-    crc_errors: int = 0  # framed lines with the wrong checksum
-    malformed: int = 0  # lines of another form, messages with NaN or without a stamp
-    garbage_bytes: int = 0  # outside of lines
-    lost: int = 0  # samples missing in the sequence
-    duplicates: int = 0  # samples that came twice; dropped
-    restarts: int = 0  # resets of the device
-    implausible: int = 0  # samples that did not fit the others; dropped
+    # Samples with the right checksum and form.
+    good: int = 0
+    # Framed lines with the wrong checksum.
+    crc_errors: int = 0
+    # Lines of another form, messages with NaN or without a stamp.
+    malformed: int = 0
+    # Bytes outside of lines.
+    garbage_bytes: int = 0
+    # Samples missing in the sequence.
+    lost: int = 0
+    # Samples that came twice; dropped.
+    duplicates: int = 0
+    # Resets of the device.
+    restarts: int = 0
+    # Samples that did not fit the others; dropped.
+    implausible: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +59,8 @@ class Arrival:
 
     sample: Any
     moment: Moment
-    identity: Any = None  # what the device had told about itself when it sent this
+    # What the device had told about itself when it sent this.
+    identity: Any = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +89,11 @@ class Health:
 
     phase: Phase
     sentence: str
-    rate_hz: float = 0.0  # of the recent samples
+    # Rate of the recent samples.
+    rate_hz: float = 0.0
     counts: Counts = field(default_factory=Counts)
-    complaint: str = ""  # what is wrong although samples come
-    step: Step | None = None  # the last step of the host's clock
+    # What is wrong although samples come.
+    complaint: str = ""
+    # The last step of the host's clock.
+    step: Step | None = None
     values: Mapping[str, object] = field(default_factory=dict)

@@ -27,9 +27,11 @@ MIN_SILENCE_S, SILENT_PERIODS = 1.0, 1.5
 # Lines of which none is believed are reported after so many times the patience with silence.
 UNFIT_PATIENCES = 3.0
 READ_BYTES = 4096
-QUEUE_SAMPLES = 512  # 10 s at the highest rate
+# 10 s at the highest rate.
+QUEUE_SAMPLES = 512
 RATE_WINDOW_S = 5.0
-PTY_MAJORS = range(136, 144)  # pseudo-terminals, Linux's devices.txt
+# pseudo-terminals, Linux's devices.txt.
+PTY_MAJORS = range(136, 144)
 
 # pyserial raises its own error, passes on some errors of the system, and raises TypeError if its descriptor is gone.
 PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueError)
@@ -99,10 +101,14 @@ class LinkState:
     phase: Phase = Phase.ABSENT
     sentence: str = "the port has not been opened yet"
     counts: Counts = field(default_factory=Counts)
-    connections: int = 0  # how often the port was opened
-    dropped: int = 0  # samples that nobody fetched in time
-    rate_hz: float = 0.0  # of the recent samples
-    step: Step | None = None  # the last step of the host's clock
+    # How often the port was opened.
+    connections: int = 0
+    # Samples that nobody fetched in time.
+    dropped: int = 0
+    # Rate of the recent samples.
+    rate_hz: float = 0.0
+    # The last step of the host's clock.
+    step: Step | None = None
 
 
 class SerialLink:

@@ -31,7 +31,8 @@ UNLEVELLED = 1.25, 0.3
 UNTIMED = 1e-4
 # the last in sigma of the priors
 MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6
-STEP_RAD = 1e-6  # of the numerical derivatives for the attitudes
+# Step of the numerical derivatives for the attitudes.
+STEP_RAD = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)

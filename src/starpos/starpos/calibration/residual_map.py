@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 # more stars than this are drawn as the means of cells
 MOST_ARROWS = 400
-ARROW_CELLS, COLOUR_CELLS = 22, 12  # along the longer side
+# How many stand along the longer side.
+ARROW_CELLS, COLOUR_CELLS = 22, 12
 # length of the key's arrow, in cells of ARROW_CELLS
 USUAL_ARROW = 0.8
 FEWEST_IN_CELL = 3

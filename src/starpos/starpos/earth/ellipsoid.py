@@ -7,8 +7,10 @@ import numpy as np
 
 from starpos.rotation import unit_vector
 
-EQUATOR_RADIUS_M, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3  # WGS 84
-EARTH_RADIUS_M = 6.371e6  # mean radius, for errors in metres
+# WGS 84.
+EQUATOR_RADIUS_M, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
+# The mean radius, for errors in metres.
+EARTH_RADIUS_M = 6.371e6
 # Tangent of the latitude 6 m from a pole; closer, the heading is not known in any case.
 STEEPEST = 1e6
 

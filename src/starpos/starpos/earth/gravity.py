@@ -16,7 +16,8 @@ from starpos.rotation import unit_vector
 # NIMA TR8350.2, tables 3.1 and 3.4: gravity at the equator, flattening, and its ratio m of forces
 EQUATOR_GRAVITY, FLATTENING, FORCES_RATIO = 9.7803253359, 1 / 298.257223563, 0.00344978650684
 SPIN = np.array([0.0, 0.0, ROTATION_RAD_S])
-WGS84 = 1  # ERFA's number of the ellipsoid
+# ERFA's number of the ellipsoid.
+WGS84 = 1
 
 
 def geodetic_place(place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

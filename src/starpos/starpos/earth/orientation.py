@@ -24,9 +24,11 @@ TT_MINUS_TAI_S = 32.184
 # Since 2017; in 1900 it was 72 s less, which changes the aberration by 0.3 mas.
 TT_MINUS_UTC_S = 69.184
 SPEED_OF_LIGHT = erfa.CMPS
-ROTATION_RAD_S = 7.292115e-5  # IERS Conventions (2010), table 1.1
+# IERS Conventions (2010), table 1.1.
+ROTATION_RAD_S = 7.292115e-5
 EQUATOR_M_PER_S = ROTATION_RAD_S * EQUATOR_RADIUS_M
-FIRST_MJD = 41684.0  # 1973-01-02: the first day of the IERS table
+# 1973-01-02: the first day of the IERS table.
+FIRST_MJD = 41684.0
 # Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
 # holding the pole (test_orientation.py computes both).
 EXTRAPOLATION_DAYS = (0.0, 30.0, 90.0, 180.0, 365.0, 730.0, 1095.0)
@@ -175,7 +177,8 @@ class _Table:
     pole_x: np.ndarray
     pole_y: np.ndarray
     pole_sigma: np.ndarray
-    slope: float  # s per day, of UT1-TAI over the last year
+    # How UT1-TAI changed over the last year, s per day.
+    slope: float
     measured_until_mjd: float
 
 

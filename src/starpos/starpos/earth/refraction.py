@@ -23,9 +23,11 @@ MIN_COS_ZENITH = 0.05
 class Atmosphere:
     """The air at the instrument and how well it is known (1 sigma); InstrumentError for impossible values."""
 
-    pressure_pa: float = STANDARD_PRESSURE_PA  # not reduced to sea level; 0: a vacuum
+    # Not reduced to sea level; 0: a vacuum.
+    pressure_pa: float = STANDARD_PRESSURE_PA
     temperature_c: float = STANDARD_TEMPERATURE_C
-    humidity: float = 0.5  # 0..1
+    # From 0 to 1.
+    humidity: float = 0.5
     wavelength_um: float = 0.55
     pressure_stddev_pa: float = 200.0
     temperature_stddev_c: float = 2.0

@@ -12,7 +12,8 @@ import numpy as np
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 
-Colour = tuple[int, int, int]  # BGR
+# Blue, green, red.
+Colour = tuple[int, int, int]
 
 # Length of the picture's longer side, at most.
 SHOWN_PX = 1600

@@ -20,7 +20,8 @@ from starpos.frames.stars import Stars
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff", ".bmp")
-JPEG = (".jpg", ".jpeg")  # beside raw files usually a copy of them
+# Beside raw files usually a copy of them.
+JPEG = (".jpg", ".jpeg")
 HEIF = (".heic", ".heif", ".hif")
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 

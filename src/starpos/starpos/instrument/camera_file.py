@@ -9,7 +9,8 @@ from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
 from starpos.instrument.camera import COEFFICIENTS, Camera
 
-LARGEST_SIDE = 1_000_000  # px of a frame
+# Most pixels along a frame's side.
+LARGEST_SIDE = 1_000_000
 
 
 def read(path: Path) -> Camera:

@@ -224,7 +224,8 @@ class Instrument:
         link = np.asarray(self.link_to_camera, float)
         if (
             link.shape != (3, 3)
-            or np.abs(link).max() > 2  # squares must not overflow
+            # Squares must not overflow.
+            or np.abs(link).max() > 2
             or not np.allclose(link @ link.T, np.eye(3), atol=1e-6)
             or np.linalg.det(link) < 0
         ):

@@ -12,8 +12,10 @@ from starpos.errors import InstrumentError
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.units import ARCSEC
 
-MG = 1e-3  # rad: an acceleration of 1 mg looks like this tilt
-FIRST_ORDER = 1.57  # noise bandwidth of a filter of first order, in its -3 dB bandwidths: pi / 2
+# Rad: an acceleration of 1 mg looks like this tilt.
+MG = 1e-3
+# Noise bandwidth of a filter of first order, in its -3 dB bandwidths: pi / 2.
+FIRST_ORDER = 1.57
 
 
 def limit(most: float) -> float:

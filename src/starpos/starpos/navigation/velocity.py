@@ -12,7 +12,8 @@ from starpos.navigation.table import read_record
 COLUMNS = ("vx", "vy", "vz", "sigma")
 # below it a stated error is a mistake; above it nothing is measured
 LEAST_SIGMA, MOST_SIGMA = 1e-6, 1000.0
-FASTEST = 1000.0  # m/s
+# In m/s.
+FASTEST = 1000.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

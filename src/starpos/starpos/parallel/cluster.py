@@ -163,7 +163,8 @@ class _Task:
 
     work: Callable
     files: Files
-    sizes: dict[str, int]  # bytes of each file
+    # Bytes of each file, by name.
+    sizes: dict[str, int]
     here: Same
 
     def __reduce__(self) -> tuple[Callable[..., bytes], tuple]:

@@ -29,7 +29,8 @@ DYING_S = 1.0
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 
-Task = tuple[int, Call]  # a call and its number
+# A call and its number.
+Task = tuple[int, Call]
 
 
 class ProcessError(StarposError):
@@ -107,7 +108,8 @@ class _Board:
         self._coming, self._ahead = enumerate(calls), ahead
         self._under_way: set[int] = set()
         self._again: deque[Task] = deque()
-        self._tried: set[int] = set()  # calls that have ended a process
+        # Calls that have ended a process.
+        self._tried: set[int] = set()
         self._done: dict[int, bytes] = {}
         self._given = self._told = 0
 

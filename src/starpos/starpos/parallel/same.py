@@ -9,7 +9,8 @@ from pathlib import Path
 import starpos
 from starpos.sky import catalogue, deeper
 
-Same = dict[str, str]  # version by name
+# Versions by name.
+Same = dict[str, str]
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 # more points than this are drawn small, with a band instead of bars
 MANY = 150
-SMALLEST_SHOWN = 1e-3  # m or arcsec
+# In m or arcsec.
+SMALLEST_SHOWN = 1e-3
 DEFLECTION = "deflection (geodetic only)"
 
 

@@ -43,8 +43,10 @@ class Averaging:
         """Start again, because the instrument, the air, the clock or the place has changed."""
         self._averager = Averager()
         self._turned: Average | None = None
-        self._pose: Fix | None = None  # the first fix of the present pose
-        self._elsewhere = False  # whether the fixes seem to be of another place than the turn
+        # The first fix of the present pose.
+        self._pose: Fix | None = None
+        # Whether the fixes seem to be of another place than the turn.
+        self._elsewhere = False
         self._news = News.USED
         self._moved = 0
 

@@ -77,10 +77,14 @@ class Calibrating:
         self._era = 0
         self._worker = jobs
         self._running: Coming | None = None
-        self._asked = False  # whether a service waits for a job
-        self._again = False  # whether to calibrate by itself again when there is time
-        self._about = ""  # a sentence about `found`
-        self._said = ""  # why the last calibration by itself was not taken
+        # Whether a service waits for a job.
+        self._asked = False
+        # Whether to calibrate by itself again when there is time.
+        self._again = False
+        # A sentence about `found`.
+        self._about = ""
+        # Why the last calibration by itself was not taken.
+        self._said = ""
 
     @property
     def busy(self) -> bool:

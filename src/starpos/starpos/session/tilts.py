@@ -19,7 +19,8 @@ from starpos.recording.messages import (
 )
 from starpos.session.tilt_publishers import TiltPublishers
 
-CAPACITY = 6000  # ten minutes at 10 Hz
+# Ten minutes at 10 Hz.
+CAPACITY = 6000
 # The noise is measured from so many samples.
 NOISE_CAPACITY = 2000
 # Between two samples of one exposure at most so many others arrive.
@@ -34,7 +35,8 @@ class TiltBuffer:
     """Keeps the latest samples, in any order; keeps unusable ones only to explain a missing tilt."""
 
     def __init__(self) -> None:
-        self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)  # with the number of its arrival
+        # Each with the number of its arrival.
+        self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)
         self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
         # of each sample and the one before it: time of the later, how far they differ, and the stated variance

@@ -21,7 +21,8 @@ from starpos.sky.zones import ZONES, cell_starts, rows_near
 from starpos.table_cache import rising
 from starpos.units import MAS, MAS_DEG
 
-EPOCH = 2000.0  # Julian year of ra and dec
+# Julian year of ra and dec.
+EPOCH = 2000.0
 FORMAT = 3
 EPOCH_ZERO = 1900.0
 # A stored error is the smallest times CODE_STEP ** code.

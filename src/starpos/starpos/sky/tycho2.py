@@ -22,11 +22,13 @@ SUPPLEMENT_EPOCH = 1991.25
 # these very stars, less the fast ones (63 to 97 from V = 2 to 9; tools/data/fast_stars.py). They move faster than other
 # stars, because fast stars were not found again on old plates.
 UNMEASURED_MAS_YEAR = 100.0
-MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123  # a record and its newline
+# A record and its newline.
+MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123
 # Four times the largest of the original files.
 MOST_BYTES = 120_000_000
 
-_MAIN = {  # name: (first byte from 0, length)
+# Each column's first byte (from 0) and length, by name.
+_MAIN = {
     "tyc1": (0, 4), "tyc2": (5, 5), "tyc3": (11, 1), "pflag": (13, 1), "ra_mean": (15, 12), "dec_mean": (28, 12),
     "pm_ra": (41, 7), "pm_dec": (49, 7), "e_ra": (57, 3), "e_dec": (61, 3), "e_pm_ra": (65, 4), "e_pm_dec": (70, 4),
     "epoch_ra": (75, 7), "epoch_dec": (83, 7), "bt": (110, 6), "vt": (123, 6), "hip": (142, 6),

@@ -9,8 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-ZONES = 180  # zones of declination
-CELLS = 360  # cells of right ascension in each zone
+# Zones of declination.
+ZONES = 180
+# Cells of right ascension in each zone.
+CELLS = 360
 
 
 def cell_starts(zone_start: np.ndarray, ra_deg: np.ndarray) -> np.ndarray:

@@ -91,7 +91,8 @@ def test_half_a_turn_takes_the_calibration_off_the_position(rng):
     a = average(
         fixes(field, rng, [10.0, 100.0, 190.0, 280.0], tilt=0.1, calibration=60.0, slip=(50.0, -30.0, 0.0))
     )
-    assert np.all(np.abs(moved_m(a, field)) < 60)  # a single one is 1.5 km off
+    # A single one is 1.5 km off.
+    assert np.all(np.abs(moved_m(a, field)) < 60)
     assert np.all(sigmas(a, "calibration")[:2] < 60)
 
 
@@ -114,7 +115,8 @@ def test_an_instrument_that_turned_has_the_heading_of_its_last_pose(rng):
     a, last = average(made), average(made[2:])
     assert a.poses == 2
     assert turn(a.heading - last.heading) == pytest.approx(0, abs=3 * sigmas(last)[2])
-    assert 0.5 * sigmas(last)[2] < sigmas(a)[2] < sigmas(last)[2]  # what is known of the place helps it
+    # What is known of the place helps it.
+    assert 0.5 * sigmas(last)[2] < sigmas(a)[2] < sigmas(last)[2]
 
 
 def test_over_the_date_line_and_over_north(rng):
@@ -182,7 +184,8 @@ def dense(made):
     seen = np.array([plane.seen(f) * UNIT for f in made])
     whole = np.zeros((n, 3, n, 3))
     for k, term in enumerate(made[0].terms):
-        like = [made[0] if term.posed else f for f in made]  # they are of one pose
+        # They are of one pose.
+        like = [made[0] if term.posed else f for f in made]
         factors = [plane.turned(f, f.terms[k].factor) * UNIT[:, None] for f in like]
         for i, f in enumerate(made):
             for j, g in enumerate(made):
@@ -209,12 +212,14 @@ def wandering(f, rad_per_s=3e-7):
 @pytest.mark.parametrize("shared", ["nothing", "a reading", "one reading of three"])
 def test_the_recursion_is_generalised_least_squares_over_all(shared, rng):
     field = replace(SkyField(), altitude=80.0)
-    if shared == "a reading":  # of three frames each
+    # Each reading serves three frames.
+    if shared == "a reading":
         made = [f for f in fixes(field, rng, [40.0] * 3, calibration=10.0) for _ in range(3)]
         made = [read_at(spoiled(f, *rng.normal(0, 3, 2)), UTC + k // 3) for k, f in enumerate(made)]
     else:
         made = fixes(field, rng, [40.0] * 6, calibration=10.0)
-    if shared == "one reading of three":  # of two frames each
+    # Each reading serves two frames.
+    if shared == "one reading of three":
         made = [read_at(f, *(UTC + 10 * (k // 2) + 2 * (k % 2) + np.arange(3))) for k, f in enumerate(made)]
     made = in_order([wandering(f) for f in made])
     moved, covariance = dense(made)
@@ -367,9 +372,8 @@ def test_a_clock_that_was_far_off_bends_no_average(rng):
     field, averager, worst = SkyField(latitude=55.0), Averager(), 0.0
     for k in range(8):
         known = k >= 3
-        now = replace(
-            field, utc=UTC + k, azimuth=150.0 if known else 40.0
-        )  # touched, or the stamp has slipped
+        # Touched, or the stamp has slipped.
+        now = replace(field, utc=UTC + k, azimuth=150.0 if known else 40.0)
         xy, places = now.places(earth_state(now.utc), rng)
         tilt = replace(now.tilt(np.eye(2) * (0.16 * ARCSEC) ** 2), utc_unix_s=now.utc + 60 * (not known))
         state = earth_state(tilt.utc_unix_s)
@@ -386,7 +390,8 @@ def test_memory_does_not_grow(rng):
         sizes.append(len(pickle.dumps(vars(averager))))
     # once as much is remembered as ever
     settled = MOST_REMEMBERED + 10
-    assert max(sizes[settled:]) <= max(sizes[:settled]) + 8 * MOST_REMEMBERED  # counts have grown
+    # Counts have grown.
+    assert max(sizes[settled:]) <= max(sizes[:settled]) + 8 * MOST_REMEMBERED
 
 
 def test_the_heading_of_a_pose_that_nobody_believed_is_none(rng):

@@ -104,7 +104,8 @@ def run(made):
         for f in made.fixes:
             averager.add(f)
             a = averager.average
-            rows = 2 if np.isnan(a.heading) else 3  # nobody believes a fix since the camera was touched
+            # Nobody believes a fix since the camera was touched.
+            rows = 2 if np.isnan(a.heading) else 3
             covariance = a.covariance[:rows, :rows]
             assert np.isfinite([a.utc_unix_s, a.latitude, a.longitude, a.began_unix_s]).all()
             assert np.isfinite(covariance).all() and np.isnan(a.covariance[rows:]).all()
@@ -159,7 +160,8 @@ def test_after_a_drive_it_is_true_of_the_new_place(rng):
         made = walk(rng, 60, drive=0.04, turn=0.1)
         answers, _ = run(made)
         for k in range(8, 60):
-            if len(set(made.places[k - 8 : k + 1])) == 1:  # it stands there for eight frames
+            # It stands there for eight frames.
+            if len(set(made.places[k - 8 : k + 1])) == 1:
                 off.append(sigmas_off(answers[k], made.places[k]))
     assert len(off) > 80
     assert np.mean(np.array(off) > 5) < 0.005

@@ -52,7 +52,8 @@ def test_from_an_ideal_camera_to_the_true_one(field, catalogue, rng):
     assert rms(errors) < 0.02
     assert np.abs(errors).max() < max(0.04, 4 * fit.worst_sigma_px)
     assert fit.rms_px < 0.35 * rms(fit.before)
-    assert len(fit.xy) > 0.97 * sum(map(len, lists))  # to the faint and the corners
+    # To the faint and the corners.
+    assert len(fit.xy) > 0.97 * sum(map(len, lists))
 
 
 @pytest.mark.parametrize("corner", [-0.06, -0.02, 0.02, 0.06])

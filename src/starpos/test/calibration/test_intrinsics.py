@@ -54,9 +54,11 @@ def test_over_many_cameras_the_errors_are_those_claimed(field, rng):
         claimed.append(fit.sigma_px(corner)[0])
     z2, off2 = np.square(z), np.square(off) / np.square(claimed)[:, None]
     assert 0.6 < z2.mean() < 1.5
-    assert (z2.mean(0) < 2.2).all()  # chi-square of 30, one in 10000
+    # chi-square of 30, one in 10000.
+    assert (z2.mean(0) < 2.2).all()
     assert (z2.mean(0) > 0.3).all()
-    assert 0.5 < off2.mean() < 1.7  # of the pixels of the corner, which are what matters
+    # In squared pixels at the corner, which is what matters.
+    assert 0.5 < off2.mean() < 1.7
 
 
 def test_what_a_few_stars_of_a_narrow_field_cannot_tell_the_prior_holds(rng):
@@ -177,9 +179,8 @@ def test_refraction_is_undone_where_the_level_is_known(rng):
     assert np.abs(fit.values - values(true))[:2].max() < 0.02
     assert np.abs(prediction_errors(true, fit.camera)).max() < 2e-3
     without = fit_camera([replace(s, level=None) for s in seen], ideal(11), VACUUM)
-    assert (
-        np.abs(without.values - values(true))[:2].min() > 1.0
-    )  # 3e-4 of the focal length: the test can tell
+    # 3e-4 of the focal length: the test can tell.
+    assert np.abs(without.values - values(true))[:2].min() > 1.0
 
 
 def test_air_that_is_stronger_than_said_is_in_the_sigma(rng):
@@ -211,7 +212,8 @@ def test_unbent_is_the_inverse_of_what_the_fit_does(rng):
     air = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
     (s,) = bent(clean(ideal(11), 1, 20, rng), air)
     back = unbent(ideal(11).directions(*s.xy.T), s.level, air)
-    np.testing.assert_allclose(back, s.directions @ s.attitude.T, atol=2e-4)  # the attitude is 20 arcsec off
+    # The attitude is 20 arcsec off.
+    np.testing.assert_allclose(back, s.directions @ s.attitude.T, atol=2e-4)
     assert np.linalg.norm(back, axis=1) == pytest.approx(1)
     smaller = unbent(ideal(11).directions(*s.xy.T), None, air)
     assert np.hypot(*smaller[:, :2].T) == pytest.approx(

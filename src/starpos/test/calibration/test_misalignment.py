@@ -18,7 +18,8 @@ from starpos.units import DAY_S
 from starpos_testing.skies.scenes import START
 from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
-NOISE_ARCSEC = 12.6  # of one reading
+# Errors of one reading.
+NOISE_ARCSEC = 12.6
 
 
 def found_at(shot, catalogue, given=(0.0, 0.0, 0.0), **more):
@@ -65,10 +66,11 @@ def test_one_lean_is_right_at_that_lean_and_wide_at_another(catalogue, rng, fram
     # the noise of both readings, 390 m each, and the lean by which they differ turned by nobody knows what
     assert metres < 4 * 390 * np.sqrt(1 + 1 / frames)
     assert sigma_m(same) < 3000
+    # As wide as the turn is unknown: sideways and, beyond half a turn, along the lean.
     for lean in (
         -4.0,
         4.0,
-    ):  # as wide as the turn is unknown: sideways and, beyond half a turn, along the lean
+    ):
         there = shots(catalogue, rng, [lean], start=START + 900)
         other, metres, sigmas = solved(there, found, catalogue)
         assert sigmas < 3
@@ -115,7 +117,8 @@ def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, off_deg, which):
     found = found_at(shot, catalogue).instrument.calibration
     off, chi2 = a3_error(shot, found)
     moved = np.abs(off - a3_error(sound, expected)[0])
-    if abs(off_deg) < 0.05:  # six sigma: it is hardly one, and pulls as hard as three
+    # Six sigma: it is hardly one, and pulls as hard as three.
+    if abs(off_deg) < 0.05:
         assert chi2 < 20
         return
     assert np.all(moved < stddev(expected))
@@ -215,7 +218,8 @@ def test_what_is_said_of_the_turn_holds_where_the_leans_tell_little(catalogue, r
     told = found_at(shot, catalogue, near, turn_stddev_deg=2.0).instrument.calibration
     turn = np.sqrt(np.linalg.eigvalsh(told.covariance_arcsec2)[-1]) / 3600
     assert turn == pytest.approx(2.0, rel=0.02)
-    assert told.misalignment_deg[2] == pytest.approx(128.0, abs=0.2)  # as it was said to be
+    # As it was said to be.
+    assert told.misalignment_deg[2] == pytest.approx(128.0, abs=0.2)
     assert a3_error(shot, told)[1] < 16
     # against leans that tell it to 0.04 deg it has nothing to say
     leaning = shots(catalogue, rng, [0.0, 0.0, 6.0, 6.0])
@@ -239,7 +243,8 @@ def test_a_turn_said_wide_counts_from_what_was_said(catalogue):
 def test_time_temperature_tilt_and_number_are_recorded(catalogue, rng):
     shot = shots(catalogue, rng, [0.0, 4.0])
     for mid, t in shot.tilts.items():
-        shot.tilts[mid] = replace(t, temperature_c=10.0 + (mid - START - 0.25) / 10)  # 10 and 12
+        # 10 and 12.
+        shot.tilts[mid] = replace(t, temperature_c=10.0 + (mid - START - 0.25) / 10)
     c = found_at(shot, catalogue).instrument.calibration
     mids = list(shot.tilts)
     assert c.utc_unix_s == pytest.approx(np.mean(mids), abs=1e-6)
@@ -266,9 +271,8 @@ def test_what_the_calibration_costs_elsewhere_and_later(catalogue, rng):
             there.tilts[mid] = replace(t, temperature_c=10.0 + warmer)
         f, metres, sigmas = solved(there, found, catalogue)
         assert sigmas < 4
-        flat = (
-            0.06 * arcsec_m
-        )  # A2's axes at some degrees of lean, and the radii of the Earth, are not quite one
+        # A2's axes at some degrees of lean, and the radii of the Earth, are not quite one.
+        flat = 0.06 * arcsec_m
         drift = 2.0 * np.sqrt(24 * days) * arcsec_m
         assert budget_m(f, "tilt drift") == pytest.approx(drift, rel=0.05)
         assert budget_m(f, "tilt temperature") == pytest.approx(3.0 * abs(warmer) * arcsec_m, rel=0.05)
@@ -281,7 +285,8 @@ def test_a_stale_calibration_is_refused_in_words(catalogue, rng):
     shot = shots(catalogue, rng)
     found = found_at(shot, catalogue)
     for days, ok in ((VALID_DAYS - 1, True), (VALID_DAYS + 1, False), (-VALID_DAYS - 1, False)):
-        later = shots(catalogue, rng, start=START - days * DAY_S)  # the past is in all tables
+        # The past is in all tables.
+        later = shots(catalogue, rng, start=START - days * DAY_S)
         solver = replace(shot.solver(catalogue), instrument=found.instrument)
         solution = solver.solve(later.frames[0], later.tilt)
         assert (solution.status is Status.OK) == ok

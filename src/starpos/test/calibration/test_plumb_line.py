@@ -19,7 +19,8 @@ SCA100T, QUIET = 12.6 * ARCSEC, 0.1 * ARCSEC
 class Truth:
     a3: np.ndarray
     zenith: np.ndarray
-    given: np.ndarray  # another A3, some degrees of lean and any turn away
+    # Another A3, some degrees of lean and any turn away.
+    given: np.ndarray
 
 
 def upright(rng) -> np.ndarray:
@@ -121,7 +122,8 @@ def test_level_errs_as_it_says(kind, noise):
         zenith.append(zenith_sigmas(found, truth))
     bound = 4 * np.sqrt(4 / 40)
     assert np.mean(plumb) == pytest.approx(2, abs=bound)
-    assert np.quantile(zenith, 0.9) < 2.7  # of the worse of two axes, without the turn of A3
+    # The worse of two axes, without the turn of A3.
+    assert np.quantile(zenith, 0.9) < 2.7
 
 
 def test_leans_by_hand_tell_the_turn_of_a3_too():
@@ -168,7 +170,8 @@ def test_about_an_axis_that_leans_the_zenith_is_lost_on_a_circle(headings, lean,
 def test_a_zero_that_wanders_is_no_lean(noise):
     for seed in range(30):
         made, truth = readings(np.random.default_rng(seed), MANY, noise, wander=30 * ARCSEC)
-        level(made, truth.given)  # no FixError
+        # No FixError.
+        level(made, truth.given)
 
 
 def test_one_heading_tells_nothing_and_says_so():
@@ -192,7 +195,8 @@ def test_the_smaller_the_turn_the_wider_the_claim(turn_arcsec):
         assert found.scatter < 12
         assert chi2_of_plumb(found, truth, at) < 16
         seen = SCA100T / np.sqrt(2) / (turn_arcsec * ARCSEC)
-        assert found.stddev_across(at) > 0.9 / np.hypot(1 / seen, 1 / np.radians(10))  # no A3 is off by more
+        # No A3 is off by more.
+        assert found.stddev_across(at) > 0.9 / np.hypot(1 / seen, 1 / np.radians(10))
 
 
 def test_frames_of_two_places_scatter():

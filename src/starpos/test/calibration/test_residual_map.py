@@ -25,7 +25,8 @@ def test_each_of_a_few_stars_has_its_arrow(rng):
     axes, arrows, key = drawn(xy, residual)
     np.testing.assert_array_equal(arrows.get_offsets(), xy)
     np.testing.assert_array_equal(np.stack([arrows.U, arrows.V], -1), residual)
-    assert axes.get_ylim() == (699.5, -0.5)  # the top of the frame on top
+    # The top of the frame on top.
+    assert axes.get_ylim() == (699.5, -0.5)
     assert axes.get_xlim() == (-0.5, 999.5)
     assert key.label == "0.1 px"
     assert key.U == 0.1

@@ -98,7 +98,8 @@ def miss(place, scene):
 @pytest.mark.parametrize("lean", [0.0, 0.02, 0.7])
 def test_the_place_of_an_instrument_whose_a3_nobody_knows(catalogue, rng, headings, lean):
     if len(headings) == 2 and lean > 0:
-        return  # of about_an_axis
+        # about_an_axis has no place that is held.
+        return
     answer, scene = turned(catalogue, rng, headings, lean=lean)
     place = average(answer.fixes)
     metres, sigmas = miss(place, scene)
@@ -113,7 +114,8 @@ def test_the_place_of_an_instrument_whose_a3_nobody_knows(catalogue, rng, headin
 def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
     misalignment, zero = (1.5, -2.0, 130.0), (0.2, -0.1)
     answer, scene = turned(catalogue, rng, range(0, 360, 30), misalignment, zero)
-    s = answer.solutions[-1].tilt  # what the inclinometer says, its zero off, and what is so
+    # What the inclinometer says, its zero off, and what is so.
+    s = answer.solutions[-1].tilt
     read = s.up
     true = up_of(s.theta - np.radians(zero))
     truth = (
@@ -121,7 +123,8 @@ def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
     )
     found = answer.instrument.mounting.a3.T @ read
     off_arcsec = np.degrees(np.arccos(np.clip(truth @ found, -1, 1))) * 3600
-    assert off_arcsec < 4 * 12.6  # one reading's noise is in both
+    # One reading's noise is in both.
+    assert off_arcsec < 4 * 12.6
     assert answer.plumb_stddev_arcsec < 10
 
 

@@ -17,7 +17,8 @@ from starpos.units import ARCSEC
 
 EVERYWHERE = [(90, 0), (90, 77), (89.9, -130), (-90, 10), (-89.95, 200), (85.03, 33), (60, 179.99), (47.3, -179.99),
               (0, 0), (0.01, -0.01), (-33.4, 123.456), (12.5, 180), (-70.1, 359.9), (45, -540.2)]  # fmt: skip
-WORLDS = {  # south, west, columns' step, columns, rows
+# South, west, columns' step, columns, rows.
+WORLDS = {
     "-180 to 179.5": (-90, -180, 0.5, 720, 361),
     "0 to 359.5": (-90, 0, 0.5, 720, 361),
     "the first column again": (-90, -180, 0.5, 721, 361),
@@ -112,7 +113,8 @@ def test_slopes_of_a_harmonic_all_over_the_globe(tmp_path, name):
         at = np.array([np.clip(place[0], -np.radians(89.999), np.radians(89.999)), place[1]])
         xi, eta = deflection(at[0], *harmonic(*at)[1:])
         assert (d.xi_arcsec, d.eta_arcsec) == pytest.approx((xi, eta), abs=0.01), np.degrees(place)
-        assert d.stddev_arcsec < 1  # there is nothing in it that half a degree could not resolve
+        # There is nothing in it that half a degree could not resolve.
+        assert d.stddev_arcsec < 1
 
 
 def test_a_plane_in_degrees_is_exact(tmp_path):
@@ -121,9 +123,8 @@ def test_a_plane_in_degrees_is_exact(tmp_path):
     d = geoid.read(gtx(tmp_path / "plane.gtx", heights, 45, 7, 0.25)).at(np.radians(47.1), np.radians(10.3))
     expected = deflection(np.radians(47.1), np.degrees(1), np.degrees(2) / np.cos(np.radians(47.1)))
     assert (d.xi_arcsec, d.eta_arcsec) == pytest.approx(expected, rel=1e-6)
-    assert d.xi_arcsec == pytest.approx(
-        -1.855, abs=0.001
-    )  # 1 m in 111.18 km; the plumb line leans away from the height
+    # 1 m in 111.18 km; the plumb line leans away from the height.
+    assert d.xi_arcsec == pytest.approx(-1.855, abs=0.001)
 
 
 def hill(height_m, width_deg, step, centre=(46.0, 8.0)):
@@ -187,14 +188,16 @@ def test_outside_nothing_is_known(tmp_path):
     heights[20:22, 30] = -88.8888
     heights[40, 30] = np.nan
     heights[50, 60] = -2147479936
-    grid = geoid.read(gtx(tmp_path / "region.gtx", heights, 30, 170, 0.25))  # over the date line: to -170.25
+    # Over the date line: to -170.25.
+    grid = geoid.read(gtx(tmp_path / "region.gtx", heights, 30, 170, 0.25))
     unknown = Deflection(0.0, 0.0, UNKNOWN_STDDEV_ARCSEC)
     for place in [(29.9, 175), (30.1, 175), (44.6, 175), (35, 169.9), (35, -170.3), (35, 0), (35, -10), (-35, 175),
                   (90, 175), (35.1, 177.4), (40, 177.5), (42.6, -175.1), (np.nan, 175), (35, np.inf)]:  # fmt: skip
         assert grid.at(*np.radians(place)) == unknown, place
     phi = np.radians(36.1)
     expected = deflection(phi, np.degrees(0.8), -np.degrees(0.4) / np.cos(phi))
-    for longitude in (175.1, 179.99, 180, -180, -179.6, -175, 177, 178.9, 185 - 720):  # and beside the hole
+    # Beside the hole it answers.
+    for longitude in (175.1, 179.99, 180, -180, -179.6, -175, 177, 178.9, 185 - 720):
         d = grid.at(phi, np.radians(longitude))
         assert (d.xi_arcsec, d.eta_arcsec) == pytest.approx(expected, rel=1e-4), longitude
 
@@ -216,7 +219,8 @@ def test_what_is_unknown_widens_the_geodetic_place(tmp_path):
     assert np.sqrt(outside.covariance[1, 1]) == pytest.approx(UNKNOWN_STDDEV_ARCSEC * 30.9, rel=0.01)
 
 
-HEIGHTS = np.fromfunction(lambda r, c: 20 + 0.3 * r + 0.02 * r * c - 0.5 * c, (40, 50))  # rows from the south
+# Rows from the south.
+HEIGHTS = np.fromfunction(lambda r, c: 20 + 0.3 * r + 0.02 * r * c - 0.5 * c, (40, 50))
 TIFFS = {
     "a strip, little endian": {},
     "big endian": {"order": ">"},
@@ -249,7 +253,8 @@ def test_a_geotiff_says_what_the_gtx_says(tmp_path, name):
 
 def test_no_data_of_a_geotiff(tmp_path):
     heights = HEIGHTS[::-1].copy()
-    heights[20, 30] = 21.53125  # 0.6 m off, no cliff; exact in single precision, and no other node has it
+    # 0.6 m off, no cliff; exact in single precision, and no other node has it.
+    heights[20, 30] = 21.53125
     path = tiff(tmp_path / "a.tif", heights, (10.0, 48.9), (0.2, 0.1), extra=[(42113, "s", b"21.53125\0")])
     assert geoid.read(path).at(*np.radians([46.95, 16.1])) == Deflection()
     assert geoid.read(path).at(*np.radians([46.1, 12.0])) != Deflection()
@@ -340,7 +345,8 @@ def test_files_that_are_cut_off_or_changed_raise_one_error_or_still_hold(tmp_pat
     for _ in range(300):
         changed = bytearray(good[: rng.integers(4, len(good) + 1)] if rng.random() < 0.3 else good)
         for at in rng.integers(4, len(changed), rng.integers(1, 4)):
-            changed[-at if rng.random() < 0.7 else at] = rng.integers(256)  # its directory is at the end
+            # Its directory is at the end.
+            changed[-at if rng.random() < 0.7 else at] = rng.integers(256)
         path.write_bytes(changed)
         try:
             d = geoid.read(path).at(*np.radians([46.5, 13.0]))

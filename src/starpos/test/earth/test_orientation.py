@@ -247,7 +247,8 @@ def test_the_sigmas_of_extrapolation_are_what_it_would_have_erred_since_1974():
     table = iers.IERS_A.open(IERS_A_FILE)
     measured = np.asarray(table["UT1Flag"]) != "P"
     mjd, ut1 = np.asarray(table["MJD"].value)[measured], np.asarray(table["UT1_UTC"].value)[measured]
-    ut1 = ut1 - np.round((erfa.utctai(2400000.5, mjd)[1] - mjd) * 86400)  # without leap seconds
+    # Without leap seconds.
+    ut1 = ut1 - np.round((erfa.utctai(2400000.5, mjd)[1] - mjd) * 86400)
     pole = np.stack([table[c][measured].to_value("rad") for c in ("PM_x", "PM_y")], -1)
     for days, sigma in zip(EXTRAPOLATION_DAYS[1:], EXTRAPOLATION_SIGMA_S[1:], strict=True):
         now = np.arange(365, len(ut1) - int(days))

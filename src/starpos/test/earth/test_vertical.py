@@ -37,7 +37,8 @@ def test_an_unknown_deflection_widens_position_and_heading():
     """6 arcsec are 185 m; of the heading eta tan(phi)."""
     g = geodetic(np.radians(45.0), 0.0, 0.0, NONE, Deflection())
     assert np.sqrt(np.diag(g.covariance)) == pytest.approx([185.8, 185.0, 6 * ARCSEC], rel=2e-3)
-    assert g.covariance[0, 2] > 0  # east and clockwise go together: both are minus eta
+    # East and clockwise go together: both are minus eta.
+    assert g.covariance[0, 2] > 0
     assert g.covariance[1, 2] == g.covariance[0, 1] == 0
     np.testing.assert_allclose(g.covariance, g.deflection_covariance, rtol=1e-12)
     before = np.diag([4.0, 9.0, 1e-10])

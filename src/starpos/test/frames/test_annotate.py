@@ -93,7 +93,8 @@ def test_background_is_dark_and_stars_are_white(kind):
 def test_a_strong_gradient_leaves_its_stars_to_be_seen():
     places = [(60, 240), (580, 240)]
     frame = frame_of(places)
-    slope = np.linspace(0, 20000, SIZE[0])  # over a star of 18000
+    # Over a star of 18000.
+    slope = np.linspace(0, 20000, SIZE[0])
     bright = Frame((frame.pixels + slope).astype(np.uint16))
     picture = annotate(bright, no_stars(*SIZE))[..., 0].astype(int)
     for x, y in places:

@@ -19,7 +19,8 @@ from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
 MOSAIC = raws.mosaic()
-SHOWN_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()  # raws.START, were it UTC
+# raws.START, were it UTC.
+SHOWN_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()
 TEHRAN = CameraClock(3.5, 2.0)
 
 needs_rawpy, needs_exifread = needs("rawpy"), needs("exifread")
@@ -132,7 +133,8 @@ def test_the_error_of_a_clock_that_counts_in_steps_is_as_large_as_it_is_said_to_
         start = f"2026:11:02 18:00:{int(whole):02d}"
         frame = read_frame(write(tmp_path / "a.jpg", jpeg(start=start, subsec=subsec)), CameraClock(0.0))
         if subsec and not int(subsec):
-            continue  # such are taken for no fraction
+            # Such are taken for no fraction.
+            continue
         away.append(frame.mid_unix_s - frame.exposure_s / 2 - SHOWN_S - true)
         claimed = np.sqrt(frame.stamp_stddev_s**2 - UNKNOWN_LATENCY_S**2)
     assert abs(np.mean(away)) < 4 * claimed / np.sqrt(len(away))

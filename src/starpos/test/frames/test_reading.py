@@ -179,7 +179,8 @@ def huge_fits():
         ("a.fits", b""),
         ("a.fits", b"not a fits file " * 300),
         ("a.fits", huge_fits()),
-        ("a.fits", huge_fits().replace(b"999999999", b"        3")),  # no pixels follow
+        # No pixels follow.
+        ("a.fits", huge_fits().replace(b"999999999", b"        3")),
         ("a.fits", huge_fits().replace(b"999999999", b"       -3")),
         ("a.fits", huge_fits().replace(b"999999999", b"        0")),
         ("a.fits", huge_fits().replace(b"BITPIX  =                   16", b"BITPIX  =                   17")),
@@ -198,9 +199,11 @@ def huge_fits():
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux,sigma\n1,2,3,0\n'),
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9, "DATE-OBS": "now", "EXPTIME": 1}\nx,y,flux\n'),
         ("a.csv", b"# [1, 2]\nx,y,flux\n"),
-        ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n' + b"1" * 200_000),  # over csv's field limit
+        # Over csv's field limit.
+        ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n' + b"1" * 200_000),
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9, "EXPTIME": 1' + b"0" * 400 + b"}\nx,y,flux\n"),
-        (f"{'a' * 300}.fits", None),  # longer than a file system's names
+        # Longer than a file system's names.
+        (f"{'a' * 300}.fits", None),
         ("a\0.fits", None),
     ],
 )

@@ -7,7 +7,8 @@ from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
 
 SIZE = (5616, 3744)
-STRONG = (-0.28, 0.11, 1.2e-3, -8e-4, -0.02)  # of a wide lens
+# A wide lens.
+STRONG = (-0.28, 0.11, 1.2e-3, -8e-4, -0.02)
 WIDE = Camera(width=1392, height=1040, fx=1300.0, fy=1305.0, cx=700.3, cy=515.8, distortion=STRONG)
 PAPER = Camera.from_focal(*SIZE, 93750.0)
 BENT = Camera(

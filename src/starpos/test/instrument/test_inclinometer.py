@@ -32,7 +32,8 @@ def test_a2_turns_up_as_the_sensor_feels_it_into_z(rng):
         np.testing.assert_allclose(a2 @ a2.T, np.eye(3), atol=1e-15)
         assert np.linalg.det(a2) == pytest.approx(1)
         np.testing.assert_allclose(a2[2], up, atol=1e-15)
-        assert a2[1, 0] == 0  # R2 R1: X' stays above the X axis of L
+        # R2 R1: X' stays above the X axis of L.
+        assert a2[1, 0] == 0
 
 
 def test_a_sensor_of_three_axes_leans_in_any_way(rng):

@@ -80,7 +80,8 @@ def test_the_covariance_of_the_angles_is_that_of_turned_a3s(angles, rng):
 )
 def test_a_calibration_that_is_none(given, words):
     with warnings.catch_warnings(), pytest.raises(InstrumentError, match=words):
-        warnings.simplefilter("error")  # of numpy, for a user to wonder at
+        # A warning of numpy would make a user wonder.
+        warnings.simplefilter("error")
         Calibration(**given)
 
 
@@ -121,7 +122,8 @@ def test_age():
         with pytest.raises(InstrumentError, match=r"2001-09-09T01:46:40\.000Z is 10 days .* holds for 10"):
             c.check_age(1e9 + off * 86400)
     replace(c, valid_days=float("inf")).check_age(1e12)
-    Calibration(valid_days=1.0).check_age(1e9)  # nobody knows how old it is
+    # Nobody knows how old it is.
+    Calibration(valid_days=1.0).check_age(1e9)
 
 
 def test_focal_length_in_pixels():

@@ -254,7 +254,8 @@ REFUSED = {
 def test_refused_with_one_sentence_that_names_the_file(kind, reads, tmp_path):
     text, words = REFUSED[kind]
     with warnings.catch_warnings(), pytest.raises(InstrumentError) as e:
-        warnings.simplefilter("error")  # would reach the user's screen
+        # Would reach the user's screen.
+        warnings.simplefilter("error")
         reads(text.replace("EXECUTED", str(tmp_path / "executed")) if isinstance(text, str) else text)
     assert words in str(e.value)
     assert "instrument.yaml" in str(e.value)
@@ -332,7 +333,8 @@ def test_what_is_written_is_read(full, rng, tmp_path):
         assert again.camera == i.camera
         np.testing.assert_allclose(numbers(again), numbers(i), rtol=1e-14)
         assert again.calibration.utc_unix_s == pytest.approx(i.calibration.utc_unix_s, abs=1.1e-3)
-        write(tmp_path / "again.yaml", again)  # and from then on to the last bit
+        # From then on it is the same to the last bit.
+        write(tmp_path / "again.yaml", again)
         assert (tmp_path / "again.yaml").read_text() == text
 
 
@@ -407,7 +409,8 @@ def test_a_disk_that_is_full_leaves_the_old_file(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]  # nothing half written beside it
+    # Nothing half written beside it.
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_where_no_file_can_be(tmp_path):

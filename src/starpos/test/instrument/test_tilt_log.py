@@ -226,7 +226,8 @@ def test_csv(tmp_path):
         "utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n12.5,1,-2,20.5\n10.5,0.5,nan,20\nnan,1,1,20\n"
     )
     read = read_tilt_csv(path)
-    assert read.utc_unix_s.tolist() == [10.5, 12.5]  # sorted, and only those with a time
+    # Sorted, and only those with a time.
+    assert read.utc_unix_s.tolist() == [10.5, 12.5]
     assert read.theta_x / DEG == pytest.approx([0.5, 1])
     assert read.theta_y[1] / DEG == pytest.approx(-2)
     assert read.temperature_c.tolist() == [20, 20.5]
@@ -361,7 +362,8 @@ def test_hostile_csv_gives_one_sentence_that_names_the_file(tmp_path, kind):
     path = tmp_path / "tilt.csv"
     path.write_bytes(HOSTILE[kind])
     with warnings.catch_warnings(), pytest.raises(TiltError) as e:
-        warnings.simplefilter("error")  # a warning would reach the user's screen
+        # A warning would reach the user's screen.
+        warnings.simplefilter("error")
         read_tilt_csv(path).average(1.0, 1.0)
     assert "\n" not in str(e.value)
     assert str(path) in str(e.value) or "tilt reading" in str(e.value)

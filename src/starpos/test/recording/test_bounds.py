@@ -17,7 +17,8 @@ from starpos.recording import bounds
 from starpos.recording.bag import BagReader
 
 bounds.bound_rosbags()
-zstd = reader.zstd._zstd  # the module that rosbags found
+# The module that rosbags found.
+zstd = reader.zstd._zstd
 PACKERS = {"zstd": zstd.compress, "lz4": lz4, "": bytes}
 MAGIC = b"\x89MCAP0\r\n"
 TOPIC, KIND = "/stars", "std_msgs/msg/UInt8MultiArray"
@@ -48,7 +49,8 @@ def mcap(path, payloads, compression, stated=None, indexed=False):
         packed, size = PACKERS[compression](raw), len(raw) if stated is None else stated
         head = struct.pack("<QQQI", 5, 5, size, 0) + text(compression) + struct.pack("<Q", len(packed))
         chunk = part(6, head + packed)
-        places = struct.pack("<IHQ", 10, 1, 0)  # where channel 1 is in it
+        # Where channel 1 is in it.
+        places = struct.pack("<IHQ", 10, 1, 0)
         index += part(8, struct.pack("<QQQQ", 5, 5, len(data), len(chunk)) + places + struct.pack("<Q", 0)
                       + text(compression) + struct.pack("<QQ", len(packed), size))  # fmt: skip
         data += chunk
@@ -122,7 +124,8 @@ def test_a_compressed_message_is_bounded(tmp_path, small):
 def test_a_compressed_file_is_unpacked_only_where_there_is_room(tmp_path, monkeypatch):
     path = packed_as(CompressionMode.FILE, tmp_path / "a", bytes(1 << 21))
     assert read(path) == [bytes(1 << 21)]
-    monkeypatch.setattr(bounds, "LEFT_ON_DISK", 1 << 60)  # as on a disk that is nearly full
+    # As on a disk that is nearly full.
+    monkeypatch.setattr(bounds, "LEFT_ON_DISK", 1 << 60)
     with pytest.raises(BagError, match="more than there is room for"):
         read(path)
 

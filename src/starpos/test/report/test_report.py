@@ -254,7 +254,8 @@ def test_without_matplotlib_the_pip_line_is_said(still, tmp_path, capsys, monkey
 def test_a_report_leaves_matplotlib_as_it_was(still, tmp_path, capsys):
     import matplotlib
 
-    settings = {k: v for k, v in matplotlib.rcParams.items() if k != "backend"}  # a look at that one sets it
+    # A look at that one sets it.
+    settings = {k: v for k, v in matplotlib.rcParams.items() if k != "backend"}
     pyplot = sys.modules.pop("matplotlib.pyplot", None)
     report(capsys, still, tmp_path / "out")
     assert "matplotlib.pyplot" not in sys.modules

@@ -277,7 +277,8 @@ def test_what_is_no_bag_is_refused_in_one_line(damage, lists, tilts, tmp_path, c
 @pytest.mark.usefixtures("unpainted")
 def test_a_recording_that_was_killed_says_how_to_get_it_back(lists, tilts, tmp_path, capsys):
     bag = record(tmp_path / "bag", lists, tilts)
-    (bag / "metadata.yaml").unlink()  # both come at the end
+    # Both come at the end.
+    (bag / "metadata.yaml").unlink()
     (file,) = bag.glob("*.mcap")
     whole = file.read_bytes()
     for left in (0, 8, 9, len(whole) - 1):

@@ -89,7 +89,8 @@ def test_deviations_are_from_the_mean_in_arcsec():
     np.testing.assert_allclose(s.mean_absolute, [4 / 3, 2, 0], atol=1e-9)
     prime, meridian = curvature_radii_m(0.7)
     wanted = np.array([100 / meridian, 100 / (prime * np.cos(0.7)), 0]) / ARCSEC
-    np.testing.assert_allclose(s.sigma, [wanted] * 3, rtol=1e-4)  # what all frames share is not in it
+    # What all frames share is not in it.
+    np.testing.assert_allclose(s.sigma, [wanted] * 3, rtol=1e-4)
 
 
 def test_deviations_across_the_date_line_and_north():
@@ -103,9 +104,8 @@ def test_one_frame_that_jumps_is_the_outlier(rng):
     latitudes[11] += 60 * ARCSEC
     s = measures.stability(night(latitudes, 0.5 + rng.normal(0, 3, 30) * ARCSEC, [1.0] * 30))
     assert np.flatnonzero(s.outlier).tolist() == [11]
-    assert not measures.stability(
-        night([0.7, 0.7, 0.8], [0.5] * 3, [1.0] * 3)
-    ).outlier.any()  # too few to tell
+    # Too few to tell.
+    assert not measures.stability(night([0.7, 0.7, 0.8], [0.5] * 3, [1.0] * 3)).outlier.any()
 
 
 def test_headings_of_a_turned_instrument_are_held_against_the_truth():
@@ -137,7 +137,8 @@ def test_a_residual_points_to_where_the_star_was_seen(lists, catalogue):
     path = lists / "stars_0000.csv"
     whole = path.read_text()
     head, names, *rows = whole.splitlines()
-    x, y = before.xy[-1]  # a faint one, whose error allows for what is done to it
+    # A faint one, whose error allows for what is done to it.
+    x, y = before.xy[-1]
     row = next(k for k, r in enumerate(rows) if np.allclose([float(v) for v in r.split(",")[:2]], [x, y]))
     values = rows[row].split(",")
     rows[row] = ",".join([f"{x + 0.1:.5f}", f"{y - 0.15:.5f}", *values[2:]])
@@ -157,7 +158,8 @@ def test_stars_are_drawn_where_they_stand_on_the_sky(lists, catalogue):
         icrs = sky_figure.View(shot, shot.pointing, shot.size).directions(shot.xy)
         azimuth, zenith_deg = sky_figure.polar(site.refracted(icrs, earth_state(shot.utc_unix_s)))
         camera = Camera.from_focal(*shot.size, FOCAL_PX)
-        true = camera.directions(*shot.xy.T) @ camera_to_enu(40.0, 78.0, 15.0).T  # as `simulate` points
+        # As `simulate` points.
+        true = camera.directions(*shot.xy.T) @ camera_to_enu(40.0, 78.0, 15.0).T
         np.testing.assert_allclose(zenith_deg, np.degrees(np.arccos(true[:, 2])), atol=0.02)
         across = np.sin(azimuth - np.arctan2(true[:, 0], true[:, 1])) * np.sin(np.radians(zenith_deg))
         np.testing.assert_allclose(np.degrees(across), 0, atol=0.02)

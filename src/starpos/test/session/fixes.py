@@ -52,9 +52,8 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
     attitude = camera_to_enu(azimuth_deg, 80.0, 0.0)
     link = attitude @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     rows = np.array([1.0, 1.0, 1e-6, 1e-7, 1e-7, 1e-6])
-    turn = rotation.about_axis(2, -math.radians(azimuth_deg))[
-        :2, :2
-    ]  # a slip of the mount turns with the instrument
+    # A slip of the mount turns with the instrument.
+    turn = rotation.about_axis(2, -math.radians(azimuth_deg))[:2, :2]
     slip = np.zeros((6, 2))
     slip[:2] = turn * calibration_m
     terms = (ErrorTerm("tilt", np.diag(rows * noise_m)), ErrorTerm("calibration", slip, shared=ALWAYS))

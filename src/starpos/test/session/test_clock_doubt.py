@@ -62,7 +62,8 @@ def test_the_first_of_a_pose_alone_is_outvoted():
 
 
 def test_a_blurred_frame_is_not_what_others_are_held_against():
-    blurred = replace(stamped(0.0), camera_covariance=np.eye(3) * 4e-4**2)  # a quarter of a minute of time
+    # A quarter of a minute of time.
+    blurred = replace(stamped(0.0), camera_covariance=np.eye(3) * 4e-4**2)
     assert doubts_of(blurred, stamped(0.0), stamped(20.0)) == pytest.approx([0.0, 0.0, 20.0], rel=1e-6)
 
 

@@ -44,7 +44,8 @@ def poses_of(*frames) -> PoseMemory:
 
 def test_a_camera_that_stands_still_is_one_pose_with_its_last_stars_and_mean_tilt():
     poses = poses_of(*((10.0 * k, 40.0) for k in range(5)), (50.0, 130.0), (60.0, 40.0))
-    first, second, third = poses.frames()  # back at a heading is another pose: the instrument was touched
+    # Back at a heading is another pose: the instrument was touched.
+    first, second, third = poses.frames()
     assert [s.stars.mid_unix_s - T0 for s in (first, second, third)] == [40.0, 50.0, 60.0]
     np.testing.assert_allclose(first.tilt.covariance, np.eye(2) * NOISE**2 / 25, rtol=1e-6)
     assert first.tilt.samples == 25

@@ -113,7 +113,8 @@ def test_the_deflection_defaults_to_knowing_nothing():
 
 def test_a_deflection_is_given_by_hand_or_by_a_geoid(tmp_path):
     path = tmp_path / "slope.gtx"
-    heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))  # 1 m a degree to the north
+    # 1 m a degree to the north.
+    heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))
     path.write_bytes(struct.pack(">4d2i", 30, 40, 1, 1, *heights.shape) + heights.astype(">f4").tobytes())
     grid = geoid_file(str(path))
     there = vertical_of(values(), grid).at(math.radians(45), math.radians(60))

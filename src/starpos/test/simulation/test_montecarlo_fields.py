@@ -14,7 +14,8 @@ from starpos.instrument.camera import Camera
 from starpos.simulation import montecarlo_fields as mc
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
-CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)  # 15 deg
+# 15 deg.
+CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700")
 FEW = ("--fields", "4", "--false", "0", "3", "--stars", "6", "--points", "3", "--limit-mag", "6.5")
 
@@ -95,7 +96,8 @@ def test_a_limit_that_gives_so_many_stars(catalogue):
 
 def test_answers_are_counted(catalogue, conditions):
     tally, tolerance = mc.Tally(), conditions.tolerance_rad
-    assert tolerance == pytest.approx(1 / FOCAL_PX)  # a pixel of 45 arcsec
+    # A pixel of 45 arcsec.
+    assert tolerance == pytest.approx(1 / FOCAL_PX)
     given, points = mc.draw(catalogue, conditions, 1, 1), mc.draw_points(conditions, 1, 1)
     across = np.cross(given.centre, [0, 0, 1.0])
     beside = given.centre + across / np.linalg.norm(across) * 1.5 * tolerance

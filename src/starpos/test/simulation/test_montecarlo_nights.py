@@ -13,7 +13,8 @@ from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.simulation import montecarlo_nights
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
-CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)  # 15 deg, whose triangles build fast
+# 15 deg, whose triangles build fast.
+CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)
 KINDS = {
     "turned": partial(montecarlo_nights.turned_night, headings=4, frames=1, camera=CAMERA),
     "calibrated": partial(montecarlo_nights.calibrated_night, frames=1, camera=CAMERA),
@@ -84,7 +85,8 @@ def test_nothing_told_is_what_was_drawn(catalogue):
     assert world.scene.site.atmosphere.pressure_pa != world.air.pressure_pa
     seen = np.array([world.scene.site.latitude_deg - world.site.latitude_deg,
                      world.scene.site.longitude_deg - world.site.longitude_deg])  # fmt: skip
-    assert 0 < np.abs(seen).max() < 1e-4  # the Earth's rotation is off by milliseconds at most
+    # The Earth's rotation is off by milliseconds at most.
+    assert 0 < np.abs(seen).max() < 1e-4
     moved = (world.sky.dec_mas - catalogue.dec_mas)[:20000]
     # stars of unknown motion, one in a hundred, are moved by arcseconds
     assert 5 < np.median(np.abs(moved)) < 200
@@ -99,7 +101,8 @@ def test_a_zero_wanders_by_the_root_of_time():
         for hour in (1, 3, 9):
             off = zero.at(1000.0 + 3600 * hour)
         walked.append(off)
-        np.testing.assert_array_equal(zero.at(1000.0 + 3600 * 2), off)  # time does not go back
+        # Time does not go back.
+        np.testing.assert_array_equal(zero.at(1000.0 + 3600 * 2), off)
     assert np.std(walked) == pytest.approx(np.radians(2 / 3600) * 3, rel=4 / np.sqrt(2 * 600))
 
 
@@ -151,7 +154,8 @@ def test_whether_claims_are_honest(run):
     assert errors == []
     off = [abs(whole[k] / n - 1) for k, n in (("position_nees", 2), ("ground_nees", 2), ("heading_nees", 1))]
     assert status == int(max(off) >= 0.1)
-    assert run(*args, "--jobs", 2, "--json") == (status, said, [])  # however many work on it
+    # However many work on it.
+    assert run(*args, "--jobs", 2, "--json") == (status, said, [])
 
 
 @pytest.mark.parametrize(

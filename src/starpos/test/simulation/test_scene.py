@@ -24,11 +24,12 @@ def test_a_camera_points_where_it_is_told():
     """Azimuth from north over east, altitude; x level and to the right for one who looks along z; roll about z."""
     east = camera_to_enu(90.0, 30.0, 0.0)
     np.testing.assert_allclose(east[:, 2], [np.cos(np.pi / 6), 0, 0.5], atol=1e-15)
-    np.testing.assert_allclose(east[:, 0], [0, -1, 0], atol=1e-15)  # south is on the right
-    assert east[2, 1] < 0  # y down
-    np.testing.assert_allclose(
-        camera_to_enu(0.0, 0.0, 90.0)[:, 0], [0, 0, 1], atol=1e-15
-    )  # roll lifts the right side
+    # South is on the right.
+    np.testing.assert_allclose(east[:, 0], [0, -1, 0], atol=1e-15)
+    # Y down.
+    assert east[2, 1] < 0
+    # Roll lifts the right side.
+    np.testing.assert_allclose(camera_to_enu(0.0, 0.0, 90.0)[:, 0], [0, 0, 1], atol=1e-15)
     for roll in (0.0, 33.0, -120.0):
         c = camera_to_enu(200.0, 66.0, roll)
         np.testing.assert_allclose(c @ c.T, np.eye(3), atol=1e-15)
@@ -64,9 +65,8 @@ def test_the_sky_turns_15_arcsec_a_second(catalogue, rng):
     scene = wide_scene(latitude_deg=0.0, pointing_deg=(0.0, 90.0, 0.0))
     stars = expose(scene, catalogue, START, 10.0, rng)
     trail = np.hypot(*(stars.end - stars.start).T) * scene.camera.scale_arcsec
-    near = (
-        np.hypot(*(stars.middle - scene.camera.centre_px).T) < 200
-    )  # declination below 2.5 deg, plate scale true
+    # Declination below 2.5 deg, plate scale true.
+    near = np.hypot(*(stars.middle - scene.camera.centre_px).T) < 200
     assert trail[near] == pytest.approx(150.4, rel=0.003)
 
 
@@ -119,7 +119,8 @@ def test_a_rendered_star_has_its_light_its_place_and_its_trail(dark, rng):
     assert total == pytest.approx(2e5, rel=1e-3)
     assert (x, y) == pytest.approx((60.3, 40.7), abs=0.01)
     spread = (pixels * (column - x) ** 2).sum() / pixels.sum(), (pixels * (row - y) ** 2).sum() / pixels.sum()
-    own = (2.4 / 2.3548) ** 2 + 1 / 12  # of the image, and of a pixel
+    # The image's own variance, and a pixel's.
+    own = (2.4 / 2.3548) ** 2 + 1 / 12
     assert spread == pytest.approx((own + 9 / 12, own + 16 / 12), rel=0.02)
 
 

@@ -158,9 +158,8 @@ def test_errors_grow_with_time_as_design_section_5_says(catalogue):
         np.median(catalogue.sigma(slice(None, None, 50), year)) / MAS for year in (1995, 2010, 2026, 2040)
     ]
     assert np.all(np.diff(sigma) > 0)
-    assert (
-        43 <= np.median(catalogue.sigma(catalogue.vmag() < 9.5, 2026.0)) / MAS < 52
-    )  # they are stored rounded up
+    # They are stored rounded up.
+    assert 43 <= np.median(catalogue.sigma(catalogue.vmag() < 9.5, 2026.0)) / MAS < 52
     assert np.all(catalogue.sigma(slice(None, None, 50), 2026.0) > 0)
 
 

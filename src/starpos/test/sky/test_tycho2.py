@@ -13,8 +13,10 @@ from starpos_testing.skies.tycho2_files import FAINT, main, supplement, write_fi
 
 STARS = {
     "tyc2.dat.00": main((1, 13, 1), 1.12558209, 2.26739400, (27.7, -0.5), bt="10.488", vt=" 8.670", hip="70")
-    + main((1, 14, 1), 1.5, 2.5, bt=" 8.000")  # VT never measured
-    + main((1, 15, 1), 1.6, 2.5, vt=" 8.000")  # BT never measured
+    # VT never measured.
+    + main((1, 14, 1), 1.5, 2.5, bt=" 8.000")
+    # BT never measured.
+    + main((1, 15, 1), 1.6, 2.5, vt=" 8.000")
     + main((1, 16, 1), pflag="X", vt=" 7.000", bt=" 7.700", observed=(200.0, -30.0))
     + FAINT,
     "tyc2.dat.04": main((3014, 574, 1), pflag="X", vt=" 6.509", bt=" 7.353", observed=(178.23344944, 37.73193528),
@@ -52,7 +54,8 @@ def place(catalogue, index):
 def test_a_normal_star(built):
     i = star(built, 1, 13, 1)
     assert place(built, i) == pytest.approx((1.12558209, 2.26739400), abs=2e-7)
-    assert (built.pm_ra[i], built.pm_dec[i], built.hip[i]) == (28, 0, 70)  # -0.5 rounds to the even
+    # -0.5 rounds to the even.
+    assert (built.pm_ra[i], built.pm_dec[i], built.hip[i]) == (28, 0, 70)
     assert built.vmag(i)[0] == pytest.approx(8.670 - 0.09 * (10.488 - 8.670), abs=0.006)
     # sigma: rms of both axes, grown from the mean epoch 1981; stored rounded up
     at_epoch, later = built.sigma(i, 1981.0)[0], built.sigma(i, 2026.0)[0]

@@ -28,7 +28,8 @@ TOPICS = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 IMAGES = {"camera/image_raw": "sensor_msgs/msg/Image"}
-SAVED, BROKEN_OFF, REFUSED = 0, 1, 2  # exit statuses
+# Exit statuses.
+SAVED, BROKEN_OFF, REFUSED = 0, 1, 2
 
 
 def record() -> int:

@@ -29,7 +29,8 @@ class Recorder(Node):
 
     def __init__(self, writer: BagWriter, topics: Mapping[str, str], say: Callable[[str], None]) -> None:
         super().__init__("record", start_parameter_services=False)
-        self.trouble = ""  # why the recording broke off
+        # Why the recording broke off.
+        self.trouble = ""
         self._writer, self._say = writer, say
         for name, type_name in topics.items():
             package, message = type_name.split("/msg/")

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from starpos_bringup.recording.player import Player
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-PLAYED, CUT_SHORT, REFUSED = 0, 1, 2  # exit statuses
+# Exit statuses.
+PLAYED, CUT_SHORT, REFUSED = 0, 1, 2
 # The topic that must be there, and others.
 INPUTS = {
     "stars": ("stars", ("camera/camera_info", "tilt")),

@@ -180,12 +180,14 @@ class Cable:
 def _read(end: int) -> bytes:
     try:
         return os.read(end, ETHERNET_BYTES)
-    except OSError:  # the device is down
+    except OSError:
+        # The device is down.
         return b""
 
 
 def _write(end: int, frame: bytes) -> None:
-    with contextlib.suppress(OSError):  # the device is down, or its queue is full
+    # The device is down, or its queue is full.
+    with contextlib.suppress(OSError):
         os.write(end, frame)
 
 

@@ -14,7 +14,8 @@ from starpos_testing.patience import WAIT_S
 
 FULL_FRAME_BYTES = FULL[0] * FULL[1] * 2
 PIXEL_UM = 6.4
-TILT_RATE_HZ = 10  # of the inclinometer as it comes
+# Errors of the inclinometer as it comes.
+TILT_RATE_HZ = 10
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,10 @@ class Traffic:
 
     frames: int
     stars: float
-    bytes_per_frame: float  # above what flows without a camera
-    bytes_per_second: float  # of that: the tilts
+    # Above what flows without a camera.
+    bytes_per_frame: float
+    # How much of that is tilts.
+    bytes_per_second: float
 
 
 def traffic(folder: Path, frames: int, cadence_s: float, quiet_s: float = 10.0) -> Traffic:

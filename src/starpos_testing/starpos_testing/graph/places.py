@@ -10,7 +10,8 @@ from starpos.sky.site import Site
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import scene_at, shoot
 
-METRES = 6.371e6  # a sphere will do
+# A sphere will do.
+METRES = 6.371e6
 
 
 def misaligned(misalignment_deg=(0.3, -0.2, 0.5), azimuth_deg=40.0):

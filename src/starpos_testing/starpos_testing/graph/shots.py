@@ -14,7 +14,8 @@ from starpos.sky.catalogue import load_catalogue
 from starpos_common.messages import camera_to_message, frame_to_message, stars_to_message, tilt_to_message
 from starpos_interfaces import msg
 
-START_S = 1730656800.0  # 2024-11-03T18:00:00Z: what lies in the future is refused
+# 2024-11-03T18:00:00Z: what lies in the future is refused.
+START_S = 1730656800.0
 EXPOSURE_S, CADENCE_S, SAMPLES = 0.5, 10.0, 5
 PRESSURE_PA, TEMPERATURE_C, HUMIDITY = 95000.0, 8.0, 0.5
 LATITUDE_DEG, LONGITUDE_DEG = -23.1, -68.25

@@ -104,7 +104,8 @@ class NightBag:
         given = {k: solved[k] for k in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic")}
         given |= {"xi": solved["xi_arcsec"], "eta": solved["eta_arcsec"]}
         turned = solved["eta_arcsec"] / 3600 * np.tan(np.radians(solved["latitude_geodetic"]))
-        given["heading"] = solved["heading"] - turned  # geodetic, as the node's
+        # Geodetic, as the node's.
+        given["heading"] = solved["heading"] - turned
         given |= {k: np.ravel(solved[k]).astype(float) for k in ("covariance", "covariance_geodetic")}
         given |= {k: solved[k] for k in ("stars_detected", "stars_matched", "log_odds")}
         made = self.message("Solution", unix_s, budget=terms, residual=solved["residual_arcsec"], **given)

@@ -16,7 +16,8 @@ from starpos.instrument.instrument import TOP_OF_FRAME
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
 
-UTC = 1793642400.0  # 2026-11-02T18:00:00
+# 2026-11-02T18:00:00
+UTC = 1793642400.0
 PAPER = Camera.from_focal(5616, 3744, 93750.0)
 NO_ERROR = np.zeros((2, 2))
 

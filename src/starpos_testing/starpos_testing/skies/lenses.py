@@ -21,7 +21,8 @@ FIELDS = {
     11: ((1024, 768), 5118.0, 8.0),
     25: ((1000, 700), 2750.0, 6.8),
 }
-CORNER = (0.008, 0.002, 0.001, 0.001, 0.0005)  # 1 sigma of what k1, k2, p1, p2, k3 shift the corner by
+# 1 sigma of what k1, k2, p1, p2, k3 shift the corner by.
+CORNER = (0.008, 0.002, 0.001, 0.001, 0.0005)
 
 
 def ideal(field) -> Camera:

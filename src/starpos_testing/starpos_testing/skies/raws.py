@@ -63,8 +63,10 @@ def dng(mosaic, pattern="rggb", order="<", **exif):
         0x100: (LONG, [width]),
         0x101: (LONG, [height]),
         0x102: (SHORT, [16]),
-        0x103: (SHORT, [1]),  # not compressed
-        0x106: (SHORT, [32803]),  # a colour mosaic
+        # Not compressed.
+        0x103: (SHORT, [1]),
+        # A colour mosaic.
+        0x106: (SHORT, [32803]),
         0x10F: (ASCII, "starpos"),
         0x110: (ASCII, "test"),
         0x112: (SHORT, [1]),
@@ -75,7 +77,8 @@ def dng(mosaic, pattern="rggb", order="<", **exif):
         0x828E: (BYTE, [COLOURS[c] for c in pattern]),
         0xC612: (BYTE, [1, 4, 0, 0]),
         0xC614: (ASCII, "starpos test"),
-        0xC621: (SRATIONAL, [1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1]),  # colours are XYZ
+        # Colours are XYZ.
+        0xC621: (SRATIONAL, [1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1]),
     }
     return tiff(tags, exif_tags(**exif), order, pixels)
 

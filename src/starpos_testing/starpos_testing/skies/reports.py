@@ -10,7 +10,8 @@ import numpy as np
 from starpos.cli import main
 from starpos_testing.command_line import run
 
-OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# 4636 px: 15 deg across 1000 x 700 px.
+OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")
 # that A3 is known
 A3 = ("--misalignment", 0, 0, 0, "--misalignment-stddev", 5)
 KNOWN = (*OPTICS, *A3)
@@ -62,4 +63,5 @@ def assert_drawn(png):
 
     pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert pixels is not None and min(pixels.shape[:2]) > 300
-    assert 0.003 < np.mean(pixels.min(2) < 200) < 0.6  # ink on white
+    # Ink on white.
+    assert 0.003 < np.mean(pixels.min(2) < 200) < 0.6

@@ -11,9 +11,11 @@ from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulation.scene import Optics, Scene, detected, expose, read_tilt, scene_of
 
-START = 1793642400.0  # 2026-11-02T18:00:00
+# 2026-11-02T18:00:00
+START = 1793642400.0
 EXPOSURE = 0.5
-SIZE, FOCAL_PX = (1000, 700), 4636.0  # a diagonal of 15 deg, 44.5 arcsec a pixel
+# A diagonal of 15 deg, 44.5 arcsec a pixel.
+SIZE, FOCAL_PX = (1000, 700), 4636.0
 AIR = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
 
 
