@@ -10,6 +10,7 @@ from pathlib import Path
 import astropy_iers_data
 import numpy as np
 import pytest
+from astropy.utils import iers
 from cli_calls import KNOWN, PLACE, objects, solve
 
 from starpos.earth import orientation
@@ -28,6 +29,8 @@ def old_table(tmp_path, monkeypatch):
     path = tmp_path / "finals2000A.all"
     path.write_bytes(gzip.decompress(TABLE.read_bytes()))
     monkeypatch.setattr(astropy_iers_data, "IERS_A_FILE", str(path))
+    # Loaded before, so that astropy's own table stays as it was, for the tests that come after.
+    assert str(path) != iers.IERS_A_FILE
     orientation._table.cache_clear()
     yield
     orientation._table.cache_clear()
