@@ -12,6 +12,8 @@ from dataclasses import dataclass
 # one publisher alone is believed again after so long; where the other sent seldom, after so many of its periods, up to so
 # long
 ALONE_S, ALONE_PERIODS, MOST_ALONE_S = 1.0, 2.5, 10.0
+# no inclinometer sends more often: what is missing between two messages of one publisher was sent between them
+MOST_HZ = 500.0
 
 
 @dataclass
@@ -46,12 +48,19 @@ class TiltPublishers:
         self._speaking = [v for v in self._voices if v.speaks(now_s)]
 
     def _voice_of(self, frame_id: str, number: int | None, now_s: float) -> _Voice | None:
-        """The publisher that this message continues: rather one that goes on than one that was heard long ago."""
+        """The publisher that this message continues: of the same number rather one that goes on than one of long ago.
+
+        A number that is further on than messages can have been lost meanwhile is another publisher's.
+        """
         of_frame = [v for v in self._voices if v.frame_id == frame_id]
         if number is None:
             return of_frame[0] if of_frame else None
-        before = [v for v in of_frame if v.number is not None and v.number < number]
-        return max(before, key=lambda v: (v.speaks(now_s), v.number, v.heard_s), default=None)
+        before = [
+            v
+            for v in of_frame
+            if v.number is not None and v.number < number <= v.number + 1 + abs(now_s - v.heard_s) * MOST_HZ
+        ]
+        return max(before, key=lambda v: (v.number, v.speaks(now_s), v.heard_s), default=None)
 
     @property
     def several(self) -> str:

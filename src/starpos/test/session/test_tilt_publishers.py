@@ -15,7 +15,7 @@ def heard(messages) -> TiltPublishers:
 
 
 def test_one_publisher_is_alone_also_where_messages_are_lost():
-    numbers = [1, 2, 3, 7, 8, 1000]
+    numbers = [1, 2, 3, 7, 8, 50]
     assert not heard(("s", n, 0.1 * k) for k, n in enumerate(numbers)).several
     assert not heard(("s", n, 60.0 * k) for k, n in enumerate(numbers)).several
 
@@ -43,6 +43,17 @@ def test_two_publishers_that_send_seldom_are_seen(frames):
     assert all(heard(messages[:k]).several for k in range(5, 20))
     alone = [(frames[0], 11 + k, 26 + 2.6 * k) for k in range(5)]
     assert not heard([*messages, *alone]).several
+
+
+@pytest.mark.parametrize("silent_s", [0.5, 1.5, 20.0])
+@pytest.mark.parametrize(("own", "other"), [(501, 1), (51, 1000), (5, 900)])
+@pytest.mark.parametrize("first", ["own", "other"])
+def test_readings_of_another_are_seen_in_the_first_exposure_that_mixes_them(silent_s, own, other, first):
+    """The other's come all at once, before the own ones or after them, when the own ones were silent for a while."""
+    before = [("s", own - 5 + k, 0.1 * k) for k in range(5)]
+    now_s = 0.4 + silent_s
+    mine, foreign = ([("s", begin + k, now_s) for k in range(5)] for begin in (own, other))
+    assert heard([*before, *(mine + foreign if first == "own" else foreign + mine)]).several
 
 
 def test_a_frame_that_changes_is_another_inclinometer():
