@@ -4,24 +4,26 @@
 
 from libc.math cimport M_PI, exp, fabs, hypot, log, sqrt
 from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
 
 import numpy as np
 
 from starpos.core.algebra cimport best_rotation, factored, solved, turn_by, turned
 from starpos.core.frame cimport Frame, direction_of, on_frame, pixel_of
 from starpos.core.matching cimport Matching, begin, match, order
+from starpos.core.sky cimport Date, StarTable, Visible, date_of
 
 cdef enum:
     NONE = -1
     DOUBLED = -2
 
 
-cdef void _project(const double *attitude, double focal, const double[:, ::1] w, double *pixel) noexcept nogil:
-    """Pixels (S, 2) of directions w (S, 3)."""
+cdef void _project(const double *attitude, double focal, const double *w, int n, double *pixel) noexcept nogil:
+    """Set pixel (n, 2) to those of directions w (n, 3)."""
     cdef double[3] u
     cdef int s
-    for s in range(w.shape[0]):
-        turned(attitude, &w[s, 0], u)
+    for s in range(n):
+        turned(attitude, &w[3 * s], u)
         pixel_of(u, focal, &pixel[2 * s])
 
 
@@ -37,7 +39,7 @@ cdef void _slopes(const double *u, double focal, double *pixel, double *slope) n
 
 
 cdef int _fit(
-    const double[:, ::1] xy, const double[:, ::1] w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
+    const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
     """Fit attitude (3, 3) and focal length to pixels xy[star[k]] of directions w[near[k]], with errors sigma[k] px."""
@@ -54,7 +56,7 @@ cdef int _fit(
         for i in range(4):
             right[i] = 0.0
         for k in range(n):
-            turned(attitude, &w[near[k], 0], u)
+            turned(attitude, &w[3 * near[k]], u)
             _slopes(u, focal[0], pixel, slope)
             weight = 1 / (sigma[k] * sigma[k])
             for axis in range(2):
@@ -80,7 +82,7 @@ cdef int _fit(
 
 
 cdef void _fit_alone(
-    const double[:, ::1] xy, const double[:, ::1] w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
+    const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
     """As `_fit`, from the rotation that is best with the given focal length: the result depends on no starting pose."""
@@ -93,7 +95,7 @@ cdef void _fit_alone(
         direction_of(xy[star[k], 0], xy[star[k], 1], focal[0], v)
         for i in range(3):
             for j in range(3):
-                b[3 * i + j] += v[i] * w[near[k], j]
+                b[3 * i + j] += v[i] * w[3 * near[k] + j]
     best_rotation(b, attitude)
     _fit(xy, w, sigma, star, near, n, steps, small_step, attitude, focal)
 
@@ -114,9 +116,9 @@ def fitted(
     if n == 0:
         return out, focal_px
     if alone:
-        _fit_alone(xy, w, &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
+        _fit_alone(xy, &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
     else:
-        _fit(xy, w, &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
+        _fit(xy, &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
     return out, focal_px
 
 
@@ -143,92 +145,169 @@ cdef double _median(double *values, int n) noexcept nogil:
     return values[k]
 
 
+cdef class Rules:
+    """Rules by which stars are matched.
+
+    rounds, fewest_stars            so often stars are matched and a pose fitted; with fewer pairs there is none
+    steps, small_step               most steps of a fit; a step below this (rad) is the last one
+    floor_px                        error beside each star's own
+    sigma_per_mad, least_spread_px  the spread of residuals over their median, and its least value
+    gate_sigma, gate_px             a star may be so many times the spread from its place, and so far beyond
+    edge_px, inside_px              a star so far beyond the frame is on it, and one so near its edge may be cut off
+    blend_px                        closer stars make one image
+    """
+
+    cdef int rounds, fewest, steps
+    cdef double small_step, floor_px, per_mad, least, gate_sigma, gate_px, edge_px, inside_px, blend_px
+
+    def __init__(
+        self, *, int rounds, int fewest_stars, int steps, double small_step, double floor_px, double sigma_per_mad,
+        double least_spread_px, double gate_sigma, double gate_px, double edge_px, double inside_px, double blend_px,
+    ):
+        self.rounds, self.fewest, self.steps, self.small_step = rounds, fewest_stars, steps, small_step
+        self.floor_px, self.per_mad, self.least = floor_px, sigma_per_mad, least_spread_px
+        self.gate_sigma, self.gate_px = gate_sigma, gate_px
+        self.edge_px, self.inside_px, self.blend_px = edge_px, inside_px, blend_px
+
+
+cdef struct Settled:
+    # The pose, and the pairs: rows in the frame and among the stars.
+    double[9] attitude
+    double focal
+    int count
+    Py_ssize_t *star
+    Py_ssize_t *near
+    # Of the residuals: spread by their median, rms with the weights of the fit, mean square.
+    double spread
+    double rms
+    double mean_square
+
+
+cdef void _settle(
+    Frame frame, const double[:, ::1] xy, int n, const Visible *stars, Rules rules, double *radius, Matching *m,
+    double *pixel, double *work, Settled *out,
+) noexcept nogil:
+    """Set `out`, which holds the pose to begin with, as `settled` says.
+
+    radius (n,): how far from their places stars may be.  pixel (S, 2), work (3 for a pair): room to work in.
+    """
+    cdef double *sigma = work + 2 * min(n, stars.count)
+    cdef double square, weight, whole, weighted, weights
+    cdef int turn, i, k
+    cdef bint same
+    out.count = 0
+    order(m, xy, n)
+    _project(out.attitude, out.focal, stars.w, stars.count, pixel)
+    for turn in range(rules.rounds):
+        match(m, n, pixel, stars.count, radius)
+        same, k = turn > 0, 0
+        for i in range(n):
+            if m.near[i] < 0:
+                continue
+            same = same and k < out.count and out.star[k] == i and out.near[k] == m.near[i]
+            out.star[k], out.near[k], sigma[k] = i, m.near[i], hypot(frame.sigma[i], rules.floor_px)
+            k += 1
+        if same and k == out.count:
+            break
+        out.count = k
+        if out.count < rules.fewest:
+            break
+        out.focal = frame.focal
+        _fit_alone(
+            xy, stars.w, sigma, out.star, out.near, out.count, rules.steps, rules.small_step, out.attitude, &out.focal
+        )
+        _project(out.attitude, out.focal, stars.w, stars.count, pixel)
+        whole = weighted = weights = 0.0
+        for k in range(out.count):
+            weight = 1 / (sigma[k] * sigma[k])
+            for i in range(2):
+                work[2 * k + i] = fabs(xy[out.star[k], i] - pixel[2 * out.near[k] + i])
+                square = work[2 * k + i] * work[2 * k + i]
+                whole += square
+                weighted += square * weight
+                weights += weight
+        out.spread = rules.per_mad * _median(work, 2 * out.count)
+        out.rms, out.mean_square = sqrt(weighted / weights), whole / (2 * out.count)
+        for i in range(n):
+            radius[i] = rules.gate_sigma * hypot(max(out.spread, rules.least), frame.sigma[i]) + rules.gate_px
+
+
 def settled(
-    Frame frame, bint mirrored, int n, const double[:, ::1] w, const double[:, ::1] attitude, double focal_px,
-    const double[::1] radius_px, rules,
+    Frame frame, StarTable table, bint mirrored, int n, const double[:, ::1] attitude, double focal_px,
+    const double[::1] radius_px, double years, velocity, int most, int cut, Rules rules,
 ):
-    """Match a frame's n brightest stars with stars w (S, 3), fit the pose, and match again until no pair changes.
+    """Match a frame's n brightest stars with the catalogue's, fit the pose, and match again until no pair changes.
 
     mirrored            whether the frame's rows are flipped
     attitude, focal_px  the pose to begin with; the fit begins with the frame's focal length
     radius_px           (n,): how far from their places stars may be at first
-    rules               `full.RULES`
+    years, velocity     of the date, as `StarTable.on_frame` has them
+    most, cut           so many catalogue stars are taken, of so many brightest, as there
 
-    Returns attitude (3, 3), focal length, the rows of the pairs in the frame and in w (M,), whether each of the stars is
-    well inside the frame (S,), and of the residuals: the spread (px) that their median shows, the rms (px) along one axis
-    with the weights of the fit, and their mean square (px2); None if there are too few pairs.
+    Returns attitude (3, 3) and focal length; of the pairs the rows in the frame (M,), the catalogue stars' ranks on the
+    frame (M,) and directions (M, 3), their rows (M,), and how far (px) fainter stars move them (M,); the rows of all
+    catalogue stars well inside the frame (E,), brightest first; and of the residuals the spread (px) that their median
+    shows, the rms (px) along one axis with the weights of the fit, and their mean square (px2). None if there are too few
+    pairs.
     """
-    cdef const double[:, ::1] xy = frame.xy[mirrored]
-    cdef int stars = w.shape[0], most = min(n, stars), k, i, count = 0, turn
-    cdef int rounds = rules.rounds, fewest = rules.fewest_stars, steps = rules.steps
-    cdef double floor_px = rules.floor_px, per_mad = rules.sigma_per_mad, least = rules.least_spread_px
-    cdef double gate_sigma = rules.gate_sigma, gate_px = rules.gate_px, small_step = rules.small_step
-    cdef double inside_px = rules.inside_px
-    cdef double focal = focal_px, spread = 0.0, square, whole = 0.0, weighted = 0.0, weights = 0.0
-    cdef bint same
-    if most < fewest:
-        return None
-    out, pair, within = np.empty((3, 3)), np.empty((2, most), np.intp), np.empty(stars, bool)
-    cdef unsigned char[::1] inside = within.view(np.uint8)
-    cdef double[:, ::1] turned_to = out
-    cdef Py_ssize_t[:, ::1] rows = pair
+    cdef Date date = date_of(years, velocity)
+    cdef Visible stars
     cdef Matching m
-    m.memory = NULL
-    cdef double *memory = <double *>malloc((2 * stars + n + 3 * most) * sizeof(double))
-    cdef double *pixel = memory
-    cdef double *radius = pixel + 2 * stars
-    cdef double *sigma = radius + n
-    cdef double *off = sigma + most
+    cdef Settled end
+    cdef double *memory = NULL
+    cdef double *radius
+    cdef double *work
+    cdef int i, pairs
+    stars.memory = m.memory = NULL
     try:
+        table.find(frame, &attitude[0, 0], focal_px, &date, rules.edge_px, most, cut, rules.blend_px, &stars)
+        pairs = min(n, stars.count)
+        if pairs < rules.fewest:
+            return None
+        begin(&m, n, stars.count)
+        memory = <double *>malloc((2 * stars.count + n + 5 * pairs) * sizeof(double))
         if memory == NULL:
             raise MemoryError
-        begin(&m, n, stars)
-        with nogil:
-            order(&m, xy, n)
-            for i in range(n):
-                radius[i] = radius_px[i]
-            _project(&attitude[0, 0], focal, w, pixel)
-            match(&m, n, pixel, stars, radius)
-            for turn in range(rounds):
-                same, k = turn > 0, 0
-                for i in range(n):
-                    if m.near[i] < 0:
-                        continue
-                    same = same and k < count and rows[0, k] == i and rows[1, k] == m.near[i]
-                    rows[0, k], rows[1, k], sigma[k] = i, m.near[i], hypot(frame.sigma[i], floor_px)
-                    k += 1
-                if same and k == count:
-                    break
-                count = k
-                if count < fewest:
-                    break
-                focal = frame.focal
-                _fit_alone(
-                    xy, w, sigma, &rows[0, 0], &rows[1, 0], count, steps, small_step, &turned_to[0, 0], &focal
-                )
-                _project(&turned_to[0, 0], focal, w, pixel)
-                whole = weighted = weights = 0.0
-                for k in range(count):
-                    for i in range(2):
-                        off[2 * k + i] = fabs(xy[rows[0, k], i] - pixel[2 * rows[1, k] + i])
-                        square = off[2 * k + i] * off[2 * k + i]
-                        whole += square
-                        weighted += square / (sigma[k] * sigma[k])
-                        weights += 1 / (sigma[k] * sigma[k])
-                spread = per_mad * _median(off, 2 * count)
-                for i in range(n):
-                    radius[i] = gate_sigma * hypot(max(spread, least), frame.sigma[i]) + gate_px
-                if turn + 1 < rounds:
-                    match(&m, n, pixel, stars, radius)
-        if count < fewest:
+        radius = memory + 2 * stars.count
+        work = radius + n
+        end.star = <Py_ssize_t *>(work + 3 * pairs)
+        end.near = end.star + pairs
+        memcpy(radius, &radius_px[0], n * sizeof(double))
+        memcpy(end.attitude, &attitude[0, 0], 9 * sizeof(double))
+        end.focal = focal_px
+        _settle(frame, frame.xy[mirrored], n, &stars, rules, radius, &m, memory, work, &end)
+        if end.count < rules.fewest:
             return None
-        for i in range(stars):
-            inside[i] = on_frame(frame, &pixel[2 * i], -inside_px)
-        star, near = pair[0, :count], pair[1, :count]
-        return out, focal, star, near, within, spread, sqrt(weighted / weights), whole / (2 * count)
+        return _columns(frame, &stars, rules.inside_px, memory, &end)
     finally:
         free(memory)
         free(m.memory)
+        free(stars.memory)
+
+
+cdef _columns(Frame frame, const Visible *stars, double inside_px, const double *pixel, const Settled *end):
+    """What `settled` returns; pixel (S, 2) of the stars."""
+    cdef int i, k, inside = 0
+    attitude, rows = np.empty((3, 3)), np.empty((3, end.count), np.intp)
+    directions, blends, expected = np.empty((end.count, 3)), np.empty(end.count), np.empty(stars.count, np.intp)
+    cdef double[:, ::1] to = attitude
+    cdef Py_ssize_t[:, ::1] row = rows
+    cdef double[:, ::1] w = directions
+    cdef double[::1] blend = blends
+    cdef Py_ssize_t[::1] due = expected
+    memcpy(&to[0, 0], end.attitude, 9 * sizeof(double))
+    for k in range(end.count):
+        row[0, k], row[1, k], row[2, k] = end.star[k], end.near[k], stars.row[end.near[k]]
+        memcpy(&w[k, 0], &stars.w[3 * end.near[k]], 3 * sizeof(double))
+        blend[k] = stars.moved[end.near[k]]
+    for k in range(stars.count):
+        if on_frame(frame, &pixel[2 * k], -inside_px):
+            due[inside] = stars.row[k]
+            inside += 1
+    return (
+        attitude, end.focal, rows[0], rows[1], directions, rows[2], blends, expected[:inside], end.spread, end.rms,
+        end.mean_square,
+    )
 
 
 def log_ratio(

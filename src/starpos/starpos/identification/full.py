@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starpos.core.poses import fitted, settled
+from starpos.core.poses import Rules, fitted, settled
 from starpos.identification.evidence import Prior, log_evidence
 from starpos.identification.pose import SMALL_STEP, STEPS, FrameStars, Pose
 from starpos.identification.sky import Sky
@@ -31,22 +31,6 @@ BLEND_PX = 2.5
 EDGE_PX, INSIDE_PX = 2.0, 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rules:
-    """Rules by which the compiled core settles on pairs, as the constants here have them."""
-
-    rounds: int
-    fewest_stars: int
-    steps: int
-    small_step: float
-    floor_px: float
-    sigma_per_mad: float
-    least_spread_px: float
-    gate_sigma: float
-    gate_px: float
-    inside_px: float
-
-
 RULES = Rules(
     rounds=ROUNDS,
     fewest_stars=FEWEST_STARS,
@@ -57,7 +41,9 @@ RULES = Rules(
     least_spread_px=LEAST_SPREAD_PX,
     gate_sigma=GATE_SIGMA,
     gate_px=GATE_PX,
+    edge_px=EDGE_PX,
     inside_px=INSIDE_PX,
+    blend_px=BLEND_PX,
 )
 
 
@@ -105,7 +91,6 @@ class OnFrame:
     @classmethod
     def of(cls, field: FrameStars, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
         """The stars that the field's brightest detections may be, at most `most_detections` of them."""
-        stars = min(len(field), most_detections)
         found = sky.stars.on_frame(
             field.compiled,
             pose.attitude,
@@ -113,20 +98,28 @@ class OnFrame:
             sky.years,
             sky.velocity,
             EDGE_PX,
-            3 * stars + 50,
-            # three times too many again, because the cells reach beyond the frame
-            12 * stars + 300,
+            *most_stars(min(len(field), most_detections)),
             BLEND_PX,
         )
         return cls(*found)
+
+
+def most_stars(detections: int) -> tuple[int, int]:
+    """How many catalogue stars so many detections may be, and of how many of the brightest about the frame."""
+    # three times too many again, because the cells reach beyond the frame
+    return 3 * detections + 50, 12 * detections + 300
 
 
 class Match(NamedTuple):
     """Stars on which a pose has settled.
 
     attitude, focal_px  the pose
-    star, near          (M,): rows of the detections and of the stars matched with them
-    inside              (S,): whether each catalogue star is well inside the frame
+    star                (M,): rows of the detections
+    rank                (M,): brightness rank on the frame of the catalogue stars matched with them
+    directions          (M, 3) of these
+    index               (M,): their rows in the catalogue
+    blend_px            (M,): how far fainter stars that make one image with them may move it
+    expected            (E,): rows of the catalogue's stars well inside the frame, brightest first
     spread_px           standard deviation that the median of the residuals shows
     rms_px              of the residuals along one axis, with the weights of the fit
     mean_square_px2     of the residuals along one axis, all alike
@@ -135,8 +128,11 @@ class Match(NamedTuple):
     attitude: np.ndarray
     focal_px: float
     star: np.ndarray
-    near: np.ndarray
-    inside: np.ndarray
+    rank: np.ndarray
+    directions: np.ndarray
+    index: np.ndarray
+    blend_px: np.ndarray
+    expected: np.ndarray
     spread_px: float
     rms_px: float
     mean_square_px2: float
@@ -150,60 +146,63 @@ def identified(
     None unless the evidence is beyond doubt (ENOUGH).
     """
     mirrored, tested = near_pose.mirrored, min(len(field), field.tested)
-    stars = OnFrame.of(field, sky, near_pose, tested)
-    match = _settled(field, tested, stars, near_pose, radius_px)
+    match = _settled(field, sky, tested, near_pose, radius_px)
     if match is None:
         return None
     pose = Pose(match.attitude, match.focal_px, mirrored)
-    xy, sigma, w = field.xy[int(mirrored), :tested], field.sigma[:tested], stars.directions[match.near]
-    log_odds = log_evidence(xy, sigma, field.area_px2, pose, prior, match.star, match.near, w)
+    xy, sigma = field.xy[int(mirrored), :tested], field.sigma[:tested]
+    log_odds = log_evidence(
+        xy, sigma, field.area_px2, pose, prior, match.star, match.rank, match.directions
+    )
     # true for NaN too
     if not log_odds >= ENOUGH:
         return None
     if len(field) > tested:
         most = min(len(field), FAINTEST_FIT)
-        stars = OnFrame.of(field, sky, pose, most)
         gate_px = GATE_SIGMA * np.hypot(max(match.spread_px, LEAST_SPREAD_PX), field.sigma[:most]) + GATE_PX
-        match = _settled(field, most, stars, pose, gate_px)
+        match = _settled(field, sky, most, pose, gate_px)
         if match is None:
             return None
     if match.spread_px > BENT_PX:
-        match = _all_alike(field, mirrored, stars, match)
+        match = _all_alike(field, mirrored, match)
     return Identification(
         star=match.star,
-        catalogue=stars.index[match.near],
-        blend_px=stars.blend_px[match.near],
+        catalogue=match.index,
+        blend_px=match.blend_px,
         attitude=match.attitude,
         focal_scale=match.focal_px / field.focal_px,
         residual_px=match.rms_px,
         mean_square_px2=match.mean_square_px2,
         log_odds=log_odds,
-        expected=stars.index[match.inside],
+        expected=match.expected,
         mirrored=mirrored,
     )
 
 
-def _settled(field: FrameStars, most: int, stars: OnFrame, pose: Pose, radius_px: np.ndarray) -> Match | None:
+def _settled(field: FrameStars, sky: Sky, most: int, pose: Pose, radius_px: np.ndarray) -> Match | None:
     """Match the `most` brightest within radius_px (most,) of their places by a pose, fit it, and match again.
 
     None if there are fewer than FEWEST_STARS pairs.
     """
     found = settled(
         field.compiled,
+        sky.stars,
         pose.mirrored,
         most,
-        stars.directions,
         pose.attitude,
         pose.focal_px,
         radius_px,
+        sky.years,
+        sky.velocity,
+        *most_stars(most),
         RULES,
     )
     return None if found is None else Match(*found)
 
 
-def _all_alike(field: FrameStars, mirrored: bool, stars: OnFrame, match: Match) -> Match:
+def _all_alike(field: FrameStars, mirrored: bool, match: Match) -> Match:
     """The match with the pose to which all stars count alike."""
-    xy, w = field.xy[int(mirrored), match.star], stars.directions[match.near]
+    xy, w = field.xy[int(mirrored), match.star], match.directions
     sigma = field.sigma[match.star]
     attitude, focal_px = fitted(
         xy, w, np.hypot(sigma, match.spread_px), match.attitude, field.focal_px, True, STEPS, SMALL_STEP
