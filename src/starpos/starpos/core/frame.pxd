@@ -9,6 +9,8 @@ cdef class Frame:
     cdef const double[::1] sigma
     cdef double focal
     cdef double radius
+    cdef double area
+    cdef int tested
     cdef double[2] middle
     cdef double[2] half
 

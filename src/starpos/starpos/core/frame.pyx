@@ -15,10 +15,12 @@ cdef class Frame:
     middle, half  (2,) px: the frame's centre, and half its size
     focal_px      approximate focal length
     radius_rad    of a cone about the frame's centre that contains the frame
+    area_px2      over which false detections are spread
+    tested        so many of the brightest decide whether a pose is right
     """
 
-    def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad):
-        self.xy, self.sigma = xy, sigma
+    def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad, double area_px2, int tested):
+        self.xy, self.sigma, self.area, self.tested = xy, sigma, area_px2, tested
         self.middle[0], self.middle[1] = middle
         self.half[0], self.half[1] = half
         self.focal, self.radius = focal_px, radius_rad

@@ -4,14 +4,13 @@
 
 from libc.math cimport M_PI, exp, fabs, hypot, log, sqrt
 from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy
 
 import numpy as np
 
 from starpos.core.algebra cimport best_rotation, factored, solved, turn_by, turned
-from starpos.core.frame cimport Frame, direction_of, on_frame, pixel_of
-from starpos.core.matching cimport Matching, begin, match, order
-from starpos.core.sky cimport Date, StarTable, Visible, date_of
+from starpos.core.frame cimport Frame, direction_of, pixel_of
+from starpos.core.matching cimport Matching, match, order
+from starpos.core.sky cimport Visible
 
 cdef enum:
     NONE = -1
@@ -101,23 +100,16 @@ cdef void _fit_alone(
 
 
 def fitted(
-    const double[:, ::1] xy, const double[:, ::1] w, const double[::1] sigma_px, attitude, double focal_px, bint alone,
-    int steps, double small_step,
+    const double[:, ::1] xy, const double[:, ::1] w, const double[::1] sigma_px, attitude, double focal_px, int steps,
+    double small_step,
 ):
-    """Fit attitude (3, 3) and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3).
-
-    alone: without the given attitude, so that the result does not depend on it.
-    """
-    cdef int k, n = xy.shape[0]
+    """Fit attitude (3, 3) and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
+    cdef int n = xy.shape[0]
     both = np.arange(n)
     out = np.array(attitude, float)
     cdef Py_ssize_t[::1] rows = both
     cdef double[:, ::1] turned_to = out
-    if n == 0:
-        return out, focal_px
-    if alone:
-        _fit_alone(xy, &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
-    else:
+    if n > 0:
         _fit(xy, &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
     return out, focal_px
 
@@ -145,6 +137,20 @@ cdef double _median(double *values, int n) noexcept nogil:
     return values[k]
 
 
+cdef class Chances:
+    """What `weighed` reckons with.
+
+    errors_px, log_shares  (4,): errors beside the centroids' own, and the logarithms of their probabilities
+    double_px              a closer detection says nothing new
+    """
+
+    def __init__(self, errors_px, log_shares, double double_px):
+        cdef int k
+        self.double_px = double_px
+        for k in range(ERRORS):
+            self.errors_px[k], self.log_shares[k] = errors_px[k], log_shares[k]
+
+
 cdef class Rules:
     """Rules by which stars are matched.
 
@@ -155,44 +161,38 @@ cdef class Rules:
     gate_sigma, gate_px             a star may be so many times the spread from its place, and so far beyond
     edge_px, inside_px              a star so far beyond the frame is on it, and one so near its edge may be cut off
     blend_px                        closer stars make one image
+    per_detection, more_stars       so many catalogue stars are taken for each detection, and so many more
+    most_stars                      so many of the brightest detections take part
+    bent_px                         where the residuals spread more, the lens bends, and all stars count alike
     """
 
-    cdef int rounds, fewest, steps
-    cdef double small_step, floor_px, per_mad, least, gate_sigma, gate_px, edge_px, inside_px, blend_px
 
     def __init__(
         self, *, int rounds, int fewest_stars, int steps, double small_step, double floor_px, double sigma_per_mad,
         double least_spread_px, double gate_sigma, double gate_px, double edge_px, double inside_px, double blend_px,
+        int per_detection, int more_stars, int most_stars, double bent_px,
     ):
         self.rounds, self.fewest, self.steps, self.small_step = rounds, fewest_stars, steps, small_step
         self.floor_px, self.per_mad, self.least = floor_px, sigma_per_mad, least_spread_px
         self.gate_sigma, self.gate_px = gate_sigma, gate_px
         self.edge_px, self.inside_px, self.blend_px = edge_px, inside_px, blend_px
+        self.per_detection, self.more_stars, self.most_stars = per_detection, more_stars, most_stars
+        self.bent_px = bent_px
 
 
-cdef struct Settled:
-    # The pose, and the pairs: rows in the frame and among the stars.
-    double[9] attitude
-    double focal
-    int count
-    Py_ssize_t *star
-    Py_ssize_t *near
-    # Of the residuals: spread by their median, rms with the weights of the fit, mean square.
-    double spread
-    double rms
-    double mean_square
-
-
-cdef void _settle(
-    Frame frame, const double[:, ::1] xy, int n, const Visible *stars, Rules rules, double *radius, Matching *m,
-    double *pixel, double *work, Settled *out,
+cdef void settle(
+    Frame frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
+    double *work, Settled *out,
 ) noexcept nogil:
-    """Set `out`, which holds the pose to begin with, as `settled` says.
+    """Match a frame's n brightest stars with the catalogue's, fit the pose, and match again until no pair changes.
 
-    radius (n,): how far from their places stars may be.  pixel (S, 2), work (3 for a pair): room to work in.
+    radius  (n,): how far from their places stars may be at first; it changes
+    pixel   room for the pixels (S, 2) of the catalogue stars, which remain
+    work    room for 3 numbers a pair
+    out     holds the pose to begin with; the fit begins with the frame's focal length
     """
+    cdef const double[:, ::1] xy = frame.xy[mirrored]
     cdef double *sigma = work + 2 * min(n, stars.count)
-    cdef double square, weight, whole, weighted, weights
     cdef int turn, i, k
     cdef bint same
     out.count = 0
@@ -212,114 +212,76 @@ cdef void _settle(
         out.count = k
         if out.count < rules.fewest:
             break
-        out.focal = frame.focal
-        _fit_alone(
-            xy, stars.w, sigma, out.star, out.near, out.count, rules.steps, rules.small_step, out.attitude, &out.focal
-        )
-        _project(out.attitude, out.focal, stars.w, stars.count, pixel)
-        whole = weighted = weights = 0.0
-        for k in range(out.count):
-            weight = 1 / (sigma[k] * sigma[k])
-            for i in range(2):
-                work[2 * k + i] = fabs(xy[out.star[k], i] - pixel[2 * out.near[k] + i])
-                square = work[2 * k + i] * work[2 * k + i]
-                whole += square
-                weighted += square * weight
-                weights += weight
+        _refit(frame, xy, stars, rules, sigma, sigma, pixel, work, out)
         out.spread = rules.per_mad * _median(work, 2 * out.count)
-        out.rms, out.mean_square = sqrt(weighted / weights), whole / (2 * out.count)
-        for i in range(n):
-            radius[i] = rules.gate_sigma * hypot(max(out.spread, rules.least), frame.sigma[i]) + rules.gate_px
+        gates(frame, rules, out.spread, n, radius)
 
 
-def settled(
-    Frame frame, StarTable table, bint mirrored, int n, const double[:, ::1] attitude, double focal_px,
-    const double[::1] radius_px, double years, velocity, int most, int cut, Rules rules,
-):
-    """Match a frame's n brightest stars with the catalogue's, fit the pose, and match again until no pair changes.
-
-    mirrored            whether the frame's rows are flipped
-    attitude, focal_px  the pose to begin with; the fit begins with the frame's focal length
-    radius_px           (n,): how far from their places stars may be at first
-    years, velocity     of the date, as `StarTable.on_frame` has them
-    most, cut           so many catalogue stars are taken, of so many brightest, as there
-
-    Returns attitude (3, 3) and focal length; of the pairs the rows in the frame (M,), the catalogue stars' ranks on the
-    frame (M,) and directions (M, 3), their rows (M,), and how far (px) fainter stars move them (M,); the rows of all
-    catalogue stars well inside the frame (E,), brightest first; and of the residuals the spread (px) that their median
-    shows, the rms (px) along one axis with the weights of the fit, and their mean square (px2). None if there are too few
-    pairs.
-    """
-    cdef Date date = date_of(years, velocity)
-    cdef Visible stars
-    cdef Matching m
-    cdef Settled end
-    cdef double *memory = NULL
-    cdef double *radius
-    cdef double *work
-    cdef int i, pairs
-    stars.memory = m.memory = NULL
-    try:
-        table.find(frame, &attitude[0, 0], focal_px, &date, rules.edge_px, most, cut, rules.blend_px, &stars)
-        pairs = min(n, stars.count)
-        if pairs < rules.fewest:
-            return None
-        begin(&m, n, stars.count)
-        memory = <double *>malloc((2 * stars.count + n + 5 * pairs) * sizeof(double))
-        if memory == NULL:
-            raise MemoryError
-        radius = memory + 2 * stars.count
-        work = radius + n
-        end.star = <Py_ssize_t *>(work + 3 * pairs)
-        end.near = end.star + pairs
-        memcpy(radius, &radius_px[0], n * sizeof(double))
-        memcpy(end.attitude, &attitude[0, 0], 9 * sizeof(double))
-        end.focal = focal_px
-        _settle(frame, frame.xy[mirrored], n, &stars, rules, radius, &m, memory, work, &end)
-        if end.count < rules.fewest:
-            return None
-        return _columns(frame, &stars, rules.inside_px, memory, &end)
-    finally:
-        free(memory)
-        free(m.memory)
-        free(stars.memory)
-
-
-cdef _columns(Frame frame, const Visible *stars, double inside_px, const double *pixel, const Settled *end):
-    """What `settled` returns; pixel (S, 2) of the stars."""
-    cdef int i, k, inside = 0
-    attitude, rows = np.empty((3, 3)), np.empty((3, end.count), np.intp)
-    directions, blends, expected = np.empty((end.count, 3)), np.empty(end.count), np.empty(stars.count, np.intp)
-    cdef double[:, ::1] to = attitude
-    cdef Py_ssize_t[:, ::1] row = rows
-    cdef double[:, ::1] w = directions
-    cdef double[::1] blend = blends
-    cdef Py_ssize_t[::1] due = expected
-    memcpy(&to[0, 0], end.attitude, 9 * sizeof(double))
-    for k in range(end.count):
-        row[0, k], row[1, k], row[2, k] = end.star[k], end.near[k], stars.row[end.near[k]]
-        memcpy(&w[k, 0], &stars.w[3 * end.near[k]], 3 * sizeof(double))
-        blend[k] = stars.moved[end.near[k]]
-    for k in range(stars.count):
-        if on_frame(frame, &pixel[2 * k], -inside_px):
-            due[inside] = stars.row[k]
-            inside += 1
-    return (
-        attitude, end.focal, rows[0], rows[1], directions, rows[2], blends, expected[:inside], end.spread, end.rms,
-        end.mean_square,
+cdef void _refit(
+    Frame frame, const double[:, ::1] xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
+    double *pixel, double *off, Settled *out,
+) noexcept nogil:
+    """Fit the pose to the pairs with errors sigma (M,); set pixels, offsets (M, 2) and residuals, with errors floored (M,)."""
+    cdef double square, weight, whole = 0.0, weighted = 0.0, weights = 0.0
+    cdef int k, i
+    out.focal = frame.focal
+    _fit_alone(
+        xy, stars.w, sigma, out.star, out.near, out.count, rules.steps, rules.small_step, out.attitude, &out.focal
     )
+    _project(out.attitude, out.focal, stars.w, stars.count, pixel)
+    for k in range(out.count):
+        weight = 1 / (floored[k] * floored[k])
+        for i in range(2):
+            off[2 * k + i] = fabs(xy[out.star[k], i] - pixel[2 * out.near[k] + i])
+            square = off[2 * k + i] * off[2 * k + i]
+            whole += square
+            weighted += square * weight
+            weights += weight
+    out.rms, out.mean_square = sqrt(weighted / weights), whole / (2 * out.count)
+
+
+cdef void gates(Frame frame, Rules rules, double spread, int n, double *radius) noexcept nogil:
+    """Set how far (n,) px the n brightest stars may be from their places, where the residuals have a spread."""
+    cdef int i
+    for i in range(n):
+        radius[i] = rules.gate_sigma * hypot(max(spread, rules.least), frame.sigma[i]) + rules.gate_px
+
+
+cdef void count_alike(
+    Frame frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
+) noexcept nogil:
+    """Fit the pose of pairs again, to all alike; the arguments are those of `settle`, and work for 4 numbers a pair."""
+    cdef double *sigma = work + 2 * out.count
+    cdef double *floored = sigma + out.count
+    cdef int k
+    for k in range(out.count):
+        sigma[k] = hypot(frame.sigma[out.star[k]], out.spread)
+        floored[k] = hypot(frame.sigma[out.star[k]], rules.floor_px)
+    _refit(frame, frame.xy[mirrored], stars, rules, sigma, floored, pixel, work, out)
 
 
 def log_ratio(
     const double[:, ::1] xy, const double[::1] sigma_px, double area_px2, const double[:, ::1] attitude, double focal_px,
-    const double[::1] width, const Py_ssize_t[::1] star, const Py_ssize_t[::1] rank, const double[:, ::1] w,
-    const double[::1] errors_px, const double[::1] log_shares, double double_px,
+    const double[::1] width, const Py_ssize_t[::1] star, const Py_ssize_t[::1] rank, const double[:, ::1] w, Chances chances,
 ):
-    """The logarithm of the evidence of `evidence.log_evidence`, without the prior's density.
+    """The logarithm of the evidence of `evidence.log_evidence`, without the prior's density; width (4,): of the prior."""
+    rows = np.arange(star.shape[0])
+    cdef Py_ssize_t[::1] row = rows
+    cdef int n = xy.shape[0], many = star.shape[0]
+    if many == 0:
+        return weighed(xy, &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], NULL, NULL, NULL, NULL, 0, chances)
+    return weighed(
+        xy, &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], &star[0], &rank[0], &w[0, 0], &row[0], many, chances
+    )
 
-    width (4,): of the prior.  errors_px, log_shares (E,): errors beside the centroids' own, and their probabilities.
-    """
-    cdef int n = xy.shape[0], many = star.shape[0], e, i, j, k, passed, hits = 0
+
+cdef double weighed(
+    const double[:, ::1] xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
+    const double *width, const Py_ssize_t *star, const Py_ssize_t *rank, const double *w, const Py_ssize_t *row, int many,
+    Chances chances,
+) except? -1:
+    """As `log_ratio`, of the n brightest detections; w[row[k]] is the direction of the star matched with star[k]."""
+    cdef int e, i, j, k, passed, hits = 0
     cdef double best = -1e300, total, most, odds, least = 1e300, variance, volume
     cdef double[16] information
     cdef double[16] normal
@@ -341,7 +303,7 @@ def log_ratio(
         for i in range(n):
             hit[i] = NONE
         for k in range(many):
-            turned(&attitude[0, 0], &w[k, 0], u)
+            turned(attitude, &w[3 * row[k]], u)
             _slopes(u, focal_px, pixel, slope)
             for i in range(4):
                 for j in range(i + 1):
@@ -359,23 +321,23 @@ def log_ratio(
             hits += hit[i] != NONE
         for i in range(n):
             for j in range(i):
-                if (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2 < double_px * double_px:
+                if (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2 < chances.double_px * chances.double_px:
                     hit[i] = DOUBLED
-        for e in range(errors_px.shape[0]):
+        for e in range(ERRORS):
             total, most = 0.0, -1e300
             for i in range(n):
                 odds = 1.0 if hit[i] == DOUBLED else chance[i]
                 if hit[i] >= 0:
-                    variance = sigma_px[i] * sigma_px[i] + errors_px[e] * errors_px[e]
+                    variance = sigma_px[i] * sigma_px[i] + chances.errors_px[e] * chances.errors_px[e]
                     odds += gain[hit[i]] * exp(-0.5 * apart2[hit[i]] / variance) / variance
                 total += log(odds)
                 most = max(most, total)
             for i in range(16):
-                information[i] = normal[i] / (least + errors_px[e] * errors_px[e])
+                information[i] = normal[i] / (least + chances.errors_px[e] * chances.errors_px[e])
             for i in range(4):
                 information[5 * i] += 2 * M_PI / (width[i] * width[i])
             volume = 0.5 * (4 * log(2 * M_PI) - factored(information, 4))
-            best = max(best, most + volume + log_shares[e])
+            best = max(best, most + volume + chances.log_shares[e])
     free(chance)
     free(hit)
     return best

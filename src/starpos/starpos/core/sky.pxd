@@ -35,7 +35,7 @@ cdef class StarTable:
 
     cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil
     cdef int find(
-        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most, int cut,
+        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
         double blend_px, Visible *out,
     ) except -1 nogil
     cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil

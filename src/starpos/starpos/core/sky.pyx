@@ -90,13 +90,13 @@ cdef class StarTable:
 
     def on_frame(
         self, Frame frame, const double[:, ::1] attitude, double focal_px, double years, velocity, double margin_px,
-        int most, int cut, double blend_px,
+        int most, double blend_px,
     ):
         """The brightest stars on a frame: rows (S,), directions (S, 3), and how far (px) fainter ones move the image.
 
         attitude, focal_px  the pose
         margin_px           stars so far beyond the frame are on it
-        most, cut           so many stars are taken, of so many brightest in the cells about the frame
+        most                so many stars are taken
         blend_px            closer stars make one image
         """
         cdef Date date = date_of(years, velocity)
@@ -107,7 +107,7 @@ cdef class StarTable:
         cdef int k, i
         found.memory = NULL
         try:
-            self.find(frame, &attitude[0, 0], focal_px, &date, margin_px, most, cut, blend_px, &found)
+            self.find(frame, &attitude[0, 0], focal_px, &date, margin_px, most, blend_px, &found)
             index, directions, drawn = np.empty(found.count, np.intp), np.empty((found.count, 3)), np.empty(found.count)
             row, w, moved = index, directions, drawn
             for k in range(found.count):
@@ -119,13 +119,14 @@ cdef class StarTable:
             free(found.memory)
 
     cdef int find(
-        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most, int cut,
+        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
         double blend_px, Visible *out,
     ) except -1 nogil:
         """Set `out` to the stars of `on_frame`; its memory is the caller's to free, even after an error."""
         cdef int[2 * MOST_RUNS] runs
         cdef double[3] axis
-        cdef int i, n = 0, count
+        # the cells reach beyond the frame
+        cdef int cut = 4 * most + 100, i, n = 0, count
         axis_of(frame, attitude, axis)
         count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
         for i in range(count):

@@ -16,8 +16,6 @@ cdef extern from *:
     void fetch "STARPOS_FETCH"(const void *address) noexcept nogil
 
 cdef enum:
-    # Queries that are prepared before the first of them is answered, so that memory has time.
-    AHEAD = 16
     # Of the number of candidates that chance makes: 64 for each power of two.
     STEPS = 4096
     # Logarithm of the size of a table that fits into a processor's cache.
@@ -30,46 +28,6 @@ cdef double LEAST_SIDE = 1e-9
 ctypedef unsigned long long key_t
 
 
-cdef struct Query:
-    int[3] star
-    # of the shape in CODES
-    int[3] low
-    int[3] high
-    double longest
-    bint turn
-
-
-cdef struct Candidate:
-    int[3] star
-    int[3] corner
-    bint mirrored
-    int support
-    # Longest side, over that of the frame's triangle.
-    double size
-
-
-cdef struct Shape:
-    # The corners, and the sides opposite to them: the longest first.
-    int[3] star
-    double[3] side
-    # Of the largest and the smallest angle and of the longest side.
-    double[3] tolerance
-    bint usable
-
-
-cdef struct Search:
-    # Of the frame's stars: directions, errors (rad), and the distance (rad) of star b from a brighter one a at [a, b].
-    int stars
-    double *v
-    double *error
-    double *side
-    Query[2 * AHEAD] waiting
-    int queries
-    Candidate *found
-    int count
-    int room
-
-
 cdef class TriangleTable:
     """Columns of a `TriangleCatalogue`, and how its shapes are looked up.
 
@@ -77,13 +35,6 @@ cdef class TriangleTable:
     scale_tolerance  the share by which the focal length may be off
     sigmas           a triangle may be off by so many sigma of its stars
     """
-
-    cdef const int[:, ::1] corners
-    cdef const unsigned char[::1] turn
-    cdef const unsigned short[:, ::1] shape
-    cdef const int[::1] bin_start
-    cdef double crowded, scale_tolerance, sigmas
-    cdef double[3] codes
 
     def __init__(self, table, double crowded, double scale_tolerance, double sigmas):
         self.corners = np.ascontiguousarray(table.corners, np.int32)
@@ -97,14 +48,30 @@ cdef class TriangleTable:
     def candidates(
         self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose
     ):
-        """Candidates for triangles of a frame's stars whose faintest is first .. last - 1, brightest first.
+        """The candidates of `best` as arrays: star (K, 3), corner (K, 3) and mirrored (K,)."""
+        cdef int k, count
+        cdef Candidate *found = <Candidate *>malloc((most + 1) * sizeof(Candidate))
+        try:
+            if found == NULL:
+                raise MemoryError
+            count = self.best(frame, first, last, error_px, most_expected, most, loose, found)
+            rows = [(found[k].star, found[k].corner, found[k].mirrored) for k in range(count)]
+        finally:
+            free(found)
+        star, corner, mirrored = zip(*rows) if rows else ((), (), ())
+        return np.array(star, int).reshape(-1, 3), np.array(corner, int).reshape(-1, 3), np.array(mirrored, bool)
+
+    cdef int best(
+        self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
+    ) except -1:
+        """Write candidates for triangles of a frame's stars whose faintest is first .. last - 1, brightest first.
 
         error_px       of all stars, beside their own
         most_expected  no more triangles are looked up once chance makes so many candidates
-        most           so many are returned: best supported first, then those of the likeliest size
+        most           so many are written: best supported first, then those of the likeliest size
         loose          only those that another one supports
 
-        Returns star (K, 3), corner (K, 3) and mirrored (K,).
+        Returns how many there are.
         """
         cdef Search s
         cdef Shape shape
@@ -122,15 +89,18 @@ cdef class TriangleTable:
                             self._ask(&s, &shape)
                             expected += self._expected(&shape)
             self._answer(&s)
-            return _best(&s, most, 1 if loose else 0, True)
+            return _best(&s, most, 1 if loose else 0, True, out)
         finally:
             free(s.found)
             free(s.v)
 
-    def supported(self, Frame frame, int stars, double error_px, double most_expected, int most):
-        """Candidates as `candidates` returns them, those that at least two others support, in a crowd of false stars.
+    cdef int supported(
+        self, Frame frame, int stars, double error_px, double most_expected, int most, Candidate *out
+    ) except -1:
+        """Write candidates as `best` does, those that at least two others support, in a crowd of false stars.
 
-        Only the triangles that chance matches least are looked up, until it makes so many candidates.
+        Where most of these stars are false, nearly all candidates are chance, but chance supports few. Only the triangles
+        that chance matches least are looked up, until it makes so many candidates.
         """
         cdef Search s
         cdef Shape shape
@@ -146,7 +116,7 @@ cdef class TriangleTable:
                         if shape.usable and self._expected(&shape) < limit:
                             self._ask(&s, &shape)
             self._answer(&s)
-            return _best(&s, most, 2, False)
+            return _best(&s, most, 2, False, out)
         finally:
             free(s.found)
             free(s.v)
@@ -370,8 +340,8 @@ cdef int _support(Search *s) except -1:
     return 0
 
 
-cdef _best(Search *s, int most, int least_support, bint by_size):
-    """The `most` candidates with most support, equal ones by their size or in their order: star, corner, mirrored."""
+cdef int _best(Search *s, int most, int least_support, bint by_size, Candidate *out) except -1:
+    """Write the `most` candidates with most support, equal ones by their size or in their order; how many."""
     cdef int k, j, kept = 0
     cdef Candidate *c
     cdef int *order = <int *>malloc((most + 1) * sizeof(int))
@@ -393,7 +363,9 @@ cdef _best(Search *s, int most, int least_support, bint by_size):
             if j < most:
                 order[j] = k
                 kept = min(kept + 1, most)
-        return _columns(s, order, kept)
+        for k in range(kept):
+            out[k] = s.found[order[k]]
+        return kept
     finally:
         free(order)
         free(marks)
@@ -403,17 +375,3 @@ cdef inline bint _precedes(const Candidate *one, const Candidate *other, bint by
     if one.support != other.support:
         return one.support > other.support
     return by_size and fabs(log(one.size)) < fabs(log(other.size))
-
-
-cdef _columns(const Search *s, const int *order, int count):
-    """Candidates in an order as arrays: star, corner, mirrored."""
-    cdef int k, i
-    stars, corners, mirror = np.empty((count, 3), np.intp), np.empty((count, 3), np.intp), np.empty(count, bool)
-    cdef Py_ssize_t[:, ::1] star = stars
-    cdef Py_ssize_t[:, ::1] corner = corners
-    cdef unsigned char[::1] mirrored = mirror.view(np.uint8)
-    for k in range(count):
-        for i in range(3):
-            star[k, i], corner[k, i] = s.found[order[k]].star[i], s.found[order[k]].corner[i]
-        mirrored[k] = s.found[order[k]].mirrored
-    return stars, corners, mirror

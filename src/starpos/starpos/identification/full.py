@@ -2,12 +2,12 @@
 """Verify a pose by a frame's stars, and match all detections with all catalogue stars of the field."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from starpos.core.poses import Rules, fitted, settled
-from starpos.identification.evidence import Prior, log_evidence
+from starpos.core.poses import Rules
+from starpos.core.search import Judge
+from starpos.identification.evidence import CHANCES, Prior
 from starpos.identification.pose import SMALL_STEP, STEPS, FrameStars, Pose
 from starpos.identification.sky import Sky
 from starpos.normal import SIGMA_PER_MAD
@@ -27,6 +27,8 @@ FLOOR_PX = 0.05
 BENT_PX = 0.3
 # Closer stars make one image.
 BLEND_PX = 2.5
+# So many catalogue stars may be those of a frame: for each detection, and so many more.
+PER_DETECTION, MORE_STARS = 3, 50
 # Stars so far beyond the frame (px) are on it, and a star so near its edge may be cut off.
 EDGE_PX, INSIDE_PX = 2.0, 5.0
 
@@ -44,6 +46,10 @@ RULES = Rules(
     edge_px=EDGE_PX,
     inside_px=INSIDE_PX,
     blend_px=BLEND_PX,
+    per_detection=PER_DETECTION,
+    more_stars=MORE_STARS,
+    most_stars=FAINTEST_FIT,
+    bent_px=BENT_PX,
 )
 
 
@@ -74,6 +80,25 @@ class Identification:
     expected: np.ndarray
     mirrored: bool
 
+    @classmethod
+    def of(cls, found: tuple, field: FrameStars) -> "Identification":
+        """The identification of a field that the compiled core has found."""
+        star, catalogue, blend_px, attitude, focal_px, rms_px, square_px2, log_odds, expected, mirrored = (
+            found
+        )
+        return cls(
+            star=star,
+            catalogue=catalogue,
+            blend_px=blend_px,
+            attitude=attitude,
+            focal_scale=focal_px / field.focal_px,
+            residual_px=rms_px,
+            mean_square_px2=square_px2,
+            log_odds=log_odds,
+            expected=expected,
+            mirrored=mirrored,
+        )
+
 
 @dataclass(frozen=True)
 class OnFrame:
@@ -98,120 +123,34 @@ class OnFrame:
             sky.years,
             sky.velocity,
             EDGE_PX,
-            *most_stars(min(len(field), most_detections)),
+            PER_DETECTION * min(len(field), most_detections) + MORE_STARS,
             BLEND_PX,
         )
         return cls(*found)
 
 
-def most_stars(detections: int) -> tuple[int, int]:
-    """How many catalogue stars so many detections may be, and of how many of the brightest about the frame."""
-    # three times too many again, because the cells reach beyond the frame
-    return 3 * detections + 50, 12 * detections + 300
-
-
-class Match(NamedTuple):
-    """Stars on which a pose has settled.
-
-    attitude, focal_px  the pose
-    star                (M,): rows of the detections
-    rank                (M,): brightness rank on the frame of the catalogue stars matched with them
-    directions          (M, 3) of these
-    index               (M,): their rows in the catalogue
-    blend_px            (M,): how far fainter stars that make one image with them may move it
-    expected            (E,): rows of the catalogue's stars well inside the frame, brightest first
-    spread_px           standard deviation that the median of the residuals shows
-    rms_px              of the residuals along one axis, with the weights of the fit
-    mean_square_px2     of the residuals along one axis, all alike
-    """
-
-    attitude: np.ndarray
-    focal_px: float
-    star: np.ndarray
-    rank: np.ndarray
-    directions: np.ndarray
-    index: np.ndarray
-    blend_px: np.ndarray
-    expected: np.ndarray
-    spread_px: float
-    rms_px: float
-    mean_square_px2: float
+def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> Judge:
+    """What judges poses of a frame by a prior, for the compiled core; enough: log-odds of an identification."""
+    return Judge(
+        field.compiled,
+        sky.stars,
+        sky.years,
+        sky.velocity,
+        prior.width,
+        prior.log_density_at,
+        enough,
+        RULES,
+        CHANCES,
+    )
 
 
 def identified(
-    field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior
+    field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior, enough: float = ENOUGH
 ) -> Identification | None:
     """Identify a frame's stars, starting from those within radius_px (N,) of their places by a pose near the right one.
 
-    None unless the evidence is beyond doubt (ENOUGH).
+    None unless the evidence is beyond doubt: log-odds of `enough`.
     """
-    mirrored, tested = near_pose.mirrored, min(len(field), field.tested)
-    match = _settled(field, sky, tested, near_pose, radius_px)
-    if match is None:
-        return None
-    pose = Pose(match.attitude, match.focal_px, mirrored)
-    xy, sigma = field.xy[int(mirrored), :tested], field.sigma[:tested]
-    log_odds = log_evidence(
-        xy, sigma, field.area_px2, pose, prior, match.star, match.rank, match.directions
-    )
-    # true for NaN too
-    if not log_odds >= ENOUGH:
-        return None
-    if len(field) > tested:
-        most = min(len(field), FAINTEST_FIT)
-        gate_px = GATE_SIGMA * np.hypot(max(match.spread_px, LEAST_SPREAD_PX), field.sigma[:most]) + GATE_PX
-        match = _settled(field, sky, most, pose, gate_px)
-        if match is None:
-            return None
-    if match.spread_px > BENT_PX:
-        match = _all_alike(field, mirrored, match)
-    return Identification(
-        star=match.star,
-        catalogue=match.index,
-        blend_px=match.blend_px,
-        attitude=match.attitude,
-        focal_scale=match.focal_px / field.focal_px,
-        residual_px=match.rms_px,
-        mean_square_px2=match.mean_square_px2,
-        log_odds=log_odds,
-        expected=match.expected,
-        mirrored=mirrored,
-    )
-
-
-def _settled(field: FrameStars, sky: Sky, most: int, pose: Pose, radius_px: np.ndarray) -> Match | None:
-    """Match the `most` brightest within radius_px (most,) of their places by a pose, fit it, and match again.
-
-    None if there are fewer than FEWEST_STARS pairs.
-    """
-    found = settled(
-        field.compiled,
-        sky.stars,
-        pose.mirrored,
-        most,
-        pose.attitude,
-        pose.focal_px,
-        radius_px,
-        sky.years,
-        sky.velocity,
-        *most_stars(most),
-        RULES,
-    )
-    return None if found is None else Match(*found)
-
-
-def _all_alike(field: FrameStars, mirrored: bool, match: Match) -> Match:
-    """The match with the pose to which all stars count alike."""
-    xy, w = field.xy[int(mirrored), match.star], match.directions
-    sigma = field.sigma[match.star]
-    attitude, focal_px = fitted(
-        xy, w, np.hypot(sigma, match.spread_px), match.attitude, field.focal_px, True, STEPS, SMALL_STEP
-    )
-    square = np.square(xy - Pose(attitude, focal_px, mirrored).project(w)).sum(1)
-    weight = 1 / (sigma**2 + FLOOR_PX**2)
-    return match._replace(
-        attitude=attitude,
-        focal_px=focal_px,
-        rms_px=float(np.sqrt(square @ weight / (2 * weight.sum()))),
-        mean_square_px2=float(square.mean() / 2),
-    )
+    judged = judge(field, sky, prior, enough)
+    found = judged.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)
+    return None if found is None else Identification.of(found, field)
