@@ -141,9 +141,8 @@ cdef class BrightTable:
                 self.stars.direction(self.row[k], date, w)
                 turned(attitude, w, u)
                 pixel_of(u, focal_px, u)
-                if on_frame(frame, u, EDGE_PX):
-                    bright[kept].x, bright[kept].y, bright[kept].rank = u[0], u[1], self.rank[k]
-                    kept += 1
+                bright[kept].x, bright[kept].y, bright[kept].rank = u[0], u[1], self.rank[k]
+                kept += on_frame(frame, u, EDGE_PX)
         return kept
 
 

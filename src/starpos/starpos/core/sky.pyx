@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport Point, sort_by_x, turned
+from starpos.core.algebra cimport Point, Strips, fetch, sort_by_x, turned
 from starpos.core.frame cimport Frame, axis_of, on_frame, pixel_of
 
 cdef enum:
@@ -16,6 +16,8 @@ cdef enum:
     # Of brightness: V from -10.24 to 30.71 in steps of 0.01.
     BINS = 4096
     BRIGHTEST = -1024
+    # Memory is asked for so many stars ahead.
+    SOON = 12
 
 cdef double MAS = M_PI / 180 / DEGREE
 
@@ -131,16 +133,20 @@ cdef class StarTable:
         count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
         for i in range(count):
             n += runs[2 * i + 1] - runs[2 * i]
+            fetch(&self.vmag[runs[2 * i]])
+            fetch(&self.ra[runs[2 * i]])
+            fetch(&self.dec[runs[2 * i]])
         most = min(most, n)
-        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + sizeof(Point)) + (n + 1) * sizeof(int))
+        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + (n + 1) * sizeof(int))
         if out.memory == NULL:
             with gil:
                 raise MemoryError
         out.w = <double *>out.memory
         out.moved = out.w + 3 * most
         out.row = <Py_ssize_t *>(out.moved + most)
+        # half of it to sort in
         cdef Point *pixel = <Point *>(out.row + most)
-        cdef int *near = <int *>(pixel + most)
+        cdef int *near = <int *>(pixel + 2 * most)
         n = self._by_light(runs, count, cut, near)
         self._projected(near, n, frame, attitude, focal_px, margin_px, date, most, out, pixel)
         return self._unblended(pixel, blend_px, frame.focal, out, near)
@@ -148,7 +154,7 @@ cdef class StarTable:
     cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil:
         """Write the rows of runs to `near`, brightest first, about `cut` of them; how many."""
         cdef int[BINS] first
-        cdef int i, k, bin, total = 0, kept, low = BINS - 1, high = 0
+        cdef int i, k, bin, total = 0, kept = 0, low = BINS - 1, high = 0
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
                 bin = _light(self.vmag[k])
@@ -158,36 +164,39 @@ cdef class StarTable:
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
                 first[_light(self.vmag[k])] += 1
-        # how many are brighter; stars that come after `cut` others are left out
+        # how many are brighter; stars that come after `cut` others do not count
         for bin in range(low, high + 1):
-            kept = first[bin] if total < cut else 0
-            first[bin] = total if kept else -1
-            total += kept
+            kept = kept if total >= cut else total + first[bin]
+            first[bin], total = total, total + first[bin]
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
                 bin = _light(self.vmag[k])
-                if first[bin] >= 0:
-                    near[first[bin]] = k
-                    first[bin] += 1
-        return total
+                near[first[bin]] = k
+                first[bin] += 1
+        return kept
 
     cdef int _projected(
         self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
         const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil:
         """Keep of the rows `near` (n,) those on the frame, with their directions and pixels, at most so many."""
-        cdef int k, kept = 0
+        cdef int k, soon, kept = 0
         cdef double[3] u
         for k in range(n):
             if kept == most:
                 break
+            soon = near[min(k + SOON, n - 1)]
+            fetch(&self.ra[soon])
+            fetch(&self.dec[soon])
+            if date.moved:
+                fetch(&self.pm_ra[soon])
+                fetch(&self.pm_dec[soon])
             self.direction(near[k], date, &out.w[3 * kept])
             turned(attitude, &out.w[3 * kept], u)
             pixel_of(u, focal_px, u)
-            if on_frame(frame, u, margin_px):
-                out.row[kept] = near[k]
-                pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
-                kept += 1
+            out.row[kept] = near[k]
+            pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
+            kept += on_frame(frame, u, margin_px)
         out.count = kept
         return kept
 
@@ -197,11 +206,12 @@ cdef class StarTable:
         """Leave those out that make one image with a brighter star, which they move; how many stay."""
         cdef int i, j, a, b, n = out.count, kept = 0
         cdef double apart, ratio
+        cdef Strips strips
         cdef const double *one
         cdef const double *other
         for i in range(n):
             out.moved[i], single[i] = 0.0, 1
-        sort_by_x(pixel, n)
+        sort_by_x(pixel, n, pixel + n, &strips)
         for i in range(n):
             for j in range(i + 1, n):
                 if pixel[j].x - pixel[i].x >= blend_px:

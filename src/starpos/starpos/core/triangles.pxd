@@ -17,16 +17,18 @@ cdef enum:
     BITS_2 = 6
     # Queries that are prepared before the first of them is answered, so that memory has time.
     AHEAD = 16
+    # Triangles that are compared with a query at once.
+    ALIKE = 64
 
 
 cdef struct Candidate:
-    # Rows of the frame's stars and of the catalogue's that may be those.
-    int[3] star
-    int[3] corner
-    bint mirrored
-    int support
     # Longest side, over that of the frame's triangle.
     double size
+    # Rows of the catalogue's stars, and of the frame's that they may be: less than 256.
+    int[3] corner
+    int support
+    unsigned char[3] star
+    unsigned char mirrored
 
 
 cdef struct Shape:
@@ -79,6 +81,7 @@ cdef class TriangleTable:
     cdef double _expected(self, const Shape *shape) noexcept nogil
     cdef int _ask(self, Search *s, const Shape *shape) except -1 nogil
     cdef int _answer(self, Search *s) except -1 nogil
+    cdef int _add(self, Search *s, const Query *q, int first, int end) except -1 nogil
 
 
 cdef inline int bin_of(int code_0, int code_1, int code_2) noexcept nogil:

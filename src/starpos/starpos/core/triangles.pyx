@@ -7,13 +7,8 @@ from libc.stdlib cimport calloc, free, malloc, realloc
 
 import numpy as np
 
+from starpos.core.algebra cimport fetch
 from starpos.core.frame cimport Frame, direction_of
-
-cdef extern from *:
-    """
-    #define STARPOS_FETCH(address) __builtin_prefetch(address)
-    """
-    void fetch "STARPOS_FETCH"(const void *address) noexcept nogil
 
 cdef enum:
     # Of the number of candidates that chance makes: 64 for each power of two.
@@ -55,7 +50,7 @@ cdef class TriangleTable:
             if found == NULL:
                 raise MemoryError
             count = self.best(frame, first, last, error_px, most_expected, most, loose, found)
-            rows = [(found[k].star, found[k].corner, found[k].mirrored) for k in range(count)]
+            rows = [(list(found[k].star[:3]), found[k].corner, found[k].mirrored) for k in range(count)]
         finally:
             free(found)
         star, corner, mirrored = zip(*rows) if rows else ((), (), ())
@@ -178,7 +173,7 @@ cdef class TriangleTable:
         cdef double[3] angle
         cdef double[3] middle
         cdef double[3] least
-        cdef int i, swap
+        cdef int i, swap, row, column
         cdef Query *q
         least[0], least[1], least[2] = M_PI / 3, 0.0, 0.0
         angles_of(shape.side, angle)
@@ -196,7 +191,9 @@ cdef class TriangleTable:
                 q.star[swap - 1], q.star[swap] = q.star[swap], q.star[swap - 1]
             q.longest = middle[2]
             q.turn = is_counter_clockwise(&s.v[3 * q.star[0]], &s.v[3 * q.star[1]], &s.v[3 * q.star[2]])
-            fetch(&self.bin_start[bin_of(q.low[0], q.low[1], q.low[2])])
+            for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
+                for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
+                    fetch(&self.bin_start[(row << BITS_1 | column) << BITS_2 | q.low[2] >> SHIFT_2])
         if s.queries >= AHEAD:
             self._answer(s)
         return 0
@@ -204,37 +201,62 @@ cdef class TriangleTable:
     cdef int _answer(self, Search *s) except -1 nogil:
         """Add the candidates of all queries that wait."""
         cdef const Query *q
-        cdef int k, row, column, run, t, i, last = <int>self.shape.shape[0] - 1
         cdef Candidate *c
+        cdef int k, row, column, run, t, end, stop, before = s.count, last = <int>self.shape.shape[0] - 1
         for k in range(s.queries if last >= 0 else 0):
             q = &s.waiting[k]
-            t = min(self.bin_start[bin_of(q.low[0], q.low[1], q.low[2])], last)
-            fetch(&self.shape[t, 0])
-            fetch(&self.corners[t, 0])
-            fetch(&self.turn[t])
+            for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
+                for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
+                    t = min(self.bin_start[(row << BITS_1 | column) << BITS_2 | q.low[2] >> SHIFT_2], last)
+                    fetch(&self.shape[t, 0])
         for k in range(s.queries):
             q = &s.waiting[k]
             for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
                 for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
                     run = (row << BITS_1 | column) << BITS_2
-                    for t in range(
-                        self.bin_start[run + (q.low[2] >> SHIFT_2)], self.bin_start[run + (q.high[2] >> SHIFT_2) + 1]
-                    ):
-                        if not (
-                            q.low[0] <= self.shape[t, 0] <= q.high[0]
-                            and q.low[1] <= self.shape[t, 1] <= q.high[1]
-                            and q.low[2] <= self.shape[t, 2] <= q.high[2]
-                        ):
-                            continue
-                        if s.count == s.room:
-                            _grow(s)
-                        c = &s.found[s.count]
-                        s.count += 1
-                        for i in range(3):
-                            c.star[i], c.corner[i] = q.star[i], self.corners[t, i]
-                        c.mirrored = self.turn[t] != q.turn
-                        c.size = (self.shape[t, 2] + 0.5) / self.codes[2] / q.longest
+                    t = self.bin_start[run + (q.low[2] >> SHIFT_2)]
+                    end = self.bin_start[run + (q.high[2] >> SHIFT_2) + 1]
+                    while t < end:
+                        stop = min(t + ALIKE, end)
+                        self._add(s, q, t, stop)
+                        t = stop
+        # what `_add` has left open, now that memory has had time
+        for k in range(before, s.count):
+            c = &s.found[k]
+            t = c.corner[0]
+            c.corner[0], c.corner[1], c.corner[2] = self.corners[t, 0], self.corners[t, 1], self.corners[t, 2]
+            c.mirrored = self.turn[t] != c.mirrored
         s.queries = 0
+        return 0
+
+    cdef int _add(self, Search *s, const Query *q, int first, int end) except -1 nogil:
+        """Add the candidates of a query among the triangles first .. end - 1, at most ALIKE.
+
+        For now the first corner is the triangle's row, and `mirrored` whether the query's turn is counter-clockwise.
+        """
+        cdef int[ALIKE] alike
+        cdef Candidate *c
+        cdef int t, k, i, count = 0
+        # without a jump for each number, whose outcome no processor can guess
+        for t in range(first, end):
+            alike[count] = t
+            count += (
+                (q.low[0] <= self.shape[t, 0]) & (self.shape[t, 0] <= q.high[0])
+                & (q.low[1] <= self.shape[t, 1]) & (self.shape[t, 1] <= q.high[1])
+                & (q.low[2] <= self.shape[t, 2]) & (self.shape[t, 2] <= q.high[2])
+            )
+        while s.count + count > s.room:
+            _grow(s)
+        for k in range(count):
+            t = alike[k]
+            c = &s.found[s.count]
+            s.count += 1
+            for i in range(3):
+                c.star[i] = q.star[i]
+            c.corner[0], c.mirrored = t, q.turn
+            fetch(&self.corners[t, 0])
+            fetch(&self.turn[t])
+            c.size = (self.shape[t, 2] + 0.5) / self.codes[2] / q.longest
         return 0
 
 
