@@ -9,15 +9,16 @@ cdef class Frame:
     cdef const double[::1] sigma
     cdef double focal
     cdef double radius
+    cdef double area
+    cdef int tested
     cdef double[2] middle
     cdef double[2] half
 
 
 cdef inline bint on_frame(Frame frame, const double *pixel, double margin) noexcept nogil:
     """Whether a pixel (2,) lies on a frame or within a margin (px) of it."""
-    return (
-        fabs(pixel[0] - frame.middle[0]) < frame.half[0] + margin
-        and fabs(pixel[1] - frame.middle[1]) < frame.half[1] + margin
+    return (fabs(pixel[0] - frame.middle[0]) < frame.half[0] + margin) & (
+        fabs(pixel[1] - frame.middle[1]) < frame.half[1] + margin
     )
 
 

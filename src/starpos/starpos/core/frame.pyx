@@ -15,10 +15,12 @@ cdef class Frame:
     middle, half  (2,) px: the frame's centre, and half its size
     focal_px      approximate focal length
     radius_rad    of a cone about the frame's centre that contains the frame
+    area_px2      over which false detections are spread
+    tested        so many of the brightest decide whether a pose is right
     """
 
-    def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad):
-        self.xy, self.sigma = xy, sigma
+    def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad, double area_px2, int tested):
+        self.xy, self.sigma, self.area, self.tested = xy, sigma, area_px2, tested
         self.middle[0], self.middle[1] = middle
         self.half[0], self.half[1] = half
         self.focal, self.radius = focal_px, radius_rad
@@ -89,23 +91,43 @@ def mean_sigma(const double[:, :, ::1] covariance):
     return out
 
 
-def place_of(const double[:, ::1] v, const double[:, ::1] attitude, velocity, bint mirrored):
+def explained(const Py_ssize_t[::1] star, const Py_ssize_t[::1] index, const Py_ssize_t[::1] expected, int bright, int least):
+    """How much stars (M,), rows of a frame, that are catalogue rows `index` (M,) explain, of the expected ones (E,).
+
+    Returns how many of the frame's `bright` brightest they are; how many of the brightest expected stars are among them,
+    of as many and at least `least`; and how many these are.
+    """
+    cdef Py_ssize_t k, j, due
+    cdef int found = 0, seen = 0
+    for k in range(star.shape[0]):
+        found += star[k] < bright
+    due = min(max(found, least), <int>expected.shape[0])
+    for k in range(due):
+        for j in range(index.shape[0]):
+            if index[j] == expected[k]:
+                seen += 1
+                break
+    return found, seen, due
+
+
+def place_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
     """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
 
-    v         (2, 3): vectors in C, of any length, of the frame's centre and of a pixel above it
+    centre    vector in C, three numbers of any length, of the frame's centre
+    above     the same of a pixel above it
     attitude  (3, 3): ICRS into C
     velocity  (3,): of the Earth, in units of c
     mirrored  whether the frame's rows run bottom-up
     """
     cdef double[2][3] seen
     cdef double[3] up
-    cdef double norm, flat, east, north
+    cdef double norm, flat, east, north, x, y, z
     cdef int k, i
     for k in range(2):
-        norm = sqrt(v[k, 0] * v[k, 0] + v[k, 1] * v[k, 1] + v[k, 2] * v[k, 2])
+        x, y, z = above if k else centre
+        norm = sqrt(x * x + y * y + z * z)
         for i in range(3):
-            seen[k][i] = (v[k, 0] * attitude[0, i] + v[k, 1] * attitude[1, i] + v[k, 2] * attitude[2, i]) / norm
-            seen[k][i] -= velocity[i]
+            seen[k][i] = (x * attitude[0, i] + y * attitude[1, i] + z * attitude[2, i]) / norm - <double>velocity[i]
         norm = sqrt(seen[k][0] ** 2 + seen[k][1] ** 2 + seen[k][2] ** 2)
         for i in range(3):
             seen[k][i] /= norm

@@ -4,12 +4,13 @@
 
 from libc.stdlib cimport malloc
 
-from starpos.core.algebra cimport Point, sort_by_x
+from starpos.core.algebra cimport Point, Strips, sort_by_x, strip_of
 
 
 cdef struct Matching:
     # Detections in the order of x; and for each detection and each star its nearest partner and their squared distance.
     Point *sorted
+    Strips strips
     int *near
     int *back
     double *near2
@@ -19,13 +20,14 @@ cdef struct Matching:
 
 cdef inline int begin(Matching *m, int detections, int stars) except -1 nogil:
     """Take memory for so many detections and stars."""
-    cdef size_t each = detections * (sizeof(Point) + sizeof(double) + sizeof(int)) + stars * (sizeof(double) + sizeof(int))
+    cdef size_t each = detections * (2 * sizeof(Point) + sizeof(double) + sizeof(int)) + stars * (sizeof(double) + sizeof(int))
     m.memory = malloc(each + 64)
     if m.memory == NULL:
         with gil:
             raise MemoryError
     m.sorted = <Point *>m.memory
-    m.near2 = <double *>(m.sorted + detections)
+    # half of it to sort in
+    m.near2 = <double *>(m.sorted + 2 * detections)
     m.back2 = m.near2 + detections
     m.near = <int *>(m.back2 + stars)
     m.back = m.near + detections
@@ -37,7 +39,7 @@ cdef inline void order(Matching *m, const double[:, ::1] xy, int n) noexcept nog
     cdef int i
     for i in range(n):
         m.sorted[i].x, m.sorted[i].y, m.sorted[i].row = xy[i, 0], xy[i, 1], i
-    sort_by_x(m.sorted, n)
+    sort_by_x(m.sorted, n, m.sorted + n, &m.strips)
 
 
 cdef inline void match(Matching *m, int n, const double *star, int stars, const double *radius) noexcept nogil:
@@ -46,20 +48,14 @@ cdef inline void match(Matching *m, int n, const double *star, int stars, const 
     m.near of the others becomes -1.
     """
     cdef double widest = 0.0, x, y, apart2
-    cdef int i, j, s, low, high, middle
+    cdef int i, j, s, low
     for i in range(n):
         widest = max(widest, radius[i])
         m.near[i], m.near2[i] = -1, 1e300
     for s in range(stars):
         x, y = star[2 * s], star[2 * s + 1]
         m.back[s], m.back2[s] = -1, 1e300
-        low, high = 0, n
-        while low < high:
-            middle = (low + high) // 2
-            if m.sorted[middle].x < x - widest:
-                low = middle + 1
-            else:
-                high = middle
+        low = m.strips.first[strip_of(x - widest, &m.strips)]
         while low < n and m.sorted[low].x <= x + widest:
             i = m.sorted[low].row
             apart2 = (m.sorted[low].x - x) ** 2 + (m.sorted[low].y - y) ** 2

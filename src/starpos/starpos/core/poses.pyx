@@ -8,20 +8,21 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos.core.algebra cimport best_rotation, factored, solved, turn_by, turned
-from starpos.core.frame cimport Frame, direction_of, on_frame, pixel_of
-from starpos.core.matching cimport Matching, begin, match, order
+from starpos.core.frame cimport Frame, direction_of, pixel_of
+from starpos.core.matching cimport Matching, match, order
+from starpos.core.sky cimport Visible
 
 cdef enum:
     NONE = -1
     DOUBLED = -2
 
 
-cdef void _project(const double *attitude, double focal, const double[:, ::1] w, double *pixel) noexcept nogil:
-    """Pixels (S, 2) of directions w (S, 3)."""
+cdef void _project(const double *attitude, double focal, const double *w, int n, double *pixel) noexcept nogil:
+    """Set pixel (n, 2) to those of directions w (n, 3)."""
     cdef double[3] u
     cdef int s
-    for s in range(w.shape[0]):
-        turned(attitude, &w[s, 0], u)
+    for s in range(n):
+        turned(attitude, &w[3 * s], u)
         pixel_of(u, focal, &pixel[2 * s])
 
 
@@ -37,7 +38,7 @@ cdef void _slopes(const double *u, double focal, double *pixel, double *slope) n
 
 
 cdef int _fit(
-    const double[:, ::1] xy, const double[:, ::1] w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
+    const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
     """Fit attitude (3, 3) and focal length to pixels xy[star[k]] of directions w[near[k]], with errors sigma[k] px."""
@@ -54,7 +55,7 @@ cdef int _fit(
         for i in range(4):
             right[i] = 0.0
         for k in range(n):
-            turned(attitude, &w[near[k], 0], u)
+            turned(attitude, &w[3 * near[k]], u)
             _slopes(u, focal[0], pixel, slope)
             weight = 1 / (sigma[k] * sigma[k])
             for axis in range(2):
@@ -80,7 +81,7 @@ cdef int _fit(
 
 
 cdef void _fit_alone(
-    const double[:, ::1] xy, const double[:, ::1] w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
+    const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
     """As `_fit`, from the rotation that is best with the given focal length: the result depends on no starting pose."""
@@ -93,30 +94,23 @@ cdef void _fit_alone(
         direction_of(xy[star[k], 0], xy[star[k], 1], focal[0], v)
         for i in range(3):
             for j in range(3):
-                b[3 * i + j] += v[i] * w[near[k], j]
+                b[3 * i + j] += v[i] * w[3 * near[k] + j]
     best_rotation(b, attitude)
     _fit(xy, w, sigma, star, near, n, steps, small_step, attitude, focal)
 
 
 def fitted(
-    const double[:, ::1] xy, const double[:, ::1] w, const double[::1] sigma_px, attitude, double focal_px, bint alone,
-    int steps, double small_step,
+    const double[:, ::1] xy, const double[:, ::1] w, const double[::1] sigma_px, attitude, double focal_px, int steps,
+    double small_step,
 ):
-    """Fit attitude (3, 3) and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3).
-
-    alone: without the given attitude, so that the result does not depend on it.
-    """
-    cdef int k, n = xy.shape[0]
+    """Fit attitude (3, 3) and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
+    cdef int n = xy.shape[0]
     both = np.arange(n)
     out = np.array(attitude, float)
     cdef Py_ssize_t[::1] rows = both
     cdef double[:, ::1] turned_to = out
-    if n == 0:
-        return out, focal_px
-    if alone:
-        _fit_alone(xy, w, &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
-    else:
-        _fit(xy, w, &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
+    if n > 0:
+        _fit(xy, &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
     return out, focal_px
 
 
@@ -143,104 +137,151 @@ cdef double _median(double *values, int n) noexcept nogil:
     return values[k]
 
 
-def settled(
-    Frame frame, bint mirrored, int n, const double[:, ::1] w, const double[:, ::1] attitude, double focal_px,
-    const double[::1] radius_px, rules,
-):
-    """Match a frame's n brightest stars with stars w (S, 3), fit the pose, and match again until no pair changes.
+cdef class Chances:
+    """What `weighed` reckons with.
 
-    mirrored            whether the frame's rows are flipped
-    attitude, focal_px  the pose to begin with; the fit begins with the frame's focal length
-    radius_px           (n,): how far from their places stars may be at first
-    rules               `full.RULES`
+    errors_px, log_shares  (4,): errors beside the centroids' own, and the logarithms of their probabilities
+    double_px              a closer detection says nothing new
+    """
 
-    Returns attitude (3, 3), focal length, the rows of the pairs in the frame and in w (M,), whether each of the stars is
-    well inside the frame (S,), and of the residuals: the spread (px) that their median shows, the rms (px) along one axis
-    with the weights of the fit, and their mean square (px2); None if there are too few pairs.
+    def __init__(self, errors_px, log_shares, double double_px):
+        cdef int k
+        self.double_px = double_px
+        for k in range(ERRORS):
+            self.errors_px[k], self.log_shares[k] = errors_px[k], log_shares[k]
+
+
+cdef class Rules:
+    """Rules by which stars are matched.
+
+    rounds, fewest_stars            so often stars are matched and a pose fitted; with fewer pairs there is none
+    steps, small_step               most steps of a fit; a step below this (rad) is the last one
+    floor_px                        error beside each star's own
+    sigma_per_mad, least_spread_px  the spread of residuals over their median, and its least value
+    gate_sigma, gate_px             a star may be so many times the spread from its place, and so far beyond
+    edge_px, inside_px              a star so far beyond the frame is on it, and one so near its edge may be cut off
+    blend_px                        closer stars make one image
+    per_detection, more_stars       so many catalogue stars are taken for each detection, and so many more
+    most_stars                      so many of the brightest detections take part
+    bent_px                         where the residuals spread more, the lens bends, and all stars count alike
+    """
+
+
+    def __init__(
+        self, *, int rounds, int fewest_stars, int steps, double small_step, double floor_px, double sigma_per_mad,
+        double least_spread_px, double gate_sigma, double gate_px, double edge_px, double inside_px, double blend_px,
+        int per_detection, int more_stars, int most_stars, double bent_px,
+    ):
+        self.rounds, self.fewest, self.steps, self.small_step = rounds, fewest_stars, steps, small_step
+        self.floor_px, self.per_mad, self.least = floor_px, sigma_per_mad, least_spread_px
+        self.gate_sigma, self.gate_px = gate_sigma, gate_px
+        self.edge_px, self.inside_px, self.blend_px = edge_px, inside_px, blend_px
+        self.per_detection, self.more_stars, self.most_stars = per_detection, more_stars, most_stars
+        self.bent_px = bent_px
+
+
+cdef void settle(
+    Frame frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
+    double *work, Settled *out,
+) noexcept nogil:
+    """Match a frame's n brightest stars with the catalogue's, fit the pose, and match again until no pair changes.
+
+    radius  (n,): how far from their places stars may be at first; it changes
+    pixel   room for the pixels (S, 2) of the catalogue stars, which remain
+    work    room for 3 numbers a pair
+    out     holds the pose to begin with; the fit begins with the frame's focal length
     """
     cdef const double[:, ::1] xy = frame.xy[mirrored]
-    cdef int stars = w.shape[0], most = min(n, stars), k, i, count = 0, turn
-    cdef int rounds = rules.rounds, fewest = rules.fewest_stars, steps = rules.steps
-    cdef double floor_px = rules.floor_px, per_mad = rules.sigma_per_mad, least = rules.least_spread_px
-    cdef double gate_sigma = rules.gate_sigma, gate_px = rules.gate_px, small_step = rules.small_step
-    cdef double inside_px = rules.inside_px
-    cdef double focal = focal_px, spread = 0.0, square, whole = 0.0, weighted = 0.0, weights = 0.0
+    cdef double *sigma = work + 2 * min(n, stars.count)
+    cdef int turn, i, k
     cdef bint same
-    if most < fewest:
-        return None
-    out, pair, within = np.empty((3, 3)), np.empty((2, most), np.intp), np.empty(stars, bool)
-    cdef unsigned char[::1] inside = within.view(np.uint8)
-    cdef double[:, ::1] turned_to = out
-    cdef Py_ssize_t[:, ::1] rows = pair
-    cdef Matching m
-    m.memory = NULL
-    cdef double *memory = <double *>malloc((2 * stars + n + 3 * most) * sizeof(double))
-    cdef double *pixel = memory
-    cdef double *radius = pixel + 2 * stars
-    cdef double *sigma = radius + n
-    cdef double *off = sigma + most
-    try:
-        if memory == NULL:
-            raise MemoryError
-        begin(&m, n, stars)
-        with nogil:
-            order(&m, xy, n)
-            for i in range(n):
-                radius[i] = radius_px[i]
-            _project(&attitude[0, 0], focal, w, pixel)
-            match(&m, n, pixel, stars, radius)
-            for turn in range(rounds):
-                same, k = turn > 0, 0
-                for i in range(n):
-                    if m.near[i] < 0:
-                        continue
-                    same = same and k < count and rows[0, k] == i and rows[1, k] == m.near[i]
-                    rows[0, k], rows[1, k], sigma[k] = i, m.near[i], hypot(frame.sigma[i], floor_px)
-                    k += 1
-                if same and k == count:
-                    break
-                count = k
-                if count < fewest:
-                    break
-                focal = frame.focal
-                _fit_alone(
-                    xy, w, sigma, &rows[0, 0], &rows[1, 0], count, steps, small_step, &turned_to[0, 0], &focal
-                )
-                _project(&turned_to[0, 0], focal, w, pixel)
-                whole = weighted = weights = 0.0
-                for k in range(count):
-                    for i in range(2):
-                        off[2 * k + i] = fabs(xy[rows[0, k], i] - pixel[2 * rows[1, k] + i])
-                        square = off[2 * k + i] * off[2 * k + i]
-                        whole += square
-                        weighted += square / (sigma[k] * sigma[k])
-                        weights += 1 / (sigma[k] * sigma[k])
-                spread = per_mad * _median(off, 2 * count)
-                for i in range(n):
-                    radius[i] = gate_sigma * hypot(max(spread, least), frame.sigma[i]) + gate_px
-                if turn + 1 < rounds:
-                    match(&m, n, pixel, stars, radius)
-        if count < fewest:
-            return None
-        for i in range(stars):
-            inside[i] = on_frame(frame, &pixel[2 * i], -inside_px)
-        star, near = pair[0, :count], pair[1, :count]
-        return out, focal, star, near, within, spread, sqrt(weighted / weights), whole / (2 * count)
-    finally:
-        free(memory)
-        free(m.memory)
+    out.count = 0
+    order(m, xy, n)
+    _project(out.attitude, out.focal, stars.w, stars.count, pixel)
+    for turn in range(rules.rounds):
+        match(m, n, pixel, stars.count, radius)
+        same, k = turn > 0, 0
+        for i in range(n):
+            if m.near[i] < 0:
+                continue
+            same = same and k < out.count and out.star[k] == i and out.near[k] == m.near[i]
+            out.star[k], out.near[k], sigma[k] = i, m.near[i], hypot(frame.sigma[i], rules.floor_px)
+            k += 1
+        if same and k == out.count:
+            break
+        out.count = k
+        if out.count < rules.fewest:
+            break
+        _refit(frame, xy, stars, rules, sigma, sigma, pixel, work, out)
+        out.spread = rules.per_mad * _median(work, 2 * out.count)
+        gates(frame, rules, out.spread, n, radius)
+
+
+cdef void _refit(
+    Frame frame, const double[:, ::1] xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
+    double *pixel, double *off, Settled *out,
+) noexcept nogil:
+    """Fit the pose to the pairs with errors sigma (M,); set pixels, offsets (M, 2) and residuals, with errors floored (M,)."""
+    cdef double square, weight, whole = 0.0, weighted = 0.0, weights = 0.0
+    cdef int k, i
+    out.focal = frame.focal
+    _fit_alone(
+        xy, stars.w, sigma, out.star, out.near, out.count, rules.steps, rules.small_step, out.attitude, &out.focal
+    )
+    _project(out.attitude, out.focal, stars.w, stars.count, pixel)
+    for k in range(out.count):
+        weight = 1 / (floored[k] * floored[k])
+        for i in range(2):
+            off[2 * k + i] = fabs(xy[out.star[k], i] - pixel[2 * out.near[k] + i])
+            square = off[2 * k + i] * off[2 * k + i]
+            whole += square
+            weighted += square * weight
+            weights += weight
+    out.rms, out.mean_square = sqrt(weighted / weights), whole / (2 * out.count)
+
+
+cdef void gates(Frame frame, Rules rules, double spread, int n, double *radius) noexcept nogil:
+    """Set how far (n,) px the n brightest stars may be from their places, where the residuals have a spread."""
+    cdef int i
+    for i in range(n):
+        radius[i] = rules.gate_sigma * hypot(max(spread, rules.least), frame.sigma[i]) + rules.gate_px
+
+
+cdef void count_alike(
+    Frame frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
+) noexcept nogil:
+    """Fit the pose of pairs again, to all alike; the arguments are those of `settle`, and work for 4 numbers a pair."""
+    cdef double *sigma = work + 2 * out.count
+    cdef double *floored = sigma + out.count
+    cdef int k
+    for k in range(out.count):
+        sigma[k] = hypot(frame.sigma[out.star[k]], out.spread)
+        floored[k] = hypot(frame.sigma[out.star[k]], rules.floor_px)
+    _refit(frame, frame.xy[mirrored], stars, rules, sigma, floored, pixel, work, out)
 
 
 def log_ratio(
     const double[:, ::1] xy, const double[::1] sigma_px, double area_px2, const double[:, ::1] attitude, double focal_px,
-    const double[::1] width, const Py_ssize_t[::1] star, const Py_ssize_t[::1] rank, const double[:, ::1] w,
-    const double[::1] errors_px, const double[::1] log_shares, double double_px,
+    const double[::1] width, const Py_ssize_t[::1] star, const Py_ssize_t[::1] rank, const double[:, ::1] w, Chances chances,
 ):
-    """The logarithm of the evidence of `evidence.log_evidence`, without the prior's density.
+    """The logarithm of the evidence of `evidence.log_evidence`, without the prior's density; width (4,): of the prior."""
+    rows = np.arange(star.shape[0])
+    cdef Py_ssize_t[::1] row = rows
+    cdef int n = xy.shape[0], many = star.shape[0]
+    if many == 0:
+        return weighed(xy, &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], NULL, NULL, NULL, NULL, 0, chances)
+    return weighed(
+        xy, &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], &star[0], &rank[0], &w[0, 0], &row[0], many, chances
+    )
 
-    width (4,): of the prior.  errors_px, log_shares (E,): errors beside the centroids' own, and their probabilities.
-    """
-    cdef int n = xy.shape[0], many = star.shape[0], e, i, j, k, passed, hits = 0
+
+cdef double weighed(
+    const double[:, ::1] xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
+    const double *width, const Py_ssize_t *star, const Py_ssize_t *rank, const double *w, const Py_ssize_t *row, int many,
+    Chances chances,
+) except? -1:
+    """As `log_ratio`, of the n brightest detections; w[row[k]] is the direction of the star matched with star[k]."""
+    cdef int e, i, j, k, passed, hits = 0
     cdef double best = -1e300, total, most, odds, least = 1e300, variance, volume
     cdef double[16] information
     cdef double[16] normal
@@ -262,7 +303,7 @@ def log_ratio(
         for i in range(n):
             hit[i] = NONE
         for k in range(many):
-            turned(&attitude[0, 0], &w[k, 0], u)
+            turned(attitude, &w[3 * row[k]], u)
             _slopes(u, focal_px, pixel, slope)
             for i in range(4):
                 for j in range(i + 1):
@@ -280,23 +321,23 @@ def log_ratio(
             hits += hit[i] != NONE
         for i in range(n):
             for j in range(i):
-                if (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2 < double_px * double_px:
+                if (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2 < chances.double_px * chances.double_px:
                     hit[i] = DOUBLED
-        for e in range(errors_px.shape[0]):
+        for e in range(ERRORS):
             total, most = 0.0, -1e300
             for i in range(n):
                 odds = 1.0 if hit[i] == DOUBLED else chance[i]
                 if hit[i] >= 0:
-                    variance = sigma_px[i] * sigma_px[i] + errors_px[e] * errors_px[e]
+                    variance = sigma_px[i] * sigma_px[i] + chances.errors_px[e] * chances.errors_px[e]
                     odds += gain[hit[i]] * exp(-0.5 * apart2[hit[i]] / variance) / variance
                 total += log(odds)
                 most = max(most, total)
             for i in range(16):
-                information[i] = normal[i] / (least + errors_px[e] * errors_px[e])
+                information[i] = normal[i] / (least + chances.errors_px[e] * chances.errors_px[e])
             for i in range(4):
                 information[5 * i] += 2 * M_PI / (width[i] * width[i])
             volume = 0.5 * (4 * log(2 * M_PI) - factored(information, 4))
-            best = max(best, most + volume + log_shares[e])
+            best = max(best, most + volume + chances.log_shares[e])
     free(chance)
     free(hit)
     return best

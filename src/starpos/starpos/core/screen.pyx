@@ -10,16 +10,11 @@ import numpy as np
 from starpos.core.algebra cimport best_rotation, turned
 from starpos.core.frame cimport Frame, axis_of, direction_of, on_frame, pixel_of
 from starpos.core.matching cimport Matching, begin, match, order
-from starpos.core.sky cimport MOST_RUNS, Date, StarTable, date_of, runs_near
+from starpos.core.sky cimport MOST_RUNS, Date, StarTable, runs_near
+from starpos.core.triangles cimport Candidate
 
 # Stars so far beyond a frame are on it.
 cdef double EDGE_PX = 2.0
-
-
-cdef struct Bright:
-    double x
-    double y
-    int rank
 
 
 cdef int _by_rank(const void *one, const void *other) noexcept nogil:
@@ -29,133 +24,109 @@ cdef int _by_rank(const void *one, const void *other) noexcept nogil:
 cdef class BrightTable:
     """The brightest stars of a catalogue: their rows, their rank in brightness, first rows of the cells of the sky."""
 
-    cdef StarTable stars
-    cdef const int[::1] row
-    cdef const int[::1] rank
-    cdef const int[::1] cell_start
-
     def __init__(self, StarTable stars, row, rank, cell_start):
         self.stars = stars
         self.row = np.ascontiguousarray(row, np.int32)
         self.rank = np.ascontiguousarray(rank, np.int32)
         self.cell_start = np.ascontiguousarray(cell_start, np.int32)
 
-    def poses(
-        self, Frame frame, const Py_ssize_t[:, ::1] star, const Py_ssize_t[:, ::1] corner, mirrored, double years,
-        velocity, double error_px, double match_sigma, int tested,
-    ):
-        """Poses that bring triangles of these stars, corner (K, 3), to those of a frame, star (K, 3).
+    cdef void pose(
+        self, Frame frame, const Candidate *c, const Date *date, double error_px, double match_sigma, int n,
+        double *attitude, double *focal, double *radius,
+    ) noexcept nogil:
+        """Set the pose that brings a candidate's catalogue triangle to that of the frame.
 
-        mirrored     (K,): whether with the frame's rows flipped
         error_px     of all stars, beside their own
         match_sigma  how many sigma stars may be off
+        radius       (n,): the distance (px) by which the n brightest may be
 
-        The focal length makes a triangle's perimeter right, then the rotation brings it into place. Returns attitude
-        (K, 3, 3), focal length (K,), and the distance (K, n) px by which the n = min(N, tested) brightest may be off.
+        The focal length makes the triangle's perimeter right, then the rotation brings it into place.
         """
-        cdef Date date = date_of(years, velocity)
-        cdef int many = star.shape[0], n = min(<int>frame.sigma.shape[0], tested), k, i, j, c, turn
-        attitudes, focals, radii = np.empty((many, 3, 3)), np.empty(many), np.empty((many, n))
-        cdef double[:, :, ::1] attitude = attitudes
-        cdef double[::1] focal = focals
-        cdef double[:, ::1] radius = radii
-        cdef const unsigned char[::1] mirror = mirrored.view(np.uint8)
         cdef double[9] w
         cdef double[9] seen
         cdef double[9] b
-        cdef double x, y, size2, away2, wanted
+        cdef double x = 0.0, y = 0.0, size2 = 0.0, away2, wanted
         cdef const double *pixel
-        for k in range(many):
-            x = y = size2 = 0.0
-            for c in range(3):
-                self.stars.direction(self.row[corner[k, c]], &date, &w[3 * c])
-                pixel = &frame.xy[mirror[k], star[k, c], 0]
-                x += pixel[0] / 3
-                y += pixel[1] / 3
-            wanted = _perimeter(w)
-            focal[k] = frame.focal
-            for turn in range(3):
-                for c in range(3):
-                    pixel = &frame.xy[mirror[k], star[k, c], 0]
-                    direction_of(pixel[0], pixel[1], focal[k], &seen[3 * c])
-                if turn < 2:
-                    focal[k] *= _perimeter(seen) / wanted
-            for i in range(3):
-                for j in range(3):
-                    b[3 * i + j] = 0.0
-                    for c in range(3):
-                        b[3 * i + j] += seen[3 * c + i] * w[3 * c + j]
-            best_rotation(b, &attitude[k, 0, 0])
-            # a triangle's error grows with the distance from it
-            for c in range(3):
-                pixel = &frame.xy[mirror[k], star[k, c], 0]
-                size2 += ((pixel[0] - x) ** 2 + (pixel[1] - y) ** 2) / 3
-            for i in range(n):
-                pixel = &frame.xy[mirror[k], i, 0]
-                away2 = (pixel[0] - x) ** 2 + (pixel[1] - y) ** 2
-                radius[k, i] = match_sigma * hypot(frame.sigma[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
-        return attitudes, focals, radii
+        cdef int i, j, k, turn
+        for k in range(3):
+            self.stars.direction(self.row[c.corner[k]], date, &w[3 * k])
+            pixel = &frame.xy[c.mirrored, c.star[k], 0]
+            x += pixel[0] / 3
+            y += pixel[1] / 3
+        wanted = _perimeter(w)
+        focal[0] = frame.focal
+        for turn in range(3):
+            for k in range(3):
+                pixel = &frame.xy[c.mirrored, c.star[k], 0]
+                direction_of(pixel[0], pixel[1], focal[0], &seen[3 * k])
+            if turn < 2:
+                focal[0] *= _perimeter(seen) / wanted
+        for i in range(3):
+            for j in range(3):
+                b[3 * i + j] = 0.0
+                for k in range(3):
+                    b[3 * i + j] += seen[3 * k + i] * w[3 * k + j]
+        best_rotation(b, attitude)
+        # a triangle's error grows with the distance from it
+        for k in range(3):
+            pixel = &frame.xy[c.mirrored, c.star[k], 0]
+            size2 += ((pixel[0] - x) ** 2 + (pixel[1] - y) ** 2) / 3
+        for i in range(n):
+            pixel = &frame.xy[c.mirrored, i, 0]
+            away2 = (pixel[0] - x) ** 2 + (pixel[1] - y) ** 2
+            radius[i] = match_sigma * hypot(frame.sigma[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
 
-    def worth(
-        self, Frame frame, const double[:, :, ::1] attitude, const double[::1] focal_px, mirrored,
-        const Py_ssize_t[:, ::1] star, const double[:, ::1] radius_px, double years, velocity, int most_stars,
-        double match_sigma, double log_false,
-    ):
-        """The log-odds (K,) of poses against chance, by stars that coincide with the n brightest of a frame.
+    cdef double worth(
+        self, Frame frame, const Candidate *c, const Date *date, const double *attitude, double focal_px, int n,
+        const double *radius_px, int most_stars, double match_sigma, double log_false,
+    ) except? -1:
+        """The log-odds of a pose against chance, by stars that coincide with the n brightest of a frame.
 
-        attitude, focal_px, mirrored  (K, 3, 3), (K,), (K,)
-        star                          (K, 3): the frame's stars from which each pose was made, no evidence for it
-        radius_px                     (K, n): how far stars may be off, match_sigma of their errors
-        most_stars                    so many of the brightest catalogue stars on the frame are looked at
-        log_false                     logarithm of the share of detections that may be false
+        c           the candidate from which the pose was made: its stars are no evidence for it
+        radius_px   (n,): how far stars may be off, match_sigma of their errors
+        most_stars  so many of the brightest catalogue stars on the frame are looked at
+        log_false   logarithm of the share of detections that may be false
         """
-        cdef Date date = date_of(years, velocity)
-        cdef int many = attitude.shape[0], n = radius_px.shape[1], k, i, j, count, room = 0
-        cdef const unsigned char[::1] mirror = mirrored.view(np.uint8)
-        out = np.empty(many)
-        cdef double[::1] worth = out
         cdef int[2 * MOST_RUNS] runs
         cdef double[3] axis
-        cdef double total, variance, area_px2 = 4 * frame.half[0] * frame.half[1]
+        cdef double total = 0.0, best = -1e300, variance, area_px2 = 4 * frame.half[0] * frame.half[1]
         cdef Matching m
         cdef Bright *bright = NULL
         cdef double *pixel
-        for k in range(many):
-            axis_of(frame, &attitude[k, 0, 0], axis)
-            count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
-            room = 0
+        cdef int i, count, room = 0
+        axis_of(frame, attitude, axis)
+        count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
+        for i in range(count):
+            room += runs[2 * i + 1] - runs[2 * i]
+        m.memory = NULL
+        bright = <Bright *>malloc((room + 1) * (sizeof(Bright) + 2 * sizeof(double)))
+        try:
+            if bright == NULL:
+                raise MemoryError
+            pixel = <double *>(bright + room + 1)
+            count = self._on_frame(runs, count, frame, attitude, focal_px, date, bright)
+            if count > most_stars:
+                qsort(bright, count, sizeof(Bright), _by_rank)
+                count = most_stars
             for i in range(count):
-                room += runs[2 * i + 1] - runs[2 * i]
-            m.memory = NULL
-            bright = <Bright *>malloc((room + 1) * (sizeof(Bright) + 2 * sizeof(double)))
-            try:
-                if bright == NULL:
-                    raise MemoryError
-                pixel = <double *>(bright + room + 1)
-                count = self._on_frame(runs, count, frame, &attitude[k, 0, 0], focal_px[k], &date, bright)
-                if count > most_stars:
-                    qsort(bright, count, sizeof(Bright), _by_rank)
-                    count = most_stars
-                for i in range(count):
-                    pixel[2 * i], pixel[2 * i + 1] = bright[i].x, bright[i].y
-                begin(&m, n, count)
-                order(&m, frame.xy[mirror[k]], n)
-                match(&m, n, pixel, count, &radius_px[k, 0])
-                # the sum from the brightest star down to the one where it is largest
-                total, worth[k] = 0.0, -1e300
-                for i in range(n):
-                    if i != star[k, 0] and i != star[k, 1] and i != star[k, 2]:
-                        if m.near[i] >= 0:
-                            variance = (radius_px[k, i] / match_sigma) ** 2
-                            total -= 0.5 * m.near2[i] / variance
-                            total -= log(2 * M_PI * variance * max(count, 1) / area_px2)
-                        else:
-                            total += log_false
-                    worth[k] = max(worth[k], total)
-            finally:
-                free(bright)
-                free(m.memory)
-        return out
+                pixel[2 * i], pixel[2 * i + 1] = bright[i].x, bright[i].y
+            begin(&m, n, count)
+            order(&m, frame.xy[c.mirrored], n)
+            match(&m, n, pixel, count, radius_px)
+            # the sum from the brightest star down to the one where it is largest
+            for i in range(n):
+                if i != c.star[0] and i != c.star[1] and i != c.star[2]:
+                    if m.near[i] >= 0:
+                        variance = (radius_px[i] / match_sigma) ** 2
+                        total -= 0.5 * m.near2[i] / variance
+                        total -= log(2 * M_PI * variance * max(count, 1) / area_px2)
+                    else:
+                        total += log_false
+                best = max(best, total)
+        finally:
+            free(bright)
+            free(m.memory)
+        return best
 
     cdef int _on_frame(
         self, const int *runs, int count, Frame frame, const double *attitude, double focal_px, const Date *date,
@@ -170,9 +141,8 @@ cdef class BrightTable:
                 self.stars.direction(self.row[k], date, w)
                 turned(attitude, w, u)
                 pixel_of(u, focal_px, u)
-                if on_frame(frame, u, EDGE_PX):
-                    bright[kept].x, bright[kept].y, bright[kept].rank = u[0], u[1], self.rank[k]
-                    kept += 1
+                bright[kept].x, bright[kept].y, bright[kept].rank = u[0], u[1], self.rank[k]
+                kept += on_frame(frame, u, EDGE_PX)
         return kept
 
 

@@ -16,6 +16,15 @@ cdef struct Date:
     bint moved
 
 
+cdef struct Visible:
+    # Stars on a frame, brightest first: rows, directions (count, 3), and how far (px) fainter ones move their images.
+    int count
+    Py_ssize_t *row
+    double *w
+    double *moved
+    void *memory
+
+
 cdef class StarTable:
     cdef const unsigned int[::1] ra
     cdef const int[::1] dec
@@ -25,14 +34,17 @@ cdef class StarTable:
     cdef const int[::1] cell_start
 
     cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil
+    cdef int find(
+        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
+        double blend_px, Visible *out,
+    ) except -1 nogil
     cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil
     cdef int _projected(
         self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
-        const Date *date, int most, Py_ssize_t[::1] row, double[:, ::1] w, Point *pixel,
+        const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil
     cdef int _unblended(
-        self, Point *pixel, int n, double blend_px, double focal_px, Py_ssize_t[::1] row, double[:, ::1] w,
-        double[::1] moved, int *single,
+        self, Point *pixel, double blend_px, double focal_px, Visible *out, int *single
     ) noexcept nogil
 
 

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport Point, sort_by_x, turned
+from starpos.core.algebra cimport Point, Strips, fetch, sort_by_x, turned
 from starpos.core.frame cimport Frame, axis_of, on_frame, pixel_of
 
 cdef enum:
@@ -16,6 +16,8 @@ cdef enum:
     # Of brightness: V from -10.24 to 30.71 in steps of 0.01.
     BINS = 4096
     BRIGHTEST = -1024
+    # Memory is asked for so many stars ahead.
+    SOON = 12
 
 cdef double MAS = M_PI / 180 / DEGREE
 
@@ -90,45 +92,69 @@ cdef class StarTable:
 
     def on_frame(
         self, Frame frame, const double[:, ::1] attitude, double focal_px, double years, velocity, double margin_px,
-        int most, int cut, double blend_px,
+        int most, double blend_px,
     ):
         """The brightest stars on a frame: rows (S,), directions (S, 3), and how far (px) fainter ones move the image.
 
         attitude, focal_px  the pose
         margin_px           stars so far beyond the frame are on it
-        most, cut           so many stars are taken, of so many brightest in the cells about the frame
+        most                so many stars are taken
         blend_px            closer stars make one image
         """
         cdef Date date = date_of(years, velocity)
+        cdef Visible found
+        cdef Py_ssize_t[::1] row
+        cdef double[:, ::1] w
+        cdef double[::1] moved
+        cdef int k, i
+        found.memory = NULL
+        try:
+            self.find(frame, &attitude[0, 0], focal_px, &date, margin_px, most, blend_px, &found)
+            index, directions, drawn = np.empty(found.count, np.intp), np.empty((found.count, 3)), np.empty(found.count)
+            row, w, moved = index, directions, drawn
+            for k in range(found.count):
+                row[k], moved[k] = found.row[k], found.moved[k]
+                for i in range(3):
+                    w[k, i] = found.w[3 * k + i]
+            return index, directions, drawn
+        finally:
+            free(found.memory)
+
+    cdef int find(
+        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
+        double blend_px, Visible *out,
+    ) except -1 nogil:
+        """Set `out` to the stars of `on_frame`; its memory is the caller's to free, even after an error."""
         cdef int[2 * MOST_RUNS] runs
         cdef double[3] axis
-        cdef int i, n = 0, count
-        axis_of(frame, &attitude[0, 0], axis)
+        # the cells reach beyond the frame
+        cdef int cut = 4 * most + 100, i, n = 0, count
+        axis_of(frame, attitude, axis)
         count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
         for i in range(count):
             n += runs[2 * i + 1] - runs[2 * i]
+            fetch(&self.vmag[runs[2 * i]])
+            fetch(&self.ra[runs[2 * i]])
+            fetch(&self.dec[runs[2 * i]])
         most = min(most, n)
-        index, directions, drawn = np.empty(most, np.intp), np.empty((most, 3)), np.empty(most)
-        cdef Py_ssize_t[::1] row = index
-        cdef double[:, ::1] w = directions
-        cdef double[::1] moved = drawn
-        cdef int *near = <int *>malloc((n + 1) * sizeof(int))
-        cdef Point *pixel = <Point *>malloc((most + 1) * sizeof(Point))
-        try:
-            if near == NULL or pixel == NULL:
+        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + (n + 1) * sizeof(int))
+        if out.memory == NULL:
+            with gil:
                 raise MemoryError
-            n = self._by_light(runs, count, cut, near)
-            n = self._projected(near, n, frame, &attitude[0, 0], focal_px, margin_px, &date, most, row, w, pixel)
-            n = self._unblended(pixel, n, blend_px, frame.focal, row, w, moved, near)
-        finally:
-            free(near)
-            free(pixel)
-        return index[:n], directions[:n], drawn[:n]
+        out.w = <double *>out.memory
+        out.moved = out.w + 3 * most
+        out.row = <Py_ssize_t *>(out.moved + most)
+        # half of it to sort in
+        cdef Point *pixel = <Point *>(out.row + most)
+        cdef int *near = <int *>(pixel + 2 * most)
+        n = self._by_light(runs, count, cut, near)
+        self._projected(near, n, frame, attitude, focal_px, margin_px, date, most, out, pixel)
+        return self._unblended(pixel, blend_px, frame.focal, out, near)
 
     cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil:
         """Write the rows of runs to `near`, brightest first, about `cut` of them; how many."""
         cdef int[BINS] first
-        cdef int i, k, bin, total = 0, kept, low = BINS - 1, high = 0
+        cdef int i, k, bin, total = 0, kept = 0, low = BINS - 1, high = 0
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
                 bin = _light(self.vmag[k])
@@ -138,48 +164,54 @@ cdef class StarTable:
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
                 first[_light(self.vmag[k])] += 1
-        # how many are brighter; stars that come after `cut` others are left out
+        # how many are brighter; stars that come after `cut` others do not count
         for bin in range(low, high + 1):
-            kept = first[bin] if total < cut else 0
-            first[bin] = total if kept else -1
-            total += kept
+            kept = kept if total >= cut else total + first[bin]
+            first[bin], total = total, total + first[bin]
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
                 bin = _light(self.vmag[k])
-                if first[bin] >= 0:
-                    near[first[bin]] = k
-                    first[bin] += 1
-        return total
+                near[first[bin]] = k
+                first[bin] += 1
+        return kept
 
     cdef int _projected(
         self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
-        const Date *date, int most, Py_ssize_t[::1] row, double[:, ::1] w, Point *pixel,
+        const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil:
         """Keep of the rows `near` (n,) those on the frame, with their directions and pixels, at most so many."""
-        cdef int k, kept = 0
+        cdef int k, soon, kept = 0
         cdef double[3] u
         for k in range(n):
             if kept == most:
                 break
-            self.direction(near[k], date, &w[kept, 0])
-            turned(attitude, &w[kept, 0], u)
+            soon = near[min(k + SOON, n - 1)]
+            fetch(&self.ra[soon])
+            fetch(&self.dec[soon])
+            if date.moved:
+                fetch(&self.pm_ra[soon])
+                fetch(&self.pm_dec[soon])
+            self.direction(near[k], date, &out.w[3 * kept])
+            turned(attitude, &out.w[3 * kept], u)
             pixel_of(u, focal_px, u)
-            if on_frame(frame, u, margin_px):
-                row[kept] = near[k]
-                pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
-                kept += 1
+            out.row[kept] = near[k]
+            pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
+            kept += on_frame(frame, u, margin_px)
+        out.count = kept
         return kept
 
     cdef int _unblended(
-        self, Point *pixel, int n, double blend_px, double focal_px, Py_ssize_t[::1] row, double[:, ::1] w,
-        double[::1] moved, int *single,
+        self, Point *pixel, double blend_px, double focal_px, Visible *out, int *single
     ) noexcept nogil:
         """Leave those out that make one image with a brighter star, which they move; how many stay."""
-        cdef int i, j, a, b, kept = 0
+        cdef int i, j, a, b, n = out.count, kept = 0
         cdef double apart, ratio
+        cdef Strips strips
+        cdef const double *one
+        cdef const double *other
         for i in range(n):
-            moved[i], single[i] = 0.0, 1
-        sort_by_x(pixel, n)
+            out.moved[i], single[i] = 0.0, 1
+        sort_by_x(pixel, n, pixel + n, &strips)
         for i in range(n):
             for j in range(i + 1, n):
                 if pixel[j].x - pixel[i].x >= blend_px:
@@ -187,19 +219,33 @@ cdef class StarTable:
                 if (pixel[j].x - pixel[i].x) ** 2 + (pixel[j].y - pixel[i].y) ** 2 >= blend_px * blend_px:
                     continue
                 a, b = min(pixel[i].row, pixel[j].row), max(pixel[i].row, pixel[j].row)
-                ratio = pow(10, -0.004 * (self.vmag[row[b]] - self.vmag[row[a]]))
-                apart = sqrt((w[b, 0] - w[a, 0]) ** 2 + (w[b, 1] - w[a, 1]) ** 2 + (w[b, 2] - w[a, 2]) ** 2)
+                one, other = &out.w[3 * a], &out.w[3 * b]
+                ratio = pow(10, -0.004 * (self.vmag[out.row[b]] - self.vmag[out.row[a]]))
+                apart = sqrt((other[0] - one[0]) ** 2 + (other[1] - one[1]) ** 2 + (other[2] - one[2]) ** 2)
                 # from directions and rounded, so that it does not depend on the pose
                 apart = rint(focal_px * apart * 1e6) / 1e6
-                moved[a] += apart * ratio / (1 + ratio)
+                out.moved[a] += apart * ratio / (1 + ratio)
                 single[b] = 0
         for i in range(n):
             if single[i]:
-                row[kept], moved[kept] = row[i], moved[i]
+                out.row[kept], out.moved[kept] = out.row[i], out.moved[i]
                 for j in range(3):
-                    w[kept, j] = w[i, j]
+                    out.w[3 * kept + j] = out.w[3 * i + j]
                 kept += 1
+        out.count = kept
         return kept
+
+
+def designations(const int[::1] hip, const short[:, ::1] tyc, const Py_ssize_t[::1] index):
+    """Names of rows (n,) of columns (N,), (N, 3): by Hipparcos number, by Tycho's three where that is 0."""
+    cdef Py_ssize_t k, row
+    out = []
+    for k in range(index.shape[0]):
+        row = index[k]
+        if not 0 <= row < hip.shape[0]:
+            raise IndexError(f"the star catalogue has no row {row}")
+        out.append(f"HIP {hip[row]}" if hip[row] else f"TYC {tyc[row, 0]}-{tyc[row, 1]}-{tyc[row, 2]}")
+    return out
 
 
 cdef inline int _light(short vmag) noexcept nogil:

@@ -7,17 +7,10 @@ from libc.stdlib cimport calloc, free, malloc, realloc
 
 import numpy as np
 
+from starpos.core.algebra cimport fetch
 from starpos.core.frame cimport Frame, direction_of
 
-cdef extern from *:
-    """
-    #define STARPOS_FETCH(address) __builtin_prefetch(address)
-    """
-    void fetch "STARPOS_FETCH"(const void *address) noexcept nogil
-
 cdef enum:
-    # Queries that are prepared before the first of them is answered, so that memory has time.
-    AHEAD = 16
     # Of the number of candidates that chance makes: 64 for each power of two.
     STEPS = 4096
     # Logarithm of the size of a table that fits into a processor's cache.
@@ -30,46 +23,6 @@ cdef double LEAST_SIDE = 1e-9
 ctypedef unsigned long long key_t
 
 
-cdef struct Query:
-    int[3] star
-    # of the shape in CODES
-    int[3] low
-    int[3] high
-    double longest
-    bint turn
-
-
-cdef struct Candidate:
-    int[3] star
-    int[3] corner
-    bint mirrored
-    int support
-    # Longest side, over that of the frame's triangle.
-    double size
-
-
-cdef struct Shape:
-    # The corners, and the sides opposite to them: the longest first.
-    int[3] star
-    double[3] side
-    # Of the largest and the smallest angle and of the longest side.
-    double[3] tolerance
-    bint usable
-
-
-cdef struct Search:
-    # Of the frame's stars: directions, errors (rad), and the distance (rad) of star b from a brighter one a at [a, b].
-    int stars
-    double *v
-    double *error
-    double *side
-    Query[2 * AHEAD] waiting
-    int queries
-    Candidate *found
-    int count
-    int room
-
-
 cdef class TriangleTable:
     """Columns of a `TriangleCatalogue`, and how its shapes are looked up.
 
@@ -77,13 +30,6 @@ cdef class TriangleTable:
     scale_tolerance  the share by which the focal length may be off
     sigmas           a triangle may be off by so many sigma of its stars
     """
-
-    cdef const int[:, ::1] corners
-    cdef const unsigned char[::1] turn
-    cdef const unsigned short[:, ::1] shape
-    cdef const int[::1] bin_start
-    cdef double crowded, scale_tolerance, sigmas
-    cdef double[3] codes
 
     def __init__(self, table, double crowded, double scale_tolerance, double sigmas):
         self.corners = np.ascontiguousarray(table.corners, np.int32)
@@ -97,14 +43,30 @@ cdef class TriangleTable:
     def candidates(
         self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose
     ):
-        """Candidates for triangles of a frame's stars whose faintest is first .. last - 1, brightest first.
+        """The candidates of `best` as arrays: star (K, 3), corner (K, 3) and mirrored (K,)."""
+        cdef int k, count
+        cdef Candidate *found = <Candidate *>malloc((most + 1) * sizeof(Candidate))
+        try:
+            if found == NULL:
+                raise MemoryError
+            count = self.best(frame, first, last, error_px, most_expected, most, loose, found)
+            rows = [(list(found[k].star[:3]), found[k].corner, found[k].mirrored) for k in range(count)]
+        finally:
+            free(found)
+        star, corner, mirrored = zip(*rows) if rows else ((), (), ())
+        return np.array(star, int).reshape(-1, 3), np.array(corner, int).reshape(-1, 3), np.array(mirrored, bool)
+
+    cdef int best(
+        self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
+    ) except -1:
+        """Write candidates for triangles of a frame's stars whose faintest is first .. last - 1, brightest first.
 
         error_px       of all stars, beside their own
         most_expected  no more triangles are looked up once chance makes so many candidates
-        most           so many are returned: best supported first, then those of the likeliest size
+        most           so many are written: best supported first, then those of the likeliest size
         loose          only those that another one supports
 
-        Returns star (K, 3), corner (K, 3) and mirrored (K,).
+        Returns how many there are.
         """
         cdef Search s
         cdef Shape shape
@@ -122,15 +84,18 @@ cdef class TriangleTable:
                             self._ask(&s, &shape)
                             expected += self._expected(&shape)
             self._answer(&s)
-            return _best(&s, most, 1 if loose else 0, True)
+            return _best(&s, most, 1 if loose else 0, True, out)
         finally:
             free(s.found)
             free(s.v)
 
-    def supported(self, Frame frame, int stars, double error_px, double most_expected, int most):
-        """Candidates as `candidates` returns them, those that at least two others support, in a crowd of false stars.
+    cdef int supported(
+        self, Frame frame, int stars, double error_px, double most_expected, int most, Candidate *out
+    ) except -1:
+        """Write candidates as `best` does, those that at least two others support, in a crowd of false stars.
 
-        Only the triangles that chance matches least are looked up, until it makes so many candidates.
+        Where most of these stars are false, nearly all candidates are chance, but chance supports few. Only the triangles
+        that chance matches least are looked up, until it makes so many candidates.
         """
         cdef Search s
         cdef Shape shape
@@ -146,7 +111,7 @@ cdef class TriangleTable:
                         if shape.usable and self._expected(&shape) < limit:
                             self._ask(&s, &shape)
             self._answer(&s)
-            return _best(&s, most, 2, False)
+            return _best(&s, most, 2, False, out)
         finally:
             free(s.found)
             free(s.v)
@@ -208,7 +173,7 @@ cdef class TriangleTable:
         cdef double[3] angle
         cdef double[3] middle
         cdef double[3] least
-        cdef int i, swap
+        cdef int i, swap, row, column
         cdef Query *q
         least[0], least[1], least[2] = M_PI / 3, 0.0, 0.0
         angles_of(shape.side, angle)
@@ -226,7 +191,9 @@ cdef class TriangleTable:
                 q.star[swap - 1], q.star[swap] = q.star[swap], q.star[swap - 1]
             q.longest = middle[2]
             q.turn = is_counter_clockwise(&s.v[3 * q.star[0]], &s.v[3 * q.star[1]], &s.v[3 * q.star[2]])
-            fetch(&self.bin_start[bin_of(q.low[0], q.low[1], q.low[2])])
+            for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
+                for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
+                    fetch(&self.bin_start[(row << BITS_1 | column) << BITS_2 | q.low[2] >> SHIFT_2])
         if s.queries >= AHEAD:
             self._answer(s)
         return 0
@@ -234,37 +201,62 @@ cdef class TriangleTable:
     cdef int _answer(self, Search *s) except -1 nogil:
         """Add the candidates of all queries that wait."""
         cdef const Query *q
-        cdef int k, row, column, run, t, i, last = <int>self.shape.shape[0] - 1
         cdef Candidate *c
+        cdef int k, row, column, run, t, end, stop, before = s.count, last = <int>self.shape.shape[0] - 1
         for k in range(s.queries if last >= 0 else 0):
             q = &s.waiting[k]
-            t = min(self.bin_start[bin_of(q.low[0], q.low[1], q.low[2])], last)
-            fetch(&self.shape[t, 0])
-            fetch(&self.corners[t, 0])
-            fetch(&self.turn[t])
+            for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
+                for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
+                    t = min(self.bin_start[(row << BITS_1 | column) << BITS_2 | q.low[2] >> SHIFT_2], last)
+                    fetch(&self.shape[t, 0])
         for k in range(s.queries):
             q = &s.waiting[k]
             for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
                 for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
                     run = (row << BITS_1 | column) << BITS_2
-                    for t in range(
-                        self.bin_start[run + (q.low[2] >> SHIFT_2)], self.bin_start[run + (q.high[2] >> SHIFT_2) + 1]
-                    ):
-                        if not (
-                            q.low[0] <= self.shape[t, 0] <= q.high[0]
-                            and q.low[1] <= self.shape[t, 1] <= q.high[1]
-                            and q.low[2] <= self.shape[t, 2] <= q.high[2]
-                        ):
-                            continue
-                        if s.count == s.room:
-                            _grow(s)
-                        c = &s.found[s.count]
-                        s.count += 1
-                        for i in range(3):
-                            c.star[i], c.corner[i] = q.star[i], self.corners[t, i]
-                        c.mirrored = self.turn[t] != q.turn
-                        c.size = (self.shape[t, 2] + 0.5) / self.codes[2] / q.longest
+                    t = self.bin_start[run + (q.low[2] >> SHIFT_2)]
+                    end = self.bin_start[run + (q.high[2] >> SHIFT_2) + 1]
+                    while t < end:
+                        stop = min(t + ALIKE, end)
+                        self._add(s, q, t, stop)
+                        t = stop
+        # what `_add` has left open, now that memory has had time
+        for k in range(before, s.count):
+            c = &s.found[k]
+            t = c.corner[0]
+            c.corner[0], c.corner[1], c.corner[2] = self.corners[t, 0], self.corners[t, 1], self.corners[t, 2]
+            c.mirrored = self.turn[t] != c.mirrored
         s.queries = 0
+        return 0
+
+    cdef int _add(self, Search *s, const Query *q, int first, int end) except -1 nogil:
+        """Add the candidates of a query among the triangles first .. end - 1, at most ALIKE.
+
+        For now the first corner is the triangle's row, and `mirrored` whether the query's turn is counter-clockwise.
+        """
+        cdef int[ALIKE] alike
+        cdef Candidate *c
+        cdef int t, k, i, count = 0
+        # without a jump for each number, whose outcome no processor can guess
+        for t in range(first, end):
+            alike[count] = t
+            count += (
+                (q.low[0] <= self.shape[t, 0]) & (self.shape[t, 0] <= q.high[0])
+                & (q.low[1] <= self.shape[t, 1]) & (self.shape[t, 1] <= q.high[1])
+                & (q.low[2] <= self.shape[t, 2]) & (self.shape[t, 2] <= q.high[2])
+            )
+        while s.count + count > s.room:
+            _grow(s)
+        for k in range(count):
+            t = alike[k]
+            c = &s.found[s.count]
+            s.count += 1
+            for i in range(3):
+                c.star[i] = q.star[i]
+            c.corner[0], c.mirrored = t, q.turn
+            fetch(&self.corners[t, 0])
+            fetch(&self.turn[t])
+            c.size = (self.shape[t, 2] + 0.5) / self.codes[2] / q.longest
         return 0
 
 
@@ -370,8 +362,8 @@ cdef int _support(Search *s) except -1:
     return 0
 
 
-cdef _best(Search *s, int most, int least_support, bint by_size):
-    """The `most` candidates with most support, equal ones by their size or in their order: star, corner, mirrored."""
+cdef int _best(Search *s, int most, int least_support, bint by_size, Candidate *out) except -1:
+    """Write the `most` candidates with most support, equal ones by their size or in their order; how many."""
     cdef int k, j, kept = 0
     cdef Candidate *c
     cdef int *order = <int *>malloc((most + 1) * sizeof(int))
@@ -393,7 +385,9 @@ cdef _best(Search *s, int most, int least_support, bint by_size):
             if j < most:
                 order[j] = k
                 kept = min(kept + 1, most)
-        return _columns(s, order, kept)
+        for k in range(kept):
+            out[k] = s.found[order[k]]
+        return kept
     finally:
         free(order)
         free(marks)
@@ -403,17 +397,3 @@ cdef inline bint _precedes(const Candidate *one, const Candidate *other, bint by
     if one.support != other.support:
         return one.support > other.support
     return by_size and fabs(log(one.size)) < fabs(log(other.size))
-
-
-cdef _columns(const Search *s, const int *order, int count):
-    """Candidates in an order as arrays: star, corner, mirrored."""
-    cdef int k, i
-    stars, corners, mirror = np.empty((count, 3), np.intp), np.empty((count, 3), np.intp), np.empty(count, bool)
-    cdef Py_ssize_t[:, ::1] star = stars
-    cdef Py_ssize_t[:, ::1] corner = corners
-    cdef unsigned char[::1] mirrored = mirror.view(np.uint8)
-    for k in range(count):
-        for i in range(3):
-            star[k, i], corner[k, i] = s.found[order[k]].star[i], s.found[order[k]].corner[i]
-        mirrored[k] = s.found[order[k]].mirrored
-    return stars, corners, mirror

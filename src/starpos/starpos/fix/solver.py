@@ -421,11 +421,11 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     fx, fy = camera.fx * found.focal_scale, camera.fy * found.focal_scale
     x, y = camera.centre_px
     if not camera.is_ideal:
-        v = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
+        centre, above = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
     else:
         across, down = (x - camera.cx) / fx, (y - camera.cy) / fy
-        v = np.array([[across, down, 1.0], [across, down - 1 / fy, 1.0]])
-    ra, dec, roll = place_of(v, found.attitude, sky.velocity, found.mirrored)
+        centre, above = (across, down, 1.0), (across, down - 1 / fy, 1.0)
+    ra, dec, roll = place_of(centre, above, found.attitude, sky.velocity, found.mirrored)
     return Attitude(
         ra=full_turn(ra),
         dec=dec,

@@ -16,9 +16,8 @@ import numpy as np
 from starpos import rotation
 from starpos.identification.evidence import any_scale
 from starpos.identification.full import FEWEST_STARS, Identification, identified
-from starpos.identification.pose import FrameStars, Pose, Poses, directions
+from starpos.identification.pose import MATCH_SIGMA, FrameStars, Pose, Poses, directions
 from starpos.identification.quads import SHORTEST, SIDES, QuadCatalogue, shapes
-from starpos.identification.screen import MATCH_SIGMA
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
 

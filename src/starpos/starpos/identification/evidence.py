@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.core.poses import log_ratio
+from starpos.core.poses import Chances, log_ratio
 from starpos.identification.pose import Pose
 from starpos.identification.triangles import SCALE_TOLERANCE
 
@@ -33,6 +33,7 @@ MIRRORED = 0.1
 WIDTH = np.append(np.full(3, np.cbrt(8 * np.pi**2)), 2 * SCALES[0][0])
 # Closer detections may be the same star, so the second says nothing new.
 DOUBLE_PX = 3.0
+CHANCES = Chances(ERRORS_PX, LOG_SHARES, DOUBLE_PX)
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,10 @@ class Prior:
 
     log_density: Callable[[Pose], float]
     width: np.ndarray
+
+    def log_density_at(self, attitude: np.ndarray, focal_px: float, mirrored: bool) -> float:
+        """Logarithm of the density at a pose in its parts."""
+        return self.log_density(Pose(attitude, focal_px, mirrored))
 
 
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
@@ -99,8 +104,6 @@ def log_evidence(
         star,
         rank,
         w,
-        ERRORS_PX,
-        LOG_SHARES,
-        DOUBLE_PX,
+        CHANCES,
     )
     return ratio + prior.log_density(pose)

@@ -3,8 +3,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from starpos.core.frame import explained
 from starpos.identification.full import Identification
 from starpos.identification.pose import TEST_STARS, FrameStars
 
@@ -41,6 +40,5 @@ def explained_by(found: Identification, field: FrameStars) -> Explained:
     stars of the sky, nearly all are seen, however faint the frame goes; where they are chance, few are.
     """
     bright = min(len(field), TEST_STARS)
-    explained = int(np.count_nonzero(found.star < bright))
-    due = found.expected[: max(explained, LEAST_DUE)].tolist()
-    return Explained(explained, bright, len(set(due).intersection(found.catalogue.tolist())), len(due))
+    number, seen, due = explained(found.star, found.catalogue, found.expected, bright, LEAST_DUE)
+    return Explained(number, bright, seen, due)

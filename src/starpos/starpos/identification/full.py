@@ -2,12 +2,12 @@
 """Verify a pose by a frame's stars, and match all detections with all catalogue stars of the field."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from starpos.core.poses import fitted, settled
-from starpos.identification.evidence import Prior, log_evidence
+from starpos.core.poses import Rules
+from starpos.core.search import Judge
+from starpos.identification.evidence import CHANCES, Prior
 from starpos.identification.pose import SMALL_STEP, STEPS, FrameStars, Pose
 from starpos.identification.sky import Sky
 from starpos.normal import SIGMA_PER_MAD
@@ -27,24 +27,10 @@ FLOOR_PX = 0.05
 BENT_PX = 0.3
 # Closer stars make one image.
 BLEND_PX = 2.5
+# So many catalogue stars may be those of a frame: for each detection, and so many more.
+PER_DETECTION, MORE_STARS = 3, 50
 # Stars so far beyond the frame (px) are on it, and a star so near its edge may be cut off.
 EDGE_PX, INSIDE_PX = 2.0, 5.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rules:
-    """Rules by which the compiled core settles on pairs, as the constants here have them."""
-
-    rounds: int
-    fewest_stars: int
-    steps: int
-    small_step: float
-    floor_px: float
-    sigma_per_mad: float
-    least_spread_px: float
-    gate_sigma: float
-    gate_px: float
-    inside_px: float
 
 
 RULES = Rules(
@@ -57,7 +43,13 @@ RULES = Rules(
     least_spread_px=LEAST_SPREAD_PX,
     gate_sigma=GATE_SIGMA,
     gate_px=GATE_PX,
+    edge_px=EDGE_PX,
     inside_px=INSIDE_PX,
+    blend_px=BLEND_PX,
+    per_detection=PER_DETECTION,
+    more_stars=MORE_STARS,
+    most_stars=FAINTEST_FIT,
+    bent_px=BENT_PX,
 )
 
 
@@ -88,6 +80,25 @@ class Identification:
     expected: np.ndarray
     mirrored: bool
 
+    @classmethod
+    def of(cls, found: tuple, field: FrameStars) -> "Identification":
+        """The identification of a field that the compiled core has found."""
+        star, catalogue, blend_px, attitude, focal_px, rms_px, square_px2, log_odds, expected, mirrored = (
+            found
+        )
+        return cls(
+            star=star,
+            catalogue=catalogue,
+            blend_px=blend_px,
+            attitude=attitude,
+            focal_scale=focal_px / field.focal_px,
+            residual_px=rms_px,
+            mean_square_px2=square_px2,
+            log_odds=log_odds,
+            expected=expected,
+            mirrored=mirrored,
+        )
+
 
 @dataclass(frozen=True)
 class OnFrame:
@@ -105,7 +116,6 @@ class OnFrame:
     @classmethod
     def of(cls, field: FrameStars, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
         """The stars that the field's brightest detections may be, at most `most_detections` of them."""
-        stars = min(len(field), most_detections)
         found = sky.stars.on_frame(
             field.compiled,
             pose.attitude,
@@ -113,106 +123,34 @@ class OnFrame:
             sky.years,
             sky.velocity,
             EDGE_PX,
-            3 * stars + 50,
-            # three times too many again, because the cells reach beyond the frame
-            12 * stars + 300,
+            PER_DETECTION * min(len(field), most_detections) + MORE_STARS,
             BLEND_PX,
         )
         return cls(*found)
 
 
-class Match(NamedTuple):
-    """Stars on which a pose has settled.
-
-    attitude, focal_px  the pose
-    star, near          (M,): rows of the detections and of the stars matched with them
-    inside              (S,): whether each catalogue star is well inside the frame
-    spread_px           standard deviation that the median of the residuals shows
-    rms_px              of the residuals along one axis, with the weights of the fit
-    mean_square_px2     of the residuals along one axis, all alike
-    """
-
-    attitude: np.ndarray
-    focal_px: float
-    star: np.ndarray
-    near: np.ndarray
-    inside: np.ndarray
-    spread_px: float
-    rms_px: float
-    mean_square_px2: float
+def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> Judge:
+    """What judges poses of a frame by a prior, for the compiled core; enough: log-odds of an identification."""
+    return Judge(
+        field.compiled,
+        sky.stars,
+        sky.years,
+        sky.velocity,
+        prior.width,
+        prior.log_density_at,
+        enough,
+        RULES,
+        CHANCES,
+    )
 
 
 def identified(
-    field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior
+    field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior, enough: float = ENOUGH
 ) -> Identification | None:
     """Identify a frame's stars, starting from those within radius_px (N,) of their places by a pose near the right one.
 
-    None unless the evidence is beyond doubt (ENOUGH).
+    None unless the evidence is beyond doubt: log-odds of `enough`.
     """
-    mirrored, tested = near_pose.mirrored, min(len(field), field.tested)
-    stars = OnFrame.of(field, sky, near_pose, tested)
-    match = _settled(field, tested, stars, near_pose, radius_px)
-    if match is None:
-        return None
-    pose = Pose(match.attitude, match.focal_px, mirrored)
-    xy, sigma, w = field.xy[int(mirrored), :tested], field.sigma[:tested], stars.directions[match.near]
-    log_odds = log_evidence(xy, sigma, field.area_px2, pose, prior, match.star, match.near, w)
-    # true for NaN too
-    if not log_odds >= ENOUGH:
-        return None
-    if len(field) > tested:
-        most = min(len(field), FAINTEST_FIT)
-        stars = OnFrame.of(field, sky, pose, most)
-        gate_px = GATE_SIGMA * np.hypot(max(match.spread_px, LEAST_SPREAD_PX), field.sigma[:most]) + GATE_PX
-        match = _settled(field, most, stars, pose, gate_px)
-        if match is None:
-            return None
-    if match.spread_px > BENT_PX:
-        match = _all_alike(field, mirrored, stars, match)
-    return Identification(
-        star=match.star,
-        catalogue=stars.index[match.near],
-        blend_px=stars.blend_px[match.near],
-        attitude=match.attitude,
-        focal_scale=match.focal_px / field.focal_px,
-        residual_px=match.rms_px,
-        mean_square_px2=match.mean_square_px2,
-        log_odds=log_odds,
-        expected=stars.index[match.inside],
-        mirrored=mirrored,
-    )
-
-
-def _settled(field: FrameStars, most: int, stars: OnFrame, pose: Pose, radius_px: np.ndarray) -> Match | None:
-    """Match the `most` brightest within radius_px (most,) of their places by a pose, fit it, and match again.
-
-    None if there are fewer than FEWEST_STARS pairs.
-    """
-    found = settled(
-        field.compiled,
-        pose.mirrored,
-        most,
-        stars.directions,
-        pose.attitude,
-        pose.focal_px,
-        radius_px,
-        RULES,
-    )
-    return None if found is None else Match(*found)
-
-
-def _all_alike(field: FrameStars, mirrored: bool, stars: OnFrame, match: Match) -> Match:
-    """The match with the pose to which all stars count alike."""
-    xy, w = field.xy[int(mirrored), match.star], stars.directions[match.near]
-    sigma = field.sigma[match.star]
-    attitude, focal_px = fitted(
-        xy, w, np.hypot(sigma, match.spread_px), match.attitude, field.focal_px, True, STEPS, SMALL_STEP
-    )
-    square = np.square(xy - Pose(attitude, focal_px, mirrored).project(w)).sum(1)
-    weight = 1 / (sigma**2 + FLOOR_PX**2)
-    return match._replace(
-        attitude=attitude,
-        focal_px=focal_px,
-        rms_px=float(np.sqrt(square @ weight / (2 * weight.sum()))),
-        mean_square_px2=float(square.mean() / 2),
-    )
+    judged = judge(field, sky, prior, enough)
+    found = judged.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)
+    return None if found is None else Identification.of(found, field)

@@ -18,6 +18,8 @@ STEPS, SMALL_STEP = 2, 3e-5
 TEST_STARS, CROWD_STARS = 50, 200
 # No centroid is better than this.
 LEAST_SIGMA_PX = 1e-3
+# A star lies within so many sigma of its place.
+MATCH_SIGMA = 3.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +73,16 @@ class FrameStars:
     def compiled(self) -> Frame:
         """The stars, for the compiled core; the cone about the frame's centre has some margin."""
         radius_rad = math.atan(math.hypot(*self.half.tolist()) / self.focal_px) * 1.05 + 2e-4
-        return Frame(self.xy, self.sigma, self.middle, self.half, self.focal_px, radius_rad)
+        return Frame(
+            self.xy,
+            self.sigma,
+            self.middle,
+            self.half,
+            self.focal_px,
+            radius_rad,
+            self.area_px2,
+            self.tested,
+        )
 
 
 @dataclass(frozen=True)
@@ -89,7 +100,7 @@ class Pose:
 
     def fitted(self, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> "Pose":
         """Fit attitude and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
-        attitude, focal_px = fitted(xy, w, sigma_px, self.attitude, self.focal_px, False, STEPS, SMALL_STEP)
+        attitude, focal_px = fitted(xy, w, sigma_px, self.attitude, self.focal_px, STEPS, SMALL_STEP)
         return Pose(attitude, focal_px, self.mirrored)
 
 

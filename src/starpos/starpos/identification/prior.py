@@ -10,8 +10,7 @@ import numpy as np
 from starpos import rotation
 from starpos.identification.evidence import SCALE_TOLERANCE, Prior
 from starpos.identification.full import OnFrame
-from starpos.identification.pose import FrameStars, Pose, directions
-from starpos.identification.screen import MATCH_SIGMA
+from starpos.identification.pose import MATCH_SIGMA, FrameStars, Pose, directions
 from starpos.identification.sky import Sky
 
 # The stars may be off by this where the prior is right.

@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from starpos.core.frame import projected
+from starpos.core.search import Limits, Lost
 from starpos.identification import wide
 from starpos.identification.evidence import anywhere
-from starpos.identification.full import FEWEST_STARS, Identification, identified
-from starpos.identification.lookup import Candidates, Lookup
-from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, FrameStars, Pose, Poses
-from starpos.identification.prior import Attempt, PlumbPrior, PointingPrior
-from starpos.identification.screen import MATCH_SIGMA, promising
+from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified, judge
+from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, FrameStars
+from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
 
@@ -26,8 +25,20 @@ EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
 # Triangles of the brightest stars, and the error in px, where a crowd of them is false.
 CROWD_STAGES = (60, 0.3), (140, 0.1)
+LIMITS = Limits(
+    match_sigma=MATCH_SIGMA,
+    log_false=math.log(0.35),
+    worth_a_fit=4.0,
+    most_stars=440,
+    loose_px=1.0,
+    most_candidates=25_000,
+    most_looked_at=25,
+    most_in_crowd=60_000,
+    most_supported=40,
+)
 
 Priors = Sequence[PointingPrior | PlumbPrior]
+Stages = Sequence[tuple[int, float]]
 
 
 def identify(
@@ -91,16 +102,40 @@ def identify_frame(
     """Identify stars as `identify` does, from FrameStars, or from those of a fisheye."""
     if isinstance(field, wide.WideField):
         return _by_parts(field, sky, priors)
-    if len(field) < FEWEST_STARS:
-        return None
-    for pose, radius_px, prior in attempts(field, sky, priors, STAGES):
-        if found := identified(field, sky, pose, radius_px, prior):
-            return found
-    field = replace(field, tested=CROWD_STARS)
-    for pose, radius_px, prior in crowded_attempts(field, sky, priors):
-        if found := identified(field, sky, pose, radius_px, prior):
-            return found
-    return None
+    return next(identifications(field, sky, priors), None)
+
+
+def identifications(
+    field: FrameStars, sky: Sky, priors: Priors, enough: float = ENOUGH
+) -> Iterator[Identification]:
+    """Yield all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order."""
+    if len(field) >= FEWEST_STARS:
+        yield from near_or_lost(field, sky, priors, STAGES, enough)
+        crowd = replace(field, tested=CROWD_STARS)
+        stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
+        yield from near_or_lost(crowd, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
+
+
+def near_or_lost(
+    field: FrameStars,
+    sky: Sky,
+    priors: Priors,
+    stages: Stages,
+    enough: float = ENOUGH,
+    crowded: bool = False,
+) -> Iterator[Identification]:
+    """Yield what is identified with log-odds of `enough`: by the priors, then lost in space by `stages`.
+
+    Half of the probability is that of the priors, if there are any.
+    crowded: only triangles that others support are looked at, but all of those.
+    """
+    for prior in priors:
+        for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
+            if found := identified(field, sky, pose, radius_px, known, enough):
+                yield found
+    lost = judge(field, sky, anywhere(field.focal_px, LOG_HALF if priors else 0.0), enough)
+    for found in Lost(lost, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS):
+        yield Identification.of(found, field)
 
 
 def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification | None:
@@ -111,67 +146,3 @@ def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification
         if found and found.log_odds >= wide.enough(len(parts)):
             return wide.everywhere(field, sky, part, found)
     return None
-
-
-def crowded_attempts(field: FrameStars, sky: Sky, priors: Priors) -> Iterator[Attempt]:
-    """Yield the attempts for a frame whose brightest stars may nearly all be false, or in any order of brightness."""
-    for prior in priors:
-        yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
-    lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
-    lookup, stages = (
-        Lookup(field, sky.triangles),
-        [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES],
-    )
-    for stars, error_px in dict.fromkeys(stages):
-        candidates = lookup.supported(stars, error_px)
-        made, radius_px = _of_triangles(field, sky, candidates, error_px)
-        for k in range(len(made)):
-            yield made[k], radius_px[k], lost
-
-
-def attempts(
-    field: FrameStars, sky: Sky, priors: Priors, stages: Sequence[tuple[int, float]]
-) -> Iterator[Attempt]:
-    """Yield the attempts in their order: by the priors, then lost in space by `stages`.
-
-    Half of the probability is that of the priors, if there are any.
-    """
-    for prior in priors:
-        yield from prior.attempts(field, sky, LOG_HALF - np.log(len(priors)))
-    lost = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
-    for pose, radius_px in _lost_in_space(field, sky, stages):
-        yield pose, radius_px, lost
-
-
-def _lost_in_space(
-    field: FrameStars, sky: Sky, stages: Sequence[tuple[int, float]]
-) -> Iterator[tuple[Pose, np.ndarray]]:
-    """Yield poses from triangles, stage by stage, and the distance (N,) px by which each star may be off."""
-    lookup = Lookup(field, sky.triangles)
-    for stars, error_px in stages:
-        candidates = lookup.candidates(min(stars, len(field)), error_px)
-        # mostly the first one is right
-        if len(candidates):
-            made, radius_px = _of_triangles(field, sky, candidates[:1], error_px)
-            yield made[0], radius_px[0]
-        if len(candidates) > 1:
-            others = candidates[1:]
-            made, radius_px = _of_triangles(field, sky, others, error_px)
-            for k in promising(field, sky, made, others.star, radius_px):
-                yield made[k], radius_px[k]
-
-
-def _of_triangles(field: FrameStars, sky: Sky, c: Candidates, error_px: float) -> tuple[Poses, np.ndarray]:
-    """The poses of K candidates, and the distance (K, n) px by which the field's brightest stars may be off."""
-    attitude, focal_px, radius_px = sky.brightest.poses(
-        field.compiled,
-        c.star,
-        c.corner,
-        c.mirrored,
-        sky.years,
-        sky.velocity,
-        error_px,
-        MATCH_SIGMA,
-        field.tested,
-    )
-    return Poses(attitude, focal_px, c.mirrored), radius_px

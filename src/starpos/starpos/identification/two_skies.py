@@ -16,11 +16,11 @@ from dataclasses import replace
 import numpy as np
 
 from starpos.identification.evidence import DOUBLE_PX
-from starpos.identification.full import ENOUGH, Identification, identified
+from starpos.identification.full import ENOUGH, Identification
 from starpos.identification.pairs import close_pairs
 from starpos.identification.pose import TEST_STARS, FrameStars, Pose
 from starpos.identification.prior import PointingPrior
-from starpos.identification.search import STAGES, attempts
+from starpos.identification.search import STAGES, near_or_lost
 from starpos.identification.sky import Sky
 
 # A second sky leaves at least so many of the TEST_STARS brightest over, and this share of them.
@@ -201,10 +201,9 @@ def _same_camera(rest: FrameStars, sky: Sky, first: Pose, most_residual_px: floa
     """Identify the rest of a frame's stars near the first pose, or anywhere, with its parity and focal length."""
     # a prior is for frames that are not mirrored
     priors = () if first.mirrored else (PointingPrior(first.attitude, first.focal_px),)
-    for pose, radius_px, prior in attempts(rest, sky, priors, QUICK_STAGES):
-        second = identified(rest, sky, pose, radius_px, prior) if pose.mirrored == first.mirrored else None
+    for second in near_or_lost(rest, sky, priors, QUICK_STAGES):
         if (
-            second is not None
+            second.mirrored == first.mirrored
             and abs(math.log(second.focal_scale)) < SAME_FOCAL
             and second.residual_px < most_residual_px
         ):

@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -27,6 +28,9 @@ MOST_CLOCK_S = 86400.0
 # 1 sigma of a clock of which nobody has said anything, if it is kept by NTP
 UNKNOWN_CLOCK_S = 0.1
 MOST_RESPONSE = 0.5
+
+# every frame asks for its camera
+_ideal = lru_cache(maxsize=4)(Camera.from_focal)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,7 +238,7 @@ class Instrument:
     def camera_for(self, width: int, height: int) -> Camera:
         """The camera for a frame of this size; InstrumentError if the intrinsics are for another size."""
         if self.camera is None:
-            return Camera.from_focal(width, height, self.focal_px, self.model)
+            return _ideal(width, height, self.focal_px, self.model)
         if (self.camera.width, self.camera.height) != (width, height):
             raise InstrumentError(
                 f"the frame is {width} x {height} px but the camera's intrinsics are of {self.camera.width} x "

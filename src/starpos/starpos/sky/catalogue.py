@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starpos.core.sky import designations
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
@@ -128,12 +129,9 @@ class Catalogue:
         motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
         return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
-    def names(self, index: Rows) -> list[str]:
+    def names(self, index: np.ndarray) -> list[str]:
         """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""
-        return [
-            f"HIP {h}" if h else "TYC {}-{}-{}".format(*t)
-            for h, t in zip(self.hip[index].tolist(), self.tyc[index].tolist(), strict=True)
-        ]
+        return designations(self.hip, self.tyc, np.asarray(index, np.intp))
 
     def cone(self, centre: np.ndarray, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Rows of the stars within radius_rad of the unit vector `centre` (3,) at J2000, brightest first."""

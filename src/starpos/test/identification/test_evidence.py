@@ -6,8 +6,8 @@ import pytest
 from test_identification import random_attitude, seen, sky_for
 
 from starpos import rotation
-from starpos.identification import PlumbPrior, PointingPrior, full, identify, identify_directions, search
-from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, Prior, anywhere, log_evidence
+from starpos.identification import PlumbPrior, PointingPrior, full, identify, search
+from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, WIDTH, Prior, anywhere, log_evidence
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.instrument.camera import Camera
 from starpos.simulation.montecarlo_fields import Conditions, draw
@@ -19,34 +19,21 @@ SIGMA_PX = 0.05
 FOUR_STARS = 3360, 4849, 5625, 7250, 7450, 10342, 11075, 11546
 
 
-@pytest.fixture
-def weighed(monkeypatch):
-    """The evidence of all that is tried, none of which is accepted."""
-    seen = []
-
-    def watched(*given):
-        seen.append(log_evidence(*given))
-        return -np.inf
-
-    monkeypatch.setattr(full, "log_evidence", watched)
-    return seen
-
-
-def largest(fields, rng, catalogue, weighed, priors=tuple):
-    """The largest evidence of each of so many fields of random points."""
+def largest(fields, rng, catalogue, priors=tuple):
+    """The largest evidence of all that is tried in each of so many fields of random points."""
     sky, best = sky_for(catalogue, SMALL), []
     for _ in range(fields):
         n = int(rng.integers(5, 10))
-        weighed.clear()
-        identify(rng.uniform(0, [299, 224], (n, 2)), np.full(n, SIGMA_PX), SMALL, sky, priors())
-        best.append(max(weighed, default=-np.inf))
+        field = FrameStars.of(rng.uniform(0, [299, 224], (n, 2)), np.full(n, SIGMA_PX), SMALL)
+        tried = search.identifications(field, sky, priors(), enough=-np.inf)
+        best.append(max((found.log_odds for found in tried), default=-np.inf))
     return np.array(best)
 
 
 @pytest.mark.montecarlo
-def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rng, weighed):
+def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rng):
     """Ville: a likelihood ratio exceeds x at most once in x, all hypotheses of a frame taken together."""
-    best = largest(80, rng, catalogue, weighed)
+    best = largest(80, rng, catalogue)
     for x in (1, 2, 3, 4):
         allowed = np.exp(-x)
         assert np.mean(best > x) < allowed + 3 * np.sqrt(allowed / len(best))
@@ -54,13 +41,13 @@ def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rn
 
 
 @pytest.mark.montecarlo
-def test_a_prior_raises_it_no_further(catalogue, rng, weighed):
+def test_a_prior_raises_it_no_further(catalogue, rng):
     def priors():
         return PointingPrior(random_attitude(rng), SMALL.fx), PlumbPrior(
             random_attitude(rng)[2], np.eye(3)[2], 4e-4
         )
 
-    best = largest(60, rng, catalogue, weighed, priors)
+    best = largest(60, rng, catalogue, priors)
     for x in (1, 2, 3, 4):
         allowed = np.exp(-x)
         assert np.mean(best > x) < allowed + 3 * np.sqrt(allowed / len(best))
@@ -139,12 +126,21 @@ def test_a_detection_upon_another_says_nothing(rng):
     assert alone - 3 < evidence(pose, np.insert(w, 1, neighbour, 0), seen) < alone + 3
 
 
-def test_the_priors_share_half_of_the_probability(catalogue, rng):
+def test_the_priors_share_half_of_the_probability(catalogue, rng, monkeypatch):
     sky, attitude = sky_for(catalogue, SMALL), random_attitude(rng)
     field = FrameStars.of(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL)
     priors = PointingPrior(attitude, SMALL.fx), PlumbPrior(attitude[2], np.eye(3)[2], 1e-3)
     expected = Pose(attitude, SMALL.fx, False)
-    tried = {id(prior): prior for _, _, prior in search.attempts(field, sky, priors, search.STAGES)}
+    tried = {}
+
+    def judge(field, sky, prior, enough):
+        tried[id(prior)] = prior
+        return real(field, sky, prior, enough)
+
+    real = full.judge
+    for module in (full, search):
+        monkeypatch.setattr(module, "judge", judge)
+    assert not list(search.near_or_lost(field, sky, priors, search.STAGES))
     *led, lost = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
     assert sorted(led) == pytest.approx([1 / 8, 1 / 8, 1 / 4])
     assert lost < 1 / 2
@@ -206,18 +202,20 @@ def test_errors_of_nothing_are_no_certainty(catalogue, rng):
 
 
 def test_what_is_no_number_is_not_accepted(catalogue, rng, monkeypatch):
-    monkeypatch.setattr(full, "log_evidence", lambda *_: np.nan)
     sky = sky_for(catalogue, SMALL)
-    assert identify(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL, sky) is None
+    xy, _ = seen(sky, SMALL, random_attitude(rng), 8.0, rng, sigma=0.02)
+    sigma_px = np.full(len(xy), 0.02)
+    assert identify(xy, sigma_px, SMALL, sky) is not None
+    monkeypatch.setattr(search, "anywhere", lambda *_: Prior(lambda pose: np.nan, WIDTH))
+    assert identify(xy, sigma_px, SMALL, sky) is None
 
 
-def test_what_lies_beyond_the_frame_does_not_make_chance_rarer(catalogue, rng, monkeypatch):
-    seen = set()
-    monkeypatch.setattr(full, "log_evidence", lambda xy, sigma, area_px2, *_: seen.add(area_px2) or -np.inf)
+def test_what_lies_beyond_the_frame_does_not_make_chance_rarer(rng):
     xy = rng.uniform(0, [299, 224], (20, 2))
     xy[3] = -40.0, 100.0  # as a lens that draws in does
-    identify_directions(SMALL.directions(*xy.T), np.full(20, SIGMA_PX), SMALL, sky_for(catalogue, SMALL))
-    assert seen == {AREA_PX2}
+    field = search.frame_stars(SMALL.directions(*xy.T), np.full(20, SIGMA_PX), SMALL)
+    assert (field.half > [150, 112.5]).all()
+    assert field.area_px2 == AREA_PX2
 
 
 def test_more_evidence_than_the_prior_leaves_room_for_is_not_claimed(rng):

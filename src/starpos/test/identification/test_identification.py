@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from starpos.identification import Sky, identify, identify_directions, search, triangle_cache
-from starpos.identification.lookup import LOOSE_PX
 from starpos.instrument.camera import Camera
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
 
@@ -220,7 +219,7 @@ def test_coarse_centroids_are_searched_with_their_own_error(catalogue, rng):
     for _ in range(8):
         attitude = random_attitude(rng)
         xy, _ = seen(sky, camera, attitude, limit, rng, sigma=error_px)
-        tight = [stage for stage in search.STAGES if stage[1] < LOOSE_PX]
+        tight = [stage for stage in search.STAGES if stage[1] < 1.0]
         with (
             pytest.MonkeyPatch.context() as only
         ):  # the loose stages, made for lenses that distort, would help out

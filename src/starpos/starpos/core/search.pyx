@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The search for a frame's place in the sky: poses of triangles, stage by stage, and the judgement of each pose."""
+
+from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
+
+import numpy as np
+
+from starpos.core.frame cimport Frame, on_frame
+from starpos.core.matching cimport Matching, begin
+from starpos.core.poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
+from starpos.core.screen cimport BrightTable
+from starpos.core.sky cimport Date, StarTable, Visible, date_of
+from starpos.core.triangles cimport Candidate, TriangleTable
+
+
+cdef struct Work:
+    # The catalogue's stars on a frame, their pixels (S, 2) and room to work in, and the pose on which they have settled.
+    Visible stars
+    Matching m
+    Settled end
+    double *memory
+
+
+cdef class Judge:
+    """Judges poses of a frame by the evidence of its stars.
+
+    years, velocity  of the date: Julian years after J2000, and (3,) in units of c
+    width            (4,): of the prior, as `evidence.Prior` has it
+    log_density      of the prior: of an attitude (3, 3), a focal length (px) and whether the frame is mirrored
+    enough           log-odds of an identification
+    """
+
+    cdef Frame frame
+    cdef StarTable table
+    cdef Date date
+    cdef Rules rules
+    cdef Chances chances
+    cdef double[4] width
+    cdef object log_density
+    cdef double enough
+
+    def __init__(
+        self, Frame frame, StarTable table, double years, velocity, width, log_density, double enough, Rules rules,
+        Chances chances,
+    ):
+        cdef int k
+        self.frame, self.table, self.date, self.rules = frame, table, date_of(years, velocity), rules
+        self.chances = chances
+        self.log_density, self.enough = log_density, enough
+        for k in range(4):
+            self.width[k] = width[k]
+
+    def identified(self, const double[:, ::1] attitude, double focal_px, bint mirrored, const double[::1] radius_px):
+        """What is identified by a pose near the right one.
+
+        mirrored   whether the frame's rows are flipped
+        radius_px  (n,): how far from their places those of the frame's stars may be that decide
+
+        Returns None where the evidence is not enough, else: of the stars matched, the rows in the frame (M,), the rows in
+        the catalogue (M,), and how far (px) fainter stars move them (M,); attitude (3, 3) and focal length; the rms of the
+        residuals (px) along one axis with the weights of the fit, and their mean square (px2); the log-odds; the catalogue's
+        rows of all stars well inside the frame (E,), brightest first; and whether the frame is mirrored.
+        """
+        if radius_px.shape[0] < self._deciding():
+            raise ValueError(f"{radius_px.shape[0]} radii for {self._deciding()} stars: each one that decides needs its own")
+        return self.judged(&attitude[0, 0], focal_px, mirrored, &radius_px[0])
+
+    cdef int _deciding(self):
+        """How many of the frame's stars decide."""
+        return min(<int>self.frame.sigma.shape[0], self.frame.tested)
+
+    cdef judged(self, const double *attitude, double focal, bint mirrored, const double *radius):
+        """As `identified`."""
+        cdef Work work
+        cdef int n = self._deciding(), most = min(<int>self.frame.sigma.shape[0], self.rules.most_stars)
+        cdef double log_odds
+        memcpy(work.end.attitude, attitude, 9 * sizeof(double))
+        work.end.focal, work.stars.memory, work.m.memory, work.memory = focal, NULL, NULL, NULL
+        try:
+            if not self._settled(mirrored, n, radius, &work):
+                return None
+            log_odds = weighed(
+                self.frame.xy[mirrored], &self.frame.sigma[0], n, self.frame.area, work.end.attitude, work.end.focal,
+                self.width, work.end.star, work.end.near, work.stars.w, work.end.near, work.end.count, self.chances,
+            )
+            log_odds += self.log_density(_attitude(&work.end), work.end.focal, mirrored)
+            # true for NaN too
+            if not log_odds >= self.enough:
+                return None
+            if self.frame.sigma.shape[0] > n and not self._settled(mirrored, most, NULL, &work):
+                return None
+            if work.end.spread > self.rules.bent_px:
+                count_alike(
+                    self.frame, mirrored, &work.stars, self.rules, work.memory, work.memory + 2 * work.stars.count, &work.end
+                )
+            return self._columns(mirrored, &work, log_odds)
+        finally:
+            _release(&work)
+
+    cdef bint _settled(self, bint mirrored, int n, const double *radius, Work *work) except -1:
+        """Settle on pairs of the frame's n brightest stars, from the pose in `work`; whether there are enough.
+
+        radius (n,): how far from their places they may be; NULL: as the spread of the residuals allows.
+        """
+        cdef int most = self.rules.per_detection * n + self.rules.more_stars, pairs
+        cdef double *room
+        _release(work)
+        self.table.find(
+            self.frame, work.end.attitude, work.end.focal, &self.date, self.rules.edge_px, most, self.rules.blend_px,
+            &work.stars,
+        )
+        pairs = min(n, work.stars.count)
+        if pairs < self.rules.fewest:
+            return False
+        begin(&work.m, n, work.stars.count)
+        work.memory = <double *>malloc((2 * work.stars.count + 4 * pairs + n) * sizeof(double) + 2 * pairs * sizeof(Py_ssize_t))
+        if work.memory == NULL:
+            raise MemoryError
+        room = work.memory + 2 * work.stars.count + 4 * pairs
+        work.end.star = <Py_ssize_t *>(room + n)
+        work.end.near = work.end.star + pairs
+        if radius != NULL:
+            memcpy(room, radius, n * sizeof(double))
+        else:
+            gates(self.frame, self.rules, work.end.spread, n, room)
+        settle(
+            self.frame, mirrored, n, &work.stars, self.rules, room, &work.m, work.memory,
+            work.memory + 2 * work.stars.count, &work.end,
+        )
+        return work.end.count >= self.rules.fewest
+
+    cdef _columns(self, bint mirrored, const Work *work, double log_odds):
+        """What `identified` returns."""
+        cdef const Settled *end = &work.end
+        cdef int k, inside = 0
+        rows, blends, due = np.empty((2, end.count), np.intp), np.empty(end.count), np.empty(work.stars.count, np.intp)
+        cdef Py_ssize_t[:, ::1] row = rows
+        cdef double[::1] blend = blends
+        cdef Py_ssize_t[::1] expected = due
+        for k in range(end.count):
+            row[0, k], row[1, k] = end.star[k], work.stars.row[end.near[k]]
+            blend[k] = work.stars.moved[end.near[k]]
+        for k in range(work.stars.count):
+            if on_frame(self.frame, &work.memory[2 * k], -self.rules.inside_px):
+                expected[inside] = work.stars.row[k]
+                inside += 1
+        return (
+            rows[0], rows[1], blends, _attitude(end), end.focal, end.rms, end.mean_square, log_odds, due[:inside], mirrored
+        )
+
+
+cdef _attitude(const Settled *end):
+    """The attitude as an array (3, 3)."""
+    out = np.empty((3, 3))
+    cdef double[:, ::1] attitude = out
+    memcpy(&attitude[0, 0], end.attitude, 9 * sizeof(double))
+    return out
+
+
+cdef void _release(Work *work) noexcept:
+    """Free what `work` holds."""
+    free(work.stars.memory)
+    free(work.m.memory)
+    free(work.memory)
+    work.stars.memory, work.m.memory, work.memory = NULL, NULL, NULL
+
+
+cdef class Limits:
+    """Limits of the search.
+
+    match_sigma              stars lie within so many sigma of their places
+    log_false                logarithm of the share of detections that may be false
+    worth_a_fit, most_stars  log-odds of a pose that is judged, by so many of the brightest catalogue stars on the frame
+    loose_px                 with larger errors of the centroids a candidate counts only if another one supports it
+    most_candidates          a look-up is limited to triangles for which so many candidates are expected by chance
+    most_looked_at           so many candidates, the best ones, are looked at
+    most_in_crowd, most_supported  the same in a crowd of false stars
+    """
+
+    cdef double match_sigma, log_false, worth_a_fit, loose_px, most_candidates, most_in_crowd
+    cdef int most_stars, most_looked_at, most_supported
+
+    def __init__(
+        self, *, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
+        double most_candidates, int most_looked_at, double most_in_crowd, int most_supported,
+    ):
+        self.match_sigma, self.log_false, self.worth_a_fit, self.most_stars = match_sigma, log_false, worth_a_fit, most_stars
+        self.loose_px, self.most_candidates, self.most_looked_at = loose_px, most_candidates, most_looked_at
+        self.most_in_crowd, self.most_supported = most_in_crowd, most_supported
+
+
+cdef class Lost:
+    """An iterator over what is identified, as `Judge.identified` returns it, of a frame lost in space.
+
+    stages   (number of brightest stars, their error in px): triangles of these are looked up, none twice with one error
+    crowded  most of the brightest stars may be false: only candidates that two others support are judged, all of them;
+             else the best candidate is judged, and of the others those that are worth a fit
+    """
+
+    cdef Judge judge
+    cdef TriangleTable table
+    cdef BrightTable bright
+    cdef Limits limits
+    cdef object stages
+    cdef dict looked_up
+    cdef bint crowded, ranked
+    cdef double error_px
+    # Candidates of a stage; their order, where in it the search is, and its end; radii (px) of the stars that decide.
+    cdef Candidate *found
+    cdef int *order
+    cdef double *radius
+    cdef int count, at
+
+    def __init__(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits):
+        cdef int most = max(limits.most_looked_at, limits.most_supported) + 1
+        self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
+        self.stages, self.looked_up, self.crowded = iter(stages), {}, crowded
+        self.found = <Candidate *>malloc(most * (sizeof(Candidate) + sizeof(int)))
+        self.radius = <double *>malloc((judge._deciding() + 1) * sizeof(double))
+        if self.found == NULL or self.radius == NULL:
+            raise MemoryError
+        self.order = <int *>(self.found + most)
+
+    def __dealloc__(self):
+        free(self.found)
+        free(self.radius)
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        cdef double[9] attitude
+        cdef double focal
+        cdef const Candidate *c
+        while True:
+            if self.at == 1 and not self.ranked:
+                self._rank()
+            if self.at == self.count:
+                # at the end of the stages the search ends
+                stars, error_px = next(self.stages)
+                self._look_up(stars, error_px)
+                continue
+            c = &self.found[self.order[self.at]]
+            self.at += 1
+            self._pose(c, attitude, &focal)
+            identified = self.judge.judged(attitude, focal, c.mirrored, self.radius)
+            if identified is not None:
+                return identified
+
+    cdef int _look_up(self, int stars, double error_px) except -1:
+        """Take the candidates of a stage."""
+        cdef Frame frame = self.judge.frame
+        cdef Limits limits = self.limits
+        cdef int k, done
+        stars = min(stars, <int>frame.sigma.shape[0])
+        if self.crowded:
+            self.count = self.table.supported(
+                frame, stars, error_px, limits.most_in_crowd, limits.most_supported, self.found
+            )
+        else:
+            done = self.looked_up.get(error_px, 0)
+            self.count = self.table.best(
+                frame, done, stars, error_px, limits.most_candidates, limits.most_looked_at, error_px > limits.loose_px,
+                self.found,
+            )
+        self.looked_up[error_px] = stars
+        self.error_px, self.at, self.ranked = error_px, 0, self.crowded
+        for k in range(self.count):
+            self.order[k] = k
+        return 0
+
+    cdef void _pose(self, const Candidate *c, double *attitude, double *focal) noexcept:
+        """Set the pose of a candidate, and the radii of the stars that decide."""
+        self.bright.pose(
+            self.judge.frame, c, &self.judge.date, self.error_px, self.limits.match_sigma, self.judge._deciding(), attitude,
+            focal, self.radius,
+        )
+
+    cdef int _rank(self) except -1:
+        """Keep of the candidates behind the first, which mostly is right, those that are worth a fit, best first."""
+        cdef double[9] attitude
+        cdef double focal, worth
+        cdef double *kept = <double *>malloc((self.count + 1) * sizeof(double))
+        cdef int k, j, end = 1
+        self.ranked = True
+        try:
+            if kept == NULL:
+                raise MemoryError
+            for k in range(1, self.count):
+                self._pose(&self.found[k], attitude, &focal)
+                worth = self.bright.worth(
+                    self.judge.frame, &self.found[k], &self.judge.date, attitude, focal, self.judge._deciding(), self.radius,
+                    self.limits.most_stars, self.limits.match_sigma, self.limits.log_false,
+                )
+                if not worth > self.limits.worth_a_fit:
+                    continue
+                j = end
+                while j > 1 and worth > kept[j - 1]:
+                    kept[j], self.order[j] = kept[j - 1], self.order[j - 1]
+                    j -= 1
+                kept[j], self.order[j] = worth, k
+                end += 1
+            self.count = end
+        finally:
+            free(kept)
+        return 0
