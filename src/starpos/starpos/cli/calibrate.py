@@ -14,6 +14,7 @@ from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameter
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
 from starpos.cli.frame_work import NO_CAMERA, reader_of
+from starpos.cli.output import add_formats
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.frames.pointings import read_pointings
@@ -33,9 +34,8 @@ CAMERA_NAME = "camera"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(
-        parser, "one JSON object for --camera and one for --site instead of text", pointings=True
-    )
+    common.add_frames(parser, pointings=True)
+    add_formats(parser, "one JSON object for --camera and one for --site instead of text", None)
     parser.add_argument(
         "--camera",
         metavar="OUT",

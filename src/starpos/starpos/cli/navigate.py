@@ -9,8 +9,9 @@ import numpy as np
 
 from starpos.cli import common, jobs
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
+from starpos.cli.fix_output import in_degrees
 from starpos.cli.frame_work import Look, Reader, reader_of
-from starpos.cli.solve import in_degrees
+from starpos.cli.output import Output, add_formats, length_text
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, VoyageError
@@ -32,10 +33,17 @@ OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "
 KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
         "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
         "deflection_stddev_arcsec")  # fmt: skip
+# of --csv
+COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
+HEAD = (
+    "file: latitude and longitude (deg, astronomic: as the plumb line has them) +- 1 sigma, heading (deg, from true "
+    "north over east) +- 1 sigma, speed"
+)
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
+    add_formats(parser, "one JSON object a frame instead of a table", "a row of a CSV a frame")
     parser.add_argument(
         "--imu",
         required=True,
@@ -151,15 +159,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertical: Vertical) -> int:
-    """Print the answer for each frame; returns the exit status."""
+    """Write the answer for each frame; returns the exit status."""
+    output = Output(args, COLUMNS, HEAD)
     for fault in voyage.faults:
         common.complain("navigate", fault)
     for path, frame, fix in zip(args.frames, seen, voyage.fixes, strict=True):
         status = _status(frame, fix)
-        if args.json:
-            common.print_json({"file": path} | json_of(fix, vertical) | {"status": status})
-        else:
-            print(f"{path}: {status if fix is None else text_of(fix)}", flush=True)
+        output.put(
+            {"file": path} | json_of(fix, vertical) | {"status": status},
+            f"{path}: {status if fix is None else text_of(fix)}",
+        )
     fixes = [fix for fix in voyage.fixes if fix is not None]
     if not fixes:
         return NO_ANSWER
@@ -203,6 +212,7 @@ def text_of(fix: VoyageFix) -> str:
     """The line of a fix for people."""
     east, north, turn = np.sqrt(np.diag(in_degrees(fix.covariance)))
     return (
-        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, heading "
-        f"{np.degrees(fix.heading):.4f} +- {turn:.4f} deg, {np.hypot(*fix.velocity[:2]):.2f} m/s"
+        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {length_text(north)} N "
+        f"{length_text(east)} E, heading {np.degrees(fix.heading):.4f} +- {turn:.4f} deg, "
+        f"{np.hypot(*fix.velocity[:2]):.2f} m/s"
     )
