@@ -137,7 +137,7 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
             trouble = watcher.watch(frames, processes)
             memory = {} if trouble else processes.peak_mb()
             if stay and not trouble:
-                look(watcher, processes, page)
+                trouble = look(watcher, processes, page)
         except KeyboardInterrupt:
             trouble, memory = "interrupted", {}
         codes = processes.stop()
@@ -150,13 +150,14 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
     return status
 
 
-def look(watcher: PictureWatcher, processes: Processes, page: str):
-    """Wait until Ctrl-C, or until a process ends."""
+def look(watcher: PictureWatcher, processes: Processes, page: str) -> str | None:
+    """Wait until Ctrl-C, or until a process ends; then say in a sentence which."""
     print(f"\nit goes on: {page}, Ctrl-C ends it", flush=True)
     try:
-        watcher.watch(math.inf, processes, patience_s=math.inf)
+        return watcher.watch(math.inf, processes, patience_s=math.inf)
     except KeyboardInterrupt:
         print()
+        return None
 
 
 def conclude(watcher: PictureWatcher, codes: dict, memory: dict, trouble: str | None, out: Path) -> int:

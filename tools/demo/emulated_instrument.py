@@ -47,13 +47,16 @@ NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
 
 def lacking() -> str | None:
-    """Say how to install what the devices need and this machine lacks; None if it has all."""
+    """Say in commands how to install all that the devices need and this machine lacks; None if it has all."""
     missing = subprocess.run(
         [ROOT / "tools" / "setup" / "missing", "tests"], capture_output=True, text=True, check=True
     )
+    commands = []
     if packages := sorted(NEEDED & set(missing.stdout.split())):
-        return f"sudo apt-get install {' '.join(packages)}"
-    return None if find_spec("indipyclient") else "pip install indipyclient"
+        commands.append(f"sudo apt-get install {' '.join(packages)}")
+    if not find_spec("indipyclient"):
+        commands.append("pip install indipyclient")
+    return " && ".join(commands) or None
 
 
 def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict]:
@@ -120,7 +123,7 @@ def latenesses_ms(watcher: Watcher, begun_s: list[float]) -> np.ndarray:
 def main() -> int:
     args = parse(parser_of(__doc__, FRAMES, "demo/emulated"))
     if lack := lacking():
-        print(f"emulated_instrument: something is not installed: {lack}", file=sys.stderr)
+        print(f"emulated_instrument: not all that it needs is here; type: {lack}", file=sys.stderr)
         return 2
     with own_domain():
         return run(args.seed, args.frames, args.out)

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from starpos import __version__
 from starpos.errors import StarposError, one_line
+from starpos.units import DAY_S
 
 SOMETHING_MISSING = 1
 # modules that everything needs, with the names of their packages
@@ -39,7 +40,6 @@ CV2 = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
 SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
 # interface class of a photo camera, in USB's list
 STILL_IMAGE = "06"
-DAY_S = 86400.0
 
 
 class State(str, Enum):

@@ -21,7 +21,7 @@ COUNTS = ("frames", "poses", "left_out", "moved")
 # the first line for people
 HEAD = (
     "file: latitude and longitude (deg, astronomic: as the plumb line has them) +- 1 sigma, heading (deg, from true "
-    "north over east) +- 1 sigma, stars identified"
+    "north over east) +- 1 sigma"
 )
 # of --csv: keys of --json that are one value
 COLUMNS = ("file", "combined", "night", "status", "utc", "latitude", "longitude", "heading", "latitude_geodetic",

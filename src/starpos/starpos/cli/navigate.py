@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos.cli import common, jobs
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
-from starpos.cli.fix_output import in_degrees
+from starpos.cli.fix_output import HEAD, in_degrees
 from starpos.cli.frame_work import Look, Reader, reader_of
 from starpos.cli.output import Output, add_formats, length_text
 from starpos.earth.orientation import earth_orientation
@@ -35,10 +35,6 @@ KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocit
         "deflection_stddev_arcsec")  # fmt: skip
 # of --csv
 COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
-HEAD = (
-    "file: latitude and longitude (deg, astronomic: as the plumb line has them) +- 1 sigma, heading (deg, from true "
-    "north over east) +- 1 sigma, speed"
-)
 
 
 def define(parser: argparse.ArgumentParser) -> None:

@@ -29,23 +29,23 @@ class Output:
     def __init__(self, args: argparse.Namespace, columns: Sequence[str], head: str) -> None:
         self._json, self._head = args.json, head
         self._rows = csv.DictWriter(sys.stdout, columns, extrasaction="ignore", lineterminator="\n")
-        self._csv = args.csv
-        if self._csv:
-            self._rows.writeheader()
+        self._csv, self._begun = args.csv, False
 
     def put(self, value: dict, line: str, rows: Sequence[dict] | None = None) -> None:
         """Write an answer; line: the same for people, of one or more lines, or none; rows: if it is not one of a CSV."""
         if self._json:
             common.print_json(value)
         elif self._csv:
+            if not self._begun:
+                self._rows.writeheader()
             for row in [value] if rows is None else rows:
                 self._rows.writerow({k: _cell(v) for k, v in common.plain(row).items()})
             sys.stdout.flush()
         elif line:
-            if self._head:
+            if self._head and not self._begun:
                 print(self._head)
-                self._head = ""
             print(line, flush=True)
+        self._begun |= self._csv or bool(line)
 
 
 def _cell(value: object) -> object:

@@ -26,11 +26,12 @@ from starpos.utc import utc_text
 
 # the status of a row that tells an elevation
 ELEVATION = "elevation alone"
+ELEVATIONS_HEAD = "row: how far from the zenith its direction is; together these tell the place"
 
 
 def run(args: argparse.Namespace) -> int:
     """Work on the table of --pointings; returns the exit status."""
-    near, output = near_of(args), Output(args, COLUMNS, HEAD)
+    near = near_of(args)
     pointings, vertical = read_pointings(args.pointings), vertical_of(args)
     own_level = common.has_own_level(args)
     if args.tilt is None and not own_level:
@@ -40,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     solver = _solver_of(args)
     log = None if own_level else tilts(args.tilt, solver.instrument.inclinometer.noise_rad)
     whole = [p for p in pointings if p.has_roll]
+    output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:
         if args.self_calibrate:
             raise InstrumentError(
