@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.averaging.average import Average
-from starpos.cli.output import length_text
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import InstrumentError
 from starpos.fix.budget import place_of
 from starpos.fix.fix import Fix
+from starpos.fix.readable import length_text
 from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.mounting import Mounting
 from starpos.units import HOUR_S

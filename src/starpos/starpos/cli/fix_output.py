@@ -8,10 +8,11 @@ import numpy as np
 
 from starpos.averaging.average import Average
 from starpos.cli.archive import NightFolder
-from starpos.cli.output import Output, length_text
+from starpos.cli.output import Output
 from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.fix.fix import Fix
+from starpos.fix.readable import InDegrees, length_text
 from starpos.fix.solver import Solution, Status
 from starpos.instrument.inclinometer import Tilt
 from starpos.utc import utc_text
@@ -127,12 +128,7 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
 
 def place_text(fix: Fix | Average) -> str:
     """Place and heading with their errors, for people."""
-    east, north, heading = np.sqrt(np.diag(in_degrees(fix.covariance)))
-    facing = f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
-    if np.isnan(fix.heading):
-        facing = "heading not known: the camera was touched, or nobody knows its roll"
-    where = f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f}"
-    return f"{where} +- {length_text(north)} N {length_text(east)} E, {facing}"
+    return str(InDegrees.of(fix.latitude, fix.longitude, fix.heading, fix.covariance))
 
 
 def put_combined(
@@ -173,11 +169,10 @@ def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
     ground = geodetic(together.latitude, together.longitude, 0.0, together.covariance, vertical)
     turned = f" (the last of {together.poses} poses)" if together.poses > 1 else ""
     folder = "" if night.folder is None else f"{night.folder}: "
-    east, north = np.sqrt(np.diag(ground.covariance))[:2]
+    on_ground = InDegrees.of(ground.latitude, ground.longitude, 0.0, ground.covariance)
     lines = [
         f"{folder}{together.frames} frames together: {place_text(together)}{turned} (astronomic)",
-        f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
-        f"+- {length_text(north)} N {length_text(east)} E (the deflection of the vertical included)",
+        f"geodetic, WGS 84: {on_ground.where} (the deflection of the vertical included)",
         "where the error comes from, 1 sigma of each source in the place and the heading:",
     ]
     for name, (east, north, heading) in budget_of(together, vertical).items():

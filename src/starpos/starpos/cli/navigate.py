@@ -11,10 +11,11 @@ from starpos.cli import common, jobs
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.fix_output import HEAD, in_degrees
 from starpos.cli.frame_work import Look, Reader, reader_of
-from starpos.cli.output import Output, add_formats, length_text
+from starpos.cli.output import Output, add_formats
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, VoyageError
+from starpos.fix.readable import InDegrees
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument
 from starpos.navigation.imu import ImuModel, read_imu, read_imu_model
@@ -206,9 +207,5 @@ def json_of(fix: VoyageFix | None, vertical: Vertical) -> dict:
 
 def text_of(fix: VoyageFix) -> str:
     """The line of a fix for people."""
-    east, north, turn = np.sqrt(np.diag(in_degrees(fix.covariance)))
-    return (
-        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {length_text(north)} N "
-        f"{length_text(east)} E, heading {np.degrees(fix.heading):.4f} +- {turn:.4f} deg, "
-        f"{np.hypot(*fix.velocity[:2]):.2f} m/s"
-    )
+    place = InDegrees.of(fix.latitude, fix.longitude, fix.heading, fix.covariance)
+    return f"{place}, {np.hypot(*fix.velocity[:2]):.2f} m/s"

@@ -8,9 +8,6 @@ from collections.abc import Sequence
 
 from starpos.cli import common
 
-# lengths from here on are told in km
-LONG_M = 10_000.0
-
 
 def add_formats(parser: argparse.ArgumentParser, json_help: str, csv_help: str | None) -> None:
     """Add --json and, with a help for it, --csv."""
@@ -51,8 +48,3 @@ class Output:
 def _cell(value: object) -> object:
     """A value of JSON in a CSV: of several, the words with spaces between."""
     return " ".join(map(str, value)) if isinstance(value, list) else value
-
-
-def length_text(metres: float, digits: int = 0) -> str:
-    """A length as people read it: in m, or where metres mean nothing in km."""
-    return f"{metres:.{digits}f} m" if abs(metres) < LONG_M else f"{metres / 1000:.0f} km"

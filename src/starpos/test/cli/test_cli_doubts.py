@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cli_calls import KNOWN, PLACE, WIDE, objects, solve
 
-from starpos.cli.output import length_text
+from starpos.fix.readable import length_text
 from starpos_testing.command_line import run
 
 NEAR = ("--near", PLACE["latitude"] - 0.2, PLACE["longitude"] + 0.2)
