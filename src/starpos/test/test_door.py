@@ -87,6 +87,18 @@ def test_a_night_in_a_notebook_is_a_short_table_in_degrees(tmp_path):
     assert "nan" not in html
 
 
+def test_a_solution_and_an_average_are_a_line_when_they_are_printed(tmp_path):
+    simulated(tmp_path, "-n", "2", "--stars-only")
+    solver = starpos.Solver(starpos.Instrument(4635.9375), starpos.load_catalogue())
+    tilts = starpos.read_tilt_csv(tmp_path / "tilt.csv")
+    stars = [starpos.read_frame(path) for path in sorted(tmp_path.glob("stars_*.csv"))]
+    solutions = [solver.solve(one, tilts.average) for one in stars]
+    for value in (solutions[0], solutions[0].fix, starpos.average([s.fix for s in solutions])):
+        assert "+35.70" in repr(value) and "heading 235." in repr(value) and len(repr(value)) < 150
+    lost = solver.solve(stars[0])
+    assert repr(lost).startswith("<Solution no tilt: ") and len(repr(lost)) < 150
+
+
 def test_a_night_that_cannot_be_opened_is_said_in_a_sentence(night, tmp_path):
     with pytest.raises(starpos.StarposError, match="there is no such folder"):
         starpos.open_night(tmp_path / "none")

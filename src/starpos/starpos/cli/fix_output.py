@@ -121,14 +121,9 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     # one frame of a turn does not tell A3, so its own place would be 1100 km wide
-    where = "its place waits for the whole turn" if turning else place_text(s.fix)
+    where = "its place waits for the whole turn" if turning else str(s.fix.in_degrees)
     stars = f", {len(s.names)} of {s.stars_detected} stars" if s.stars_detected else ""
     return f"{path}: {where}{stars}"
-
-
-def place_text(fix: Fix | Average) -> str:
-    """Place and heading with their errors, for people."""
-    return str(InDegrees.of(fix.latitude, fix.longitude, fix.heading, fix.covariance))
 
 
 def put_combined(
@@ -171,7 +166,7 @@ def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
     folder = "" if night.folder is None else f"{night.folder}: "
     on_ground = InDegrees.of(ground.latitude, ground.longitude, 0.0, ground.covariance)
     lines = [
-        f"{folder}{together.frames} frames together: {place_text(together)}{turned} (astronomic)",
+        f"{folder}{together.frames} frames together: {together.in_degrees}{turned} (astronomic)",
         f"geodetic, WGS 84: {on_ground.where} (the deflection of the vertical included)",
         "where the error comes from, 1 sigma of each source in the place and the heading:",
     ]

@@ -81,7 +81,7 @@ class Attitude:
     model: str = PLUMB_BOB
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution:
     """Solution of one frame: a status, a sentence, and as much of the answer as there is.
 
@@ -117,6 +117,10 @@ class Solution:
         """A solution that has nothing but its status and message."""
         number = len(stars) if isinstance(stars, Stars) else 0
         return cls(status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=number)
+
+    def __repr__(self) -> str:
+        found = self.fix.in_degrees if self.fix else self.message
+        return f"<Solution {self.status.value}: {found}; {len(self.names)} of {self.stars_detected} stars>"
 
     @property
     def ok(self) -> bool:
