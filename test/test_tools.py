@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from starpos.fix.solver import Status
+
 TOOLS = Path(__file__).parent.parent / "tools"
 
 OUTCOMES = {
@@ -116,9 +118,10 @@ def instrument_run(monkeypatch):
     return instrument_run
 
 
-def watched(*texts):
-    """What a watcher has heard: a solution a text, a fix where it is OK."""
-    solutions = [SimpleNamespace(OK=0, status=int(t != "OK"), status_text=t) for t in texts]
+def watched(*statuses):
+    """What a watcher has heard: a solution a status, by the name of its constant."""
+    number = {status.name: k for k, status in enumerate(Status)}
+    solutions = [SimpleNamespace(status=number[name], **number) for name in statuses]
     good = [s for s in solutions if s.status == s.OK]
     return SimpleNamespace(solutions=dict(enumerate(solutions)), good=lambda: good)
 
@@ -129,12 +132,12 @@ SUMMARY = dict.fromkeys(
 
 
 def test_a_demo_whose_tilts_stop_says_so_and_not_that_the_truth_is_outside(instrument_run, capsys):
-    lost = watched("no tilt", "OK", "OK", "no tilt", "no tilt", "not identified")
+    lost = watched("NO_TILT", "OK", "OK", "NO_TILT", "NO_TILT", "NOT_IDENTIFIED")
     assert not instrument_run.say_errors(lost, SUMMARY)
     said = capsys.readouterr().out
     assert "the truth lies within 4 sigma: 0.4 sigma off" in said and "OUTSIDE" not in said
     assert "3 of 6 frames gave no fix: no tilt (2), not identified (1)" in said
-    assert instrument_run.say_errors(watched("no tilt", "OK"), SUMMARY)
+    assert instrument_run.say_errors(watched("NO_TILT", "OK"), SUMMARY)
     assert not instrument_run.say_errors(watched("OK"), SUMMARY | {"sigmas_off": 4.1})
     assert "OUTSIDE 4 sigma: 4.1" in capsys.readouterr().out
 
@@ -146,7 +149,7 @@ def test_a_demo_names_the_node_that_was_killed_and_what_lacked(instrument_run):
         "solver was ended by SIGKILL; camera ended with status 1; "
         "detector did not end when it was asked to, and was killed"
     )
-    assert trouble_of(watched("no tilt"), {"solver": 0}, None) == "none of 1 frames gave a fix: no tilt (1)"
+    assert trouble_of(watched("NO_TILT"), {"solver": 0}, None) == "none of 1 frames gave a fix: no tilt (1)"
 
 
 def test_a_demo_that_stays_says_which_node_ended(instrument_run, capsys):

@@ -161,23 +161,27 @@ def look(watcher: PictureWatcher, processes: Processes, page: str) -> str | None
 
 
 def conclude(watcher: PictureWatcher, codes: dict, memory: dict, trouble: str | None, out: Path) -> int:
-    if trouble := trouble_of(watcher, codes, trouble):
+    trouble = trouble_of(watcher, codes, trouble)
+    if not watcher.good():
         print(f"\ndemo: {trouble}", file=sys.stderr)
         return 1
     summary, errors, covariance = summarise(watcher.good(), watcher.place)
     summary |= {"seconds_median": float(np.nanmedian(watcher.seconds)), "peak_memory_mb": memory}
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     inside = say_errors(watcher, summary)
+    took = ", ".join(f"{name} {mb} MB" for name, mb in memory.items() if name != "emulator")
     print(
-        f"frame published to fix received: median {np.nanmedian(watcher.seconds):.2f} s; peak memory "
-        + ", ".join(f"{name} {mb} MB" for name, mb in memory.items() if name != "emulator")
+        f"frame published to fix received: median {np.nanmedian(watcher.seconds):.2f} s"
+        + (f"; peak memory {took}" if took else "")
     )
     drawn = picture(watcher, errors, covariance, out / "demo.png")
     print(f"picture: {out / 'demo.png'}" if drawn else "no picture: no frame with a fix was heard whole")
     heavy = {name: mb for name, mb in memory.items() if mb > MEMORY_LIMIT_MB}
     for name, mb in heavy.items():
         print(f"demo: {name} took {mb} MB, over the {MEMORY_LIMIT_MB} MB a node may take", file=sys.stderr)
-    return 0 if inside and not heavy else 1
+    if trouble:
+        print(f"demo: NOT ALL IS WELL: {trouble}", file=sys.stderr)
+    return 0 if inside and not heavy and not trouble else 1
 
 
 if __name__ == "__main__":

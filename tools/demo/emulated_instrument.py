@@ -167,14 +167,15 @@ def run(seed: int, frames: int, out: Path) -> int:
 
 
 def conclude(watcher: Watcher, trouble: str | None, begun_s: list[float], memory: dict, out: Path) -> int:
+    if watcher.good():
+        summary, *_ = summarise(watcher.good(), watcher.place)
+        inside = say_errors(watcher, summary)
     if trouble:
         print(f"\nemulated_instrument: {trouble}; the logs are in {out}", file=sys.stderr)
         return 1
-    summary, *_ = summarise(watcher.good(), watcher.place)
     late_ms = latenesses_ms(watcher, begun_s)
     summary |= {"sky_late_ms": late_ms.tolist(), "peak_memory_mb": memory}
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-    inside = say_errors(watcher, summary)
     print(
         f"the frames showed the sky of {np.median(np.abs(late_ms)):.2f} ms (median; at most {np.abs(late_ms).max():.2f}) "
         "from the mid-exposure that they state; peak memory "

@@ -254,8 +254,12 @@ def trouble_of(watcher: Watcher, codes: dict, trouble: str | None) -> str | None
 
 
 def why_none(solutions) -> str:
-    """Count what the solutions without a fix say of themselves."""
-    told = Counter(s.status_text for s in solutions if s.status != s.OK)
+    """Count the solutions without a fix by their status."""
+    lost = [s for s in solutions if s.status != s.OK]
+    # the message's constants are those of its status
+    constants = [(name, getattr(s, name)) for s in lost[:1] for name in dir(s) if name.isupper()]
+    names = {number: name for name, number in constants if isinstance(number, int)}
+    told = Counter(names[s.status].replace("_", " ").lower() for s in lost)
     return ", ".join(f"{text} ({number})" for text, number in told.most_common())
 
 
