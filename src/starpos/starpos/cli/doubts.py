@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.averaging.average import Average
+from starpos.cli import common
+from starpos.cli.frame_work import tilts
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import InstrumentError
@@ -20,6 +22,8 @@ from starpos.fix.fix import Fix
 from starpos.fix.readable import length_text
 from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.mounting import Mounting
+from starpos.instrument.tilt_doubt import like_radians
+from starpos.instrument.tilt_log import TiltLog
 from starpos.units import HOUR_S
 
 NEAR_KM = 50.0
@@ -59,6 +63,14 @@ class Near:
     def km_from(self, latitude: float, longitude: float) -> float:
         """Distance in km, on a sphere, to a place in rad."""
         return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
+
+
+def checked_tilts(command: str, path: str, noise_rad: float) -> TiltLog:
+    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
+    log = tilts(path, noise_rad)
+    if doubt := like_radians(log):
+        common.complain(command, f"{path}: {doubt}")
+    return log
 
 
 def add_near(parser: argparse.ArgumentParser) -> None:

@@ -13,9 +13,9 @@ from starpos.calibration.unknown import unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
-from starpos.cli.doubts import Levelled, Near, add_near, far, mistaken, near_of
+from starpos.cli.doubts import Levelled, Near, add_near, checked_tilts, far, mistaken, near_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, Solved, json_about, json_of, line_of, put_combined
-from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of, tilts
+from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.what_fits import say_what_would_fit
 from starpos.earth.vertical import Vertical
@@ -26,7 +26,6 @@ from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.utc import utc_text
@@ -122,9 +121,8 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     if about is None:
         return Plan(night, Listing(read))
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
-    table = None if night.tilt is None else tilts(night.tilt, instrument.inclinometer.noise_rad)
-    if table is not None and (doubt := like_radians(table)):
-        _say(night, f"{night.tilt}: {doubt}")
+    noise = instrument.inclinometer.noise_rad
+    table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=common.ProgressBar())
     return Plan(

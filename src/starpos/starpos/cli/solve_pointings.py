@@ -10,9 +10,9 @@ from starpos.averaging.altitudes import Circle, circle_of, place_of_circles
 from starpos.cli import common
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown, vertical_of
-from starpos.cli.doubts import Near, far, near_of
+from starpos.cli.doubts import Near, checked_tilts, far, near_of
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
-from starpos.cli.frame_work import NO_CAMERA, tilts
+from starpos.cli.frame_work import NO_CAMERA
 from starpos.cli.output import Output
 from starpos.cli.solve import NO_FIX, solved_by_turning, tell
 from starpos.earth.vertical import Vertical
@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
     if args.jobs is not None or args.scheduler is not None:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
     solver = _solver_of(args)
-    log = None if own_level else tilts(args.tilt, solver.instrument.inclinometer.noise_rad)
+    noise = solver.instrument.inclinometer.noise_rad
+    log = None if own_level else checked_tilts("solve", args.tilt, noise)
     whole = [p for p in pointings if p.has_roll]
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:

@@ -27,5 +27,5 @@ def like_radians(log: TiltLog) -> str:
         return ""
     return (
         f"the tilts look like radians: none is above pi/2, and their noise of {noise:.2g} would be that of the "
-        f"inclinometer ({stated_rad:.2g} rad): write them in deg"
+        f"inclinometer ({stated_rad:.2g} rad): write them in deg, or state the inclinometer's noise if it is so quiet"
     )

@@ -14,6 +14,7 @@ from starpos.files import read_regular
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.report.night import Truth
 
@@ -33,7 +34,7 @@ class StarList:
 class StarLists:
     """Exposures to solve: each call of `read` goes through all `count` of them, one at a time.
 
-    tilt: a function of (mid_unix_s, exposure_s, spread_s) that may raise TiltError.
+    tilt: a function of (mid_unix_s, exposure_s, spread_s) that may raise TiltError.  remarks: what looks wrong.
     """
 
     name: str
@@ -42,6 +43,7 @@ class StarLists:
     read: Callable[[], Iterator[StarList]]
     tilt: Callable[[float, float, float], Tilt]
     truth: Truth | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
@@ -52,8 +54,10 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
     """
     frames = frames_in(folder)
     tilt: Callable[[float, float, float], Tilt]
+    doubt = ""
     try:
-        tilt = read_tilt_csv(folder / TILTS, tilt_noise_rad).average
+        log = read_tilt_csv(folder / TILTS, tilt_noise_rad)
+        tilt, doubt = log.average, like_radians(log)
     except TiltError as error:
         tilt = _no_tilt(str(error))
 
@@ -73,6 +77,7 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
         read=read,
         tilt=tilt,
         truth=truth_in(folder),
+        remarks=(f"{TILTS}: {doubt}",) if doubt else (),
     )
 
 

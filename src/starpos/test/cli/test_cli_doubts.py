@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli_calls import KNOWN, PLACE, WIDE, objects, solve
 
+from starpos import open_night
 from starpos.fix.readable import length_text
 from starpos_testing.command_line import run
 
@@ -67,11 +68,12 @@ def test_columns_exchanged_show_by_themselves_where_the_camera_is_turned(lists, 
 
 
 def test_tilts_that_look_like_radians_are_told(night, tmp_path, capsys):
-    tilt = rewritten(night / "tilt.csv", tmp_path, MISTAKES["tilts that were radians"])
-    frames = [night / "frame_0000.fits"]
-    _, _, errors = run(capsys, "solve", *frames, "--tilt", tilt, *KNOWN)
+    rewritten(night / "tilt.csv", tmp_path, MISTAKES["tilts that were radians"])
+    shutil.copy(night / "frame_0000.fits", tmp_path)
+    _, _, errors = run(capsys, "solve", tmp_path, *KNOWN)
     (line,) = errors
     assert "the tilts look like radians" in line and "write them in deg" in line
+    assert any("look like radians" in remark for remark in open_night(tmp_path).solve().remarks)
 
 
 def test_what_a_glob_takes_in_beside_the_frames_is_left_out(lists, tmp_path, capsys):
