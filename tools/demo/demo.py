@@ -94,9 +94,7 @@ def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray,
     solution, stars = watcher.solutions[stamp_of(frame)], message_to_stars(watcher.stars[stamp_of(frame)])
     known = Identified(solution.indices, solution.ids, solution.magnitudes)
     shown = annotate(message_to_frame(frame), stars, known)
-    title = (
-        f"starpos at {place.latitude:+.4f} {place.longitude:+.4f}: {len(errors)} frames of {EXPOSURE_S:g} s"
-    )
+    title = f"simulated sky, {place.latitude:+.4f} {place.longitude:+.4f}: {len(errors)} frames of {EXPOSURE_S:g} s"
     about = f"a frame and its {len(solution.ids)} identified stars"
     draw(path, errors, covariance[:2, :2], title, shown, about)
     return True

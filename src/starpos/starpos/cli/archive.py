@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starpos.errors import FrameError, TiltError
-from starpos.report.folder import TILTS, TRUTH, frames_in
+from starpos.frames.night_files import TILTS, TRUTH
+from starpos.report.folder import frames_in
 
 
 @dataclass(frozen=True)

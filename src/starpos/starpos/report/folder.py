@@ -11,6 +11,7 @@ import numpy as np
 from starpos.detection import detect
 from starpos.errors import FrameError, TiltError
 from starpos.files import read_regular
+from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
@@ -18,7 +19,6 @@ from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.report.night import Truth
 
-TILTS, TRUTH = "tilt.csv", "truth.json"
 TRUTH_LIMIT = 1 << 26
 
 
@@ -107,6 +107,7 @@ def truth_in(folder: Path) -> Truth | None:
     try:
         content = json.loads(read_regular(path, TRUTH_LIMIT))
         place = [float(content[k]) for k in ("latitude_deg", "longitude_deg")]
+        simulated = bool(content.get(SIMULATED))
         frames = content.get("frames", [])
         headings = tuple((float(f["mid_unix_s"]), float(np.radians(f["heading_deg"]))) for f in frames)
         if not (np.isfinite(place).all() and np.isfinite(headings).all() and abs(place[0]) <= 90):
@@ -118,7 +119,7 @@ def truth_in(folder: Path) -> Truth | None:
             f"{path}: not what is true of a night: give latitude_deg and longitude_deg, or take the file away"
         ) from None
     latitude, longitude = np.radians(place).tolist()
-    return Truth(latitude, longitude, headings)
+    return Truth(latitude, longitude, headings, simulated)
 
 
 def _no_tilt(reason: str) -> Callable[[float, float, float], Tilt]:

@@ -103,11 +103,15 @@ class Shot:
 
 @dataclass(frozen=True)
 class Truth:
-    """The true place of the instrument (astronomic, rad); headings: (mid_unix_s, rad) of frames."""
+    """The true place of the instrument (astronomic, rad); headings: (mid_unix_s, rad) of frames.
+
+    simulated: whether no camera took these frames.
+    """
 
     latitude: float
     longitude: float
     headings: tuple[tuple[float, float], ...] = ()
+    simulated: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -129,6 +133,11 @@ class Night:
     truth: Truth | None = None
     steady: np.ndarray | None = None
     remarks: tuple[str, ...] = ()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether its truth.json says that no camera took its frames."""
+        return self.truth is not None and self.truth.simulated
 
     @property
     def wgs84(self) -> InDegrees | None:

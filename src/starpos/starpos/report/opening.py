@@ -7,12 +7,13 @@ from pathlib import Path
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, InstrumentError
+from starpos.frames.night_files import TILTS
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.progress import Progress, quiet
-from starpos.report.folder import TILTS, exposures, frames_in
+from starpos.report.folder import exposures, frames_in
 from starpos.report.night import Night
 from starpos.report.working import Workshop, worked
 from starpos.sky.catalogue import load_catalogue

@@ -11,6 +11,7 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.files import read_regular
 from starpos.frames.frame import Frame
+from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS
 from starpos.frames.star_list import write_star_list
 from starpos.progress import Progress, quiet
@@ -19,9 +20,6 @@ from starpos.sky.catalogue import Catalogue
 from starpos.utc import unix_of
 
 TILT_RATE_HZ = 10.0
-TILTS, TRUTH = "tilt.csv", "truth.json"
-# in truth.json: the other files of a simulated night, each with the digest of what was written
-MADE = "simulated_files"
 MOST_BYTES = 1 << 31
 
 
@@ -72,7 +70,7 @@ def write_night(
         rows = "".join("{:.6f},{:.7f},{:.7f},{:.2f}\n".format(*row) for row in tilts)
         (folder / TILTS).write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n" + rows)
         place = {"latitude_deg": scene.site.latitude_deg, "longitude_deg": scene.site.longitude_deg}
-        made = {MADE: {name: _digest(folder / name) for name in (*names, TILTS)}}
+        made = {SIMULATED: {name: _digest(folder / name) for name in (*names, TILTS)}}
         (folder / TRUTH).write_text(json.dumps(place | {"frames": truth} | made, indent=1))
     except OSError as e:
         raise FrameError(f"{folder}: the night cannot be written there ({e.strerror})") from None
@@ -82,7 +80,7 @@ def _made(folder: Path) -> dict:
     """The files that were simulated, each with its digest; none if nothing says so.  Raises OSError."""
     try:
         said = json.loads(read_regular(folder / TRUTH, MOST_BYTES))
-        return {Path(name).name: digest for name, digest in said[MADE].items()}
+        return {Path(name).name: digest for name, digest in said[SIMULATED].items()}
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, FileNotFoundError):
         return {}
 
