@@ -83,8 +83,13 @@ def main(argv: list[str] | None = None) -> int:
     # numpy, which reads these, is loaded with the command
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
-    parser = parser_for(given)
-    args = parser.parse_args(given)
+    try:
+        args = parser_for(given).parse_args(given)
+    except ModuleNotFoundError as e:
+        print(
+            f"starpos: the module {e.name} is not here: starpos doctor says what is missing", file=sys.stderr
+        )
+        return BAD_CALL
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _one_line_each(args.command)

@@ -11,7 +11,7 @@ import platform
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -54,7 +54,6 @@ class State(str, Enum):
 class Finding:
     """What a check found: a sentence, and what to type if something is to be done."""
 
-    check: str
     state: State
     found: str
     cure: str = ""
@@ -73,38 +72,37 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     missing = False
-    for check in CHECKS:
+    for name, check in CHECKS.items():
         finding = _safely(check)
-        if args.live and check in LIVE and finding.state is State.NOTE:
-            finding = Finding(finding.check, State.MISSING, finding.found, finding.cure)
+        if args.live and name in LIVE and finding.state is State.NOTE:
+            finding = replace(finding, state=State.MISSING)
         missing |= finding.state is State.MISSING
-        print(json.dumps(asdict(finding)) if args.json else _lines(finding), flush=True)
+        said = json.dumps({"check": name} | asdict(finding)) if args.json else _lines(name, finding)
+        print(said, flush=True)
     return SOMETHING_MISSING if missing else 0
 
 
-def _lines(finding: Finding) -> str:
+def _lines(name: str, finding: Finding) -> str:
     cure = f"\n{'':26}-> {finding.cure}" if finding.cure else ""
-    return f"{finding.state.value:<8}{finding.check:<16}  {finding.found}{cure}"
+    return f"{finding.state.value:<8}{name:<16}  {finding.found}{cure}"
 
 
 def _safely(check: Callable[[], Finding]) -> Finding:
     """The finding of a check; one that cannot be made for want of a package, or of a right, says so."""
-    name = check.__name__.replace("_", " ")
     try:
         return check()
     except ImportError as error:
         return Finding(
-            name, State.MISSING, f"cannot be told: {one_line(error)}", "see the packages that are missing"
+            State.MISSING, f"cannot be told: {one_line(error)}", "see the packages that are missing"
         )
     except (StarposError, OSError) as error:
-        return Finding(name, State.MISSING, one_line(error))
+        return Finding(State.MISSING, one_line(error))
 
 
 def versions() -> Finding:
     """The versions of starpos, Python and the system."""
     system = f"{platform.system()} {platform.machine()}"
     return Finding(
-        "starpos",
         State.OK,
         f"{__version__} in {Path(__file__).parents[1]}, Python {platform.python_version()}, {system}",
     )
@@ -114,10 +112,8 @@ def packages() -> Finding:
     """The packages that everything needs, and their versions."""
     lacking = [package for module, package in NEEDED.items() if find_spec(module) is None]
     if lacking:
-        return Finding(
-            "packages", State.MISSING, f"not here: {', '.join(lacking)}", f"pip install {' '.join(lacking)}"
-        )
-    return Finding("packages", State.OK, ", ".join(f"{p} {_version(p)}" for p in NEEDED.values()))
+        return Finding(State.MISSING, f"not here: {', '.join(lacking)}", f"pip install {' '.join(lacking)}")
+    return Finding(State.OK, ", ".join(f"{p} {_version(p)}" for p in NEEDED.values()))
 
 
 def _version(package: str) -> str:
@@ -133,21 +129,20 @@ def core() -> Finding:
     """The compiled loops."""
     if find_spec("starpos.core.frame") is None:
         return Finding(
-            "compiled core",
             State.MISSING,
             "starpos.core is not compiled",
             "pip install ./src/starpos, or make build in a clone (a C compiler is needed)",
         )
-    return Finding("compiled core", State.OK, "starpos.core is compiled")
+    return Finding(State.OK, "starpos.core is compiled")
 
 
 def optional() -> Finding:
     """The packages that some work needs."""
     lacking = {package: use for module, (package, use) in OPTIONAL.items() if find_spec(module) is None}
     if not lacking:
-        return Finding("optional", State.OK, "all optional packages are here")
+        return Finding(State.OK, "all optional packages are here")
     uses = "; ".join(f"{package} ({use})" for package, use in lacking.items())
-    return Finding("optional", State.NOTE, f"not here: {uses}", f"pip install {' '.join(lacking)}")
+    return Finding(State.NOTE, f"not here: {uses}", f"pip install {' '.join(lacking)}")
 
 
 def star_catalogue() -> Finding:
@@ -159,7 +154,7 @@ def star_catalogue() -> Finding:
     found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
     if deeper.kept() is None:
         found += "; none deeper, which fields under about 1 deg want (starpos catalogue deepen --help)"
-    return Finding("star catalogue", State.OK, found)
+    return Finding(State.OK, found)
 
 
 def cache() -> Finding:
@@ -173,7 +168,6 @@ def cache() -> Finding:
             pass
     except OSError as error:
         return Finding(
-            "cache",
             State.MISSING,
             f"{folder}: cannot be written ({error.strerror}): each start sorts the sky again",
             "export XDG_CACHE_HOME=FOLDER",
@@ -184,7 +178,7 @@ def cache() -> Finding:
         if megabytes >= 1
         else "empty: the first frame of a camera takes some seconds"
     )
-    return Finding("cache", State.OK, f"{folder}, {kept}")
+    return Finding(State.OK, f"{folder}, {kept}")
 
 
 def earth_rotation() -> Finding:
@@ -197,10 +191,9 @@ def earth_rotation() -> Finding:
     beyond = orientation.earth_orientation(now).extrapolated_days
     found = f"IERS table, measured until {utc_text(until)[:10]}, {(now - until) / DAY_S:.0f} days ago"
     if beyond <= 0:
-        return Finding("Earth rotation", State.OK, found)
+        return Finding(State.OK, found)
     sigma_m = orientation.earth_orientation(now).ut1_sigma_s * orientation.EQUATOR_M_PER_S
     return Finding(
-        "Earth rotation",
         State.NOTE,
         f"{found}: its predictions ended {beyond:.0f} days ago, an error of {sigma_m:.0f} m east at the equator",
         "pip install --upgrade astropy-iers-data",
@@ -213,13 +206,10 @@ def clock() -> Finding:
 
     state = system_clock.read()
     if state is None:
-        return Finding("clock", State.NOTE, "the system does not tell whether it is kept to UTC")
+        return Finding(State.NOTE, "the system does not tell whether it is kept to UTC")
     if state.synchronised:
-        return Finding(
-            "clock", State.OK, f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator"
-        )
+        return Finding(State.OK, f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator")
     return Finding(
-        "clock",
         State.NOTE,
         "nothing keeps it to UTC: frames that are stamped here tell no longitude; recorded ones are not concerned",
         "sudo apt-get install chrony   # or: sudo timedatectl set-ntp true",
@@ -230,8 +220,8 @@ def serial_ports(root: Path = Path("/")) -> Finding:
     """Serial ports, for an inclinometer."""
     found = {os.path.realpath(path): path for pattern in reversed(SERIAL) for path in root.glob(pattern)}
     if not found:
-        return Finding("serial ports", State.NOTE, "none: no inclinometer is plugged in")
-    return _devices("serial ports", [str(path) for path in found.values()], "dialout")
+        return Finding(State.NOTE, "none: no inclinometer is plugged in")
+    return _devices([str(path) for path in found.values()], "dialout")
 
 
 def cameras(root: Path = Path("/")) -> Finding:
@@ -244,29 +234,23 @@ def cameras(root: Path = Path("/")) -> Finding:
     )
     if not videos and not photo:
         return Finding(
-            "cameras",
             State.NOTE,
             "no video device and no photo camera on USB; a camera on the network is not looked for",
         )
     names = [f"{v} ({_text(root / 'sys/class/video4linux' / v.name / 'name') or 'no name'})" for v in videos]
-    finding = _devices(
-        "cameras", [str(v) for v in videos], "video", [*names, *(f"{p} (photo, USB)" for p in photo)]
-    )
+    finding = _devices([str(v) for v in videos], "video", [*names, *(f"{p} (photo, USB)" for p in photo)])
     if photo and find_spec("gphoto2") is None and finding.state is State.OK:
-        return Finding(
-            "cameras", State.NOTE, f"{finding.found}; photo cameras need gphoto2", "pip install gphoto2"
-        )
+        return Finding(State.NOTE, f"{finding.found}; photo cameras need gphoto2", "pip install gphoto2")
     return finding
 
 
-def _devices(check: str, paths: list[str], group: str, names: list[str] | None = None) -> Finding:
+def _devices(paths: list[str], group: str, names: list[str] | None = None) -> Finding:
     """Devices, and whether this user may open them."""
     barred = [path for path in paths if not os.access(path, os.R_OK | os.W_OK)]
     found = ", ".join(names or paths)
     if not barred:
-        return Finding(check, State.OK, found)
+        return Finding(State.OK, found)
     return Finding(
-        check,
         State.NOTE,
         f"{found}; this user may not open {', '.join(barred)}",
         f"sudo usermod -aG {group} $USER   # and log in again",
@@ -284,30 +268,29 @@ def ros() -> Finding:
     """ROS 2 and the packages of the nodes."""
     distribution = os.environ.get("ROS_DISTRO", "")
     if find_spec("rclpy") is None:
-        return Finding("ROS 2", State.NOTE, "not in this shell; the command line does not need it", "")
+        return Finding(State.NOTE, "not in this shell; the command line does not need it")
     nodes = [name for name in ("starpos_camera", "starpos_inclinometer", "starpos_solver") if find_spec(name)]
     if len(nodes) == 3:
-        return Finding("ROS 2", State.OK, f"{distribution or 'rclpy'}, and the nodes of starpos")
+        return Finding(State.OK, f"{distribution or 'rclpy'}, and the nodes of starpos")
     return Finding(
-        "ROS 2",
         State.NOTE,
         f"{distribution or 'rclpy'}, but the nodes of starpos are not in this shell",
         ". install/setup.bash   # in the workspace that was built",
     )
 
 
-CHECKS: tuple[Callable[[], Finding], ...] = (
-    versions,
-    packages,
-    core,
-    optional,
-    star_catalogue,
-    cache,
-    earth_rotation,
-    clock,
-    serial_ports,
-    cameras,
-    ros,
-)
+CHECKS: dict[str, Callable[[], Finding]] = {
+    "starpos": versions,
+    "packages": packages,
+    "compiled core": core,
+    "optional": optional,
+    "star catalogue": star_catalogue,
+    "cache": cache,
+    "Earth rotation": earth_rotation,
+    "clock": clock,
+    "serial ports": serial_ports,
+    "cameras": cameras,
+    "ROS 2": ros,
+}
 # what only an instrument that runs here needs
-LIVE = (clock, serial_ports, cameras)
+LIVE = ("clock", "serial ports", "cameras")

@@ -97,10 +97,12 @@ def _place(night: Night) -> str:
     facing = "turned between the frames"
     if np.isfinite(c.heading):
         last = "last " if c.poses > 1 else ""
-        facing = f"{last}heading {np.degrees(ground.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg;"
+        sigma_deg = np.degrees(np.sqrt(ground.covariance[2, 2]))
+        facing = f"{last}heading {np.degrees(ground.heading):.4f} &plusmn; {sigma_deg:.4f}&deg;"
     where = f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)}"
     link = f"geo:{np.degrees(ground.latitude):.6f},{np.degrees(ground.longitude):.6f}"
-    return f'<p class="place"><a href="{link}">{where}</a> {_errors(ground.covariance)} (WGS 84, as on maps), {facing}</p>'
+    errors = _errors(ground.covariance)
+    return f'<p class="place"><a href="{link}">{where}</a> {errors} (WGS 84, as on maps), {facing}</p>'
 
 
 def _errors(covariance: np.ndarray) -> str:

@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from cli_calls import KNOWN, PLACE, WIDE, objects, solve
 
 from starpos import open_night
@@ -103,6 +104,11 @@ def test_a_simulated_night_never_replaces_files_that_were_not_simulated(tmp_path
         status, _, errors = run(capsys, "simulate", folder, *make[2:])
         assert status == 2 and f"{name}: it is there already" in errors[0]
         assert [p.name for p in folder.iterdir()] == [name]
+
+
+def test_simulated_frames_state_the_focal_length_and_the_pixels_that_were_asked_for(night):
+    header = fits.getheader(night / "frame_0000.fits")
+    assert (header["FOCALLEN"], header["XPIXSZ"], header["ORIGIN"]) == (29.67, 6.4, "starpos simulate")
 
 
 def test_a_report_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys):

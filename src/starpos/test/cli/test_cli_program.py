@@ -9,6 +9,7 @@ import sys
 import pytest
 from cli_calls import WIDE
 
+from starpos import cli
 from starpos.cli import common, jobs, parser_for
 from starpos.cli.commands import COMMANDS
 from starpos_testing.command_line import run
@@ -61,6 +62,16 @@ def test_help_imports_nothing_slow(words, slow):
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
     )
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_missing_package_is_a_line_that_names_the_doctor(capsys, monkeypatch):
+    def lacking(name):
+        raise ModuleNotFoundError(f"No module named 'erfa' in {name}", name="erfa")
+
+    monkeypatch.setattr(cli, "import_module", lacking)
+    status, out, errors = run(capsys, "solve", "x.fits")
+    assert (status, out) == (2, "")
+    assert errors == ["starpos: the module erfa is not here: starpos doctor says what is missing"]
 
 
 def test_python_m_starpos(tmp_path):

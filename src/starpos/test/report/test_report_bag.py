@@ -58,10 +58,10 @@ def report(capsys, bag, out, *more):
 
 
 def place(want):
-    east, north = np.sqrt(np.diag(want["covariance_geodetic"]))[:2]
+    east, north, turn = np.sqrt(np.diag(want["covariance_geodetic"]))
     return (
         f"{want['latitude_geodetic']:+.6f}°, {want['longitude_geodetic']:+.6f}° ± {north:.0f} m N {east:.0f} m E "
-        f"(WGS 84, as on maps), heading {want['heading']:.4f} ± {want['sigma_heading_deg']:.4f}°"
+        f"(WGS 84, as on maps), heading {want['heading']:.4f} ± {turn:.4f}°"
     )
 
 
