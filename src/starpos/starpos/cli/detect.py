@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 # of --csv; the stars of --json have the same, without the file
 COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
+JSON_HELP = "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], and cpu_ms"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
-    add_formats(parser, "one JSON object a frame instead of a table", "a row of a CSV a star")
+    add_formats(parser, JSON_HELP, "a row of a CSV a star")
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 

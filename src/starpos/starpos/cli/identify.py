@@ -18,6 +18,10 @@ from starpos.sky.catalogue import load_catalogue
 # of --csv
 COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
            "log_odds", "mirrored", "warnings", "cpu_ms")  # fmt: skip
+JSON_HELP = (
+    "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
+    "focal_px, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
+)
 HEAD = (
     "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
     "over east), stars identified of those detected"
@@ -26,7 +30,7 @@ HEAD = (
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
-    add_formats(parser, "one JSON object a frame instead of a table", "a row of a CSV a frame")
+    add_formats(parser, JSON_HELP, "a row of a CSV a frame")
     common.add_stamps(parser)
     parser.add_argument(
         "--instrument",

@@ -34,13 +34,17 @@ OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "
 KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
         "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
         "deflection_stddev_arcsec")  # fmt: skip
+JSON_HELP = (
+    "one JSON object a frame: latitude, longitude and heading are astronomic, in deg, their ..._geodetic on WGS 84, "
+    "covariance (3 x 3) is of east m, north m, heading deg; velocity is of east, north, up in m/s"
+)
 # of --csv
 COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
-    add_formats(parser, "one JSON object a frame instead of a table", "a row of a CSV a frame")
+    add_formats(parser, JSON_HELP, "a row of a CSV a frame")
     parser.add_argument(
         "--imu",
         required=True,

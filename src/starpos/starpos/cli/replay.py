@@ -10,7 +10,17 @@ from starpos.averaging.average import Average
 from starpos.calibration.unknown import BY_PARAMETERS, unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder
-from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, Solved, json_about, json_of, line_of, put_combined
+from starpos.cli.fix_output import (
+    COLUMNS,
+    CSV_HELP,
+    HEAD,
+    JSON_HELP,
+    Solved,
+    json_about,
+    json_of,
+    line_of,
+    put_combined,
+)
 from starpos.cli.output import Output, add_formats
 from starpos.cli.solve import NO_FIX
 from starpos.earth.vertical import Vertical
@@ -47,7 +57,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="NAME:=VALUE",
         help="a parameter of the node solver, such as misalignment_stddev:=5.0; it counts more than the file's",
     )
-    add_formats(parser, "one JSON object a frame, and one for a bag, instead of a table", CSV_HELP)
+    add_formats(parser, JSON_HELP, CSV_HELP)
     jobs.add_jobs(parser, "bags")
     parser.set_defaults(run=run)
 

@@ -14,7 +14,17 @@ from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.doubts import Levelled, Near, add_near, checked_tilts, far, mistaken, near_of
-from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, Solved, json_about, json_of, line_of, put_combined
+from starpos.cli.fix_output import (
+    COLUMNS,
+    CSV_HELP,
+    HEAD,
+    JSON_HELP,
+    Solved,
+    json_about,
+    json_of,
+    line_of,
+    put_combined,
+)
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.what_fits import say_what_would_fit
@@ -36,7 +46,7 @@ WORTH_SAVING_ARCSEC = 600.0
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser, pointings=True)
-    add_formats(parser, "one JSON object a frame, and one for all, instead of a table", CSV_HELP)
+    add_formats(parser, JSON_HELP, CSV_HELP)
     parser.add_argument(
         "--tilt",
         metavar="CSV",
