@@ -131,6 +131,8 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
         start(processes, place, seed, Path(scratch) / "inclinometer-port")
         if page := show(processes):
             print(f"to look at meanwhile: {page}", flush=True)
+        else:
+            print("no dashboard, which needs tornado: pip install tornado", flush=True)
         try:
             trouble = watcher.watch(frames, processes)
             memory = {} if trouble else processes.peak_mb()

@@ -87,7 +87,7 @@ def test_a_night_in_a_notebook_is_a_short_table_in_degrees(tmp_path):
     assert "nan" not in html
 
 
-def test_a_solution_and_an_average_are_a_line_when_they_are_printed(tmp_path):
+def test_what_a_user_prints_is_a_line(tmp_path):
     simulated(tmp_path, "-n", "2", "--stars-only")
     solver = starpos.Solver(starpos.Instrument(4635.9375), starpos.load_catalogue())
     tilts = starpos.read_tilt_csv(tmp_path / "tilt.csv")
@@ -95,6 +95,9 @@ def test_a_solution_and_an_average_are_a_line_when_they_are_printed(tmp_path):
     solutions = [solver.solve(one, tilts.average) for one in stars]
     for value in (solutions[0], solutions[0].fix, starpos.average([s.fix for s in solutions])):
         assert "+35.70" in repr(value) and "heading 235." in repr(value) and len(repr(value)) < 150
+    night = starpos.open_night(tmp_path, instrument=solver.instrument).solve()
+    for value in (stars[0], tilts, solver.catalogue, night.shots[0], night.combined):
+        assert "\n" not in repr(value) and len(repr(value)) < 200
     lost = solver.solve(stars[0])
     assert repr(lost).startswith("<Solution no tilt: ") and len(repr(lost)) < 150
 

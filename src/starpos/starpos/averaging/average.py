@@ -33,7 +33,7 @@ MOST_OF_ALL = 2 / 3
 RIVAL_FIXES = 10
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True)
 class Average:
     """The averaged place, and the heading of the last pose (rad), with the budget of their errors.
 

@@ -66,7 +66,7 @@ def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarra
     return sound if sound.sum() >= enough else np.ones(len(sound), bool)
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True)
 class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 

@@ -81,7 +81,7 @@ class Attitude:
     model: str = PLUMB_BOB
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Solution:
     """Solution of one frame: a status, a sentence, and as much of the answer as there is.
 

@@ -51,6 +51,9 @@ class ReportedPlace:
             poses=poses,
         )
 
+    def __repr__(self) -> str:
+        return f"<{self.in_degrees} (astronomic)>"
+
     @property
     def own(self) -> np.ndarray:
         """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
@@ -100,6 +103,9 @@ class Shot:
     camera_to_itrs: np.ndarray | None = None
     warnings: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.place.in_degrees if self.place else self.message}>"
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -114,7 +120,7 @@ class Truth:
     simulated: bool = False
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Night:
     """All frames of one place; printed, and in a notebook shown, in a few lines.
 
