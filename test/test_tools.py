@@ -6,8 +6,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from starpos.fix.solver import Status
 
 TOOLS = Path(__file__).parent.parent / "tools"
 
@@ -105,3 +108,63 @@ def test_a_signal_that_another_thread_of_the_sky_gets_does_not_end_it():
         [sys.executable, "-c", SIGNALLED], cwd=TOOLS / "demo", capture_output=True, text=True, check=False
     )
     assert (numbers.returncode, numbers.stdout) == (0, "29 15\n"), numbers.stderr
+
+
+@pytest.fixture
+def instrument_run(monkeypatch):
+    monkeypatch.syspath_prepend(str(TOOLS / "demo"))
+    import instrument_run
+
+    return instrument_run
+
+
+def watched(*statuses):
+    """What a watcher has heard: a solution a status, by the name of its constant."""
+    number = {status.name: k for k, status in enumerate(Status)}
+    solutions = [SimpleNamespace(status=number[name], **number) for name in statuses]
+    good = [s for s in solutions if s.status == s.OK]
+    return SimpleNamespace(solutions=dict(enumerate(solutions)), good=lambda: good)
+
+
+SUMMARY = dict.fromkeys(
+    ("north_m", "east_m", "sigma_north_m", "sigma_east_m", "heading_error_arcsec"), 0.0
+) | {"frames": 2, "sigmas_off": 0.4}
+
+
+def test_a_demo_whose_tilts_stop_says_so_and_not_that_the_truth_is_outside(instrument_run, capsys):
+    lost = watched("NO_TILT", "OK", "OK", "NO_TILT", "NO_TILT", "NOT_IDENTIFIED")
+    assert not instrument_run.say_errors(lost, SUMMARY)
+    said = capsys.readouterr().out
+    assert "the truth lies within 4 sigma: 0.4 sigma off" in said and "OUTSIDE" not in said
+    assert "3 of 6 frames gave no fix: no tilt (2), not identified (1)" in said
+    assert instrument_run.say_errors(watched("NO_TILT", "OK"), SUMMARY)
+    assert not instrument_run.say_errors(watched("OK"), SUMMARY | {"sigmas_off": 4.1})
+    assert "OUTSIDE 4 sigma: 4.1" in capsys.readouterr().out
+
+
+def test_a_demo_names_the_node_that_was_killed_and_what_lacked(instrument_run):
+    trouble_of = instrument_run.trouble_of
+    assert trouble_of(watched("OK"), {"solver": 0, "camera": 0}, None) is None
+    assert trouble_of(watched("OK"), {"solver": -9, "camera": 1, "detector": "killed"}, None) == (
+        "solver was ended by SIGKILL; camera ended with status 1; "
+        "detector did not end when it was asked to, and was killed"
+    )
+    assert trouble_of(watched("NO_TILT"), {"solver": 0}, None) == "none of 1 frames gave a fix: no tilt (1)"
+
+
+def test_a_demo_that_stays_says_which_node_ended(instrument_run, capsys):
+    import demo
+
+    watcher = SimpleNamespace(watch=lambda *_, **__: "solver was ended by SIGKILL; it said last: nothing")
+    assert demo.look(watcher, None, "").startswith("solver was ended by SIGKILL")
+
+
+def test_all_that_the_emulated_instrument_lacks_is_told_at_once(instrument_run, monkeypatch):
+    import emulated_instrument
+
+    lacking = SimpleNamespace(stdout="gcc-avr chromium indi-bin\n")
+    monkeypatch.setattr(emulated_instrument.subprocess, "run", lambda *_, **__: lacking)
+    monkeypatch.setattr(emulated_instrument, "find_spec", lambda _: None)
+    assert emulated_instrument.lacking() == (
+        "sudo apt-get install gcc-avr indi-bin && pip install indipyclient"
+    )

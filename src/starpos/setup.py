@@ -46,6 +46,7 @@ setup(
         "heif": ["pillow-heif", "exifread>=3"],
         "report": ["matplotlib", "rosbags>=0.11"],
         "cluster": ["distributed"],
+        "completion": ["argcomplete"],
         "test": ["pytest"],
     },
     entry_points={"console_scripts": ["starpos = starpos.cli:main"]},

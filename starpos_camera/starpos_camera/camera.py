@@ -26,11 +26,11 @@ from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos.recording.messages import message_to_camera
+from starpos.session import system_clock
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
-from starpos_common import system_clock
 from starpos_common.clock_report import ClockReport, time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp

@@ -3,8 +3,8 @@
 
 from collections.abc import Callable
 
+from starpos.session.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
-from starpos_common.system_clock import StepWatch
 from starpos_interfaces.msg import Capture
 
 OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from starpos_common.system_clock import StepWatch
+from starpos.session.system_clock import StepWatch
 
 # If reading both clocks takes longer, they are read again.
 QUICK_S = 1e-3

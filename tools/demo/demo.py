@@ -94,9 +94,7 @@ def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray,
     solution, stars = watcher.solutions[stamp_of(frame)], message_to_stars(watcher.stars[stamp_of(frame)])
     known = Identified(solution.indices, solution.ids, solution.magnitudes)
     shown = annotate(message_to_frame(frame), stars, known)
-    title = (
-        f"starpos at {place.latitude:+.4f} {place.longitude:+.4f}: {len(errors)} frames of {EXPOSURE_S:g} s"
-    )
+    title = f"simulated sky, {place.latitude:+.4f} {place.longitude:+.4f}: {len(errors)} frames of {EXPOSURE_S:g} s"
     about = f"a frame and its {len(solution.ids)} identified stars"
     draw(path, errors, covariance[:2, :2], title, shown, about)
     return True
@@ -133,11 +131,13 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
         start(processes, place, seed, Path(scratch) / "inclinometer-port")
         if page := show(processes):
             print(f"to look at meanwhile: {page}", flush=True)
+        else:
+            print("no dashboard, which needs tornado: pip install tornado", flush=True)
         try:
             trouble = watcher.watch(frames, processes)
             memory = {} if trouble else processes.peak_mb()
             if stay and not trouble:
-                look(watcher, processes, page)
+                trouble = look(watcher, processes, page)
         except KeyboardInterrupt:
             trouble, memory = "interrupted", {}
         codes = processes.stop()
@@ -150,33 +150,38 @@ def run(seed: int, frames: int, out: Path, stay: bool = False) -> int:
     return status
 
 
-def look(watcher: PictureWatcher, processes: Processes, page: str):
-    """Wait until Ctrl-C, or until a process ends."""
+def look(watcher: PictureWatcher, processes: Processes, page: str) -> str | None:
+    """Wait until Ctrl-C, or until a process ends; then say in a sentence which."""
     print(f"\nit goes on: {page}, Ctrl-C ends it", flush=True)
     try:
-        watcher.watch(math.inf, processes, patience_s=math.inf)
+        return watcher.watch(math.inf, processes, patience_s=math.inf)
     except KeyboardInterrupt:
         print()
+        return None
 
 
 def conclude(watcher: PictureWatcher, codes: dict, memory: dict, trouble: str | None, out: Path) -> int:
-    if trouble := trouble_of(watcher, codes, trouble):
+    trouble = trouble_of(watcher, codes, trouble)
+    if not watcher.good():
         print(f"\ndemo: {trouble}", file=sys.stderr)
         return 1
     summary, errors, covariance = summarise(watcher.good(), watcher.place)
     summary |= {"seconds_median": float(np.nanmedian(watcher.seconds)), "peak_memory_mb": memory}
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     inside = say_errors(watcher, summary)
+    took = ", ".join(f"{name} {mb} MB" for name, mb in memory.items() if name != "emulator")
     print(
-        f"frame published to fix received: median {np.nanmedian(watcher.seconds):.2f} s; peak memory "
-        + ", ".join(f"{name} {mb} MB" for name, mb in memory.items() if name != "emulator")
+        f"frame published to fix received: median {np.nanmedian(watcher.seconds):.2f} s"
+        + (f"; peak memory {took}" if took else "")
     )
     drawn = picture(watcher, errors, covariance, out / "demo.png")
     print(f"picture: {out / 'demo.png'}" if drawn else "no picture: no frame with a fix was heard whole")
     heavy = {name: mb for name, mb in memory.items() if mb > MEMORY_LIMIT_MB}
     for name, mb in heavy.items():
         print(f"demo: {name} took {mb} MB, over the {MEMORY_LIMIT_MB} MB a node may take", file=sys.stderr)
-    return 0 if inside and not heavy else 1
+    if trouble:
+        print(f"demo: NOT ALL IS WELL: {trouble}", file=sys.stderr)
+    return 0 if inside and not heavy and not trouble else 1
 
 
 if __name__ == "__main__":

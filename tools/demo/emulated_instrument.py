@@ -47,13 +47,16 @@ NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
 
 def lacking() -> str | None:
-    """Say how to install what the devices need and this machine lacks; None if it has all."""
+    """Say in commands how to install all that the devices need and this machine lacks; None if it has all."""
     missing = subprocess.run(
         [ROOT / "tools" / "setup" / "missing", "tests"], capture_output=True, text=True, check=True
     )
+    commands = []
     if packages := sorted(NEEDED & set(missing.stdout.split())):
-        return f"sudo apt-get install {' '.join(packages)}"
-    return None if find_spec("indipyclient") else "pip install indipyclient"
+        commands.append(f"sudo apt-get install {' '.join(packages)}")
+    if not find_spec("indipyclient"):
+        commands.append("pip install indipyclient")
+    return " && ".join(commands) or None
 
 
 def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict]:
@@ -120,7 +123,7 @@ def latenesses_ms(watcher: Watcher, begun_s: list[float]) -> np.ndarray:
 def main() -> int:
     args = parse(parser_of(__doc__, FRAMES, "demo/emulated"))
     if lack := lacking():
-        print(f"emulated_instrument: something is not installed: {lack}", file=sys.stderr)
+        print(f"emulated_instrument: not all that it needs is here; type: {lack}", file=sys.stderr)
         return 2
     with own_domain():
         return run(args.seed, args.frames, args.out)
@@ -164,14 +167,15 @@ def run(seed: int, frames: int, out: Path) -> int:
 
 
 def conclude(watcher: Watcher, trouble: str | None, begun_s: list[float], memory: dict, out: Path) -> int:
+    if watcher.good():
+        summary, *_ = summarise(watcher.good(), watcher.place)
+        inside = say_errors(watcher, summary)
     if trouble:
         print(f"\nemulated_instrument: {trouble}; the logs are in {out}", file=sys.stderr)
         return 1
-    summary, *_ = summarise(watcher.good(), watcher.place)
     late_ms = latenesses_ms(watcher, begun_s)
     summary |= {"sky_late_ms": late_ms.tolist(), "peak_memory_mb": memory}
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-    inside = say_errors(watcher, summary)
     print(
         f"the frames showed the sky of {np.median(np.abs(late_ms)):.2f} ms (median; at most {np.abs(late_ms).max():.2f}) "
         "from the mid-exposure that they state; peak memory "

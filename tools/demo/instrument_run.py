@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,7 +90,7 @@ class Processes:
         if name is None:
             return None
         said = (self.folder / f"{name}.log").read_text(errors="replace").splitlines() or ["nothing"]
-        return f"{name} has stopped with status {self.running[name].returncode}; it said last: {said[-1]}"
+        return f"{name} {ending_of(self.running[name].returncode)}; it said last: {said[-1]}"
 
     def peak_mb(self) -> dict[str, int]:
         """Peak resident memory of each process, 10^6 bytes."""
@@ -114,6 +115,16 @@ class Processes:
                 os.killpg(p.pid, signal.SIGKILL)
                 codes[name] = "killed"
         return codes
+
+
+def ending_of(code: int | str) -> str:
+    """Say how a process ended, by its exit code."""
+    if code == "killed":
+        return "did not end when it was asked to, and was killed"
+    try:
+        return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+    except ValueError:
+        return f"was ended by signal {-code}"
 
 
 def known_of(place: Place) -> dict:
@@ -234,10 +245,22 @@ def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarr
 
 def trouble_of(watcher: Watcher, codes: dict, trouble: str | None) -> str | None:
     """Say in a sentence that there is no fix to compare, or that a program has failed; None if all is well."""
-    unclean = {name: code for name, code in codes.items() if code != 0}
+    unclean = [f"{name} {ending_of(code)}" for name, code in codes.items() if code != 0]
     if trouble or unclean:
-        return trouble or f"unclean exits {unclean}"
-    return None if watcher.good() else "no frame gave a fix"
+        return trouble or "; ".join(unclean)
+    if watcher.good():
+        return None
+    return f"none of {len(watcher.solutions)} frames gave a fix: {why_none(watcher.solutions.values())}"
+
+
+def why_none(solutions) -> str:
+    """Count the solutions without a fix by their status."""
+    lost = [s for s in solutions if s.status != s.OK]
+    # the message's constants are those of its status
+    constants = [(name, getattr(s, name)) for s in lost[:1] for name in dir(s) if name.isupper()]
+    names = {number: name for name, number in constants if isinstance(number, int)}
+    told = Counter(names[s.status].replace("_", " ").lower() for s in lost)
+    return ", ".join(f"{text} ({number})" for text, number in told.most_common())
 
 
 def say_errors(watcher: Watcher, summary: dict) -> bool:
@@ -250,12 +273,14 @@ def say_errors(watcher: Watcher, summary: dict) -> bool:
         f"of the truth, claimed {summary['sigma_north_m']:.0f} and {summary['sigma_east_m']:.0f} m; "
         f"heading {summary['heading_error_arcsec']:+.1f} arcsec"
     )
-    fixed = [solution.status == solution.OK for solution in watcher.solutions.values()]
-    lost = fixed[fixed.index(True) :].count(False)
+    solutions = list(watcher.solutions.values())
+    first = next(k for k, s in enumerate(solutions) if s.status == s.OK)
+    lost = [s for s in solutions[first:] if s.status != s.OK]
     inside = summary["sigmas_off"] < ACCEPTED_SIGMA
-    print(f"the truth lies {'within' if inside else 'OUTSIDE'} {ACCEPTED_SIGMA:g} sigma")
+    side = "within" if inside else "OUTSIDE"
+    print(f"the truth lies {side} {ACCEPTED_SIGMA:g} sigma: {summary['sigmas_off']:.1f} sigma off")
     if lost:
-        print(f"{lost} frames after the first fix gave none")
+        print(f"NOT ALL IS WELL: {len(lost)} of {len(solutions)} frames gave no fix: {why_none(lost)}")
     return inside and not lost
 
 

@@ -3,11 +3,22 @@
 
 Data flows one way: frame -> detection -> star vectors -> identification -> apparent places -> local frame -> fix.
 
-    from starpos import Calibration, Instrument, Solver, detect, load_catalogue, read_frame, read_tilt_csv
+A night that `starpos simulate night` has written:
 
-    known = Calibration.of((0.91, -0.48, 20.0), (5.0, 5.0, 5.0))  # A3 in deg, its errors in arcsec
-    solver = Solver(Instrument(focal_px=600e3 / 6.4, calibration=known), load_catalogue())
-    solution = solver.solve(detect(read_frame("frame.fits")).stars, read_tilt_csv("tilt.csv").average)
+    >>> import starpos
+    >>> known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))  # A3 in deg, its errors in arcsec
+    >>> night = starpos.open_night("night", calibration=known)
+    >>> night
+    <night: 5 frames and tilt.csv, to be solved>
+    >>> answer = night.solve()
+    >>> answer
+    <night: 5 of 5 frames fixed; +35.70... +51.41... +- 2... m N 2... m E, heading 235... +- 0.00... deg (WGS 84)>
+    >>> answer.wgs84.sigma_north_m < 400  # 1 sigma in m; latitude, longitude and heading are in deg
+    True
+    >>> [shot.status.value for shot in answer.shots]
+    ['ok', 'ok', 'ok', 'ok', 'ok']
+
+Inside, angles are in rad, times Unix seconds in UTC.
 
 The names below are the public ones. Each is imported when it is first asked for, so that `import starpos` takes no time.
 """
@@ -42,6 +53,7 @@ _HOMES = {
     "detect": "detection",
     "geodetic": "earth.vertical",
     "load_catalogue": "sky.catalogue",
+    "open_night": "report.opening",
     "read_frame": "frames.reading",
     "read_tilt_csv": "instrument.tilt_table",
     "turn": "calibration.turning",

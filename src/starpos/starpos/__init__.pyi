@@ -22,6 +22,7 @@ from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
+from starpos.report.opening import open_night as open_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site

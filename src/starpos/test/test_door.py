@@ -2,6 +2,7 @@
 """The package's one door: its public names, each imported when it is first asked for."""
 
 import ast
+import doctest
 import re
 import subprocess
 import sys
@@ -47,11 +48,64 @@ def test_the_door_itself_imports_nothing_heavy():
     assert said(f"import sys, starpos; starpos.StarposError; print({heavy})") == "[]"
 
 
-def test_the_readmes_example_solves_a_night(tmp_path):
-    [example] = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    wide = ["--focal-mm", "29.67", "--size", "1000", "700", "-n", "1"]
+def simulated(folder, *options):
+    """A night with smaller frames than those of `starpos simulate night`."""
     from starpos.cli import main
 
-    assert main(["simulate", str(tmp_path / "night"), "--pixel-um", "6.4", *wide]) == 0
-    program = example.replace("600e3 / 6.4", "29.67e3 / 6.4").replace("night/", f"{tmp_path}/night/")
+    wide = ["--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700"]
+    assert main(["simulate", str(folder), *wide, *options]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """The night that the examples work on."""
+    return simulated(tmp_path_factory.mktemp("door") / "night")
+
+
+def test_the_readmes_example_solves_a_night(night):
+    [example] = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    program = example.replace("600e3 / 6.4", "29.67e3 / 6.4").replace("night/", f"{night}/")
     assert said(program).startswith("Status.OK")
+
+
+def test_the_doors_own_example_is_what_comes_of_it(night, monkeypatch):
+    monkeypatch.chdir(night.parent)
+    told = doctest.DocTestParser().get_doctest(starpos.__doc__, {}, "starpos", str(SOURCE), 0)
+    lines = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    runner.run(told, out=lines.append)
+    assert told.examples and runner.failures == 0, "".join(lines)
+
+
+def test_a_night_in_a_notebook_is_a_short_table_in_degrees(tmp_path):
+    simulated(tmp_path, "-n", "2", "--stars-only")
+    answer = starpos.open_night(tmp_path, instrument=starpos.Instrument(4635.9375)).solve()
+    assert answer.wgs84.sigma_north_m > 1e6 and " km N " in repr(answer) and len(repr(answer)) < 200
+    html = answer._repr_html_()
+    assert html.count("<tr>") == 3 and "stars_0001.csv" in html and "the misalignment of camera" in html
+    assert "nan" not in html
+
+
+def test_what_a_user_prints_is_a_line(tmp_path):
+    simulated(tmp_path, "-n", "2", "--stars-only")
+    solver = starpos.Solver(starpos.Instrument(4635.9375), starpos.load_catalogue())
+    tilts = starpos.read_tilt_csv(tmp_path / "tilt.csv")
+    stars = [starpos.read_frame(path) for path in sorted(tmp_path.glob("stars_*.csv"))]
+    solutions = [solver.solve(one, tilts.average) for one in stars]
+    for value in (solutions[0], solutions[0].fix, starpos.average([s.fix for s in solutions])):
+        assert "+35.70" in repr(value) and "heading 235." in repr(value) and len(repr(value)) < 150
+    night = starpos.open_night(tmp_path, instrument=solver.instrument).solve()
+    for value in (stars[0], tilts, solver.catalogue, night.shots[0], night.combined):
+        assert "\n" not in repr(value) and len(repr(value)) < 200
+    lost = solver.solve(stars[0])
+    assert repr(lost).startswith("<Solution no tilt: ") and len(repr(lost)) < 150
+
+
+def test_a_night_that_cannot_be_opened_is_said_in_a_sentence(night, tmp_path):
+    with pytest.raises(starpos.StarposError, match="there is no such folder"):
+        starpos.open_night(tmp_path / "none")
+    with pytest.raises(starpos.StarposError, match="no frames in it"):
+        starpos.open_night(tmp_path)
+    with pytest.raises(starpos.StarposError, match=r"none\.yaml"):
+        starpos.open_night(night, instrument=tmp_path / "none.yaml")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rclpy.clock import ROSClock
 from rclpy.node import Node
 
-from starpos_common import system_clock
+from starpos.session import system_clock
 from starpos_common.diagnostics import Diagnosis, Level
 
 # How long a step stays in the report.

@@ -17,6 +17,7 @@ from starpos.averaging.slip import poses_of, slip_s
 from starpos.errors import FixError
 from starpos.fix.budget import ErrorTerm, total_covariance
 from starpos.fix.fix import Fix
+from starpos.fix.readable import InDegrees
 
 # the term of what fixes scatter beyond their budgets
 SCATTER = "scatter"
@@ -60,6 +61,14 @@ class Average:
         if np.isnan(self.heading):
             covariance[2] = covariance[:, 2] = np.nan
         return covariance
+
+    @property
+    def in_degrees(self) -> InDegrees:
+        """Place and heading in degrees."""
+        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
+
+    def __repr__(self) -> str:
+        return f"<Average of {self.frames} frames: {self.in_degrees}>"
 
 
 def average(fixes: Sequence[Fix]) -> Average:

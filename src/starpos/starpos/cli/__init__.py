@@ -1,30 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
+# PYTHON_ARGCOMPLETE_OK
 """The command `starpos`: the instrument without ROS, for a night that is on disk.  Each command has a file."""
 
 import argparse
 import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
 from starpos import __version__
+from starpos.cli.commands import COMMANDS
 from starpos.errors import StarposError
 from starpos.parallel import BLAS_THREADS
 
-COMMANDS = {
-    "solve": "position and heading of frames with their tilts",
-    "navigate": "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
-    "detect": "the stars of frames",
-    "identify": "where frames look, lost in space",
-    "replay": "recorded nights (rosbag2) by the solver's own code: the same fixes as in the running graph",
-    "calibrate": "A3 at a known place, or the camera, from identified stars",
-    "report": "nights on one page: stability, scatter, residuals, sky, error budget",
-    "simulate": "write a night of frames and tilts from a place you choose",
-    "catalogue": "build the star catalogue, or say what it and its triangles hold",
-    "montecarlo": "identify random fields and work random nights, and count: the paper's tables",
-}
 BAD_CALL = 2
 
 
@@ -49,21 +40,56 @@ def _one_line_each(command: str) -> Callable[..., None]:
     return show
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
-    parser = CommandParser(prog="starpos", description="Position and heading from the stars.")
+def parser_for(given: Sequence[str]) -> CommandParser:
+    """The parser of a call; of the commands only the one in use is imported, so that --help is quick."""
+    parser = CommandParser(
+        prog="starpos",
+        description="Position and heading from the stars.",
+        epilog="starpos COMMAND --help has examples. A first try: starpos doctor, then starpos simulate night. With "
+        'argcomplete, eval "$(register-python-argcomplete starpos)" has the Tab key complete commands and options.',
+    )
     parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        text = command.text
+        sub = commands.add_parser(
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if given and given[0] == name:
+            import_module(f"starpos.cli.{name}").define(sub)
+            sub.epilog = f"{sub.epilog}\n\n{command.epilog}" if sub.epilog else command.epilog
+    return parser
+
+
+def complete() -> None:
+    """Answer the shell that asks, by argcomplete, how a line may go on; return if none asks."""
+    line = os.environ.get("COMP_LINE")
+    if line is None or "_ARGCOMPLETE" not in os.environ:
+        return
+    with suppress(ImportError):
+        from argcomplete import autocomplete
+
+        words = line[: int(os.environ.get("COMP_POINT", len(line)))].split()
+        autocomplete(parser_for(words[1:]), exclude=["-h"])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
+    complete()
     given = sys.argv[1:] if argv is None else argv
     # numpy, which reads these, is loaded with the command
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
-    for name, text in COMMANDS.items():
-        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        # only the command in use is imported, so that --help is quick
-        if given and given[0] == name:
-            import_module(f"starpos.cli.{name}").define(sub)
-    args = parser.parse_args(given)
+    try:
+        args = parser_for(given).parse_args(given)
+    except ModuleNotFoundError as e:
+        print(
+            f"starpos: the module {e.name} is not here: starpos doctor says what is missing", file=sys.stderr
+        )
+        return BAD_CALL
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _one_line_each(args.command)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starpos.errors import FrameError, TiltError
+from starpos.frames.night_files import TILTS, TRUTH
+from starpos.report.folder import frames_in
 
 
 @dataclass(frozen=True)
@@ -23,13 +25,16 @@ class NightFolder:
 def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> list[NightFolder | FrameError]:
     """One night from frames and a table, or without one for a camera that is fixed to the ground.
 
-    Else a night for each folder, or the error why it is none.
+    Else a night for each folder, or the error why it is none. What lies beside frames and is none, as a shell's *.csv
+    takes it in, is left out: the table of tilts and truth.json.
 
     A folder's frames are its FITS files, or if there are none its CSV files, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:
-        return [NightFolder(tuple(given), os.path.abspath(tilt))]
+        table = os.path.realpath(tilt)
+        frames = [p for p in given if os.path.realpath(p) != table and os.path.basename(p) != TRUTH]
+        return [NightFolder(tuple(frames or given), os.path.abspath(tilt))]
     if own_level:
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
@@ -42,8 +47,6 @@ def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> li
 
 
 def _night(folder: str) -> NightFolder | FrameError:
-    from starpos.report.folder import TILTS, frames_in
-
     try:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:

@@ -13,7 +13,9 @@ from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
+from starpos.cli.doubts import checked_tilts
 from starpos.cli.frame_work import NO_CAMERA, reader_of
+from starpos.cli.output import add_formats
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.frames.pointings import read_pointings
@@ -24,7 +26,6 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
-from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.sky import catalogue
 
 NOTHING = 1  # exit status
@@ -33,9 +34,8 @@ CAMERA_NAME = "camera"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(
-        parser, "one JSON object for --camera and one for --site instead of text", pointings=True
-    )
+    common.add_frames(parser, pointings=True)
+    add_formats(parser, "one JSON object for --camera and one for --site instead of text", None)
     parser.add_argument(
         "--camera",
         metavar="OUT",
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     if not frames:
         return common.UNREADABLE
     instrument = common.instrument_of(args, frames[0])
-    tilts = None if args.tilt is None else read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
+    tilts = _tilts(args, instrument)
     try:
         if args.camera is not None:
             camera = _camera(args, frames, instrument, tilts)
@@ -90,6 +90,13 @@ def run(args: argparse.Namespace) -> int:
     return common.UNREADABLE if unreadable else 0
 
 
+def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
+    """The table of --tilt, None without one."""
+    if args.tilt is None:
+        return None
+    return checked_tilts("calibrate", args.tilt, instrument.inclinometer.noise_rad)
+
+
 def _from_pointings(args: argparse.Namespace) -> int:
     """Calibrate from the pointings of a plate solver; returns the exit status."""
     pointings = read_pointings(args.pointings)
@@ -97,7 +104,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
     if len(whole) < len(pointings):
         common.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = common.instrument_of(args, NO_CAMERA)
-    tilts = None if args.tilt is None else read_tilt_csv(args.tilt, instrument.inclinometer.noise_rad)
+    tilts = _tilts(args, instrument)
     try:
         calibrate_site.run(args, whole, instrument, tilts)
     except FixError as e:

@@ -24,12 +24,8 @@ from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 
 
-def add_frames(
-    parser: argparse.ArgumentParser,
-    json_help: str = "one JSON object a frame instead of a table",
-    pointings: bool = False,
-) -> None:
-    """Add the frames and --json; with `pointings` also --pointings, which may stand in for frames."""
+def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:
+    """Add the frames; with `pointings` also --pointings, which may stand in for frames."""
     parser.add_argument(
         "frames",
         nargs="*" if pointings else "+",
@@ -46,7 +42,6 @@ def add_frames(
             "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
             "without a roll elevations alone tell the place, from three directions or more, and no heading",
         )
-    parser.add_argument("--json", action="store_true", help=json_help)
 
 
 def check_frames(args: argparse.Namespace) -> None:
@@ -337,15 +332,15 @@ def stars_of(item: Frame | Stars) -> Stars:
 
 def print_json(value: dict) -> None:
     """Print an object on one line; NaN and infinity become null."""
-    print(json.dumps(_plain(value)), flush=True)
+    print(json.dumps(plain(value)), flush=True)
 
 
-def _plain(value: Any) -> Any:
-    """A value of types that json knows, without NaN and infinity."""
+def plain(value: Any) -> Any:
+    """The value of types that json knows, without NaN and infinity."""
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, np.integer):

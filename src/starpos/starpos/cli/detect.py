@@ -6,51 +6,60 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import common, jobs
 from starpos.cli.frame_work import Detecting, Reader
+from starpos.cli.output import Output, add_formats
 from starpos.errors import FrameError
 from starpos.frames.stars import Stars
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
 
+# of --csv; the stars of --json have the same, without the file
+COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
+JSON_HELP = "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], and cpu_ms"
+
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
+    add_formats(parser, JSON_HELP, "a row of a CSV a star")
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    output = Output(args, COLUMNS, "")
     status, work, number = 0, Detecting(Reader()), len(args.frames)
     with jobs.workers_of(args, number) as workers:
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
                 status = common.UNREADABLE
-            _tell(path, answer, args.json)
+            _tell(path, answer, output)
     return status
 
 
-def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", as_json: bool) -> None:
+def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", output: Output) -> None:
     if isinstance(answer, FrameError):
         common.complain("detect", answer)
-        if as_json:
-            common.print_json({"file": path, "stars": [], "cpu_ms": 0.0, "status": "bad input"})
+        output.put({"file": path, "stars": [], "cpu_ms": 0.0, "status": "bad input"}, "", ())
         return
     found, cpu_ms = answer
     stars = found if isinstance(found, Stars) else found.stars
     left_out = 0 if isinstance(found, Stars) else found.left_out
-    if as_json:
-        cut = {"left_out": left_out} if left_out else {}
-        common.print_json({"file": path, "stars": _rows(stars), "cpu_ms": cpu_ms} | cut)
-    elif isinstance(found, Stars):
-        print(f"{path}: a list of {len(stars)} stars", flush=True)
-    else:
-        print(
-            f"{path}: {len(stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
-            f"FWHM {found.fwhm_px:.2f} px, chi2 {found.typical_chi2:.2f}, {cpu_ms:.0f} ms"
-            + (f"; {left_out} fainter peaks were too many and are left out" if left_out else ""),
-            flush=True,
-        )
+    rows = _rows(stars)
+    value = {"file": path, "stars": rows, "cpu_ms": cpu_ms} | ({"left_out": left_out} if left_out else {})
+    output.put(
+        value, _line(path, found, cpu_ms), [dict(zip(COLUMNS, (path, *row), strict=True)) for row in rows]
+    )
+
+
+def _line(path: str, found: "Detection | Stars", cpu_ms: float) -> str:
+    if isinstance(found, Stars):
+        return f"{path}: a list of {len(found)} stars"
+    cut = f"; {found.left_out} fainter peaks were too many and are left out" if found.left_out else ""
+    return (
+        f"{path}: {len(found.stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
+        f"FWHM {found.fwhm_px:.2f} px, chi2 {found.typical_chi2:.2f}, {cpu_ms:.0f} ms{cut}"
+    )
 
 
 def _rows(stars: Stars) -> list[list[float]]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from starpos.cli import common, jobs
 from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, reader_of
+from starpos.cli.output import Output, add_formats
 from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import FrameError
 from starpos.fix.blind import BlindSolver
@@ -14,9 +15,22 @@ from starpos.fix.solver import Solution, Status
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.sky.catalogue import load_catalogue
 
+# of --csv
+COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
+           "log_odds", "mirrored", "warnings", "cpu_ms")  # fmt: skip
+JSON_HELP = (
+    "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
+    "focal_px, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
+)
+HEAD = (
+    "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
+    "over east), stars identified of those detected"
+)
+
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
+    add_formats(parser, JSON_HELP, "a row of a CSV a frame")
     common.add_stamps(parser)
     parser.add_argument(
         "--instrument",
@@ -32,7 +46,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     any_found, unreadable, number = False, False, len(args.frames)
     lost: str | None = None
-    read = reader_of(args)
+    read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with jobs.workers_of(args, number) as workers:
         (about,) = workers.map([(Look(read), tuple(args.frames))])
         # without a frame that can be read, each one reports why it cannot
@@ -58,10 +72,7 @@ def run(args: argparse.Namespace) -> int:
             lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             if not found.ok:
                 common.complain("identify", found.message)
-            if args.json:
-                common.print_json(as_json(path, found) | {"cpu_ms": cpu_ms})
-            else:
-                print(_line(path, found), flush=True)
+            output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     if lost is not None and not any_found and isinstance(work, Identifying):
         say_what_would_fit("identify", read, work.instrument, lost)
     return common.UNREADABLE if unreadable else 0 if any_found else 1

@@ -53,11 +53,14 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     return Here() if number <= 1 else Processes(number)
 
 
-def watched(answers: Iterable, number: int, what: str = "frame") -> Iterator:
-    """The answers as they are, with a progress bar unless standard output shows them on the same terminal."""
-    bar = common.ProgressBar(terminal_only=True)
+def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:
+    """The answers as they are, with a progress bar unless standard output shows them on the same terminal.
+
+    silent: whether, where no terminal is, the answers are lines that show how far the work is.
+    """
+    bar = common.ProgressBar(terminal_only=silent)
     for k, answer in enumerate(answers, 1):
-        if not sys.stdout.isatty():
+        if not (silent and sys.stdout.isatty()):
             bar(f"{what} {k} of {number}", k / number)
         yield answer
 

@@ -9,11 +9,13 @@ import numpy as np
 
 from starpos.cli import common, jobs
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
+from starpos.cli.fix_output import HEAD, in_degrees
 from starpos.cli.frame_work import Look, Reader, reader_of
-from starpos.cli.solve import in_degrees
+from starpos.cli.output import Output, add_formats
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, VoyageError
+from starpos.fix.readable import InDegrees
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument
 from starpos.navigation.imu import ImuModel, read_imu, read_imu_model
@@ -32,10 +34,17 @@ OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "
 KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
         "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
         "deflection_stddev_arcsec")  # fmt: skip
+JSON_HELP = (
+    "one JSON object a frame: latitude, longitude and heading are astronomic, in deg, their ..._geodetic on WGS 84, "
+    "covariance (3 x 3) is of east m, north m, heading deg; velocity is of east, north, up in m/s"
+)
+# of --csv
+COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser)
+    add_formats(parser, JSON_HELP, "a row of a CSV a frame")
     parser.add_argument(
         "--imu",
         required=True,
@@ -151,15 +160,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertical: Vertical) -> int:
-    """Print the answer for each frame; returns the exit status."""
+    """Write the answer for each frame; returns the exit status."""
+    output = Output(args, COLUMNS, HEAD)
     for fault in voyage.faults:
         common.complain("navigate", fault)
     for path, frame, fix in zip(args.frames, seen, voyage.fixes, strict=True):
         status = _status(frame, fix)
-        if args.json:
-            common.print_json({"file": path} | json_of(fix, vertical) | {"status": status})
-        else:
-            print(f"{path}: {status if fix is None else text_of(fix)}", flush=True)
+        output.put(
+            {"file": path} | json_of(fix, vertical) | {"status": status},
+            f"{path}: {status if fix is None else text_of(fix)}",
+        )
     fixes = [fix for fix in voyage.fixes if fix is not None]
     if not fixes:
         return NO_ANSWER
@@ -201,8 +211,5 @@ def json_of(fix: VoyageFix | None, vertical: Vertical) -> dict:
 
 def text_of(fix: VoyageFix) -> str:
     """The line of a fix for people."""
-    east, north, turn = np.sqrt(np.diag(in_degrees(fix.covariance)))
-    return (
-        f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, heading "
-        f"{np.degrees(fix.heading):.4f} +- {turn:.4f} deg, {np.hypot(*fix.velocity[:2]):.2f} m/s"
-    )
+    place = InDegrees.of(fix.latitude, fix.longitude, fix.heading, fix.covariance)
+    return f"{place}, {np.hypot(*fix.velocity[:2]):.2f} m/s"

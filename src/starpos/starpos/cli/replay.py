@@ -10,7 +10,19 @@ from starpos.averaging.average import Average
 from starpos.calibration.unknown import BY_PARAMETERS, unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder
-from starpos.cli.solve import NO_FIX, Solved, json_about, json_of, line_of, print_combined
+from starpos.cli.fix_output import (
+    COLUMNS,
+    CSV_HELP,
+    HEAD,
+    JSON_HELP,
+    Solved,
+    json_about,
+    json_of,
+    line_of,
+    put_combined,
+)
+from starpos.cli.output import Output, add_formats
+from starpos.cli.solve import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solver import Solution
@@ -45,7 +57,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="NAME:=VALUE",
         help="a parameter of the node solver, such as misalignment_stddev:=5.0; it counts more than the file's",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object a frame instead of a table")
+    add_formats(parser, JSON_HELP, CSV_HELP)
     jobs.add_jobs(parser, "bags")
     parser.set_defaults(run=run)
 
@@ -119,19 +131,25 @@ def _light(solution: Solution) -> Solution:
 
 def run(args: argparse.Namespace) -> int:
     settings = settings_of(args.params_file, args.param, args.namespace)
+    output = Output(args, COLUMNS, HEAD)
     work = Playing(args.params_file, tuple(args.param), args.namespace)
     with jobs.workers_of(args, len(args.bags)) as workers:
         answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
-            tell(args, bag, night, settings.vertical, settings.calibration(None))
+            tell(args, output, bag, night, settings.vertical, settings.calibration(None))
             for bag, night in zip(args.bags, answers, strict=True)
         )
 
 
 def tell(
-    args: argparse.Namespace, bag: str, night: PlayedNight, vertical: Vertical, calibration: Calibration
+    args: argparse.Namespace,
+    output: Output,
+    bag: str,
+    night: PlayedNight,
+    vertical: Vertical,
+    calibration: Calibration,
 ) -> int:
-    """Print the solutions of a bag and the average of its place; returns the exit status."""
+    """Write the solutions of a bag and the average of its place; returns the exit status."""
     for sentence in night.said:
         common.complain("replay", f"{bag}: {sentence}")
     solved: list[Solved] = []
@@ -141,18 +159,17 @@ def tell(
         else:
             common.complain("replay", f"{bag}: {solution.message}")
         time = "a frame" if solution.utc_unix_s is None else utc_text(solution.utc_unix_s)
-        if args.json:
-            about = {"file": bag} | json_of(solution.fix, vertical) | json_about(solution)
-            common.print_json(about)
-        else:
-            print(line_of(f"{bag} {time}", solution, turning=False), flush=True)
+        output.put(
+            {"file": bag} | json_of(solution.fix, vertical) | json_about(solution),
+            line_of(f"{bag} {time}", solution, turning=False),
+        )
     common.tell_extrapolation("replay", solved)
     if solved:
         if night.average and (unknown := unknown_a3(calibration, night.average.covariance, BY_PARAMETERS)):
             common.complain("replay", f"{bag}: {unknown}")
         warnings = {warning for s in night.solutions for warning in s.warnings}
         whole = NightFolder((), None, bag if len(args.bags) > 1 else None)
-        print_combined(whole, night.average, solved, warnings, args, vertical)
+        put_combined(output, whole, night.average, solved, warnings, vertical)
     # a trouble names its bag
     common.complain("replay", night.trouble or f"{bag}: {night.summary}")
     return common.UNREADABLE if night.trouble else 0 if solved else NO_FIX

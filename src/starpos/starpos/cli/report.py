@@ -51,8 +51,9 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
     from starpos.report.page import page
     from starpos.report.pictures import nights_picture, pictures_of
-    from starpos.report.writing import write
+    from starpos.report.writing import PAGE, check, write
 
+    check(Path(args.out))
     nights = [_night(Path(path), args) for path in args.nights]
     for night in nights:
         for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
@@ -70,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
         files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
-    write(Path(args.out), files | {"index.html": html.encode(errors="replace")})
-    print(Path(args.out) / "index.html")
+    write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
+    print(Path(args.out) / PAGE)
     return 0 if any(n.combined for n in nights) else NO_FIX
 
 

@@ -14,7 +14,12 @@ from starpos.sky import catalogue
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", metavar="FOLDER", help="where frame_0000.fits ..., tilt.csv and truth.json go")
+    parser.add_argument(
+        "out",
+        metavar="FOLDER",
+        help="where frame_0000.fits ..., tilt.csv and truth.json go: a new folder, or one that holds a simulated "
+        "night, which is replaced",
+    )
     parser.add_argument("-n", "--frames", type=common.number(1, 1e6, int), default=5, help="how many (5)")
     parser.add_argument("--latitude", type=common.number(-90, 90), default=35.7046, help="deg, astronomic")
     parser.add_argument(
@@ -106,5 +111,6 @@ def run(args: argparse.Namespace) -> int:
         stars_only=args.stars_only,
         rng=np.random.default_rng(args.seed),
         progress=common.ProgressBar(),
+        pixel_um=args.pixel_um,
     )
     return 0

@@ -3,11 +3,9 @@
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from starpos.averaging.average import Average, average
 from starpos.calibration.turning import turn
@@ -15,36 +13,40 @@ from starpos.calibration.unknown import unknown_a3
 from starpos.cli import common, jobs
 from starpos.cli.archive import NightFolder, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
-from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of, tilts
+from starpos.cli.doubts import Levelled, Near, add_near, checked_tilts, far, mistaken, near_of
+from starpos.cli.fix_output import (
+    COLUMNS,
+    CSV_HELP,
+    HEAD,
+    JSON_HELP,
+    Solved,
+    json_about,
+    json_of,
+    line_of,
+    put_combined,
+)
+from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of
+from starpos.cli.output import Output, add_formats
 from starpos.cli.what_fits import say_what_would_fit
-from starpos.earth.orientation import measured_until, table_age_days
-from starpos.earth.vertical import Vertical, geodetic
+from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Calibration
+from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
 NO_FIX = 1
 WORTH_SAVING_ARCSEC = 600.0
-# numbers of an average that are printed
-COUNTS = ("frames", "poses", "left_out", "moved")
 
 
 def define(parser: argparse.ArgumentParser) -> None:
     common.add_frames(parser, pointings=True)
-    parser.add_argument(
-        "--near",
-        type=float,
-        nargs=2,
-        metavar=("LAT", "LON"),
-        help="pointings without a roll: which of two places it is, where their elevations leave two, deg",
-    )
+    add_formats(parser, JSON_HELP, CSV_HELP)
     parser.add_argument(
         "--tilt",
         metavar="CSV",
@@ -55,6 +57,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     common.add_instrument(parser)
     common.add_air(parser)
     add_vertical(parser)
+    add_near(parser)
     common.add_self_calibration(parser)
     parser.add_argument(
         "--save", metavar="OUT", help="write the instrument file (YAML) with the A3 of --self-calibrate"
@@ -73,24 +76,6 @@ class Plan:
     tilts: TiltLog | None = None
 
 
-@dataclass(frozen=True)
-class Solved:
-    """The part of a Solution that is needed until the end of a night."""
-
-    fix: Fix
-    extrapolated_days: float
-    stars_detected: int
-    stars_matched: int
-    log_odds: float
-
-    @classmethod
-    def of(cls, s: Solution, fix: Fix) -> "Solved":
-        """The part of a solution with a fix."""
-        light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        log_odds = s.attitude.log_odds if s.attitude else float("nan")
-        return cls(light, s.extrapolated_days, s.stars_detected, len(s.names), log_odds)
-
-
 def run(args: argparse.Namespace) -> int:
     common.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
@@ -100,9 +85,8 @@ def run(args: argparse.Namespace) -> int:
         from starpos.cli import solve_pointings
 
         return solve_pointings.run(args)
-    if args.near is not None:
-        raise InstrumentError("--near is for --pointings without a roll: leave it out")
-    vertical, read = vertical_of(args), reader_of(args)
+    vertical, read, output = vertical_of(args), reader_of(args), Output(args, COLUMNS, HEAD)
+    near_of(args)
     given = nights_of(args.frames, args.tilt, common.has_own_level(args))
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
@@ -118,19 +102,19 @@ def run(args: argparse.Namespace) -> int:
             except TiltError as error:
                 statuses.append(_refused(error, given))
         calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
-        answers = jobs.watched(workers.map(calls), sum(len(plan.night.frames) for plan in plans))
+        # the lines of a turn wait for its end, and show no progress
+        answers = jobs.watched(
+            workers.map(calls), sum(len(p.night.frames) for p in plans), silent=not args.self_calibrate
+        )
         for plan in plans:
             # takes the answers of this night, and leaves the others
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
             if args.self_calibrate:
                 rows = _turned(args, plan, list(rows))
-            known = None if plan.solver is None or args.self_calibrate else plan.solver.instrument.calibration
-            fits = (
-                None
-                if plan.solver is None
-                else partial(say_what_would_fit, "solve", read, plan.solver.instrument)
-            )
-            statuses.append(tell(args, plan.night, rows, vertical, known, fits))
+            instrument = None if plan.solver is None else plan.solver.instrument
+            fits = None if instrument is None else partial(say_what_would_fit, "solve", read, instrument)
+            known = None if args.self_calibrate else instrument
+            statuses.append(tell(args, output, plan.night, rows, vertical, known, fits))
     return max(statuses)
 
 
@@ -147,7 +131,8 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     if about is None:
         return Plan(night, Listing(read))
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
-    table = None if night.tilt is None else tilts(night.tilt, instrument.inclinometer.noise_rad)
+    noise = instrument.inclinometer.noise_rad
+    table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=common.ProgressBar())
     return Plan(
@@ -160,14 +145,16 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
 
 def tell(
     args: argparse.Namespace,
+    output: Output,
     night: NightFolder,
     rows: Iterable,
     vertical: Vertical,
-    calibration: Calibration | None = None,
+    instrument: Instrument | None = None,
     fits: Callable[[str], None] | None = None,
 ) -> int:
-    """Print (path, Solution or FrameError) of each frame, and their average; returns the exit status.
+    """Write (path, Solution or FrameError) of each frame, and their average; returns the exit status.
 
+    instrument: that whose A3 was taken as it is; None where it was found by turning.
     fits: says which focal length fits a frame that was not identified.
     """
     solved: list[Solved] = []
@@ -184,23 +171,41 @@ def tell(
             solved.append(Solved.of(answer, answer.fix))
         else:
             common.complain("solve", answer.message)
-        if args.json:
-            common.print_json({"file": path} | json_of(answer.fix, vertical) | json_about(answer))
-        else:
-            print(line_of(path, answer, args.self_calibrate), flush=True)
+        output.put(
+            {"file": path} | json_of(answer.fix, vertical) | json_about(answer),
+            line_of(path, answer, args.self_calibrate),
+        )
     if lost and not solved and fits is not None:
         fits(lost)
     common.tell_extrapolation("solve", solved)
     together = _combine(night, solved)
     if solved:
-        last = solved[-1].fix
+        last, near = solved[-1].fix, near_of(args)
+        whole = last if together is None else together
         tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        if calibration is not None:
-            wide = last if together is None else together
-            if unknown := unknown_a3(calibration, wide.covariance):
-                _say(night, unknown)
-        print_combined(night, together, solved, warnings, args, vertical)
+        if instrument is not None and (unknown := unknown_a3(instrument.calibration, whole.covariance)):
+            _say(night, unknown)
+        _tell_doubts(night, instrument, solved, whole, near)
+        about = {} if near is None else {"km_from_near": near.km_from(whole.latitude, whole.longitude)}
+        put_combined(output, night, together, solved, warnings, vertical, about)
     return common.UNREADABLE if unreadable else 0 if together else NO_FIX
+
+
+def _tell_doubts(
+    night: NightFolder,
+    instrument: Instrument | None,
+    solved: list[Solved],
+    whole: Fix | Average,
+    near: Near | None,
+) -> None:
+    """Complain about places that tilts must have set apart, or a place that lies far from `near`."""
+    given = instrument is not None and instrument.vertical is None and not instrument.calibration.unknown
+    mounting = instrument.mounting if instrument is not None and given else None
+    frames = [Levelled(s.fix.camera_to_itrs, s.tilt) for s in solved if s.tilt is not None]
+    if mounting is not None and (apart := mistaken(mounting, frames)):
+        _say(night, apart)
+    if near is not None and (away := far(near, whole, mounting, frames[-1:])):
+        _say(night, away)
 
 
 def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> Iterator:
@@ -257,132 +262,3 @@ def _combine(night: NightFolder, solved: list[Solved]) -> Average | None:
     if whole.left_out:
         _say(night, f"{whole.left_out} fixes lie far from the others and are left out of the average")
     return whole
-
-
-def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
-    """The keys of --json that come from a fix; None for each if there is none."""
-    keys = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
-            "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
-            "deflection_stddev_arcsec", "budget")  # fmt: skip
-    if fix is None:
-        return dict.fromkeys(keys)
-    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
-    covariance = in_degrees(fix.covariance)
-    sigma = np.sqrt(np.diag(covariance))
-    values = (
-        utc_text(fix.utc_unix_s),
-        np.degrees(fix.latitude),
-        np.degrees(fix.longitude),
-        np.degrees(fix.heading),
-        np.degrees(ground.latitude),
-        np.degrees(ground.longitude),
-        *sigma,
-        covariance,
-        in_degrees(ground.covariance),
-        ground.deflection.xi_arcsec,
-        ground.deflection.eta_arcsec,
-        ground.deflection.stddev_arcsec,
-        budget_of(fix, vertical),
-    )
-    return dict(zip(keys, values, strict=True))
-
-
-def in_degrees(covariance: np.ndarray) -> np.ndarray:
-    """A covariance (3, 3) of east m, north m, heading rad with the heading in deg instead."""
-    unit = np.array([1.0, 1.0, np.degrees(1.0)])
-    return covariance * np.outer(unit, unit)
-
-
-def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
-    """1 sigma (3,) of each source: east m, north m, heading deg; the deflection acts on the geodetic place only."""
-    terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
-    ground = geodetic(fix.latitude, fix.longitude, 0.0, fix.covariance, vertical)
-    terms["deflection (geodetic only)"] = np.sqrt(np.diag(ground.deflection_covariance)) * [
-        1,
-        1,
-        np.degrees(1),
-    ]
-    return terms
-
-
-def json_about(s: Solution) -> dict:
-    """The keys of --json about the stars of a frame."""
-    a = s.attitude
-    return {
-        "stars_detected": s.stars_detected,
-        "stars_matched": len(s.names),
-        "residual_arcsec": s.fix.residual_arcsec if s.fix else None,
-        "log_odds": a.log_odds if a else None,
-        "status": s.status.value,
-        "warnings": list(s.warnings),
-    }
-
-
-def line_of(path: str, s: Solution, turning: bool) -> str:
-    """The line of a frame; turning: its place waits for the other headings."""
-    if s.fix is None:
-        return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
-    # one frame of a turn does not tell A3, so its own place would be 1100 km wide
-    where = "its place waits for the whole turn" if turning else place_text(s.fix)
-    stars = f", {len(s.names)} of {s.stars_detected} stars" if s.stars_detected else ""
-    return f"{path}: {where}{stars}"
-
-
-def place_text(fix: Fix | Average) -> str:
-    east, north, heading = np.sqrt(np.diag(in_degrees(fix.covariance)))
-    facing = f"heading {np.degrees(fix.heading):.4f} +- {heading:.4f} deg"
-    if np.isnan(fix.heading):
-        facing = "heading not known: the camera was touched, or nobody knows its roll"
-    return f"{np.degrees(fix.latitude):+.6f} {np.degrees(fix.longitude):+.6f} +- {north:.0f} m N {east:.0f} m E, {facing}"
-
-
-def print_combined(
-    night: NightFolder,
-    all_together: Average | None,
-    solved: list[Solved],
-    warnings: set[str],
-    args: argparse.Namespace,
-    vertical: Vertical,
-) -> None:
-    name = {} if night.folder is None else {"night": night.folder}
-    if args.json:
-        about = {
-            "stars_detected": sum(s.stars_detected for s in solved),
-            "stars_matched": sum(s.stars_matched for s in solved),
-            "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved] or [np.nan])),
-            "log_odds": sum(s.log_odds for s in solved) if solved else None,
-            "status": (Status.OK if all_together else Status.POOR_FIT).value,
-            "warnings": sorted(warnings),
-        }
-        common.print_json(
-            {"combined": True}
-            | name
-            | (
-                dict.fromkeys(COUNTS)
-                if all_together is None
-                else {k: getattr(all_together, k) for k in COUNTS}
-            )
-            | json_of(all_together, vertical)
-            | about
-            | {"iers_table_age_days": table_age_days(all_together.utc_unix_s) if all_together else None}
-        )
-        return
-    if all_together is None:
-        return
-    ground = geodetic(all_together.latitude, all_together.longitude, 0.0, all_together.covariance, vertical)
-    turned = f" (the last of {all_together.poses} poses)" if all_together.poses > 1 else ""
-    folder = "" if night.folder is None else f"{night.folder}: "
-    print(f"{folder}{all_together.frames} frames together: {place_text(all_together)}{turned} (astronomic)")
-    sigma = np.sqrt(np.diag(ground.covariance))
-    print(
-        f"geodetic, WGS 84: {np.degrees(ground.latitude):+.6f} {np.degrees(ground.longitude):+.6f} "
-        f"+- {sigma[1]:.0f} m N {sigma[0]:.0f} m E (the deflection of the vertical included)"
-    )
-    for name, (east, north, heading) in budget_of(all_together, vertical).items():
-        turn = "" if np.isnan(all_together.heading) else f" {heading * 3600:8.2f} arcsec"
-        print(f"  {name:<28} {east:8.2f} m E {north:8.2f} m N{turn}")
-    age_days = table_age_days(all_together.utc_unix_s)
-    where = f"{age_days:.0f} days before" if age_days > 0 else "after"
-    print(
-        f"Earth rotation: IERS table, measured until {utc_text(measured_until())[:10]}, {where} these frames"
-    )

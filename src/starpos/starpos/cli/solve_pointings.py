@@ -10,8 +10,11 @@ from starpos.averaging.altitudes import Circle, circle_of, place_of_circles
 from starpos.cli import common
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown, vertical_of
-from starpos.cli.frame_work import NO_CAMERA, tilts
-from starpos.cli.solve import NO_FIX, json_of, print_combined, solved_by_turning, tell
+from starpos.cli.doubts import Near, checked_tilts, far, near_of
+from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
+from starpos.cli.frame_work import NO_CAMERA
+from starpos.cli.output import Output
+from starpos.cli.solve import NO_FIX, solved_by_turning, tell
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.pointing import IDEAL
@@ -23,12 +26,12 @@ from starpos.utc import utc_text
 
 # the status of a row that tells an elevation
 ELEVATION = "elevation alone"
+ELEVATIONS_HEAD = "row: how far from the zenith its direction is; together these tell the place"
 
 
 def run(args: argparse.Namespace) -> int:
     """Work on the table of --pointings; returns the exit status."""
-    if args.near is not None and not (abs(args.near[0]) <= 90 and abs(args.near[1]) <= 360):
-        raise InstrumentError("--near {:g} {:g}: give latitude and longitude in deg".format(*args.near))
+    near = near_of(args)
     pointings, vertical = read_pointings(args.pointings), vertical_of(args)
     own_level = common.has_own_level(args)
     if args.tilt is None and not own_level:
@@ -36,23 +39,24 @@ def run(args: argparse.Namespace) -> int:
     if args.jobs is not None or args.scheduler is not None:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
     solver = _solver_of(args)
-    log = None if own_level else tilts(args.tilt, solver.instrument.inclinometer.noise_rad)
+    noise = solver.instrument.inclinometer.noise_rad
+    log = None if own_level else checked_tilts("solve", args.tilt, noise)
     whole = [p for p in pointings if p.has_roll]
+    output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:
         if args.self_calibrate:
             raise InstrumentError(
                 "--self-calibrate needs pointings with their roll: elevations alone do not tell A3"
             )
-        return _from_elevations(args, solver, log, pointings, vertical)
-    if args.near is not None:
-        raise InstrumentError("--near is for pointings without a roll: leave it out")
+        return _from_elevations(args, output, solver, log, pointings, vertical, near)
     night = NightFolder(tuple(p.source for p in pointings), args.tilt)
     if args.self_calibrate and log is not None:
         solved = iter(solved_by_turning(args, night, solver, log, whole))
         answers = [next(solved) if p.has_roll else solver.solve(p) for p in pointings]
     else:
         answers = [solver.solve(p, None if log is None else log.average) for p in pointings]
-    return tell(args, night, zip(night.frames, answers, strict=True), vertical)
+    given = None if args.self_calibrate else solver.instrument
+    return tell(args, output, night, zip(night.frames, answers, strict=True), vertical, given)
 
 
 def _solver_of(args: argparse.Namespace) -> Solver:
@@ -63,10 +67,12 @@ def _solver_of(args: argparse.Namespace) -> Solver:
 
 def _from_elevations(
     args: argparse.Namespace,
+    output: Output,
     solver: Solver,
     log: TiltLog | None,
     pointings: Sequence[Pointing],
     vertical: Vertical,
+    near: Near | None,
 ) -> int:
     """Print the zenith distance of each row and the place that they tell together; returns the exit status."""
     circles: list[Circle] = []
@@ -77,16 +83,20 @@ def _from_elevations(
         except StarposError as e:
             common.complain("solve", e)
             zenith_distance, status = None, status_of(p, e).value
-        _print_row(args, p, zenith_distance, status, vertical)
+        _put_row(output, p, zenith_distance, status, vertical)
     together = None
     if circles:
-        near = None if args.near is None else tuple(np.radians(args.near).tolist())
         try:
-            together = place_of_circles(circles, near)
+            together = place_of_circles(circles, None if near is None else (near.latitude, near.longitude))
             tell_unknown("solve", args, vertical.at(together.latitude, together.longitude))
         except FixError as e:
             common.complain("solve", e)
-        print_combined(NightFolder((), args.tilt), together, [], set(), args, vertical)
+        about = {}
+        if near is not None and together is not None:
+            about = {"km_from_near": near.km_from(together.latitude, together.longitude)}
+            if away := far(near, together, None, ()):
+                common.complain("solve", away)
+        put_combined(output, NightFolder((), args.tilt), together, [], set(), vertical, about)
     return 0 if together else NO_FIX
 
 
@@ -104,20 +114,17 @@ def _circle(solver: Solver, log: TiltLog | None, pointing: Pointing) -> Circle:
     )
 
 
-def _print_row(
-    args: argparse.Namespace,
+def _put_row(
+    output: Output,
     pointing: Pointing,
     zenith_distance: float | None,
     status: str,
     vertical: Vertical,
 ) -> None:
     deg = None if zenith_distance is None else np.degrees(zenith_distance)
-    if not args.json:
-        about = status if deg is None else f"{deg:.5f} deg from the zenith"
-        print(f"{pointing.source}: {about}", flush=True)
-        return
     utc = {} if pointing.mid_unix_s is None else {"utc": utc_text(pointing.mid_unix_s)}
     none = dict.fromkeys(("residual_arcsec", "log_odds"))
     about_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
     row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
-    common.print_json({"file": pointing.source} | row)
+    about = status if deg is None else f"{deg:.5f} deg from the zenith"
+    output.put({"file": pointing.source} | row, f"{pointing.source}: {about}")

@@ -24,6 +24,7 @@ from starpos.fix.budget import (
     total_covariance,
 )
 from starpos.fix.outliers import expected_extra, judged
+from starpos.fix.readable import InDegrees
 from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
 from starpos.identification import Identification
@@ -101,6 +102,14 @@ class Fix:
     def covariance(self) -> np.ndarray:
         """Covariance (3, 3) of east m, north m, heading rad."""
         return total_covariance(self.terms)[:3, :3]
+
+    @property
+    def in_degrees(self) -> InDegrees:
+        """Place and heading in degrees."""
+        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
+
+    def __repr__(self) -> str:
+        return f"<Fix: {self.in_degrees}>"
 
     @property
     def attitude_covariance(self) -> np.ndarray:

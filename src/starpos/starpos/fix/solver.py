@@ -118,6 +118,10 @@ class Solution:
         number = len(stars) if isinstance(stars, Stars) else 0
         return cls(status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=number)
 
+    def __repr__(self) -> str:
+        found = self.fix.in_degrees if self.fix else self.message
+        return f"<Solution {self.status.value}: {found}; {len(self.names)} of {self.stars_detected} stars>"
+
     @property
     def ok(self) -> bool:
         """Whether all that was asked for is there."""

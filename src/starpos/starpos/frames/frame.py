@@ -46,6 +46,9 @@ class Frame(Exposure):
             allowed = "''" if colour else ", ".join(map(repr, PATTERNS))
             raise FrameError(f"{place}: the colour pattern is {self.pattern!r}; it must be {allowed}.")
 
+    def __repr__(self) -> str:
+        return f"<{self.place}: {self.width} x {self.height} px, {self.pixels.dtype}>"
+
     @property
     def width(self) -> int:
         return self.pixels.shape[1]

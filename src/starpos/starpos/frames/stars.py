@@ -85,6 +85,9 @@ class Stars(Exposure):
             raise FrameError(f"{place}: the stars' {name} holds NaN or infinity; leave such stars out.")
         object.__setattr__(self, name, value)
 
+    def __repr__(self) -> str:
+        return f"<{len(self)} stars of {self.place}, {self.width} x {self.height} px>"
+
     def __len__(self) -> int:
         return len(self.x)
 

@@ -115,6 +115,9 @@ class TiltLog:
             earlier_excess=earlier_excess,
         )
 
+    def __repr__(self) -> str:
+        return f"<{len(self.utc_unix_s)} readings of an inclinometer>"
+
     @cached_property
     def theta(self) -> np.ndarray:
         """The elevations (N, axes) in rad; where some readings have a third axis, it is NaN of those without."""

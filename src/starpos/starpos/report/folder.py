@@ -11,13 +11,14 @@ import numpy as np
 from starpos.detection import detect
 from starpos.errors import FrameError, TiltError
 from starpos.files import read_regular
+from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.report.night import Truth
 
-TILTS, TRUTH = "tilt.csv", "truth.json"
 TRUTH_LIMIT = 1 << 26
 
 
@@ -33,7 +34,7 @@ class StarList:
 class StarLists:
     """Exposures to solve: each call of `read` goes through all `count` of them, one at a time.
 
-    tilt: a function of (mid_unix_s, exposure_s, spread_s) that may raise TiltError.
+    tilt: a function of (mid_unix_s, exposure_s, spread_s) that may raise TiltError.  remarks: what looks wrong.
     """
 
     name: str
@@ -42,6 +43,7 @@ class StarLists:
     read: Callable[[], Iterator[StarList]]
     tilt: Callable[[float, float, float], Tilt]
     truth: Truth | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
@@ -52,8 +54,10 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
     """
     frames = frames_in(folder)
     tilt: Callable[[float, float, float], Tilt]
+    doubt = ""
     try:
-        tilt = read_tilt_csv(folder / TILTS, tilt_noise_rad).average
+        log = read_tilt_csv(folder / TILTS, tilt_noise_rad)
+        tilt, doubt = log.average, like_radians(log)
     except TiltError as error:
         tilt = _no_tilt(str(error))
 
@@ -73,6 +77,7 @@ def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
         read=read,
         tilt=tilt,
         truth=truth_in(folder),
+        remarks=(f"{TILTS}: {doubt}",) if doubt else (),
     )
 
 
@@ -102,6 +107,7 @@ def truth_in(folder: Path) -> Truth | None:
     try:
         content = json.loads(read_regular(path, TRUTH_LIMIT))
         place = [float(content[k]) for k in ("latitude_deg", "longitude_deg")]
+        simulated = bool(content.get(SIMULATED))
         frames = content.get("frames", [])
         headings = tuple((float(f["mid_unix_s"]), float(np.radians(f["heading_deg"]))) for f in frames)
         if not (np.isfinite(place).all() and np.isfinite(headings).all() and abs(place[0]) <= 90):
@@ -113,7 +119,7 @@ def truth_in(folder: Path) -> Truth | None:
             f"{path}: not what is true of a night: give latitude_deg and longitude_deg, or take the file away"
         ) from None
     latitude, longitude = np.radians(place).tolist()
-    return Truth(latitude, longitude, headings)
+    return Truth(latitude, longitude, headings, simulated)
 
 
 def _no_tilt(reason: str) -> Callable[[float, float, float], Tilt]:

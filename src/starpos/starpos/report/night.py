@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from html import escape
 
 import numpy as np
 
@@ -11,10 +12,13 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix
+from starpos.fix.readable import InDegrees
 from starpos.fix.solver import Attitude, Status
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
+# so many frames are shown in a notebook
+SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,6 +51,9 @@ class ReportedPlace:
             poses=poses,
         )
 
+    def __repr__(self) -> str:
+        return f"<{self.in_degrees} (astronomic)>"
+
     @property
     def own(self) -> np.ndarray:
         """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
@@ -56,6 +63,11 @@ class ReportedPlace:
     def sigma(self) -> np.ndarray:
         """Standard deviations (3,) of east m, north m, heading rad."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def in_degrees(self) -> InDegrees:
+        """Place and heading in degrees."""
+        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
 
     def on_ground(self, vertical: Vertical) -> Geodetic:
         """The geodetic place, with the deflection of the vertical removed."""
@@ -91,19 +103,26 @@ class Shot:
     camera_to_itrs: np.ndarray | None = None
     warnings: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.place.in_degrees if self.place else self.message}>"
+
 
 @dataclass(frozen=True)
 class Truth:
-    """The true place of the instrument (astronomic, rad); headings: (mid_unix_s, rad) of frames."""
+    """The true place of the instrument (astronomic, rad); headings: (mid_unix_s, rad) of frames.
+
+    simulated: whether no camera took these frames.
+    """
 
     latitude: float
     longitude: float
     headings: tuple[tuple[float, float], ...] = ()
+    simulated: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Night:
-    """All frames of one place.
+    """All frames of one place; printed, and in a notebook shown, in a few lines.
 
     origin: a sentence that says where the fixes come from.
     combined: the average; None if there is none, and why_not says why.
@@ -122,6 +141,19 @@ class Night:
     remarks: tuple[str, ...] = ()
 
     @property
+    def simulated(self) -> bool:
+        """Whether its truth.json says that no camera took its frames."""
+        return self.truth is not None and self.truth.simulated
+
+    @property
+    def wgs84(self) -> InDegrees | None:
+        """Where the night was, on WGS 84, in degrees; None if there is no average."""
+        if self.combined is None:
+            return None
+        ground = self.combined.on_ground(self.vertical)
+        return InDegrees.of(ground.latitude, ground.longitude, ground.heading, ground.covariance)
+
+    @property
     def fixed(self) -> list[tuple[int, Shot]]:
         """The frames with a fix, each with its number from 1."""
         return [(k, s) for k, s in enumerate(self.shots, 1) if s.place]
@@ -130,3 +162,23 @@ class Night:
     def places(self) -> list[ReportedPlace]:
         """The places of the frames with a fix."""
         return [s.place for s in self.shots if s.place]
+
+    def __repr__(self) -> str:
+        found = self.why_not if self.wgs84 is None else f"{self.wgs84} (WGS 84)"
+        return f"<{self.name}: {len(self.fixed)} of {len(self.shots)} frames fixed; {found}>"
+
+    def _repr_html_(self) -> str:
+        """The night as a table, for notebooks."""
+        rows = [
+            (s.name, s.status.value, s.place.in_degrees.where, s.place.in_degrees.facing)
+            if s.place
+            else (s.name, s.status.value, s.message, "")
+            for s in self.shots[:SHOWN]
+        ]
+        if len(self.shots) > SHOWN:
+            rows.append((f"{len(self.shots) - SHOWN} frames more", "", "", ""))
+        head = ("frame", "status", "place (astronomic) and 1 sigma", "")
+        table = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+        titles = "".join(f"<th>{title}</th>" for title in head)
+        said = "".join(f"<p>{escape(remark)}</p>" for remark in self.remarks)
+        return f"<p><b>{escape(repr(self)[1:-1])}</b></p><table><tr>{titles}</tr>{table}</table>{said}"

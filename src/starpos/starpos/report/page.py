@@ -12,6 +12,7 @@ from html import escape
 import numpy as np
 
 from starpos import __version__
+from starpos.fix.readable import length_text
 from starpos.report import measures
 from starpos.report.night import Night, ReportedPlace, Truth
 from starpos.report.pictures import Picture
@@ -38,8 +39,8 @@ th { font-weight: 600; width: 13rem; } thead th { width: auto; }
 .wide { margin-bottom: 1.2rem; } .wide table { white-space: nowrap; } a { color: inherit; }
 .figures { display: grid; gap: 1.2rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 36rem), 1fr)); }
 figure { margin: 0; padding: .8rem; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
-figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; } figure div { overflow-x: auto; }
-img { display: block; width: 100%; min-width: 24rem; height: auto; background: #fff; }
+figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; }
+img { display: block; width: 100%; height: auto; background: #fff; }
 figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { cursor: pointer; }
 @media (max-width: 40rem) { th { width: 8rem; } body { padding: .7rem; } }
 @media print { img { filter: none; } }
@@ -66,11 +67,11 @@ def page(
     for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
         if len(nights) > 1:
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
-        parts += [_place(night), _summary(night), _figures(pictures)]
+        parts += [_place(night), _simulated(night), _summary(night), _figures(pictures)]
     parts.append(
-        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}. Positions are astronomic unless said "
-        "otherwise; errors are 1 sigma. The paper is Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction of a "
-        "high resolution, portable and low-cost positioner by a star tracking system&rdquo;.</p></footer>"
+        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}. Positions are astronomic unless "
+        "said otherwise; errors are 1 sigma. The paper is Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction "
+        "of a high resolution, portable and low-cost positioner by a star tracking system&rdquo;.</p></footer>"
     )
     body = "\n".join(parts)
     return (
@@ -83,20 +84,31 @@ def page(
     )
 
 
+def _simulated(night: Night) -> str:
+    return '<p class="bad">Simulated: no camera took these frames.</p>' if night.simulated else ""
+
+
 def _place(night: Night) -> str:
     """The answer of a night, or the reason why there is none."""
     if night.combined is None:
         return f'<p class="place bad">No position: {escape(night.why_not)}</p>'
     c = night.combined
-    east, north, heading = c.sigma
+    ground = c.on_ground(night.vertical)
     facing = "turned between the frames"
     if np.isfinite(c.heading):
         last = "last " if c.poses > 1 else ""
-        facing = f"{last}heading {np.degrees(c.heading):.4f} &plusmn; {np.degrees(heading):.4f}&deg;"
-    return (
-        f'<p class="place">{_degrees(c.latitude)}, {_degrees(c.longitude)} '
-        f"&plusmn; {north:.0f} m N {east:.0f} m E, {facing}</p>"
-    )
+        sigma_deg = np.degrees(np.sqrt(ground.covariance[2, 2]))
+        facing = f"{last}heading {np.degrees(ground.heading):.4f} &plusmn; {sigma_deg:.4f}&deg;"
+    where = f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)}"
+    link = f"geo:{np.degrees(ground.latitude):.6f},{np.degrees(ground.longitude):.6f}"
+    errors = _errors(ground.covariance)
+    return f'<p class="place"><a href="{link}">{where}</a> {errors} (WGS 84, as on maps), {facing}</p>'
+
+
+def _errors(covariance: np.ndarray) -> str:
+    """1 sigma of a place to north and east."""
+    east, north = np.sqrt(np.diag(covariance)[:2])
+    return f"&plusmn; {length_text(north)} N {length_text(east)} E"
 
 
 def _degrees(angle: float) -> str:
@@ -108,23 +120,21 @@ def _summary(night: Night) -> str:
     rows = []
     if night.combined:
         c = night.combined
+        ground = c.on_ground(night.vertical)
+        rows.append(("WGS 84", f"{_sexagesimal(ground.latitude, 'NS')}, {_sexagesimal(ground.longitude, 'EW')}, "
+                     f"{_errors(ground.covariance)}, the deflection of the vertical included"))  # fmt: skip
         rows.append(
             (
-                "Astronomic (by gravity)",
-                f"{_sexagesimal(c.latitude, 'NS')}, {_sexagesimal(c.longitude, 'EW')}",
+                "By the plumb line (astronomic)",
+                f"{_degrees(c.latitude)}, {_degrees(c.longitude)} {_errors(c.covariance)}",
             )
         )
-        ground = c.on_ground(night.vertical)
-        sigma = np.sqrt(np.diag(ground.covariance))
-        rows.append((
-            "Geodetic, WGS 84",
-            f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)} &plusmn; {sigma[1]:.0f} m N {sigma[0]:.0f} m E, "
-            "the deflection of the vertical included",
-        ))  # fmt: skip
         if np.isfinite(c.heading):
-            text = f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; astronomic"
+            text = f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; from astronomic north"
             last = f", of the last of {c.poses} poses" if c.poses > 1 else ""
-            rows.append(("Heading", f"{text}, {np.degrees(ground.heading):.4f}&deg; geodetic{last}"))
+            rows.append(
+                ("Heading", f"{text}, {np.degrees(ground.heading):.4f}&deg; from true north on WGS 84{last}")
+            )
         else:
             rows.append(("Heading", "none in common: the instrument turned between the frames"))
     if night.truth and night.combined:
@@ -203,9 +213,9 @@ def _table_of_nights(nights: Sequence[Night]) -> str:
     titles = (
         "",
         "Night",
-        "Latitude, longitude",
-        "1 sigma N, E",
-        "Error N, E",
+        "Latitude, longitude on WGS 84",
+        "1 sigma",
+        "Error N, E, astronomic",
         "Latitude, longitude",
         "Frames",
     )
@@ -213,9 +223,9 @@ def _table_of_nights(nights: Sequence[Night]) -> str:
     for number, n in enumerate(nights, 1):
         cells = ['<span class="bad">no position</span>', "", "", ""]
         if n.combined:
-            east, north, _ = n.combined.sigma
-            cells[0] = f"{_degrees(n.combined.latitude)}, {_degrees(n.combined.longitude)}"
-            cells[1] = f"{north:.0f} m, {east:.0f} m"
+            ground = n.combined.on_ground(n.vertical)
+            cells[0] = f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)}"
+            cells[1] = _errors(ground.covariance)
         if n.combined and n.truth:
             east, north = measures.offset_m(n.combined, n.truth.latitude, n.truth.longitude)
             cells[2] = f"{north:+.0f} m, {east:+.0f} m"
@@ -231,8 +241,8 @@ def _figures(pictures: Sequence[Picture]) -> str:
     if not pictures:
         return ""
     cards = "\n".join(
-        f'<figure><h3>{escape(p.title)}</h3><div><img alt="{escape(p.title)}" '
-        f'src="data:image/png;base64,{base64.b64encode(p.png).decode()}"></div>'
+        f'<figure><h3>{escape(p.title)}</h3><img alt="{escape(p.title)}" '
+        f'src="data:image/png;base64,{base64.b64encode(p.png).decode()}">'
         f"<figcaption>{escape(p.caption)}</figcaption></figure>"
         for p in pictures
     )

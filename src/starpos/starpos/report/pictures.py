@@ -12,7 +12,7 @@ from starpos.calibration import residual_map
 from starpos.errors import TimeError
 from starpos.report import frame_figures, measures, place_figures, sky_figure
 from starpos.report.night import Night
-from starpos.report.style import figures_of, new_figure, png_of
+from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
 
 if TYPE_CHECKING:
@@ -34,43 +34,66 @@ def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
     if night.fixed:
         yield from _place_pictures(night)
         if (over := frame_figures.overlaid(night)) is not None:
-            yield _residuals(*over)
+            yield _residuals(night, *over)
         # the time of a recorded solution may lie outside the tables of the Earth's rotation
         with suppress(TimeError):
             if sky_figure.views(night):
-                yield _drawn("sky", "Where the camera looked", _sky_caption(), 6.4,
+                yield _drawn(night.simulated, "sky", "Where the camera looked", _sky_caption(), 6.4,
                          lambda f: sky_figure.draw_sky(f, night, catalogue))  # fmt: skip
     if night.shots:
-        yield _drawn("health", "Frame by frame", HEALTH, 6.4, lambda f: frame_figures.draw_health(f, night))
+        yield _drawn(
+            night.simulated,
+            "health",
+            "Frame by frame",
+            HEALTH,
+            6.4,
+            lambda f: frame_figures.draw_health(f, night),
+        )
 
 
 def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
     """The errors of numbered nights whose truth is known, at least one."""
+    simulated = all(night.simulated for _, night in nights)
     return _drawn(
-        "nights", "Error of the nights", NIGHTS, 5.0, lambda f: place_figures.draw_nights(f, nights)
+        simulated,
+        "nights",
+        "Error of the nights",
+        NIGHTS,
+        5.0,
+        lambda f: place_figures.draw_nights(f, nights),
     )
 
 
 def _place_pictures(night: Night) -> Iterator[Picture]:
     if night.steady is not None:
         s = measures.steadiness(night, night.steady)
-        yield _drawn("stability", "Stability: one tilt for all frames", _stability_caption(s, STEADY), 6.8,
-                     lambda f: place_figures.draw_stability(f, s))  # fmt: skip
+        yield _drawn(night.simulated, "stability", "Stability: one tilt for all frames",
+                     _stability_caption(s, STEADY), 6.8, lambda f: place_figures.draw_stability(f, s))  # fmt: skip
     if len(night.fixed) > 1:
         each = measures.stability(night)
-        yield _drawn("frames", "Each frame with its own tilt", _stability_caption(each, EACH), 6.8,
+        yield _drawn(night.simulated, "frames", "Each frame with its own tilt", _stability_caption(each, EACH), 6.8,
                      lambda f: place_figures.draw_stability(f, each))  # fmt: skip
-    yield _drawn("scatter", "Scatter of the fixes", _scatter_caption(night), 6.4,
+    yield _drawn(night.simulated, "scatter", "Scatter of the fixes", _scatter_caption(night), 6.4,
                  lambda f: place_figures.draw_scatter(f, night))  # fmt: skip
     if night.places[0].terms:
-        yield _drawn("budget", "Error budget", BUDGET, 5.6, lambda f: place_figures.draw_budget(f, night))
+        yield _drawn(
+            night.simulated,
+            "budget",
+            "Error budget",
+            BUDGET,
+            5.6,
+            lambda f: place_figures.draw_budget(f, night),
+        )
 
 
 def _drawn(
-    name: str, title: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
+    simulated: bool, name: str, title: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
 ) -> Picture:
     figure = new_figure(height_in)
     draw(figure)
+    if simulated:
+        mark_simulated(figure)
+        caption = f"Simulated. {caption}"
     return Picture(name, title, caption, png_of(figure))
 
 
@@ -135,7 +158,7 @@ def _scatter_caption(night: Night) -> str:
     )
 
 
-def _residuals(xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -> Picture:
+def _residuals(night: Night, xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -> Picture:
     rms = figures_of(np.sqrt(np.mean(residual_px**2)))
     text = f"{len(xy)} stars, root mean square {rms} px an axis. {RESIDUALS}"
     height = 0.9 + 6.4 * min(size[1] / size[0], 1.6)
@@ -145,7 +168,7 @@ def _residuals(xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -
         figure.set_layout_engine("constrained", rect=(0, 0.06, 1, 0.94))
         residual_map.draw_residuals(figure.subplots(), xy, residual_px, *size)
 
-    return _drawn("residuals", "Residuals over the frame", text, height, draw)
+    return _drawn(night.simulated, "residuals", "Residuals over the frame", text, height, draw)
 
 
 def _sky_caption() -> str:

@@ -28,6 +28,11 @@ def new_figure(height_in: float) -> "Figure":
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
 
 
+def mark_simulated(figure: "Figure") -> None:
+    """Write into the corner of a figure that no camera took its frames."""
+    figure.text(0.995, 0.004, "simulated", ha="right", va="bottom", fontsize=8, color=GREY)
+
+
 def png_of(figure: "Figure") -> bytes:
     """The figure as PNG, with starpos named as the software that made it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -60,7 +60,7 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
         solved = _turned(exposures, shop, shop.turn_stddev_deg)
     shots: list[Shot] = []
     fixes: list[Fix] = []
-    remarks: list[str] = []
+    remarks = list(exposures.remarks)
     instrument: Instrument | None = None
     extrapolated_days = 0.0
     for done, item in enumerate(solved, 1):

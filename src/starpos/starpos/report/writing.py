@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes the files of a report: each whole or not at all, and never over a file that is no report's."""
 
+import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from starpos.errors import StarposError
@@ -9,11 +11,29 @@ from starpos.files import open_regular, write_whole
 
 # every file of a report has this mark in its first HEAD bytes
 MARK = b"starpos"
+PAGE = "index.html"
 HEAD = 400
 
 
 class WriteError(StarposError):
     """A report cannot be written."""
+
+
+def check(folder: Path) -> None:
+    """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
+    made: list[Path] = []
+    try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        _check_ours(folder / PAGE)
+    except (OSError, ValueError) as error:
+        raise _refused(folder, error) from None
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
 
 
 def write(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -24,12 +44,14 @@ def write(folder: Path, files: Mapping[str, bytes]) -> None:
             _check_ours(folder / name)
         for name, content in files.items():
             write_whole(folder / name, content)
-    # ValueError comes from a NUL in the name
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise WriteError(
-            f"{folder}: the report cannot be written there ({reason}): give another --out"
-        ) from None
+        raise _refused(folder, error) from None
+
+
+def _refused(folder: Path, error: Exception) -> WriteError:
+    """The error for a folder; a ValueError comes from a NUL in its name."""
+    reason = getattr(error, "strerror", None) or error
+    return WriteError(f"{folder}: the report cannot be written there ({reason}): give another --out")
 
 
 def _check_ours(path: Path) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes a simulated night: frames (FITS) or star lists (CSV), tilt.csv, and truth.json to compare a solution with."""
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import FrameError
+from starpos.files import read_regular
 from starpos.frames.frame import Frame
+from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
+from starpos.frames.reading import FITS
 from starpos.frames.star_list import write_star_list
 from starpos.progress import Progress, quiet
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, render
@@ -16,6 +20,7 @@ from starpos.sky.catalogue import Catalogue
 from starpos.utc import unix_of
 
 TILT_RATE_HZ = 10.0
+MOST_BYTES = 1 << 31
 
 
 def write_night(
@@ -30,27 +35,31 @@ def write_night(
     stars_only: bool,
     rng: np.random.Generator,
     progress: Progress = quiet,
+    pixel_um: float = 1.0,
 ) -> None:
     """Write `frames` exposures of a scene that turns by turn_deg of azimuth from one to the next.
 
-    Raises FrameError if the folder cannot be written.
+    pixel_um: with the focal length in px it makes the headers' focal length in mm.
+    A simulated night that is in the folder is replaced. Raises FrameError if the folder holds frames or tilts that were
+    not simulated, or cannot be written.
     """
     begin = unix_of(start_utc)
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        truth, tilts = [], []
+        _take_away_simulated(folder)
+        truth, tilts, names = [], [], []
         for k in range(frames):
             now = replace(scene, azimuth_deg=scene.azimuth_deg + k * turn_deg)
             start = begin + k * cadence_s
             stars = expose(now, catalogue, start, exposure_s, rng)
+            names.append(f"stars_{k:04d}.csv" if stars_only else f"frame_{k:04d}.fits")
             if stars_only:
                 listed = detected(now, stars, start + exposure_s / 2, exposure_s, rng)
-                write_star_list(folder / f"stars_{k:04d}.csv", listed, _text(start))
+                write_star_list(folder / names[-1], listed, _text(start))
             else:
-                write_fits(
-                    folder / f"frame_{k:04d}.fits", render(now, stars, start, exposure_s, rng), _text(start)
-                )
+                frame = render(now, stars, start, exposure_s, rng)
+                write_fits(folder / names[-1], frame, _text(start), pixel_um)
             samples = max(1, round(exposure_s * TILT_RATE_HZ))
             for j in range(samples):
                 moment = start + (j + 0.5) * exposure_s / samples
@@ -59,11 +68,44 @@ def write_night(
                           "heading_deg": float(np.degrees(now.heading)), "stars": len(stars.electrons)})  # fmt: skip
             progress("frames", (k + 1) / frames)
         rows = "".join("{:.6f},{:.7f},{:.7f},{:.2f}\n".format(*row) for row in tilts)
-        (folder / "tilt.csv").write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n" + rows)
+        (folder / TILTS).write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n" + rows)
         place = {"latitude_deg": scene.site.latitude_deg, "longitude_deg": scene.site.longitude_deg}
-        (folder / "truth.json").write_text(json.dumps(place | {"frames": truth}, indent=1))
+        made = {SIMULATED: {name: _digest(folder / name) for name in (*names, TILTS)}}
+        (folder / TRUTH).write_text(json.dumps(place | {"frames": truth} | made, indent=1))
     except OSError as e:
         raise FrameError(f"{folder}: the night cannot be written there ({e.strerror})") from None
+
+
+def _made(folder: Path) -> dict:
+    """The files that were simulated, each with its digest; none if nothing says so.  Raises OSError."""
+    try:
+        said = json.loads(read_regular(folder / TRUTH, MOST_BYTES))
+        return {Path(name).name: digest for name, digest in said[SIMULATED].items()}
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, FileNotFoundError):
+        return {}
+
+
+def _take_away_simulated(folder: Path) -> None:
+    """Remove the simulated night that a folder holds; FrameError if it holds files of a night that is none, or changed.
+
+    Raises OSError.
+    """
+    made = _made(folder)
+    there = {p.name for p in folder.iterdir() if p.suffix.lower() in (*FITS, ".csv") or p.name == TRUTH}
+    strange = [name for name in there - {TRUTH} if made.get(name) != _digest(folder / name)]
+    if not made and TRUTH in there:
+        strange.append(TRUTH)
+    if strange:
+        raise FrameError(
+            f"{folder / min(strange)}: it is there already, and starpos simulate has not made it as it is: "
+            "give another folder, or move it away"
+        )
+    for name in there:
+        (folder / name).unlink()
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(read_regular(path, MOST_BYTES)).hexdigest()
 
 
 def _text(unix_s: float) -> str:
@@ -74,16 +116,18 @@ def _text(unix_s: float) -> str:
     return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")
 
 
-def write_fits(path: Path | str, frame: Frame, start_utc: str) -> None:
+def write_fits(path: Path | str, frame: Frame, start_utc: str, pixel_um: float = 1.0) -> None:
     """Write a frame as FITS with DATE-OBS (start of exposure, UTC), EXPTIME and, if known, focal length and shutter."""
     from astropy.io import fits
 
     header = fits.Header()
     header["DATE-OBS"] = (start_utc, "start of exposure, UTC")
     header["EXPTIME"] = (frame.exposure_s, "s")
+    header["ORIGIN"] = ("starpos simulate", "no camera took this frame")
     if frame.focal_px is not None:
-        header["FOCALLEN"] = (frame.focal_px / 1000, "mm, at 1 um pixels")
-        header["XPIXSZ"] = (1.0, "um")
+        # so many digits make 29.67 of 29.669999999999998
+        header["FOCALLEN"] = (float(f"{frame.focal_px * pixel_um / 1000:.12g}"), "mm")
+        header["XPIXSZ"] = (pixel_um, "um")
     if frame.shutter is not None:
         header["ROLLSHUT"] = (frame.shutter.readout_s, "s from the row read first to the last")
     fits.PrimaryHDU(frame.pixels, header).writeto(path, overwrite=True)

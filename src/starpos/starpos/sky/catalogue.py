@@ -60,6 +60,9 @@ class Catalogue:
     hip: np.ndarray
     zone_start: np.ndarray
 
+    def __repr__(self) -> str:
+        return f"<{len(self)} stars of a catalogue>"
+
     def __len__(self) -> int:
         return len(self.ra_mas)
 

@@ -78,8 +78,10 @@ def test_with_a_roll_each_row_is_a_fix(tables, capsys):
 def test_a_table_for_people(tables, capsys):
     status, out, _ = run(capsys, "solve", *tables.pointings("whole.csv"), *tables.tilt, *AIR, *A3)
     assert status == 0 and "whole.csv:2: " in out and "16 frames together" in out and "stars" not in out
+    assert out.startswith("file: latitude and longitude")
     status, out, _ = run(capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *A3)
     assert status == 0 and "deg from the zenith" in out and "nan" not in out
+    assert out.startswith("row: how far from the zenith")
 
 
 def test_a3_by_turning_and_at_a_known_place(tables, capsys, tmp_path):
@@ -157,8 +159,7 @@ REFUSED = {
     "no tilts": (("WHOLE",), "give --tilt CSV"),
     "no such table": (("--pointings", "none.csv", "TILT"), "none.csv: no readable table"),
     "A3 from elevations": (("BARE", "TILT", "--self-calibrate"), "elevations alone do not tell A3"),
-    "near with a roll": (("WHOLE", "TILT", *A3, "--near", "1", "2"), "--near is for pointings without a roll"),
-    "near with frames": (("x.fits", "TILT", "--near", "1", "2"), "--near is for --pointings"),
+    "how near without where": (("WHOLE", "TILT", *A3, "--near-km", "20"), "--near-km is for --near"),
     "near nowhere": (("BARE", "TILT", "--near", "95", "2"), "give latitude and longitude in deg"),
     "processes": (("WHOLE", "TILT", "--jobs", "2"), "--jobs and --scheduler are for frames"),
 }  # fmt: skip

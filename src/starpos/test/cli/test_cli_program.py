@@ -2,14 +2,18 @@
 """The program around its commands: help, start-up, what it says where a file or its reader is missing."""
 
 import os
+import shlex
 import subprocess
 import sys
 
 import pytest
 from cli_calls import WIDE
 
-from starpos.cli import COMMANDS, common
+from starpos import cli
+from starpos.cli import common, jobs, parser_for
+from starpos.cli.commands import COMMANDS
 from starpos_testing.command_line import run
+from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
 
 
@@ -44,7 +48,10 @@ def test_help_and_version(capsys):
 
 @pytest.mark.parametrize(
     ("words", "slow"),
-    [(["--help"], ["astropy", "cv2", "scipy", "numpy", "yaml"]), (["solve", "--help"], ["astropy"])],
+    [
+        (["--help"], ["astropy", "cv2", "scipy", "numpy", "yaml", "argcomplete"]),
+        (["solve", "--help"], ["astropy"]),
+    ],
 )
 def test_help_imports_nothing_slow(words, slow):
     program = (
@@ -55,6 +62,16 @@ def test_help_imports_nothing_slow(words, slow):
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=WAIT_S
     )
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_missing_package_is_a_line_that_names_the_doctor(capsys, monkeypatch):
+    def lacking(name):
+        raise ModuleNotFoundError(f"No module named 'erfa' in {name}", name="erfa")
+
+    monkeypatch.setattr(cli, "import_module", lacking)
+    status, out, errors = run(capsys, "solve", "x.fits")
+    assert (status, out) == (2, "")
+    assert errors == ["starpos: the module erfa is not here: starpos doctor says what is missing"]
 
 
 def test_python_m_starpos(tmp_path):
@@ -119,3 +136,41 @@ def test_progress_is_told_where_no_terminal_is(capsys, monkeypatch):
     common.ProgressBar()("star triangles", 0.25)
     common.ProgressBar(terminal_only=True)("frame 1 of 4", 0.25)
     assert capsys.readouterr().err == "star triangles: 25 % done\n"
+
+
+def test_frames_of_a_turn_whose_lines_wait_are_counted_on_standard_error(capsys, monkeypatch):
+    monkeypatch.setattr(common, "LINE_EVERY_S", -1.0)
+    assert list(jobs.watched("ab", 2, silent=False)) == ["a", "b"]
+    assert capsys.readouterr().err == "frame 1 of 2: 50 % done\nframe 2 of 2: 100 % done\n"
+
+
+EXAMPLES = [(name, example) for name, command in COMMANDS.items() for example in command.examples]
+
+
+@pytest.mark.parametrize(("name", "example"), EXAMPLES)
+def test_every_example_in_help_is_a_call_that_is_understood(name, example, capsys):
+    for call in example.partition(" > ")[0].split(" && "):
+        program, *words = shlex.split(call)
+        # of --help the parser itself makes the end
+        if program and "--help" not in words:
+            assert program == "starpos" and words[0] in COMMANDS
+            assert parser_for(words).parse_args(words).run
+    _, out, _ = run(capsys, name, "--help")
+    assert f"  {example}\n" in out and COMMANDS[name].next_step in out
+
+
+@pytest.mark.parametrize(
+    ("line", "completed"),
+    [("starpos so", "solve "), ("starpos solve --lens e", "equidistant ")],
+)
+def test_the_tab_key_completes_commands_and_options(line, completed, tmp_path):
+    require("argcomplete")
+    told = tmp_path / "told"
+    asked = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n"}
+    subprocess.run(
+        [sys.executable, "-m", "starpos"],
+        env={**os.environ, **asked, "_ARGCOMPLETE_STDOUT_FILENAME": str(told)},
+        timeout=WAIT_S,
+        check=False,
+    )
+    assert completed in told.read_text().split("\n")

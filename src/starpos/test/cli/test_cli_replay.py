@@ -57,7 +57,7 @@ def test_a_night_is_told_as_solve_tells_one(capsys, told):
         north_m = (frame["latitude"] - truth["latitude_deg"]) * 111_000
         assert abs(north_m) < 4 * frame["sigma_north_m"]
     status, lines, _ = run(capsys, NIGHT, *told)
-    assert status == 0 and "10 frames together" in lines[10]
+    assert status == 0 and "10 frames together" in lines[11]
 
 
 OF_TWO = """

@@ -84,9 +84,26 @@ def test_the_page_says_what_solve_says(still, tmp_path, capsys):
 
 def test_the_page_needs_nothing_else(drawn):
     page = Page(drawn / "index.html")
-    assert page.references and all(r.startswith(("data:image/png;base64,", "#")) for r in page.references)
+    assert page.references and all(
+        r.startswith(("data:image/png;base64,", "#", "geo:")) for r in page.references
+    )
     assert not page.tags & {"script", "link", "iframe", "object", "form"}
     assert not re.search(r"https?:|url\(|@import", page.source)
+
+
+def test_the_place_on_maps_comes_first_and_a_simulated_night_is_called_that(drawn, still, tmp_path):
+    page = Page(drawn / "index.html")
+    assert page.text.index("(WGS 84, as on maps)") < page.text.index("By the plumb line (astronomic)")
+    (link,) = [r for r in page.references if r.startswith("geo:")]
+    assert abs(float(link[4:].split(",")[0]) - PLACE["latitude"]) < 0.1
+    assert "Simulated: no camera took these frames." in page.text
+    assert page.text.count("Simulated. ") == len(page.pictures) == 7
+    truth = json.loads((still / "truth.json").read_text())
+    assert folder.truth_in(still).simulated
+    (tmp_path / "truth.json").write_text(
+        json.dumps({k: v for k, v in truth.items() if k != "simulated_files"})
+    )
+    assert not folder.truth_in(tmp_path).simulated
 
 
 def test_pictures_are_drawn_and_lie_beside_the_page(drawn):
@@ -155,7 +172,7 @@ def test_names_from_files_are_text_only(still, tmp_path, capsys):
     assert status == 0
     assert not page.tags & {"b", "i", "u", "em"}
     assert '<img src=x onerror="alert(1)"> & <b>' in page.text and "stars_<i>&quot;.csv" in page.text
-    assert all(r.startswith("data:image/png") for r in page.references)
+    assert all(r.startswith(("data:image/png", "geo:")) for r in page.references)
 
 
 def test_without_tilts_the_page_says_so_and_there_is_no_fix(still, tmp_path, capsys):

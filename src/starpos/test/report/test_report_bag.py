@@ -58,9 +58,10 @@ def report(capsys, bag, out, *more):
 
 
 def place(want):
+    east, north, turn = np.sqrt(np.diag(want["covariance_geodetic"]))
     return (
-        f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}° ± {want['sigma_north_m']:.0f} m N "
-        f"{want['sigma_east_m']:.0f} m E, heading {want['heading']:.4f} ± {want['sigma_heading_deg']:.4f}°"
+        f"{want['latitude_geodetic']:+.6f}°, {want['longitude_geodetic']:+.6f}° ± {north:.0f} m N {east:.0f} m E "
+        f"(WGS 84, as on maps), heading {want['heading']:.4f} ± {turn:.4f}°"
     )
 
 
@@ -141,7 +142,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
     assert status == 0
     latitude, longitude = (np.mean([one[k] for one in said]) for k in ("latitude", "longitude"))
     assert f"{latitude:+.6f}°, {longitude:+.6f}° ± " in page.text
-    assert f"heading {np.mean([one['heading'] for one in said]):.4f} ±" in page.text
+    assert f"{np.mean([one['heading'] for one in said]):.4f} ± " in page.text
     ground = [np.mean([one[f"{k}_geodetic"] for one in said]) for k in ("latitude", "longitude")]
     assert "{:+.6f}°, {:+.6f}° ±".format(*ground) in page.text
     assert "as the solver recorded it" in page.text and "none of the sky fits <its> stars" in page.text

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of `starpos`: what each does, examples of it, and what may come next."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command for --help; `text` begins with a small letter and has no full stop."""
+
+    text: str
+    examples: tuple[str, ...]
+    next_step: str
+
+    @property
+    def epilog(self) -> str:
+        """The end of its --help."""
+        examples = "".join(f"  {example}\n" for example in self.examples)
+        return f"examples:\n{examples}\nnext: {self.next_step}"
+
+
+COMMANDS = {
+    "solve": Command(
+        "position and heading of frames with their tilts",
+        (
+            "starpos simulate night && starpos solve night --misalignment 0 0 0 --misalignment-stddev 5",
+            "starpos solve *.fits --tilt tilt.csv --focal-mm 600 --pixel-um 6.4 --self-calibrate --save mine.yaml",
+            "starpos solve *.fits --tilt tilt.csv --instrument mine.yaml --near 35.7 51.4 --csv > places.csv",
+        ),
+        "starpos report draws the same night; starpos calibrate and --self-calibrate tell A3",
+    ),
+    "navigate": Command(
+        "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
+        (
+            "starpos navigate *.csv --imu imu.csv --focal-mm 16 --pixel-um 3.45",
+            "starpos navigate *.fits --imu imu.csv --velocity wheels.csv --instrument mine.yaml --json",
+        ),
+        "starpos solve, for an instrument that stands still",
+    ),
+    "detect": Command(
+        "the stars of frames",
+        (
+            "starpos detect frame.fits",
+            "starpos detect *.fits --csv > stars.csv",
+        ),
+        "starpos identify tells which stars they are",
+    ),
+    "identify": Command(
+        "where frames look, lost in space",
+        (
+            "starpos identify photo.jpg",
+            "starpos identify *.fits --focal-mm 600 --pixel-um 6.4 --jobs auto --csv > pointings.csv",
+        ),
+        "starpos solve makes a place of frames with their tilts and times",
+    ),
+    "replay": Command(
+        "recorded nights (rosbag2) by the solver's own code: the same fixes as in the running graph",
+        (
+            "starpos replay recorded_night",
+            "starpos replay nights/* --params-file mine.yaml --jobs auto --json",
+        ),
+        "starpos report draws the same bags",
+    ),
+    "calibrate": Command(
+        "A3 at a known place, or the camera, from identified stars",
+        (
+            "starpos calibrate *.fits --tilt tilt.csv --focal-mm 600 --pixel-um 6.4 --site 35.70 51.41 --output a3.yaml",
+            "starpos calibrate *.fits --focal-mm 600 --pixel-um 6.4 --camera camera.yaml",
+        ),
+        "starpos solve --instrument with the file that was written",
+    ),
+    "report": Command(
+        "nights on one page: stability, scatter, residuals, sky, error budget",
+        ("starpos report night --misalignment 0 0 0 --misalignment-stddev 5 -o my-report",),
+        "open the index.html whose path it prints",
+    ),
+    "simulate": Command(
+        "write a night of frames and tilts from a place you choose",
+        (
+            "starpos simulate night",
+            "starpos simulate turned -n 8 --turn 45 --stars-only --misalignment 1 -2 100 --latitude 47.3 --longitude 8.5",
+        ),
+        "starpos solve FOLDER, starpos report FOLDER; truth.json says what is true",
+    ),
+    "catalogue": Command(
+        "build the star catalogue, or say what it and its triangles hold",
+        (
+            "starpos catalogue info",
+            "starpos catalogue deepen tycho2_2.orig.tar.xz",
+        ),
+        "starpos identify and starpos solve take the catalogue by themselves",
+    ),
+    "montecarlo": Command(
+        "identify random fields and work random nights, and count: the paper's tables",
+        ("starpos montecarlo --fields 100", "starpos montecarlo nights --help"),
+        "docs/the_paper.md compares the tables with the paper's",
+    ),
+    "doctor": Command(
+        "what this machine has of what starpos needs, what is missing, and what to type",
+        (
+            "starpos doctor",
+            "starpos doctor --live --json",
+        ),
+        "starpos simulate night, and starpos solve night",
+    ),
+}

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos doctor`: what this machine has of what starpos needs, what is missing, and what to type.
+
+Nothing that may be missing is imported but inside the check of it.
+"""
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+
+from starpos import __version__
+from starpos.errors import StarposError, one_line
+from starpos.units import DAY_S
+
+SOMETHING_MISSING = 1
+# modules that everything needs, with the names of their packages
+NEEDED = {"numpy": "numpy", "scipy": "scipy", "erfa": "pyerfa", "astropy": "astropy", "astropy_iers_data":
+          "astropy-iers-data", "cv2": "opencv-python-headless", "yaml": "PyYAML"}  # fmt: skip
+# modules that some work needs: their packages, and which work
+OPTIONAL = {
+    "matplotlib": ("matplotlib", "starpos report, calibrate --map"),
+    "rosbags": ("rosbags", "recorded nights: report, replay"),
+    "rawpy": ("rawpy", "raw files of cameras"),
+    "exifread": ("exifread", "times of raw and HEIF files"),
+    "pillow_heif": ("pillow-heif", "HEIF pictures of phones"),
+    "distributed": ("distributed", "--scheduler"),
+    "argcomplete": ("argcomplete", "completion of commands and options by the Tab key"),
+}
+# OpenCV is one package of several
+CV2 = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
+SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
+# interface class of a photo camera, in USB's list
+STILL_IMAGE = "06"
+
+
+class State(str, Enum):
+    """What a check found."""
+
+    OK = "ok"
+    NOTE = "note"
+    MISSING = "MISSING"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found: a sentence, and what to type if something is to be done."""
+
+    state: State
+    found: str
+    cure: str = ""
+
+
+def define(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="for an instrument that runs here: a clock that nothing keeps to UTC, no serial port and no camera are "
+        "missing too, and not only noted",
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object a check instead of lines")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    missing = False
+    for name, check in CHECKS.items():
+        finding = _safely(check)
+        if args.live and name in LIVE and finding.state is State.NOTE:
+            finding = replace(finding, state=State.MISSING)
+        missing |= finding.state is State.MISSING
+        said = json.dumps({"check": name} | asdict(finding)) if args.json else _lines(name, finding)
+        print(said, flush=True)
+    return SOMETHING_MISSING if missing else 0
+
+
+def _lines(name: str, finding: Finding) -> str:
+    cure = f"\n{'':26}-> {finding.cure}" if finding.cure else ""
+    return f"{finding.state.value:<8}{name:<16}  {finding.found}{cure}"
+
+
+def _safely(check: Callable[[], Finding]) -> Finding:
+    """The finding of a check; one that cannot be made for want of a package, or of a right, says so."""
+    try:
+        return check()
+    except ImportError as error:
+        return Finding(
+            State.MISSING, f"cannot be told: {one_line(error)}", "see the packages that are missing"
+        )
+    except (StarposError, OSError) as error:
+        return Finding(State.MISSING, one_line(error))
+
+
+def versions() -> Finding:
+    """The versions of starpos, Python and the system."""
+    system = f"{platform.system()} {platform.machine()}"
+    return Finding(
+        State.OK,
+        f"{__version__} in {Path(__file__).parents[1]}, Python {platform.python_version()}, {system}",
+    )
+
+
+def packages() -> Finding:
+    """The packages that everything needs, and their versions."""
+    lacking = [package for module, package in NEEDED.items() if find_spec(module) is None]
+    if lacking:
+        return Finding(State.MISSING, f"not here: {', '.join(lacking)}", f"pip install {' '.join(lacking)}")
+    return Finding(State.OK, ", ".join(f"{p} {_version(p)}" for p in NEEDED.values()))
+
+
+def _version(package: str) -> str:
+    for name in CV2 if package in CV2 else (package,):
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            continue
+    return "(version not told)"
+
+
+def core() -> Finding:
+    """The compiled loops."""
+    if find_spec("starpos.core.frame") is None:
+        return Finding(
+            State.MISSING,
+            "starpos.core is not compiled",
+            "pip install ./src/starpos, or make build in a clone (a C compiler is needed)",
+        )
+    return Finding(State.OK, "starpos.core is compiled")
+
+
+def optional() -> Finding:
+    """The packages that some work needs."""
+    lacking = {package: use for module, (package, use) in OPTIONAL.items() if find_spec(module) is None}
+    if not lacking:
+        return Finding(State.OK, "all optional packages are here")
+    uses = "; ".join(f"{package} ({use})" for package, use in lacking.items())
+    return Finding(State.NOTE, f"not here: {uses}", f"pip install {' '.join(lacking)}")
+
+
+def star_catalogue() -> Finding:
+    """The catalogue of stars in use, and the deeper one."""
+    from starpos.sky import catalogue, deeper
+
+    stars = catalogue.load_catalogue()
+    where = os.environ.get("STARPOS_CATALOGUE") or "the one that comes with starpos"
+    found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
+    if deeper.kept() is None:
+        found += "; none deeper, which fields under about 1 deg want (starpos catalogue deepen --help)"
+    return Finding(State.OK, found)
+
+
+def cache() -> Finding:
+    """The folder where tables are kept that are built once."""
+    from starpos.table_cache import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        return Finding(
+            State.MISSING,
+            f"{folder}: cannot be written ({error.strerror}): each start sorts the sky again",
+            "export XDG_CACHE_HOME=FOLDER",
+        )
+    megabytes = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e6
+    kept = (
+        f"{megabytes:.0f} MB kept"
+        if megabytes >= 1
+        else "empty: the first frame of a camera takes some seconds"
+    )
+    return Finding(State.OK, f"{folder}, {kept}")
+
+
+def earth_rotation() -> Finding:
+    """The age of the IERS table against now."""
+    from starpos.earth import orientation
+    from starpos.utc import utc_text
+
+    now = time.time()
+    until = orientation.measured_until()
+    beyond = orientation.earth_orientation(now).extrapolated_days
+    found = f"IERS table, measured until {utc_text(until)[:10]}, {(now - until) / DAY_S:.0f} days ago"
+    if beyond <= 0:
+        return Finding(State.OK, found)
+    sigma_m = orientation.earth_orientation(now).ut1_sigma_s * orientation.EQUATOR_M_PER_S
+    return Finding(
+        State.NOTE,
+        f"{found}: its predictions ended {beyond:.0f} days ago, an error of {sigma_m:.0f} m east at the equator",
+        "pip install --upgrade astropy-iers-data",
+    )
+
+
+def clock() -> Finding:
+    """What the kernel says of this machine's clock."""
+    from starpos.session import system_clock
+
+    state = system_clock.read()
+    if state is None:
+        return Finding(State.NOTE, "the system does not tell whether it is kept to UTC")
+    if state.synchronised:
+        return Finding(State.OK, f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator")
+    return Finding(
+        State.NOTE,
+        "nothing keeps it to UTC: frames that are stamped here tell no longitude; recorded ones are not concerned",
+        "sudo apt-get install chrony   # or: sudo timedatectl set-ntp true",
+    )
+
+
+def serial_ports(root: Path = Path("/")) -> Finding:
+    """Serial ports, for an inclinometer."""
+    found = {os.path.realpath(path): path for pattern in reversed(SERIAL) for path in root.glob(pattern)}
+    if not found:
+        return Finding(State.NOTE, "none: no inclinometer is plugged in")
+    return _devices([str(path) for path in found.values()], "dialout")
+
+
+def cameras(root: Path = Path("/")) -> Finding:
+    """Video devices, and photo cameras on USB."""
+    videos = sorted(root.glob("dev/video*"))
+    photo = sorted(
+        _text(interface.parents[1] / "product") or interface.parents[1].name
+        for interface in root.glob("sys/bus/usb/devices/*/*/bInterfaceClass")
+        if _text(interface) == STILL_IMAGE
+    )
+    if not videos and not photo:
+        return Finding(
+            State.NOTE,
+            "no video device and no photo camera on USB; a camera on the network is not looked for",
+        )
+    names = [f"{v} ({_text(root / 'sys/class/video4linux' / v.name / 'name') or 'no name'})" for v in videos]
+    finding = _devices([str(v) for v in videos], "video", [*names, *(f"{p} (photo, USB)" for p in photo)])
+    if photo and find_spec("gphoto2") is None and finding.state is State.OK:
+        return Finding(State.NOTE, f"{finding.found}; photo cameras need gphoto2", "pip install gphoto2")
+    return finding
+
+
+def _devices(paths: list[str], group: str, names: list[str] | None = None) -> Finding:
+    """Devices, and whether this user may open them."""
+    barred = [path for path in paths if not os.access(path, os.R_OK | os.W_OK)]
+    found = ", ".join(names or paths)
+    if not barred:
+        return Finding(State.OK, found)
+    return Finding(
+        State.NOTE,
+        f"{found}; this user may not open {', '.join(barred)}",
+        f"sudo usermod -aG {group} $USER   # and log in again",
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def ros() -> Finding:
+    """ROS 2 and the packages of the nodes."""
+    distribution = os.environ.get("ROS_DISTRO", "")
+    if find_spec("rclpy") is None:
+        return Finding(State.NOTE, "not in this shell; the command line does not need it")
+    nodes = [name for name in ("starpos_camera", "starpos_inclinometer", "starpos_solver") if find_spec(name)]
+    if len(nodes) == 3:
+        return Finding(State.OK, f"{distribution or 'rclpy'}, and the nodes of starpos")
+    return Finding(
+        State.NOTE,
+        f"{distribution or 'rclpy'}, but the nodes of starpos are not in this shell",
+        ". install/setup.bash   # in the workspace that was built",
+    )
+
+
+CHECKS: dict[str, Callable[[], Finding]] = {
+    "starpos": versions,
+    "packages": packages,
+    "compiled core": core,
+    "optional": optional,
+    "star catalogue": star_catalogue,
+    "cache": cache,
+    "Earth rotation": earth_rotation,
+    "clock": clock,
+    "serial ports": serial_ports,
+    "cameras": cameras,
+    "ROS 2": ros,
+}
+# what only an instrument that runs here needs
+LIVE = ("clock", "serial ports", "cameras")

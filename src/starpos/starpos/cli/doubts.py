@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Doubts about an answer: tilts with their columns exchanged or in radians, a place that is far from --near.
+
+They are told, and change no answer.
+"""
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.averaging.average import Average
+from starpos.cli import common
+from starpos.cli.frame_work import tilts
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
+from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.errors import InstrumentError
+from starpos.fix.budget import place_of
+from starpos.fix.fix import Fix
+from starpos.fix.readable import length_text
+from starpos.instrument.inclinometer import Tilt, level_of, up_of
+from starpos.instrument.mounting import Mounting
+from starpos.instrument.tilt_doubt import like_radians
+from starpos.instrument.tilt_log import TiltLog
+from starpos.units import HOUR_S
+
+NEAR_KM = 50.0
+# a place is far if it lies so many sigma further than that
+FAR_SIGMA = 4.0
+# Frames of one place whose tilts are mistaken lie so far apart, and so many times nearer if they are not.
+APART_M, NEARER = 20_000.0, 20.0
+# clocks that are not on UTC are mostly wrong by a multiple of this
+ZONE_H = 0.5
+
+# what may be wrong with tilts, and the angles (N, 2) in rad that it makes of those that were read
+MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+    ("theta_x and theta_y exchanged", lambda theta: theta[:, ::-1]),
+    ("the other sign of theta_x", lambda theta: theta * [-1, 1]),
+    ("the other sign of theta_y", lambda theta: theta * [1, -1]),
+    ("the other sign of both tilts", lambda theta: -theta),
+    ("tilts that were radians", np.degrees),
+)
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """A frame's attitude by its stars, camera_to_itrs (3, 3), and its tilt."""
+
+    camera_to_itrs: np.ndarray
+    tilt: Tilt
+
+
+@dataclass(frozen=True)
+class Near:
+    """A place, in rad, at which the instrument is said to be within some km."""
+
+    latitude: float
+    longitude: float
+    km: float = NEAR_KM
+
+    def km_from(self, latitude: float, longitude: float) -> float:
+        """Distance in km, on a sphere, to a place in rad."""
+        return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
+
+
+def checked_tilts(command: str, path: str, noise_rad: float) -> TiltLog:
+    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
+    log = tilts(path, noise_rad)
+    if doubt := like_radians(log):
+        common.complain(command, f"{path}: {doubt}")
+    return log
+
+
+def add_near(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `near_of` reads."""
+    parser.add_argument(
+        "--near",
+        type=float,
+        nargs=2,
+        metavar=("LAT", "LON"),
+        help="roughly where the instrument is, deg: a fix that is far from there is told, with what may be wrong, and "
+        "never changed; of pointings without a roll it says which of two places it is, where their elevations leave two",
+    )
+    parser.add_argument(
+        "--near-km",
+        type=float,
+        metavar="KM",
+        help=f"how near that is ({NEAR_KM:g}; 4 sigma of the fix are added)",
+    )
+
+
+def near_of(args: argparse.Namespace) -> Near | None:
+    """The place of --near; None without it.  Raises InstrumentError."""
+    if args.near is None:
+        if args.near_km is not None:
+            raise InstrumentError("--near-km is for --near: give both")
+        return None
+    latitude, longitude = args.near
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
+        raise InstrumentError(f"--near {latitude:g} {longitude:g}: give latitude and longitude in deg")
+    km = NEAR_KM if args.near_km is None else args.near_km
+    if not 0 < km <= 20_000:
+        raise InstrumentError(f"--near-km {km:g}: give a distance above 0 and at most 20000")
+    return Near(math.radians(latitude), math.radians(longitude), km)
+
+
+def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Distance in m on a sphere of two places (latitude, longitude) in rad."""
+    up, other = zenith_of(*a), zenith_of(*b)
+    return EARTH_RADIUS_M * float(np.arctan2(np.linalg.norm(np.cross(up, other)), up @ other))
+
+
+def far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
+    """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not.
+
+    mounting: of the frames, None where A3 was not given, and tells nothing.
+    """
+    km = near.km_from(fix.latitude, fix.longitude)
+    sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
+    if km <= near.km + FAR_SIGMA * sigma_m / 1000:
+        return ""
+    told = f"the place is {km:.0f} km from that of --near, and should be within {near.km:g} km"
+    for name, places in _places(mounting, frames):
+        off = [near.km_from(*place) for place in places]
+        if max(off) <= near.km:
+            return f"{told}: with {name} it would be {max(off):.0f} km from there: check the tilts"
+    if ahead_h := _hours_ahead(near, fix):
+        side = "ahead of" if ahead_h > 0 else "behind"
+        return f"{told}: its times may be {abs(ahead_h):g} h {side} UTC: check the clock of the camera"
+    return f"{told}: check the times (UTC), the tilts and A3"
+
+
+def _hours_ahead(near: Near, fix: Fix | Average) -> float:
+    """By how many hours wrong times explain a place, ahead of UTC; 0 if none do."""
+    east = (fix.longitude - near.longitude + np.pi) % (2 * np.pi) - np.pi
+    hours = round(-east / ROTATION_RAD_S / HOUR_S / ZONE_H) * ZONE_H
+    turned = fix.longitude + hours * HOUR_S * ROTATION_RAD_S
+    return hours if near.km_from(fix.latitude, turned) <= near.km else 0.0
+
+
+def mistaken(mounting: Mounting, frames: Sequence[Levelled]) -> str:
+    """Say which mistake has set the places of frames far apart; '' if none explains it.
+
+    One heading alone never tells: the same mistake then moves all places alike.
+    """
+    spread_m = _spread_m([_place(f, f.tilt.theta, mounting) for f in frames])
+    if spread_m < APART_M:
+        return ""
+    for name, places in _places(mounting, frames):
+        if (left_m := _spread_m(places)) < spread_m / NEARER:
+            return (
+                f"the frames' places lie {length_text(spread_m)} apart, and with {name} {length_text(left_m)}: "
+                "check the table of tilts"
+            )
+    return ""
+
+
+def _places(
+    mounting: Mounting | None, frames: Sequence[Levelled]
+) -> list[tuple[str, list[tuple[float, float]]]]:
+    """The places of frames with two-axis tilts, by mistake."""
+    if mounting is None or not frames or any(f.tilt.axes != 2 for f in frames):
+        return []
+    theta = np.array([f.tilt.theta for f in frames])
+    found = []
+    for name, corrected in MISTAKES:
+        angles = corrected(theta)
+        if np.abs(angles).max() < np.pi / 2:
+            found.append((name, [_place(f, one, mounting) for f, one in zip(frames, angles, strict=True)]))
+    return found
+
+
+def _place(frame: Levelled, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
+    """Latitude, longitude (rad) of a frame with a tilt, but for refraction."""
+    place = place_of(level_of(up_of(theta)) @ mounting.a3 @ frame.camera_to_itrs.T)
+    return place.latitude, place.longitude
+
+
+def _spread_m(places: Sequence[tuple[float, float]]) -> float:
+    return max((apart_m(places[0], place) for place in places), default=0.0)

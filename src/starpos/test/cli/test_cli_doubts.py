@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a newcomer gets wrong, and the sentence that says so: tilts, times, what a shell's *.csv takes in; tables."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from cli_calls import KNOWN, PLACE, WIDE, objects, solve
+
+from starpos import open_night
+from starpos.fix.readable import length_text
+from starpos_testing.command_line import run
+
+NEAR = ("--near", PLACE["latitude"] - 0.2, PLACE["longitude"] + 0.2)
+ELSEWHERE = ("--near", PLACE["latitude"], PLACE["longitude"] - 90)
+
+
+def rewritten(path, folder, of_row):
+    """A table of tilts whose angles are of_row(x, y)."""
+    head, *rows = path.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    changed = [[t, *map(repr, of_row(float(x), float(y))), *rest] for t, x, y, *rest in cells]
+    (folder / "tilt.csv").write_text("\n".join([head, *(",".join(row) for row in changed)]) + "\n")
+    return folder / "tilt.csv"
+
+
+def one(capsys, lists, tilt, *more):
+    """The last JSON object and the complaints of a frame solved with other tilts."""
+    status, out, errors = run(
+        capsys, "solve", lists / "stars_0000.csv", "--tilt", tilt, *KNOWN, *more, "--json"
+    )
+    assert status == 0
+    return objects(out)[-1], errors
+
+
+def test_a_fix_near_the_stated_place_is_told_its_distance_and_one_that_is_far_is_the_same(lists, capsys):
+    near, errors = one(capsys, lists, lists / "tilt.csv", *NEAR)
+    assert errors == [] and 20 < near["km_from_near"] < 35
+    far, errors = one(capsys, lists, lists / "tilt.csv", *NEAR, "--near-km", "10")
+    assert "and should be within 10 km" in errors[0] and len(errors) == 1
+    assert far == near
+    away, errors = one(capsys, lists, lists / "tilt.csv", *ELSEWHERE)
+    assert away["latitude"] == near["latitude"] and "its times may be 6 h behind UTC" in errors[0]
+
+
+MISTAKES = {
+    "theta_x and theta_y exchanged": lambda x, y: (y, x),
+    "the other sign of theta_x": lambda x, y: (-x, y),
+    "tilts that were radians": lambda x, y: tuple(np.radians([x, y]).tolist()),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_the_mistake_that_sets_a_place_far_from_near_is_named(mistake, lists, tmp_path, capsys):
+    tilt = rewritten(lists / "tilt.csv", tmp_path, MISTAKES[mistake])
+    answer, errors = one(capsys, lists, tilt, *NEAR)
+    assert answer["km_from_near"] > 500
+    assert f"with {mistake} it would be 27 km from there" in errors[-1]
+
+
+def test_columns_exchanged_show_by_themselves_where_the_camera_is_turned(lists, tmp_path, capsys):
+    tilt = rewritten(lists / "tilt.csv", tmp_path, MISTAKES["theta_x and theta_y exchanged"])
+    frames = sorted(lists.glob("stars_*.csv"))
+    _, _, errors = run(capsys, "solve", *frames, "--tilt", tilt, *KNOWN)
+    assert any("km apart, and with theta_x and theta_y exchanged" in line for line in errors), errors
+
+
+def test_tilts_that_look_like_radians_are_told(night, tmp_path, capsys):
+    rewritten(night / "tilt.csv", tmp_path, MISTAKES["tilts that were radians"])
+    shutil.copy(night / "frame_0000.fits", tmp_path)
+    _, _, errors = run(capsys, "solve", tmp_path, *KNOWN)
+    (line,) = errors
+    assert "the tilts look like radians" in line and "write them in deg" in line
+    assert any("look like radians" in remark for remark in open_night(tmp_path).solve().remarks)
+
+
+def test_what_a_glob_takes_in_beside_the_frames_is_left_out(lists, tmp_path, capsys):
+    for path in lists.iterdir():
+        shutil.copy(path, tmp_path)
+    status, out, errors = run(
+        capsys, "solve", *sorted(tmp_path.iterdir()), "--tilt", tmp_path / "tilt.csv", *KNOWN, "--json"
+    )
+    assert (status, errors) == (0, []) and len(objects(out)) == 4
+
+
+def test_a_simulated_night_never_replaces_files_that_were_not_simulated(tmp_path, capsys):
+    make = ("simulate", tmp_path, "-n", "2", "--size", "64", "48", "--altitude", "80")
+    assert run(capsys, *make)[0] == 0
+    assert run(capsys, *make[:3], "1", *make[4:])[0] == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["frame_0000.fits", "tilt.csv", "truth.json"]
+    with open(tmp_path / "tilt.csv", "a") as tilt:
+        tilt.write("1793642400.75,0.1,0.2,15\n")
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    status, _, errors = run(capsys, *make)
+    assert status == 2 and "tilt.csv: it is there already" in errors[0]
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+    for name in ("tilt.csv", "my_frame.fits", "truth.json"):
+        folder = tmp_path / f"real-{name}"
+        folder.mkdir()
+        (folder / name).write_text("{}")
+        status, _, errors = run(capsys, "simulate", folder, *make[2:])
+        assert status == 2 and f"{name}: it is there already" in errors[0]
+        assert [p.name for p in folder.iterdir()] == [name]
+
+
+def test_simulated_frames_state_the_focal_length_and_the_pixels_that_were_asked_for(night):
+    header = fits.getheader(night / "frame_0000.fits")
+    assert (header["FOCALLEN"], header["XPIXSZ"], header["ORIGIN"]) == (29.67, 6.4, "starpos simulate")
+
+
+def test_a_report_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    status, _, errors = run(capsys, "report", tmp_path / "no night", "-o", tmp_path / "file" / "report")
+    assert status == 2 and "the report cannot be written there (Not a directory)" in errors[0]
+    status, _, errors = run(capsys, "report", tmp_path / "no night", "-o", tmp_path / "new" / "report")
+    assert "there is no such night" in errors[0] and not (tmp_path / "new").exists()
+
+
+def test_a_csv_has_the_values_of_json(lists, capsys):
+    _, out, _ = solve(capsys, lists, *KNOWN, "--json", frames="stars_*.csv")
+    expected = objects(out)
+    _, out, errors = solve(capsys, lists, *KNOWN, "--csv", frames="stars_*.csv")
+    rows = list(csv.DictReader(out.splitlines()))
+    assert errors == [] and len(rows) == len(expected) == 4
+    for row, value in zip(rows, expected, strict=True):
+        for key in ("latitude", "longitude", "sigma_east_m", "heading"):
+            assert float(row[key]) == value[key]
+        assert row["status"] == "ok" and row["file"] == value.get("file", "")
+    assert [row["combined"] for row in rows] == ["", "", "", "True"]
+    status, _, errors = solve(capsys, lists, *KNOWN, "--csv", "--json", frames="stars_*.csv")
+    assert status == 2 and "not allowed with" in errors[0]
+
+
+def test_csv_of_identify_and_detect(lists, capsys):
+    frame = lists / "stars_0000.csv"
+    _, out, _ = run(capsys, "identify", frame, *WIDE, "--csv")
+    (row,) = csv.DictReader(out.splitlines())
+    assert row["file"] == str(frame) and float(row["focal_px"]) == pytest.approx(4636, rel=3e-3)
+    _, out, _ = run(capsys, "detect", frame, "--csv")
+    stars = list(csv.DictReader(out.splitlines()))
+    _, out, _ = run(capsys, "detect", frame, "--json")
+    assert [float(s["x"]) for s in stars] == [s[0] for s in json.loads(out)["stars"]]
+
+
+def test_a_table_says_first_what_follows_and_wide_places_are_km_wide(lists, capsys):
+    _, out, _ = solve(capsys, lists, *WIDE, frames="stars_0000.csv")
+    head, frame, *_ = out.splitlines()
+    assert head.startswith("file: latitude and longitude (deg, astronomic") and "1 sigma" in head
+    assert " km N " in frame and " m N " not in frame
+    assert [length_text(x) for x in (0.4, 9999, 1.1e6)] == ["0 m", "9999 m", "1100 km"]

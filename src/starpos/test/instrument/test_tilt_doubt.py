@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of tilts that look like radians, and those that do not."""
+
+import numpy as np
+import pytest
+
+from starpos.instrument.tilt_doubt import like_radians
+from starpos.instrument.tilt_log import TiltLog
+
+NOISE = np.radians(0.0035)
+
+
+def table(theta_x, theta_y, noise, stated=NOISE, number=40):
+    """Readings at 10 Hz of two angles, in rad, that a reader took for degrees."""
+    rng = np.random.default_rng(3)
+    theta = np.array([theta_x, theta_y])[:, None] + rng.normal(0, noise, (2, number))
+    t = 1.8e9 + np.arange(number) / 10
+    return TiltLog.of(t, *np.radians(theta), np.full(number, np.nan), np.full(number, stated))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.05, -0.2, 0.5])
+def test_radians_are_seen_at_any_lean(angle):
+    assert "look like radians" in like_radians(table(angle, -0.1, NOISE))
+
+
+@pytest.mark.parametrize(
+    "sound",
+    [
+        # a level instrument in degrees
+        table(0.02, -0.01, np.degrees(NOISE)),
+        table(12.0, -3.0, np.degrees(NOISE)),
+        # readings of no noise, or too few of them
+        table(0.1, 0.1, 0.0),
+        table(0.1, 0.1, NOISE, number=6),
+        # a quiet sensor whose noise is stated
+        table(0.1, 0.1, np.degrees(1e-6), stated=1e-6),
+        # beyond a right angle no reading is of radians
+        table(2.0, 0.1, NOISE),
+    ],
+    ids=["level", "leaning", "without noise", "few", "quiet", "large"],
+)
+def test_degrees_are_left_in_peace(sound):
+    assert like_radians(sound) == ""
