@@ -7,14 +7,12 @@ Sphinx reads from the root of the repository, so that the packages' READMEs are 
 import re
 from pathlib import Path
 
-import yaml
-
 import starpos
 
 ROOT = Path(__file__).resolve().parents[1]
 PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
-# lines of a docstring that are a table: a name, two blanks or more, what it is
-COLUMNS = re.compile(r"^\S.*\S {2,}(?!\S+\.$)\S")
+# lines of a docstring that tell of something by its name, in columns or after a colon
+COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
 
 project = "starpos"
 author = "starpos maintainers"
@@ -41,27 +39,21 @@ html_title = "starpos"
 html_static_path: list[str] = []
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
-autodoc_class_signature = "separated"
 
 
 def about_parameters() -> str:
     """Tables of all parameters, from the comments of starpos.yaml, which is made from the nodes' own tables."""
-    made, said = [], []
+    made: list[str] = []
+    said: list[str] = []
     for line in PARAMETERS.read_text().splitlines():
         if node := re.match(r"/\*\*/(\w+):", line):
-            made += [
-                f"\n## {node[1]}\n",
-                "| parameter | default | what it is | what it may be |",
-                "| --- | --- | --- | --- |",
-            ]
+            made += [f"\n## {node[1]}\n", "| parameter | what it is |", "| --- | --- |"]
             said = []
         elif line.startswith("    # "):
             said.append(line[6:].replace("|", "\\|"))
         elif value := re.match(r"    ([\w./]+): (.*)", line):
-            default = yaml.safe_load(value[2])
-            shown = f"`{'unset' if default != default else value[2]}`"
-            limit = said[-1].removeprefix(f"{value[1]} must be ") if len(said) > 1 else ""
-            made.append(f"| `{value[1]}` | {shown} | {' '.join(said[:-1])} | {limit} |")
+            default = "unset" if value[2] == ".nan" else value[2]
+            made.append(f"| `{value[1]}` | {' '.join(said)} Default: `{default}`. |")
             said = []
     return "\n".join(made)
 
@@ -96,10 +88,13 @@ def as_written(app: object, what: str, name: str, thing: object, options: object
     made = []
     for paragraph in "\n".join(lines).split("\n\n"):
         rows = paragraph.split("\n")
+        plain = [re.sub(r"([\\*`_|])", r"\\\1", row).strip() for row in rows]
         if any(COLUMNS.match(row) or row.startswith("    ") for row in rows):
             made += ["::", "", *(f"    {row}" for row in rows), ""]
+        elif any(NAMED.match(row) for row in rows):
+            made += [*(f"| {row}" for row in plain if row), ""]
         else:
-            made += [re.sub(r"([\\*`_|])", r"\\\1", row).strip() for row in rows] + [""]
+            made += [*plain, ""]
     lines[:] = made
 
 
