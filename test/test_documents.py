@@ -14,7 +14,8 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = sorted(p.parent for p in (*ROOT.glob("*/package.xml"), *ROOT.glob("src/*/package.xml")))
 DOCUMENTS = sorted(
-    {d for folder in (ROOT, ROOT / "docs", ROOT / "test", *PACKAGES) for d in folder.glob("*.md")}
+    {d for folder in (ROOT, ROOT / "test", *PACKAGES) for d in folder.glob("*.md")}
+    | set((ROOT / "docs").glob("**/*.md"))
 )
 OF_NODES = {
     "camera": "starpos_camera",
@@ -57,12 +58,24 @@ def test_every_link_and_every_tool_that_is_named_is_there(document):
         assert any((folder / tool).exists() for folder in (ROOT, document.parent, *PACKAGES)), tool
 
 
-def test_the_readme_names_every_folder_of_starpos():
-    section = (
-        (ROOT / "README.md").read_text().split("## Building it, changing it\n", 1)[1].split("\n## ", 1)[0]
-    )
+def test_the_architecture_names_every_folder_of_starpos():
+    [_, section] = (ROOT / "docs" / "architecture.md").read_text().split("## Folders of starpos\n", 1)
     folders = {p.parent.name for p in MODULES["starpos"].glob("*/__init__.py")}
     assert folders and {name for name in folders if f"`{name}`" not in section} == set()
+
+
+def test_the_readme_is_short():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 120
+
+
+def test_every_page_is_in_the_sites_table_of_contents():
+    """A page that is in none is a warning of Sphinx, which is a failure; this says so without Sphinx."""
+    folder = ROOT / "docs"
+    named = re.findall(r"^(?:\.\./)?[\w/.-]+$", (folder / "index.md").read_text(), re.MULTILINE)
+    pages = {p.relative_to(folder).with_suffix("").as_posix() for p in folder.glob("**/*.md")} - {"index"}
+    assert pages - set(named) == set()
+    assert all(any((folder / f"{name}{end}").is_file() for end in (".md", ".rst")) for name in named)
 
 
 def test_every_parameter_is_in_its_packages_readme():

@@ -4,7 +4,8 @@
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
 the versions that Ubuntu 24.04 has (tools/setup/ubuntu-24.04.txt), in an environment as bare as a newcomer's: without
-the counterparts that tools/setup/counterparts brings. `test.py --both` runs all.
+the counterparts that tools/setup/counterparts brings. `test.py --both` runs all, builds the documents' site and looks
+through the licences, which `test.py --docs` does alone: a warning is a failure.
 """
 
 import os
@@ -28,6 +29,12 @@ LINTERS = [
     "codespell",
     "mypy",
     f"{sys.executable} tools/walls.py",
+]
+# the site of the documents, and whether each file has its licence, with what the first brings
+DOCS = [
+    "tools/setup/docs",
+    ".underlay/docs/bin/python -m sphinx -W --keep-going -n -q -c docs . build/docs",
+    ".underlay/docs/bin/python -m reuse lint --lines",
 ]
 # pytest's exit status where a -k left none.
 NO_TESTS = 5
@@ -87,9 +94,9 @@ def run(command: list[str], out=None, environment: dict[str, str] | None = None)
     return result.returncode
 
 
-def lint() -> Outcome:
-    """Run the linters."""
-    return Outcome(Counter("failed" if run(shlex.split(linter)) else "passed" for linter in LINTERS))
+def lint(linters: list[str]) -> Outcome:
+    """Run linters."""
+    return Outcome(Counter("failed" if run(shlex.split(linter)) else "passed" for linter in linters))
 
 
 def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
@@ -266,10 +273,12 @@ def all_of(tests: Tests) -> Outcome:
 
 
 def main(args: list[str]) -> int:
-    which = {"--lint", "--ubuntu", "--both"} & set(args)
+    which = {"--docs", "--lint", "--ubuntu", "--both"} & set(args)
     pytest_args = [a for a in args if a not in which]
-    total = Outcome() if which == {"--ubuntu"} else lint()
-    tests = {} if which & {"--lint", "--ubuntu"} else newest(pytest_args)
+    total = Outcome() if which & {"--docs", "--ubuntu"} else lint(LINTERS)
+    if which & {"--docs", "--both"}:
+        total += lint(DOCS)
+    tests = {} if which & {"--docs", "--lint", "--ubuntu"} else newest(pytest_args)
     if which & {"--ubuntu", "--both"}:
         tests |= ubuntus(pytest_args)
     total += all_of(tests)

@@ -17,13 +17,12 @@ CORE = [
     for source in sorted(glob("starpos/core/*.pyx"))
 ]
 
+# all else that is said of the package stands in pyproject.toml
 setup(
     name=package,
     version="0.1.0",
-    description="Position and heading from stars and gravity",
-    maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
-    license="Apache-2.0",
+    license="Apache-2.0 AND BSD-2-Clause",
+    license_files=["LICENSES/*"],
     python_requires=">=3.10",
     packages=find_packages(include=["starpos", "starpos.*"]),
     package_data={package: ["*/data/*", "*.pyi", "py.typed"]},
@@ -31,23 +30,6 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
+        (f"share/{package}/LICENSES", sorted(glob("LICENSES/*"))),
     ],
-    install_requires=[
-        "numpy>=1.26",
-        "scipy>=1.11",
-        "astropy>=6.0",
-        "pyerfa>=2.0.1",
-        "opencv-python-headless>=4.6",
-        "PyYAML",
-    ],
-    extras_require={
-        "picture": ["matplotlib"],
-        "raw": ["rawpy", "exifread>=3"],
-        "heif": ["pillow-heif", "exifread>=3"],
-        "report": ["matplotlib", "rosbags>=0.11"],
-        "cluster": ["distributed"],
-        "completion": ["argcomplete"],
-        "test": ["pytest"],
-    },
-    entry_points={"console_scripts": ["starpos = starpos.cli:main"]},
 )

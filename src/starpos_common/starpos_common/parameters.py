@@ -172,7 +172,9 @@ def _prepared(
 
 def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
     """Write a parameter file with every default, each below a comment with its meaning, unit and constraint."""
+    # REUSE-IgnoreStart
     lines = ["# SPDX-License-Identifier: Apache-2.0", f"/**/{node_name}:", "  ros__parameters:"]
+    # REUSE-IgnoreEnd
     for p in parameters:
         fixed = "; fixed while the node runs" if p.read_only else ""
         lines += [f"    # {p.description}", f"    # {p.name} must be {p.constraint}{fixed}."]

@@ -25,7 +25,9 @@ def package(request, monkeypatch) -> Path:
 
 def test_copyright(package):
     """Each file names the licence in one line (SPDX), instead of the header that ament_copyright wants."""
+    # REUSE-IgnoreStart
     line = f"SPDX-License-Identifier: {ElementTree.parse(package / 'package.xml').findtext('license')}"
+    # REUSE-IgnoreEnd
     sources = [f for ending in ("py", "c", "h") for f in package.rglob(f"*.{ending}")]
     assert sources
     assert not [f for f in sources if line not in "".join(f.read_text().splitlines()[:2])]

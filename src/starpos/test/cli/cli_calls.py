@@ -2,11 +2,15 @@
 """Calls of the command line, and what tests of it share."""
 
 import json
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
 from starpos_testing.command_line import run
 
+SCHEMA = Path(__file__).resolve().parents[4] / "docs" / "reference" / "starpos.schema.json"
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
 # the same, with an A3 that is known
 KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
@@ -20,10 +24,23 @@ IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "sta
 
 
 def objects(out):
+    """The objects that --json printed, each as docs/reference/starpos.schema.json has it."""
+
     def no_constants(name):
         pytest.fail(f"{name} is no JSON")
 
-    return [json.loads(line, parse_constant=no_constants) for line in out.splitlines()]
+    told = [json.loads(line, parse_constant=no_constants) for line in out.splitlines()]
+    for line in told if find_spec("fastjsonschema") else ():
+        promised()(line)
+    return told
+
+
+@lru_cache(maxsize=1)
+def promised():
+    """What refuses an object that the schema does not promise."""
+    import fastjsonschema
+
+    return fastjsonschema.compile(json.loads(SCHEMA.read_text()))
 
 
 def solve(capsys, folder, *more, frames="frame_*.fits"):

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The site of the documents: `make docs` builds it into build/docs.
+
+Sphinx reads from the root of the repository, so that the packages' READMEs are pages too and links hold on both sides.
+"""
+
+import re
+from pathlib import Path
+
+import starpos
+
+ROOT = Path(__file__).resolve().parents[1]
+PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
+# lines of a docstring that tell of something by its name, in columns or after a colon
+COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
+
+project = "starpos"
+author = "starpos maintainers"
+version = release = starpos.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+root_doc = "docs/index"
+include_patterns = [
+    "docs/**",
+    "*.md",
+    "*/README.md",
+    "*/PROTOCOL.md",
+    "src/*/README.md",
+    "*/CHANGELOG.rst",
+    "src/*/CHANGELOG.rst",
+]
+exclude_patterns = ["build", "install", "log", "demo", "tools", ".*", "**/.*", "**/node_modules"]
+myst_heading_anchors = 4
+highlight_language = "none"
+# names of other projects, for which this would need the network
+nitpick_ignore_regex = [("py:.*", ".*")]
+suppress_warnings = ["myst.header"]
+html_theme = "furo"
+html_title = "starpos"
+html_static_path: list[str] = []
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+
+
+def about_parameters() -> str:
+    """Tables of all parameters, from the comments of starpos.yaml, which is made from the nodes' own tables."""
+    made: list[str] = []
+    said: list[str] = []
+    for line in PARAMETERS.read_text().splitlines():
+        if node := re.match(r"/\*\*/(\w+):", line):
+            made += [f"\n## {node[1]}\n", "| parameter | what it is |", "| --- | --- |"]
+            said = []
+        elif line.startswith("    # "):
+            said.append(line[6:].replace("|", "\\|"))
+        elif value := re.match(r"    ([\w./]+): (.*)", line):
+            default = "unset" if value[2] == ".nan" else value[2]
+            made.append(f"| `{value[1]}` | {' '.join(said)} Default: `{default}`. |")
+            said = []
+    return "\n".join(made)
+
+
+def about_names() -> str:
+    """Directives of autodoc for the public names, by the folder of `starpos` that they live in."""
+    made, folder = [], ""
+    for name in sorted(starpos.__all__, key=lambda n: (starpos._HOMES[n].split(".")[0], n)):
+        home = starpos._HOMES[name]
+        if home.split(".")[0] != folder:
+            folder = home.split(".")[0]
+            made.append(f"\n## starpos.{folder}\n")
+        is_class = isinstance(getattr(starpos, name), type)
+        members = "   :members:\n" if is_class else ""
+        kind = "autoclass" if is_class else "autofunction"
+        made.append(f"```{{eval-rst}}\n.. {kind}:: starpos.{home}.{name}\n{members}```\n")
+    return "\n".join(made)
+
+
+MADE = {"<!-- parameters -->": about_parameters, "<!-- public names -->": about_names}
+
+
+def fill_in(app: object, name: str, source: list[str]) -> None:
+    """Put what is made of the code into a page."""
+    for mark, make in MADE.items():
+        if mark in source[0]:
+            source[0] = source[0].replace(mark, make())
+
+
+def as_written(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """Keep docstrings as they are written: they are plain text, with tables in columns, and no reStructuredText."""
+    made = []
+    for paragraph in "\n".join(lines).split("\n\n"):
+        rows = paragraph.split("\n")
+        plain = [re.sub(r"([\\*`_|])", r"\\\1", row).strip() for row in rows]
+        if any(COLUMNS.match(row) or row.startswith("    ") for row in rows):
+            made += ["::", "", *(f"    {row}" for row in rows), ""]
+        elif any(NAMED.match(row) for row in rows):
+            made += [*(f"| {row}" for row in plain if row), ""]
+        else:
+            made += [*plain, ""]
+    lines[:] = made
+
+
+def lead_in(app: object, error: Exception | None) -> None:
+    """Lead from the site's root to its first page."""
+    if error is None:
+        page = '<!doctype html><title>starpos</title><meta http-equiv="refresh" content="0; url=docs/index.html">\n'
+        (Path(app.outdir) / "index.html").write_text(page)
+
+
+def setup(app: object) -> None:
+    app.connect("source-read", fill_in)
+    app.connect("autodoc-process-docstring", as_written)
+    app.connect("build-finished", lead_in)

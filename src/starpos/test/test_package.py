@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the package says of itself, and the licences that go with it."""
+
+import re
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1]
+REPOSITORY = PACKAGE.parents[1]
+
+
+def test_the_licences_of_what_is_shipped_go_with_it():
+    kept = {f.name: f.read_bytes() for f in (PACKAGE / "LICENSES").iterdir()}
+    assert set(kept) == {"Apache-2.0.txt", "BSD-2-Clause.txt"}
+    assert kept == {name: (REPOSITORY / "LICENSES" / name).read_bytes() for name in kept}
+    assert (REPOSITORY / "LICENSE").read_bytes() == kept["Apache-2.0.txt"]
+    assert b"Redistributions in binary form" in kept["BSD-2-Clause.txt"]
+    assert b"Hog E., Fabricius C." in kept["BSD-2-Clause.txt"]
+
+
+def test_what_is_derived_from_tycho2_is_said_to_be():
+    said = (REPOSITORY / "REUSE.toml").read_text()
+    for data in PACKAGE.glob("starpos/*/data"):
+        assert f'"{data.relative_to(REPOSITORY).as_posix()}/**"' in said
+
+
+def test_every_extra_is_told_where_people_install():
+    text = (PACKAGE / "pyproject.toml").read_text()
+    [table] = re.findall(r"^\[project.optional-dependencies\]\n(.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    extras = set(re.findall(r"^(\w+) =", table, re.MULTILINE)) - {"test"}
+    page = (REPOSITORY / "docs" / "how-to" / "install.md").read_text()
+    assert extras and {name for name in extras if f"| `{name}` |" not in page} == set()

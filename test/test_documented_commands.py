@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A command that a document shows can be typed: options, nodes, launch files, parameters, targets of make are there."""
+
+import doctest
+import json
+import re
+import shlex
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import yaml
+from test_documents import DOCUMENTS, ROOT, flat
+
+from starpos.cli import COMMANDS, CommandParser
+
+LAUNCH = ROOT / "src" / "starpos_bringup" / "launch"
+PARAMETERS = {
+    name.rsplit("/", 1)[-1]: set(flat(node["ros__parameters"]))
+    for name, node in yaml.safe_load((LAUNCH.parent / "config" / "starpos.yaml").read_text()).items()
+}
+# of whole processes, the nodes in them
+NODES = {"camera_detector": ("camera", "detector")}
+OURS = ("starpos ", "ros2 run starpos_", "ros2 launch starpos_", "make ")
+
+
+def shown(document: Path) -> list[str]:
+    """The lines of code blocks, a continued one as one line, without prompts."""
+    text = document.read_text().replace("\\\n", " ")
+    fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    # neither a table nor an item of a list is so far in
+    indented = re.findall(r"^    (\S.*)", text, re.MULTILINE)
+    lines = "\n".join([*fenced, *indented]).splitlines()
+    return [re.sub(r"^\s*(?:\w*\$ )?", "", line) for line in lines]
+
+
+CALLS = sorted(
+    {
+        (line.strip(), str(document.relative_to(ROOT)))
+        for document in DOCUMENTS
+        for line in shown(document)
+        if line.startswith(OURS)
+    }
+)
+
+
+def words(call: str) -> list[str]:
+    """The words of the first command of a line."""
+    one = re.split(r" && | \| |; ", call)[0]
+    return [w for w in shlex.split(one, comments=True) if not re.fullmatch(r"[<>&]+", w)]
+
+
+def calls(begin: str) -> list:
+    return [pytest.param(call, id=f"{place}: {call[:60]}") for call, place in CALLS if call.startswith(begin)]
+
+
+@pytest.fixture(scope="module")
+def parsers():
+    """The real parser of every command."""
+    made = {name: CommandParser(prog=f"starpos {name}") for name in COMMANDS}
+    for name, parser in made.items():
+        import_module(f"starpos.cli.{name}").define(parser)
+    return made
+
+
+@pytest.mark.parametrize("call", calls("starpos "))
+def test_a_command_line_is_understood(call, parsers):
+    _, command, *arguments = words(call)
+    if command in ("--help", "COMMAND"):
+        return
+    parsers[command].parse_args([a for a in arguments if a not in ("[--images]",)])
+
+
+@pytest.mark.parametrize("call", calls("ros2 launch "))
+def test_a_launch_file_and_its_arguments_are_there(call):
+    _, _, package, file, *arguments = words(call)
+    source = (ROOT / "src" / package / "launch" / file).read_text()
+    common = (ROOT / "src" / package / package / "launching.py").read_text()
+    for name in (a.split(":=")[0] for a in arguments if ":=" in a):
+        assert re.search(rf'\(\s*"{name}",', source + common), name
+
+
+@pytest.mark.parametrize("call", calls("ros2 run "))
+def test_an_executable_and_its_parameters_are_there(call):
+    _, _, package, executable, *arguments = words(call)
+    [setup] = [p for p in (ROOT / package / "setup.py", ROOT / "src" / package / "setup.py") if p.is_file()]
+    assert f'"{executable} = ' in setup.read_text()
+    for name in re.findall(r"(?<=-p )'?([\w./]+):=", call):
+        known = set().union(*(PARAMETERS[node] for node in NODES.get(executable, (executable,))))
+        assert name in known or name.startswith("qos_overrides."), name
+    assert all(arguments)
+
+
+@pytest.mark.parametrize("call", calls("make "))
+def test_a_target_of_make_is_there(call):
+    _, *targets = words(call)
+    folder = ROOT
+    if targets[0] == "-C":
+        folder, targets = ROOT / targets[1], targets[2:]
+    makefile = (folder / "Makefile").read_text()
+    for target in (w for w in targets if "=" not in w):
+        assert re.search(rf"^(?:.* )?{target}(?: .*)?:", makefile, re.MULTILINE), target
+
+
+def test_commands_are_found():
+    found = {begin: sum(call.startswith(begin) for call, _ in CALLS) for begin in OURS}
+    assert min(found.values()) >= 3 and found["starpos "] > 20, found
+
+
+def test_the_methods_numbers_are_true():
+    page = (ROOT / "docs" / "tutorials" / "method.md").read_text()
+    examples = "\n".join(re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL))
+    test = doctest.DocTestParser().get_doctest(examples, {}, "method.md", None, 0)
+    assert doctest.DocTestRunner().run(test).failed == 0 and len(test.examples) > 15
+
+
+def test_the_notebook_is_that_of_the_page_and_runs(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "data"))
+    page = ROOT / "docs" / "tutorials" / "method.md"
+    told = page.with_suffix(".ipynb").read_text()
+    assert told == import_module("notebook").notebook(page.read_text()), "python tools/data/notebook.py"
+    code = ["".join(c["source"]) for c in json.loads(told)["cells"] if c["cell_type"] == "code"]
+    exec("\n".join(code), {})
+    assert capsys.readouterr().out.splitlines()[-1] == "35.7044 51.4104"
