@@ -17,7 +17,8 @@ CORE = [
     for source in sorted(glob("starpos/core/*.pyx"))
 ]
 
-# all else that is said of the package stands in pyproject.toml
+# What colcon needs stands here, because it builds with links beside this file alone; all else that is said of the package is
+# in pyproject.toml.
 setup(
     name=package,
     version="0.1.0",
@@ -32,4 +33,22 @@ setup(
         (f"share/{package}", ["package.xml"]),
         (f"share/{package}/LICENSES", sorted(glob("LICENSES/*"))),
     ],
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "astropy>=6.0",
+        "pyerfa>=2.0.1",
+        "opencv-python-headless>=4.6",
+        "PyYAML",
+    ],
+    extras_require={
+        "picture": ["matplotlib"],
+        "raw": ["rawpy", "exifread>=3"],
+        "heif": ["pillow-heif", "exifread>=3"],
+        "report": ["matplotlib", "rosbags>=0.11"],
+        "cluster": ["distributed"],
+        "completion": ["argcomplete"],
+        "test": ["pytest"],
+    },
+    entry_points={"console_scripts": ["starpos = starpos.cli:main"]},
 )
