@@ -185,8 +185,10 @@ def is_module(package: str, names: str) -> bool:
         return True
     while parts and (place / parts[0]).is_dir():
         place = place / parts.pop(0)
-    if parts and (place / f"{parts[0]}.py").is_file():
-        place = place / f"{parts.pop(0)}.py"
+    files = [place / f"{parts[0]}{ending}" for ending in (".py", ".pyx")] if parts else []
+    if found := [file for file in files if file.is_file()]:
+        place = found[0]
+        del parts[0]
     # What a package offers it may have from elsewhere.
     if place.is_dir():
         return all(re.search(rf"\b{part}\b", (place / "__init__.py").read_text()) for part in parts)
