@@ -70,6 +70,12 @@ def to_small_vector(r: np.ndarray) -> np.ndarray:
     return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Vector products (..., 3) of a and b, both (..., 3): as `np.cross`, which takes several times as long for a few."""
+    (ax, ay, az), (bx, by, bz) = (np.moveaxis(v, -1, 0) if v.ndim > 1 else v for v in (a, b))
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
+
+
 def cross_matrix(v: ArrayLike) -> np.ndarray:
     """The matrix (3, 3) [v]x, so that cross_matrix(v) @ w = v x w."""
     x, y, z = np.asarray(v, float)

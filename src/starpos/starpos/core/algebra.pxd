@@ -142,6 +142,29 @@ cdef inline void solved(const double *factor, double *b, int n) noexcept nogil:
         b[i] /= factor[i * n + i]
 
 
+cdef inline double median(double *values, int n) noexcept nogil:
+    """The value (n,) that would stand at n // 2 if they were sorted (Hoare's selection); it disturbs their order."""
+    cdef int low = 0, high = n - 1, k = n // 2, i, j
+    cdef double pivot
+    while low < high:
+        pivot = values[k]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    return values[k]
+
+
 cdef inline int strip_of(double x, const Strips *s) noexcept nogil:
     """The strip in which a point lies, or the nearest one."""
     cdef double strip = (x - s.least) * s.per_px

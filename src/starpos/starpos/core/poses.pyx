@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport best_rotation, factored, solved, turn_by, turned
+from starpos.core.algebra cimport best_rotation, factored, median, solved, turn_by, turned
 from starpos.core.frame cimport Frame, direction_of, pixel_of
 from starpos.core.matching cimport Matching, match, order
 from starpos.core.sky cimport Visible
@@ -114,29 +114,6 @@ def fitted(
     return out, focal_px
 
 
-cdef double _median(double *values, int n) noexcept nogil:
-    """The value (n,) that would stand at n // 2 if they were sorted (Hoare's selection); it disturbs their order."""
-    cdef int low = 0, high = n - 1, k = n // 2, i, j
-    cdef double pivot
-    while low < high:
-        pivot = values[k]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < k:
-            low = i
-        if k < i:
-            high = j
-    return values[k]
-
-
 cdef class Chances:
     """What `weighed` reckons with.
 
@@ -213,7 +190,7 @@ cdef void settle(
         if out.count < rules.fewest:
             break
         _refit(frame, xy, stars, rules, sigma, sigma, pixel, work, out)
-        out.spread = rules.per_mad * _median(work, 2 * out.count)
+        out.spread = rules.per_mad * median(work, 2 * out.count)
         gates(frame, rules, out.spread, n, radius)
 
 

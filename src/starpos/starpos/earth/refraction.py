@@ -5,10 +5,12 @@ The paper puts aberration beside it; docs/the_paper.md#matrix-a2 says where that
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import erfa
 import numpy as np
 
+from starpos.core.observed import Air
 from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
@@ -105,6 +107,11 @@ class Refraction:
 
     a: float
     b: float
+
+    @cached_property
+    def compiled(self) -> Air:
+        """The model, for the compiled core."""
+        return Air(self.a, self.b, MIN_COS_ZENITH)
 
     def bend(self, v: np.ndarray) -> np.ndarray:
         """Raise unrefracted directions v (N, 3) in L to the observed ones (ERFA's eraAtioq, one Newton step)."""

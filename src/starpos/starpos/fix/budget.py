@@ -81,7 +81,7 @@ def place_of(a4: np.ndarray) -> Place:
     latitude, longitude = place_of_zenith(a4[2])
     north = a4 @ enu_axes(latitude, longitude)[1]
     north = rotation.normalised(np.array([north[0], north[1], 0.0]))
-    return Place(latitude, longitude, np.cross(north, [0.0, 0.0, 1.0]), north)
+    return Place(latitude, longitude, np.array([north[1], -north[0], 0.0]), north)
 
 
 @dataclass(frozen=True)

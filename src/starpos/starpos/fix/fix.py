@@ -6,10 +6,12 @@ site.  The residuals are formed in pixels, because the errors of the stars are k
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
+from starpos.core.observed import observed
 from starpos.earth.orientation import EarthState, later, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
@@ -36,7 +38,6 @@ MAX_ROUNDS = 6
 # share of the frame's diagonal; stars that scatter more were not identified rightly
 MAX_SCATTER = 0.003
 MIN_STARS = 3
-STEP_RAD = 1e-6  # of the numerical derivatives
 STEP_REFRACTION = 0.01
 # so many stars tell whether two frames show the same ones
 MARKS = 20
@@ -187,7 +188,7 @@ def solve_fix(
         shutter,
     )
     axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
-    bent = np.linalg.norm(np.cross(axis, problem.refraction.unbend(axis)))
+    bent = np.linalg.norm(rotation.cross(axis, problem.refraction.unbend(axis)))
     return Fix(
         utc_unix_s=earth.utc_unix_s,
         latitude=place.latitude,
@@ -245,11 +246,16 @@ class _Adjustment:
             a4 = rotation.best_rotation(self.itrs + station_velocity(a4[2]), local)
         return _Estimate(a4, 1.0)
 
+    @cached_property
+    def principal_px(self) -> np.ndarray:
+        """The principal point (2,)."""
+        return np.array([self.camera.cx, self.camera.cy])
+
     def predict(self, state: _Estimate, refraction: Refraction | None = None) -> np.ndarray:
         """Pixels (N, 2) where the estimate has the stars."""
-        v = rotation.normalised(self.itrs + station_velocity(state.a4[2]))
-        observed = (refraction or self.refraction).bend(v @ state.a4.T)
-        return self.camera.scaled(state.scale).project(observed @ self.g)
+        air = (refraction or self.refraction).compiled
+        v = observed(self.itrs, state.a4, station_velocity(state.a4[2]), air, self.g)
+        return self.principal_px + state.scale * (self.camera.project(v) - self.principal_px)
 
     def residual(self, state: _Estimate) -> np.ndarray:
         """Predicted minus seen places (N, 2) in px."""
@@ -267,8 +273,8 @@ class _Adjustment:
         Raises FixError if it does not converge.
         """
         slope = slope[keep]
-        weighted = np.linalg.solve(covariance_px2[keep], slope)
-        gain = np.linalg.solve(np.einsum("nki,nkj->ij", slope, weighted), weighted.reshape(-1, 4).T)
+        weighted = (np.linalg.inv(covariance_px2[keep]) @ slope).reshape(-1, 4)
+        gain = np.linalg.solve(slope.reshape(-1, 4).T @ weighted, weighted.T)
         for _ in range(MOST_STEPS):
             step = -gain @ self.residual(state)[keep].ravel()
             if not np.isfinite(step).all():
@@ -279,15 +285,12 @@ class _Adjustment:
         raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
 
     def jacobian(self, state: _Estimate) -> np.ndarray:
-        """Derivatives (N, 2, 4) of `predict` by the parameters of `moved`, as central differences."""
-        columns = []
-        for i in range(4):
-            p = np.zeros(4)
-            p[i] = STEP_RAD
-            columns.append(
-                (self.predict(self.moved(state, p)) - self.predict(self.moved(state, -p))) / (2 * STEP_RAD)
-            )
-        return np.stack(columns, -1)
+        """Derivatives (N, 2, 4) of `predict` by the parameters of `moved`."""
+        air, ground = self.refraction.compiled, station_velocity(state.a4[2])
+        v, turned = observed(self.itrs, state.a4, ground, air, self.g, True)
+        from_principal = state.scale * (self.camera.project(v) - self.principal_px)
+        turned = state.scale * (self.camera.slopes(v) @ turned)
+        return np.concatenate([turned, from_principal[:, :, None]], -1)
 
 
 def _terms(
@@ -304,12 +307,13 @@ def _terms(
     shutter: Shutter,
 ) -> tuple[ErrorTerm, ...]:
     """The budget of the fix: the errors of its stars, of refraction and shutter as they act on them, and all others."""
-    stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - problem.predict(state)
+    here = problem.predict(state)
+    stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - here
     bending = (
         -np.einsum("ank,nk->a", errors.gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
     )
     turned = replace(problem, itrs=later(problem.itrs, np.ones(len(problem.itrs)))).predict(state)
-    drift = turned - problem.predict(state)
+    drift = turned - here
     late = shutter.errors_s(problem.xy[:, 1], problem.camera.height)
     rolling = -np.einsum("ank,nk,nc->ac", errors.gain, drift[keep], late[keep])
     return error_terms(

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Residuals compared with their stated errors: which are outliers, and how much more the others scatter."""
 
-from collections.abc import Callable
-
 import numpy as np
 
+from starpos.core.observed import extra_variance
 from starpos.normal import MEDIAN_OF_CHI2
 
 OUTLIER_SIGMA = 5.0
@@ -24,10 +23,9 @@ def judged(
     coordinates which the parameters of the fit leave free.
     """
     # the gate goes by the median: by the mean an outlier among a dozen stars would widen it enough to pass
-    typical = _extra_variance(
-        residual[keep], covariance[keep], lambda d2: np.median(d2, axis=-1) / MEDIAN_OF_CHI2 - share
-    )
-    extra = _extra_variance(residual[keep], covariance[keep], lambda d2: d2.mean(-1) / 2 - share)
+    kept = residual[keep], covariance[keep]
+    typical = _extra_variance(*kept, share, MEDIAN_OF_CHI2)
+    extra = _extra_variance(*kept, share)
     return extra, distance2(residual, covariance, typical) < OUTLIER_SIGMA**2
 
 
@@ -64,21 +62,14 @@ def _widened(covariance: np.ndarray, extra: float | np.ndarray) -> tuple[np.ndar
 
 
 def _extra_variance(
-    residual: np.ndarray, covariance: np.ndarray, excess: Callable[[np.ndarray], np.ndarray]
+    residual: np.ndarray, covariance: np.ndarray, share: float, median_of_chi2: float = 0.0
 ) -> float:
-    """The isotropic variance (px2) at which excess(squared distances (..., N)) falls to 0; 0 if it never exceeds 0.
+    """The isotropic variance (px2) at which residuals are as large as their covariance says, 0 if they never are larger.
 
-    The search uses grids, each between two points of the last one: to import scipy.optimize takes longer than a node
-    takes to start.
+    By the mean of their squares, or by the median where that of chi squared is given. The search uses grids, each between
+    two points of the last one: to import scipy.optimize takes longer than a node takes to start.
     """
-    if excess(distance2(residual, covariance)) <= 0:
-        return 0.0
-    high = 8 * float(np.sum(residual**2)) + 1e-12
-    low = LEAST_EXTRA * high
-    for _ in range(ROUNDS):
-        extra = np.geomspace(low, high, COARSE)
-        below = np.flatnonzero(excess(distance2(residual, covariance, extra[:, None])) < 0)
-        if not len(below):
-            return high
-        low, high = extra[max(below[0] - 1, 0)], extra[below[0]]
-    return float(np.sqrt(low * high))
+    high = 8 * float(np.vdot(residual, residual)) + 1e-12
+    return extra_variance(
+        residual, covariance, share, median_of_chi2, high, LEAST_EXTRA * high, COARSE, ROUNDS
+    )

@@ -113,6 +113,11 @@ class Camera:
         v = lens.rays(np.stack([x, y], -1), self.distortion)
         return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
 
+    def slopes(self, v: np.ndarray) -> np.ndarray:
+        """Derivatives (N, 2, 3), px, of `project` at directions v (N, 3)."""
+        lens = plumb_bob if self.model == PLUMB_BOB else equidistant
+        return lens.slopes(v, self.distortion) * np.array([[self.fx], [self.fy]])
+
     def project(self, v: ArrayLike) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind a pinhole, and outside the picture of a fisheye."""
         lens = plumb_bob if self.model == PLUMB_BOB else equidistant

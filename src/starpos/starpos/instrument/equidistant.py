@@ -13,6 +13,8 @@ import numpy as np
 COEFFICIENTS = ("k1", "k2", "k3", "k4")
 # Steps of Newton's method, which falls back to halves, and where it has converged, rad.
 MAX_STEPS, SETTLED = 60, 1e-15
+# Sine of an angle off the axis that is as good as none.
+LEAST_OFF = 1e-12
 
 
 def seen(v: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
@@ -24,6 +26,24 @@ def seen(v: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
     # straight behind has no direction on the plane
     stretch = np.where(np.isnan(theta), np.nan, stretch)
     return v[..., :2] * stretch[..., None]
+
+
+def slopes(v: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
+    """Derivatives (..., 2, 3) of `seen`."""
+    off = np.maximum(np.hypot(v[..., 0], v[..., 1]), LEAST_OFF)
+    theta = np.arctan2(off, v[..., 2])
+    theta = np.where(theta < reach(d), theta, np.nan)
+    outward = v[..., :2] / off[..., None]
+    # on the axis any azimuth will do
+    outward[off == LEAST_OFF] = 1.0, 0.0
+    stretch = _distance(theta, d) / off
+    # away from the axis the angle grows, around it the direction of the place turns
+    grows = np.concatenate([outward * v[..., 2:], -off[..., None]], -1)
+    grows *= (_slope(theta, d) / np.square(v).sum(-1))[..., None]
+    across = stretch[..., None, None] * (np.eye(2) - outward[..., :, None] * outward[..., None, :])
+    out = outward[..., :, None] * grows[..., None, :]
+    out[..., :2] += across
+    return out
 
 
 def rays(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:

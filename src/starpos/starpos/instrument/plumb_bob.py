@@ -19,6 +19,16 @@ def seen(v: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
     return _distort(plane, d) if any(d) else plane
 
 
+def slopes(v: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
+    """Derivatives (..., 2, 3) of `seen`."""
+    z = np.where(v[..., 2] > 0, v[..., 2], np.nan)
+    plane = v[..., :2] / z[..., None]
+    out = np.zeros((*v.shape[:-1], 2, 3))
+    out[..., 0, 0] = out[..., 1, 1] = 1 / z
+    out[..., 2] = -plane / z[..., None]
+    return _distortion_jacobian(plane, d) @ out if any(d) else out
+
+
 def rays(plane: np.ndarray, d: tuple[float, ...]) -> np.ndarray:
     """Directions (..., 3), not normalised, of places (..., 2) on the distorted plane.
 

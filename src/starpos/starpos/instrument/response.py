@@ -9,6 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
+from starpos import rotation
 from starpos.instrument.inclinometer import InclinometerErrors, up_of, up_slope
 
 # number of coefficients by number of axes: zeros, scales, angles between axes
@@ -30,8 +31,8 @@ def response_columns(theta: np.ndarray, calibrated_up: np.ndarray) -> np.ndarray
     axes, then = len(theta), angles_at(calibrated_up, len(theta))
     slope, lean = up_slope(theta), theta - then
     # a rotation of S by up x moved takes up there by `moved`
-    turns = np.cross(calibrated_up, up_slope(then).T)
-    zeros = slope - np.cross(turns, up_of(theta)).T
+    turns = rotation.cross(calibrated_up, up_slope(then).T)
+    zeros = slope - rotation.cross(turns, up_of(theta)).T
     pairs = [slope[:, i] * lean[j] + slope[:, j] * lean[i] for i, j in combinations(range(axes), 2)]
     return np.column_stack([zeros, slope * lean, *pairs])
 
