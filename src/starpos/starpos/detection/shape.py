@@ -7,6 +7,7 @@ a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 
 
 import numpy as np
 
+from starpos.core.moments import windowed
 from starpos.detection.stamps import Stamps
 
 # px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
@@ -30,21 +31,11 @@ def moments(
     NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the centroid
     would be biased away from the edge.
     """
-    dx, dy = stamps.offsets(x, y)
-    inverse = np.linalg.inv(window)[..., None, None].astype(np.float32)
-    xx, xy, yy = (inverse[..., i, j, :, :] for i, j in ((0, 0), (0, 1), (1, 1)))
-    exponent = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
-    weighted = np.exp(-0.5 * exponent) * stamps.signal
-    # the sums separate: from here on over (N, S)
-    rows, columns = weighted.sum(2), weighted.sum(1)
-    dx, dy = dx[:, 0, :], dy[:, :, 0]
-    mass = columns.sum(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = np.where(mass > 0, 1 / mass, np.nan)
-    mx, my = (columns * dx).sum(1) * scale, (rows * dy).sum(1) * scale
-    xx, yy = (columns * dx * dx).sum(1) * scale - mx * mx, (rows * dy * dy).sum(1) * scale - my * my
-    xy = np.einsum("nij,ni,nj->n", weighted, dy, dx) * scale - mx * my
-    return mass, np.stack([mx, my], 1), np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
+    signal = np.ascontiguousarray(stamps.signal, np.float32)
+    left, top = (
+        np.asarray(whole - stamps.reach - place, float) for whole, place in ((stamps.x, x), (stamps.y, y))
+    )
+    return windowed(signal, left, top, np.linalg.inv(window).reshape(-1, 2, 2))
 
 
 def window_for(shape: np.ndarray) -> np.ndarray:
