@@ -7,7 +7,6 @@ from pathlib import Path
 
 from starpos.errors import FrameError, TiltError
 from starpos.frames.night_files import TILTS, TRUTH
-from starpos.report.folder import frames_in
 
 
 @dataclass(frozen=True)
@@ -22,19 +21,28 @@ class NightFolder:
     folder: str | None = None
 
 
+def frames_among(given: list[str], *tables: str | None) -> list[str]:
+    """The frames among files that a shell's *.csv, or *, has taken in: without tables, tilt.csv and truth.json.
+
+    Files that are nothing else stay, and each says why it is no frame.
+    """
+    beside = {os.path.realpath(table) for table in tables if table is not None}
+    frames = [
+        p for p in given if os.path.basename(p) not in (TILTS, TRUTH) and os.path.realpath(p) not in beside
+    ]
+    return frames or given
+
+
 def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> list[NightFolder | FrameError]:
     """One night from frames and a table, or without one for a camera that is fixed to the ground.
 
-    Else a night for each folder, or the error why it is none. What lies beside frames and is none, as a shell's *.csv
-    takes it in, is left out: the table of tilts and truth.json.
+    Else a night for each folder, or the error why it is none.
 
     A folder's frames are its FITS files, or if there are none its CSV files, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:
-        table = os.path.realpath(tilt)
-        frames = [p for p in given if os.path.realpath(p) != table and os.path.basename(p) != TRUTH]
-        return [NightFolder(tuple(frames or given), os.path.abspath(tilt))]
+        return [NightFolder(tuple(given), os.path.abspath(tilt))]
     if own_level:
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
@@ -47,6 +55,8 @@ def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> li
 
 
 def _night(folder: str) -> NightFolder | FrameError:
+    from starpos.report.folder import frames_in
+
     try:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:

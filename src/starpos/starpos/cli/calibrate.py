@@ -13,6 +13,7 @@ from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, common
+from starpos.cli.archive import frames_among
 from starpos.cli.doubts import checked_tilts
 from starpos.cli.frame_work import NO_CAMERA, reader_of
 from starpos.cli.output import add_formats
@@ -118,6 +119,7 @@ def _stars_of_all(args: argparse.Namespace) -> tuple[list[Stars], bool]:
     progress, unreadable = common.ProgressBar(), False
     frames: list[Stars] = []
     read = reader_of(args)
+    args.frames = frames_among(args.frames, args.tilt)
     for k, path in enumerate(args.frames):
         try:
             frames.append(common.stars_of(read(path)))

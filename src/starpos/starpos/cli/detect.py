@@ -5,6 +5,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from starpos.cli import common, jobs
+from starpos.cli.archive import frames_among
 from starpos.cli.frame_work import Detecting, Reader
 from starpos.cli.output import Output, add_formats
 from starpos.errors import FrameError
@@ -27,6 +28,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, "")
+    args.frames = frames_among(args.frames)
     status, work, number = 0, Detecting(Reader()), len(args.frames)
     with jobs.workers_of(args, number) as workers:
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)

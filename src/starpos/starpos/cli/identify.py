@@ -6,6 +6,7 @@ import argparse
 import numpy as np
 
 from starpos.cli import common, jobs
+from starpos.cli.archive import frames_among
 from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.what_fits import say_what_would_fit
@@ -44,6 +45,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    args.frames = frames_among(args.frames)
     any_found, unreadable, number = False, False, len(args.frames)
     lost: str | None = None
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import common, jobs
+from starpos.cli.archive import frames_among
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.fix_output import HEAD, in_degrees
 from starpos.cli.frame_work import Look, Reader, reader_of
@@ -123,6 +124,7 @@ class Seeing:
 
 
 def run(args: argparse.Namespace) -> int:
+    args.frames = frames_among(args.frames, args.imu, args.velocity)
     vertical, read, number = vertical_of(args), reader_of(args), len(args.frames)
     imu = read_imu(args.imu)
     model = ImuModel() if args.imu_model is None else read_imu_model(Path(args.imu_model))

@@ -11,7 +11,7 @@ from starpos.averaging.average import Average, average
 from starpos.calibration.turning import turn
 from starpos.calibration.unknown import unknown_a3
 from starpos.cli import common, jobs
-from starpos.cli.archive import NightFolder, nights_of
+from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.doubts import Levelled, Near, add_near, checked_tilts, far, mistaken, near_of
 from starpos.cli.fix_output import (
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         return solve_pointings.run(args)
     vertical, read, output = vertical_of(args), reader_of(args), Output(args, COLUMNS, HEAD)
     near_of(args)
-    given = nights_of(args.frames, args.tilt, common.has_own_level(args))
+    given = nights_of(frames_among(args.frames, args.tilt), args.tilt, common.has_own_level(args))
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]

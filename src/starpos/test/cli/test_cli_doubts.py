@@ -80,10 +80,16 @@ def test_tilts_that_look_like_radians_are_told(night, tmp_path, capsys):
 def test_what_a_glob_takes_in_beside_the_frames_is_left_out(lists, tmp_path, capsys):
     for path in lists.iterdir():
         shutil.copy(path, tmp_path)
-    status, out, errors = run(
-        capsys, "solve", *sorted(tmp_path.iterdir()), "--tilt", tmp_path / "tilt.csv", *KNOWN, "--json"
-    )
+    (tmp_path / "tilt.csv").rename(tmp_path / "sensor.csv")
+    every = sorted(tmp_path.iterdir())
+    status, out, errors = run(capsys, "solve", *every, "--tilt", tmp_path / "sensor.csv", *KNOWN, "--json")
     assert (status, errors) == (0, []) and len(objects(out)) == 4
+    (tmp_path / "sensor.csv").rename(tmp_path / "tilt.csv")
+    for command, options in (("identify", WIDE), ("detect", ())):
+        status, out, errors = run(capsys, command, *sorted(tmp_path.iterdir()), *options, "--json")
+        assert (status, errors) == (0, []) and len(objects(out)) == 3
+    status, _, errors = run(capsys, "detect", tmp_path / "tilt.csv")
+    assert status == 2 and "tilt.csv" in errors[0]
 
 
 def test_a_simulated_night_never_replaces_files_that_were_not_simulated(tmp_path, capsys):

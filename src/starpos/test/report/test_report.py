@@ -73,7 +73,8 @@ def test_the_page_says_what_solve_says(still, tmp_path, capsys):
     assert (status, errors) == (0, [])
     place = f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}° ± {want['sigma_north_m']:.0f} m N"
     assert place in page.text
-    assert f"heading {want['heading']:.4f} ± {want['sigma_heading_deg']:.4f}°" in page.text
+    turn = np.sqrt(want["covariance_geodetic"][2][2])
+    assert f"heading {want['heading']:.4f} ± {turn:.4f}°" in page.text
     ground = f"{want['latitude_geodetic']:+.6f}°, {want['longitude_geodetic']:+.6f}°"
     assert ground in page.text
     assert "12: 12 with a fix" in page.text and "stars_0011.csv" in page.text
