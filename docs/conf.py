@@ -4,14 +4,12 @@
 Sphinx reads from the root of the repository, so that the packages' READMEs are pages too and links hold on both sides.
 """
 
-import argparse
+import os
 import re
-from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 import starpos
-from starpos.cli import COMMANDS, CommandParser
+from starpos.cli import COMMANDS, parser_for
 
 ROOT = Path(__file__).resolve().parents[1]
 INTERFACES = ROOT / "starpos_interfaces"
@@ -19,7 +17,8 @@ PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
 # lines of a docstring that tell of something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
 
-Help = partial(argparse.RawDescriptionHelpFormatter, width=96)
+# as wide as a line of code on a page
+os.environ["COLUMNS"] = "84"
 
 project = "starpos"
 author = "starpos maintainers"
@@ -84,11 +83,8 @@ def about_commands() -> str:
     """What --help says of every command."""
     made = []
     for name in COMMANDS:
-        parser = CommandParser(
-            prog=f"starpos {name}", formatter_class=Help, description=COMMANDS[name].capitalize() + "."
-        )
-        import_module(f"starpos.cli.{name}").define(parser)
-        made.append(f"### starpos {name}\n\n```\n{parser.format_help()}```\n")
+        [commands] = (action for action in parser_for([name])._actions if isinstance(action.choices, dict))
+        made.append(f"### starpos {name}\n\n```\n{commands.choices[name].format_help()}```\n")
     return "\n".join(made)
 
 
