@@ -4,15 +4,21 @@
 Sphinx reads from the root of the repository, so that the packages' READMEs are pages too and links hold on both sides.
 """
 
+import os
 import re
 from pathlib import Path
 
 import starpos
+from starpos.cli import COMMANDS, parser_for
 
 ROOT = Path(__file__).resolve().parents[1]
+INTERFACES = ROOT / "starpos_interfaces"
 PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
 # lines of a docstring that tell of something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
+
+# as wide as a line of code on a page
+os.environ["COLUMNS"] = "84"
 
 project = "starpos"
 author = "starpos maintainers"
@@ -73,7 +79,28 @@ def about_names() -> str:
     return "\n".join(made)
 
 
-MADE = {"<!-- parameters -->": about_parameters, "<!-- public names -->": about_names}
+def about_commands() -> str:
+    """What --help says of every command."""
+    made = []
+    for name in COMMANDS:
+        [commands] = (action for action in parser_for([name])._actions if isinstance(action.choices, dict))
+        made.append(f"### starpos {name}\n\n```\n{commands.choices[name].format_help()}```\n")
+    return "\n".join(made)
+
+
+def about_messages() -> str:
+    """The definitions of messages and services, which say of each field what it is."""
+    files = [*sorted(INTERFACES.glob("msg/*.msg")), *sorted(INTERFACES.glob("srv/*.srv"))]
+    about = ((f.stem, f.read_text().split("\n", 1)[1].strip()) for f in files)
+    return "\n".join(f"## {name}\n\n```\n{text}\n```\n" for name, text in about)
+
+
+MADE = {
+    "<!-- commands -->": about_commands,
+    "<!-- messages -->": about_messages,
+    "<!-- parameters -->": about_parameters,
+    "<!-- public names -->": about_names,
+}
 
 
 def fill_in(app: object, name: str, source: list[str]) -> None:

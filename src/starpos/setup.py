@@ -17,8 +17,8 @@ CORE = [
     for source in sorted(glob("starpos/core/*.pyx"))
 ]
 
-# What colcon needs stands here, because it builds with links beside this file alone; all else that is said of the package is
-# in pyproject.toml.
+# What colcon needs stands here, because it builds with links beside this file alone. All else that is said of the package
+# is in pyproject.toml.
 setup(
     name=package,
     version="0.1.0",

@@ -29,3 +29,12 @@ def test_every_extra_is_told_where_people_install():
     extras = set(re.findall(r'^ +"(\w+)":', table, re.MULTILINE)) - {"test"}
     page = (REPOSITORY / "docs" / "how-to" / "install.md").read_text()
     assert extras and {name for name in extras if f"| `{name}` |" not in page} == set()
+
+
+def test_colcon_finds_the_command_in_setup_py():
+    """It builds links from setup.py alone: an entry point in pyproject.toml would be no command on a robot."""
+    assert (
+        'entry_points={"console_scripts": ["starpos = starpos.cli:main"]}'
+        in (PACKAGE / "setup.py").read_text()
+    )
+    assert "[project.scripts]" not in (PACKAGE / "pyproject.toml").read_text()
