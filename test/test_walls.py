@@ -39,6 +39,7 @@ BREACHES = [
     ("keywords", {"starpos.fix.new": f"@dataclass(frozen=True)\nclass Six:\n{FIELDS}"}, "6 fields"),
     ("words", {"starpos.fix.new": '"""Of nothing."""'}, "a verb or a noun"),
     ("words", {"starpos.fix.new": "x = 1\n" * 500}, "500 lines"),
+    ("comments", {"starpos.fix.new": "# Above.\nx = 1  # noqa: E741\ny = 2  # in m\n"}, "new.py:3"),
 ]
 
 

@@ -5,8 +5,10 @@
 """
 
 import ast
+import io
 import re
 import sys
+import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,6 +31,8 @@ MESSAGES = re.compile(r"\w+_(msgs|srvs|interfaces)$")
 USUAL = {("numpy", "np"), ("xml.etree.ElementTree", "ET"), ("matplotlib.pyplot", "plt")}
 DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
 MOST_LINES = 450
+# What a tool reads stands beside the code that it is about.
+FOR_TOOLS = re.compile(r"# *(noqa|type:|fmt:|pragma)")
 # A dataclass of so many is made by keyword, after three fields at most.
 KEYWORD_FIELDS = 6
 
@@ -217,11 +221,23 @@ def words(house: list[Module]) -> Iterator[str]:
             yield module.at(module.tree, f"{lines} lines: more than one topic?")
 
 
+def comments(house: list[Module]) -> Iterator[str]:
+    """Comments that do not stand above their line, in the product, its tests and its tools."""
+    for module in house:
+        for token in tokenize.generate_tokens(io.StringIO(module.text).readline):
+            beside_code = token.type == tokenize.COMMENT and token.line[: token.start[1]].strip()
+            if beside_code and not FOR_TOOLS.match(token.string):
+                path = module.path.relative_to(ROOT)
+                yield f"{path}:{token.start[0]}: a comment stands above its line"
+
+
 def breaches() -> list[str]:
     """All that is against the rules."""
     house = modules()
+    everything = house + beside()
     return [line for rule in (layers, aliases, twins, keywords) for line in rule(house)] + [
-        *words(house + beside()),
+        *words(everything),
+        *comments(everything),
         *core(),
     ]
 

@@ -28,7 +28,8 @@ PICTURE = Path(__file__).resolve().parents[2] / "src" / "starpos_dashboard" / "d
 # The picture shows this name, as it would show a robot's port.
 PORT = Path("ttyUSB0")
 SIZE = (1440, 1000)
-FIXES = 6  # on the map
+# How many fixes are on the map.
+FIXES = 6
 PATIENCE_S = 120.0
 LARGEST_BYTES = 150_000
 CHROMIUM = [

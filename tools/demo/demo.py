@@ -34,7 +34,8 @@ from instrument_run import (
 from starpos_testing.domain import own_domain
 
 FRAMES, CADENCE_S, EXPOSURE_S = 10, 3.0, 0.5
-MEMORY_LIMIT_MB = 500  # of each node
+# Most memory of each node.
+MEMORY_LIMIT_MB = 500
 # Frames of 42 MB; a frame's solution comes before the third frame after it.
 FRAMES_KEPT = 3
 

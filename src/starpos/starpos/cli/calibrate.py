@@ -29,7 +29,8 @@ from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 
-NOTHING = 1  # exit status
+# Exit status.
+NOTHING = 1
 # the name that the camera node uses
 CAMERA_NAME = "camera"
 

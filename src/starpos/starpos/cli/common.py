@@ -380,7 +380,8 @@ def tell_extrapolation(command: str, solved: Sequence[HasFix]) -> None:
         )
 
 
-UNREADABLE = 2  # exit status
+# Exit status.
+UNREADABLE = 2
 # s between lines of progress
 LINE_EVERY_S = 5.0
 

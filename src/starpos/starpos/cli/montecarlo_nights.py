@@ -65,7 +65,8 @@ def run_nights(args: argparse.Namespace) -> int:
     night = partial(montecarlo_nights.turned_night, errors=_errors(args), clock_stddev_s=PAPER_CLOCK_S)
     solved = [o for o in _all(args, night) if not o.trouble]
     off = np.array([o.off for o in solved]).reshape(-1, 3)
-    error = np.abs(off[:, 1::-1]).mean(0) if solved else np.full(2, np.nan)  # north, east m
+    # North, east m.
+    error = np.abs(off[:, 1::-1]).mean(0) if solved else np.full(2, np.nan)
     if args.json:
         common.print_json(
             {

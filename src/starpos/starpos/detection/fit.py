@@ -8,7 +8,8 @@ import numpy as np
 from starpos.detection.psf import Psf
 from starpos.detection.stamps import Stamps
 
-OUTLIER = 6.0  # sigma
+# In sigmas.
+OUTLIER = 6.0
 # Pixels within so many widths of the star are fitted; farther out there are only noise and neighbours.
 FIT_WIDTHS = 4.0
 

@@ -14,7 +14,8 @@ from starpos.sky.catalogue import EPOCH, Catalogue
 from starpos.units import MAS
 
 LIMIT_MAG = 7.0
-LONGEST_SIDE_DEG = 4.13  # the diagonal of 3.43 x 2.30 deg
+# The diagonal of 3.43 x 2.30 deg.
+LONGEST_SIDE_DEG = 4.13
 PRINTED_TRIANGLES = 951_181
 # The numbers that its data give.
 STARS, TRIANGLES = 15_236, 952_970

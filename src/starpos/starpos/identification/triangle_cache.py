@@ -76,7 +76,8 @@ def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
         and t.longest_allowed[0] > 0
         and rising(t.bin_start, count)
         and rising(t.cell_start, stars)
-        and bool(np.all(np.diff(t.star) > 0))  # so that the first and the last are the limits
+        # So that the first and the last are the limits.
+        and bool(np.all(np.diff(t.star) > 0))
         and (stars == 0 or 0 <= t.star[0] <= t.star[-1] < catalogue_stars)
         and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
         and bool(np.all(t.corners[:, 0] != t.corners[:, 1]))

@@ -35,7 +35,8 @@ from starpos.units import ARCSEC, DAY_S, MAS
 # the paper's camera
 CAMERA = Camera.from_focal(5616, 3744, 93750.0)
 EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
-FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0  # 2016 to 2026
+# 2016 to 2026.
+FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0
 # 1 sigma of the lean that a turn by hand causes
 LEAN_DEG = 0.05
 SCA100T = InclinometerErrors()

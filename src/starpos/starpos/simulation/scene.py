@@ -177,10 +177,12 @@ def _star_light(camera: Camera, optics: Optics, stars: Exposed) -> tuple[np.ndar
     offset = np.arange(-reach, reach + 1)
     corner = np.round(stars.middle).astype(int)
     moments = (np.arange(steps) + 0.5) / steps
-    along = stars.start[:, None] + moments[None, :, None] * trail[:, None]  # (n, steps, 2)
+    # (n, steps, 2)
+    along = stars.start[:, None] + moments[None, :, None] * trail[:, None]
     profile = []
     for k in range(2):
-        d = corner[:, k, None, None] + offset - along[:, :, k, None]  # (n, steps, size)
+        # (n, steps, size)
+        d = corner[:, k, None, None] + offset - along[:, :, k, None]
         profile.append(0.5 * (erf((d + 0.5) / (sigma * np.sqrt(2))) - erf((d - 0.5) / (sigma * np.sqrt(2)))))
     image = np.einsum("nsx,nsy->nyx", *profile) * (stars.electrons / steps)[:, None, None]
     x = corner[:, 0, None, None] + offset[None, None, :]

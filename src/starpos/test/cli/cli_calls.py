@@ -11,7 +11,8 @@ import pytest
 from starpos_testing.command_line import run
 
 SCHEMA = Path(__file__).resolve().parents[4] / "docs" / "reference" / "starpos.schema.json"
-WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# 4636 px: 15 deg across 1000 x 700 px.
+WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
 # the same, with an A3 that is known
 KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 PLACE = {"latitude": 47.3, "longitude": -122.8}

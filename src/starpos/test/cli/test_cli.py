@@ -40,7 +40,8 @@ def test_solve_star_lists_that_turn(lists, capsys):
     assert status == 0
     *each, combined = objects(out)
     assert combined["poses"] == 3
-    assert combined["heading"] == pytest.approx(each[-1]["heading"], abs=0.01)  # of the last pose
+    # The heading is that of the last pose.
+    assert combined["heading"] == pytest.approx(each[-1]["heading"], abs=0.01)
     assert [e["status"] for e in each] == ["ok"] * 3
     assert abs(combined["latitude"] - PLACE["latitude"]) * 3600 < 1
     truth = json.loads((lists / "truth.json").read_text())
@@ -119,7 +120,8 @@ def test_a_deflection_given_by_hand_is_at_the_instrument_whatever_its_altitude(l
 
 def test_a_geoid_gives_the_deflection_of_the_place_or_says_that_it_cannot(lists, tmp_path, capsys):
     def solved(south, *options):
-        heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))  # 1 m a degree to the north
+        # 1 m a degree to the north.
+        heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))
         header = struct.pack(">4d2i", south, -140, 1, 1, *heights.shape)
         (tmp_path / "slope.gtx").write_bytes(header + heights.astype(">f4").tobytes())
         geoid = ("--geoid", tmp_path / "slope.gtx", *options)

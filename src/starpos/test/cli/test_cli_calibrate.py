@@ -18,7 +18,8 @@ AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
 INSTRUMENT = (
     "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\ncamera: {}\n"
 )
-OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10")  # 2750 px: 25 deg
+# 2750 px: 25 deg.
+OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10")
 
 NAMES = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
 A3_TOO = "starpos calibrate: an A3 belongs to the camera it was found with: find it again with this one"
@@ -146,7 +147,8 @@ def test_a_frame_without_a_tilt_and_one_that_is_none(skies, run, tmp_path):
     tilts.write_text("\n".join((folder / "tilt.csv").read_text().splitlines()[:-1]) + "\n")
     args = ("--tilt", tilts, *OPTICS, *AIR, "--camera", tmp_path / "camera.yaml")
     status, said, errors = run("calibrate", *frames(folder), tmp_path / "none.fits", *args)
-    assert status == 2  # a camera, but one frame could not be read
+    # A camera, but one frame could not be read.
+    assert status == 2
     assert said.startswith("3 frames, ")
     assert len(errors) == 3 and errors[-1] == A3_TOO
     assert "none.fits: there is no such file" in errors[0]

@@ -64,10 +64,12 @@ def opencv_threads(of):
 
 @pytest.mark.parametrize("more", [(), ("--self-calibrate",)], ids=["each", "turned"])
 def test_a_cluster_gives_the_same_answers(more, cluster, archive, capfd, monkeypatch):  # noqa: F811
-    monkeypatch.chdir(archive / "turned")  # the workers have another folder
+    # The workers have another folder.
+    monkeypatch.chdir(archive / "turned")
     command = [Path(a).name if a.endswith(".csv") else a for a in solve(archive / "turned", "--json", *more)]
     status, out, err = run(capfd, command)
-    assert status == 2  # of the broken frame
+    # It tells of the broken frame.
+    assert status == 2
     there = run(capfd, [*command, "--scheduler", cluster])
     assert there[:2] == (status, out)
     assert len(there[2].splitlines()) == len(err.splitlines())
@@ -117,7 +119,8 @@ def test_a_worker_of_another_starpos_is_refused(cluster, tmp_path, older):
         r"tcp://.*: the starpos of this worker is 0\.1\.0 .*, here it is 0\.0\.1 .*: install the same there"
     )
     with Cluster(cluster) as workers:
-        older()  # as a worker that comes when the others have been asked
+        # As a worker that comes when the others have been asked.
+        older()
         with pytest.raises(ClusterError, match=told):
             list(workers.map([(read, str(tmp_path / "a"))]))
     with pytest.raises(ClusterError, match=told), Cluster(cluster):
@@ -137,7 +140,8 @@ def test_files_that_a_worker_does_not_see_are_told(cluster, tmp_path):
     mine = tmp_path / "mine"
     mine.write_text("mine")
     with mine.open() as f:
-        number = fcntl.fcntl(f, fcntl.F_DUPFD, 500)  # a path of this process only
+        # A path of this process only.
+        number = fcntl.fcntl(f, fcntl.F_DUPFD, 500)
     try:
         with Cluster(cluster) as workers, pytest.raises(ClusterError, match="does not see it"):
             list(workers.map([(read, f"/proc/self/fd/{number}")]))

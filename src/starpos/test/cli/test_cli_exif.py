@@ -12,7 +12,8 @@ from starpos.frames.reading import read_frame
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
-OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")  # 4636 px: 15 deg across 1000 x 700 px
+# 4636 px: 15 deg across 1000 x 700 px.
+OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")
 A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 LONGITUDE_DEG, OFFSET_H = -122.8, -8.0

@@ -9,7 +9,8 @@ from cli_calls import AIR, PLACE, objects
 from starpos.cli import main
 from starpos.instrument import camera_file
 
-OPTICS = ("--focal-mm", "2.25", "--pixel-um", "4.5")  # 500 px
+# 500 px.
+OPTICS = ("--focal-mm", "2.25", "--pixel-um", "4.5")
 LENS = (*OPTICS, "--lens", "equidistant")
 A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 

@@ -60,7 +60,8 @@ def run(capfd, command):
 @pytest.mark.parametrize("more", [(), ("--self-calibrate",)], ids=["each", "turned"])
 def test_solve_gives_the_same_however_many_processes(more, archive, capfd):
     one = run(capfd, solve(archive / "turned", "--json", *more))
-    assert one[0] == 2  # of the broken frame
+    # It tells of the broken frame.
+    assert one[0] == 2
     assert one[1].count('"status": "ok"') == 8 + 1
     assert one[2].count("stars_0002b.csv") == 1
     assert run(capfd, solve(archive / "turned", "--json", "--jobs", 3, *more)) == one
@@ -203,6 +204,7 @@ def started(archive, **options):
     many = [p for p in frames(night) if "2b" not in p] * 13
     command = ["solve", *many, "--tilt", str(night / "tilt.csv"), *KNOWN, "--json", "--jobs", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+    # A shell's background ignores it.
     process = subprocess.Popen(
         [
             "env",
@@ -211,7 +213,7 @@ def started(archive, **options):
             "-m",
             "starpos",
             *command,
-        ],  # a shell's background ignores it
+        ],
         text=True,
         start_new_session=True,
         **pipes,
@@ -254,7 +256,8 @@ def test_workers_end_with_their_parent(ends, archive):
     with started(archive) as (process, _, workers, _):
         fds = [os.pidfd_open(w) for w in workers]
         if ends == signal.SIGINT:
-            os.killpg(process.pid, ends)  # as a terminal does
+            # As a terminal does.
+            os.killpg(process.pid, ends)
         else:
             process.kill()
         _, err = process.communicate(timeout=WAIT_S)
@@ -286,7 +289,8 @@ def test_a_terminal_is_shown_how_far_it_is(archive):
         while True:
             try:
                 shown += os.read(ours, 65536)
-            except OSError:  # the other end is closed
+            except OSError:
+                # The other end is closed.
                 break
     os.close(ours)
     assert f"frame {len(many)} of {len(many)}".encode() in shown

@@ -58,7 +58,8 @@ def test_todays_frames_claim_what_the_old_table_does_not_know(night, capsys, old
     for answer in each:
         east_m = (answer["longitude"] - PLACE["longitude"]) * 111320 * np.cos(np.radians(PLACE["latitude"]))
         assert abs(east_m) < 4 * answer["sigma_east_m"]
-        assert 50 < answer["budget"]["ut1"][0] < 80  # 88 m at the equator
+        # 88 m at the equator.
+        assert 50 < answer["budget"]["ut1"][0] < 80
     assert together["iers_table_age_days"] == pytest.approx(991, abs=1)
     (line,) = errors
     assert "upgrade astropy-iers-data" in line

@@ -27,7 +27,8 @@ def test_catalogue_info(capsys):
 def test_a_catalogue_that_cannot_be_written(capsys, monkeypatch, catalogue, tmp_path):
     from starpos.sky import tycho2
 
-    monkeypatch.setattr(tycho2, "build", lambda *_: catalogue)  # the real one reads 500 MB
+    # The real one reads 500 MB.
+    monkeypatch.setattr(tycho2, "build", lambda *_: catalogue)
     status, _, errors = run(
         capsys, "catalogue", "build", "x", "--out", tmp_path / "no" / "such" / "folder.npz"
     )
@@ -102,7 +103,8 @@ def starpos(*args, **environment):
 
 def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_path):
     rows = (lists / "stars_0001.csv").read_text()
-    other = tmp_path / "other.csv"  # of another size, so that two catalogues of triangles are wanted
+    # This one has another size, so that two catalogues of triangles are wanted.
+    other = tmp_path / "other.csv"
     other.write_text(rows.replace('"NAXIS1": 1000', '"NAXIS1": 1010'))
     assert other.read_text() != rows
     (tmp_path / "file").touch()

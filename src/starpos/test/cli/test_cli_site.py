@@ -94,7 +94,8 @@ def test_from_a_known_place_to_a_fix_elsewhere(known, elsewhere, run, tmp_path):
     assert a3_error(known.shot, calibration)[1] < 25
     assert calibration.misalignment_deg == pytest.approx(angles, abs=1e-5)
     assert (calibration.frames, calibration.temperature_c, calibration.valid_days) == (4, 15.0, 365.0)
-    assert said.splitlines()[0] in out.read_text()  # for people
+    # For people.
+    assert said.splitlines()[0] in out.read_text()
     check_elsewhere(run, elsewhere, out)
 
 
@@ -109,7 +110,8 @@ def test_json_is_an_object_a_line(known, elsewhere, run, tmp_path):
     assert camera["camera"] == str(a)
     assert site["instrument"] == str(b)
     i = instrument_file.read(b)
-    assert i.camera == camera_file.read(a)  # the camera that was found, and A3 with it
+    # The camera that was found, and A3 with it.
+    assert i.camera == camera_file.read(a)
     assert i.focal_px == i.camera.fx == camera["fx"]
     assert site["misalignment_deg"] == pytest.approx(i.calibration.misalignment_deg)
     np.testing.assert_allclose(site["covariance_arcsec2"], i.calibration.covariance_arcsec2)
@@ -236,7 +238,8 @@ def test_frames_that_cannot_be_read_or_solved_are_named(known, run, tmp_path):
     status, said, errors = run(
         "calibrate", *known.frames, tmp_path / "empty.csv", tmp_path / "none.fits", *args
     )
-    assert status == 2  # an instrument, but one frame could not be read
+    # An instrument, but one frame could not be read.
+    assert status == 2
     assert said.startswith("A3 of 4 frames")
     assert any("none.fits" in e for e in errors)
     assert any("empty.csv" in e for e in errors)

@@ -9,7 +9,8 @@ from starpos.frames.frame import Frame
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
 from starpos_testing.skies.rendered import BIAS, bound, coloured, field, grid, match, noisy
 
-TRAIL = (2.6, -2.2)  # px: half a second of the sky
+# In px: half a second of the sky.
+TRAIL = (2.6, -2.2)
 
 
 def errors(size, frames, electrons, seed, pattern="", gains=None, **shape):
@@ -53,7 +54,8 @@ def test_undersampled_and_defocused_stars_keep_near_the_bound(fwhm, electrons):
 
 def rings(diameter, electrons, rng, size=(500, 500)):
     """Electrons of stars out of focus in a telescope with an obstruction, and the stars (N, 3)."""
-    y, x = np.mgrid[: 5 * size[0], : 5 * size[1]] / 5 - 0.4  # px, of five dots a pixel
+    # In px, each of five dots.
+    y, x = np.mgrid[: 5 * size[0], : 5 * size[1]] / 5 - 0.4
     light, stars = np.zeros(size), grid(size, 45, electrons, rng)
     for star in stars:
         near = np.s_[
@@ -162,7 +164,8 @@ def test_faint_stars_down_to_snr_8_are_found():
     # matched SNR of a star of E electrons in this sky is E / sqrt(4 pi s^2 (sky + read^2)), s^2 = 1.04 + 1/12
     noise = np.sqrt(4 * np.pi * (1.04 + 1 / 12) * (20 + 25))
     _, _, missed, invented = errors((520, 520), 2, 9 * noise, seed=7)
-    assert missed < 10 and invented == 0  # of 512
+    # There are 512.
+    assert missed < 10 and invented == 0
 
 
 def test_moonlit_gradient_hot_pixels_and_cosmic_rays_add_no_star():
@@ -188,12 +191,16 @@ def test_saturated_edge_blended_and_elongated_stars_are_flagged_and_others_not()
     stars = grid(size, 80, 15000, rng)
     special = np.array(
         [
-            [120.3, 120.4, 9e5],  # far over the full well
-            [1.2, 200.4, 15000],  # half outside
+            # Far over the full well.
+            [120.3, 120.4, 9e5],
+            # Half outside.
+            [1.2, 200.4, 15000],
             [280.2, 120.1, 15000],
-            [283.0, 120.3, 12000],  # its neighbour 2.8 px off
+            # Its neighbour 2.8 px off.
+            [283.0, 120.3, 12000],
             [120.2, 280.0, 9000],
-            [120.2, 282.1, 9000],  # a pair closer than the resolution: one long image
+            # A pair closer than the resolution: one long image.
+            [120.2, 282.1, 9000],
         ]
     )
     light = field(size, np.concatenate([stars, special]))
@@ -234,7 +241,8 @@ def test_eight_bits_are_enough():
 def test_chi_square_tells_the_star_that_is_not_like_the_others():
     rng = np.random.default_rng(16)
     stars = grid((400, 400), 40, 15000, rng)
-    fwhm = np.where(np.arange(len(stars)) == 0, 3.2, 2.4)  # the first is a nebula
+    # The first is a nebula.
+    fwhm = np.where(np.arange(len(stars)) == 0, 3.2, 2.4)
     detection = detect(Frame(noisy(field((400, 400), stars, fwhm), rng)))
     index = match(detection.stars, stars[1:])
     assert len(detection.chi2) == len(detection.stars) and np.all(index >= 0)

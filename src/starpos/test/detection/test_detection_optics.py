@@ -45,7 +45,8 @@ def test_images_that_go_with_the_field_are_measured_at_the_bound_and_stay_one_st
 
 
 def test_coma_shifts_bright_stars_no_more_than_faint_ones(stars, rng):
-    way, tail_px = outwards(stars), 1.0  # at a corner
+    # At a corner.
+    way, tail_px = outwards(stars), 1.0
     steps = (np.arange(9) + 0.5) / 3
     share = np.exp(-steps) / np.exp(-steps).sum()
     tails = [
@@ -63,7 +64,8 @@ def test_coma_shifts_bright_stars_no_more_than_faint_ones(stars, rng):
         own = stars[:, 2] == electrons
         fit = np.linalg.lstsq(terms[own], along[own], rcond=None)[0]
         rest = error[own] - (terms[own] @ fit / far[own])[:, None] * way[own]
-        assert rms(rest) < 1.2 * rms(bound(electrons))  # of a star without a tail
+        # A star without a tail.
+        assert rms(rest) < 1.2 * rms(bound(electrons))
         assert 0.9 < rms(rest / error[own] * pull[own]) < 1.1
         shifts.append(fit.sum())
     assert abs(shifts[1] - shifts[0]) < 0.04
@@ -72,7 +74,8 @@ def test_coma_shifts_bright_stars_no_more_than_faint_ones(stars, rng):
 def test_corners_without_a_star_to_learn_from_are_no_worse_than_the_rest(rng):
     stars = grid(SIZE, 65, BRIGHT, rng)
     middle = np.abs(stars[:, 0] - SIZE[1] / 2) < 300
-    faint = np.where(middle, BRIGHT, 700.0)  # too faint to teach
+    # Too faint to teach.
+    faint = np.where(middle, BRIGHT, 700.0)
     stars = np.c_[stars[:, :2], faint]
     found = detect(Frame(noisy(field(SIZE, stars, 2.4 * (1 + 0.3 * outwards(stars)[:, 0])), rng))).stars
     index = match(found, stars)

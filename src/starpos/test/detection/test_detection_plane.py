@@ -8,12 +8,13 @@ from starpos.detection.plane import plane_of
 from starpos.frames.frame import PATTERNS, Frame
 from starpos_testing.skies.rendered import field, grid, match
 
+# OpenCV's names of them.
 OF_MOSAIC = {
     "rggb": "BayerBG",
     "grbg": "BayerGB",
     "bggr": "BayerRG",
     "gbrg": "BayerGR",
-}  # OpenCV's names of them
+}
 
 
 def mosaic(rng, size=(520, 520), electrons=12000.0, black=0.0):
@@ -62,6 +63,7 @@ def test_a_sky_cut_off_at_black_hides_no_star_and_makes_none(rng):
     index = match(found, stars)
     assert np.mean(index >= 0) > 0.97
     brightest = set(range(int(0.9 * len(stars))))
-    assert brightest <= set(index)  # what noise makes comes after them
+    # What noise makes comes after them.
+    assert brightest <= set(index)
     error = np.stack([found.x[index], found.y[index]], 1)[index >= 0] - stars[index >= 0, :2]
     assert np.all(np.abs(error.mean(0)) < 0.05)

@@ -56,9 +56,8 @@ def test_a_roof_hides_what_it_covers_and_adds_nothing(brightness, rng):
     tiles = brightness * (1 + 0.2 * rng.random((60, 90))).repeat(10, 0).repeat(10, 1)
     found = found_in(np.where(roof, tiles, field(SIZE, stars, sky=60)), rng)
     below = stars[:, 1] - 420 - 0.1 * stars[:, 0]
-    error, pull = errors(
-        found, stars[below < (-64 if brightness else -15)]
-    )  # a cell of the background's mesh
+    # A cell of the background's mesh.
+    error, pull = errors(found, stars[below < (-64 if brightness else -15)])
     assert rms(error) < 1.15 * rms(bound(ELECTRONS, sky=60))
     assert 0.75 < rms(pull) < 1.15
     index = match(found, stars)
@@ -96,7 +95,8 @@ def test_a_tree_costs_what_it_covers_and_most_of_what_its_leaves_add_is_flagged(
     near = ndimage.gaussian_filter(twigs, 9)[stars[:, 1].astype(int), stars[:, 0].astype(int)] > 0.02
     clear = stars[~near]
     clear = clear[match(found, clear) >= 0]
-    assert len(clear) > 0.98 * np.count_nonzero(~near)  # a twig's end may lie on one
+    # A twig's end may lie on one.
+    assert len(clear) > 0.98 * np.count_nonzero(~near)
     error, pull = errors(found, clear)
     assert rms(error) < 1.1 * rms(bound(ELECTRONS, sky=60))
     assert 0.85 < rms(pull) < 1.1
@@ -158,7 +158,8 @@ def test_both_stars_of_a_close_pair_are_measured(fwhms, ratio, pattern, rng):
         error, pull = errors(found, some)
         assert rms(error) < (1.4 if fwhms > 1.5 else 2.4) * rms(bound(some[0, 2], gain=mean))
         assert 0.75 < rms(pull) < 1.25
-        if fwhms > 1.5:  # resolved
+        # Resolved
+        if fwhms > 1.5:
             assert np.count_nonzero(found.flags[match(found, some)]) < 0.2 * len(some)
 
 
@@ -198,8 +199,10 @@ def test_hot_pixels_cost_no_fit_each_and_hardly_a_star(rng):
     light[hot] += rng.integers(100, 20_000, hot.sum())
     pixels = light.clip(0, 65535).astype(np.uint16)
     found = detect(Frame(pixels)).stars
-    assert np.mean(match(found, stars) >= 0) > 0.98  # a hot pixel in the midst of one may cost it
-    assert len(peaks_of(pixels).x) < len(stars) + 0.4 * hot.sum()  # pairs of hot pixels stay to be looked at
+    # A hot pixel in the midst of one may cost it.
+    assert np.mean(match(found, stars) >= 0) > 0.98
+    # Pairs of hot pixels stay to be looked at.
+    assert len(peaks_of(pixels).x) < len(stars) + 0.4 * hot.sum()
 
 
 def test_a_disc_that_saturates_is_few_peaks_and_hides_no_star_a_cell_of_the_background_away(rng):
@@ -224,7 +227,8 @@ def test_a_pixel_beyond_all_light_costs_no_other_its_precision(unit, value, star
 def test_memory_is_less_than_two_and_a_half_frames(rng):
     size = (1155, 1732)
     frame = Frame(noisy(field(size, grid(size, 80, ELECTRONS, rng)), rng))
-    detect(Frame(frame.pixels[:200, :200].copy()))  # what the first call loads
+    # What the first call loads.
+    detect(Frame(frame.pixels[:200, :200].copy()))
     tracemalloc.start()
     try:
         detect(frame)

@@ -64,7 +64,8 @@ def test_a_long_trail_on_a_large_frame_hides_no_star(rng):
     light = field(size, stars) + trail(start, end, 300, size=size)
     found = detect(Frame(noisy(light, rng))).stars
     index = match(found, stars)
-    assert np.mean(index >= 0) > 0.9  # one or two lie under it
+    # One or two lie under it.
+    assert np.mean(index >= 0) > 0.9
     assert len(found) == np.count_nonzero(index >= 0)
 
 

@@ -14,7 +14,8 @@ from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField
 
 STATE = earth_state(UTC)
-ARCSEC_M = (30.95, 30.82)  # east, north at 35.7 deg, radii of WGS 84
+# East, north at 35.7 deg, radii of WGS 84.
+ARCSEC_M = (30.95, 30.82)
 NONE = np.zeros((3, 3))
 
 
@@ -46,7 +47,8 @@ def test_drift_grows_with_the_root_of_the_hours(rng):
         assert sigma_m(fix, "tilt drift") == pytest.approx(
             2 * np.sqrt(abs(hours)) * np.array(ARCSEC_M), rel=0.01
         )
-    assert sigma_m(fixed(field, rng, errors), "tilt drift").max() == 0  # since nobody knows when
+    # Since nobody knows when.
+    assert sigma_m(fixed(field, rng, errors), "tilt drift").max() == 0
 
 
 def test_temperature_by_the_degree(rng):
@@ -63,9 +65,8 @@ def test_temperature_by_the_degree(rng):
 def test_scale_counts_from_the_tilt_it_was_calibrated_at(rng):
     """1e-4 of 10 deg is 3.6 arcsec, 111 m."""
     errors = replace(EXACT, scale=1e-4)
-    field = SkyField(
-        azimuth=0.0, altitude=80.0, roll=0.0
-    )  # leans to the north, about the camera's x axis alone
+    # Leans to the north, about the camera's x axis alone.
+    field = SkyField(azimuth=0.0, altitude=80.0, roll=0.0)
     fix = fixed(field, rng, errors)
     east, north = sigma_m(fix, "tilt response")
     assert north == pytest.approx(3.6 * ARCSEC_M[1], rel=0.01)
@@ -90,10 +91,12 @@ def test_an_unknown_turn_against_instruments_turned_at_random(turn_deg, rng):
     up = field.attitude[2]
     moved = []
     for angle in rng.normal(0, sigma, 4000):
-        off = rotation.about_axis(2, angle) @ up - up  # of the plumb line in S, which is the zenith's
+        # The plumb line in S, which is the zenith's.
+        off = rotation.about_axis(2, angle) @ up - up
         moved.append((field.attitude @ off)[:2] * 6.378e6)
     real = np.cov(np.array(moved).T) + np.outer(np.mean(moved, 0), np.mean(moved, 0))
-    floor = np.eye(2) * 1e-3 * np.trace(claimed)  # of the Earth's two radii
+    # Between the Earth's two radii.
+    floor = np.eye(2) * 1e-3 * np.trace(claimed)
     share = np.linalg.eigvals(np.linalg.solve(claimed + floor, real + floor)).real
     assert share.max() < 1.15
     if turn_deg < 10:

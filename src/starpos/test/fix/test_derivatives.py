@@ -30,7 +30,8 @@ LENSES = {
 def problem_of(camera, off_zenith_rad, rng, stars=40):
     """An adjustment with stars all over the frame of a camera that leans, and the estimate from which they come."""
     v = camera.directions(*rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (stars, 2)).T)
-    v[0] = [0.0, 0.0, 1.0]  # on the axis
+    # On the axis.
+    v[0] = [0.0, 0.0, 1.0]
     g = rotation.about_axis(0, off_zenith_rad)
     air = Atmosphere().refraction()
     a4 = rotation.from_vector(rng.normal(0, 1, 3))

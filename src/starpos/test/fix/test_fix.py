@@ -263,7 +263,8 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
         c = fix.covariance
         position.append(moved @ np.linalg.solve(c[:2, :2], moved))
         heading.append(turned**2 / c[2, 2])
-        unit = np.array([1.0, 1.0, ARCSEC / 30])  # of like size
+        # They are of like size.
+        unit = np.array([1.0, 1.0, ARCSEC / 30])
         all_three = np.array([*moved, turned]) / unit
         together.append(all_three @ np.linalg.solve(c / np.outer(unit, unit), all_three))
         spin = rotation.to_small_vector(
@@ -271,9 +272,11 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
         )
         attitude.append(np.sum(spin**2) / np.trace(fix.attitude_covariance))
     bound = 4 * np.sqrt(2 / tries)
-    assert np.mean(together) / 3 == pytest.approx(1, abs=bound / np.sqrt(3))  # with what they have in common
+    # With what they have in common.
+    assert np.mean(together) / 3 == pytest.approx(1, abs=bound / np.sqrt(3))
     assert np.mean(position) / 2 == pytest.approx(1, abs=bound / np.sqrt(2))
-    if source not in ("clock", "time stamp", "ut1"):  # these turn the Earth: heading and attitude do not mind
+    # These turn the Earth: heading and attitude do not mind.
+    if source not in ("clock", "time stamp", "ut1"):
         assert np.mean(heading) == pytest.approx(1, abs=bound)
         assert np.mean(attitude) == pytest.approx(1, abs=bound)
 

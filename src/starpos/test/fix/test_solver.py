@@ -122,7 +122,8 @@ def test_identify_gives_the_pointing_of_the_frames_centre(night, catalogue):
         site.enu[2]
     )
     ra, dec = erfa.aticq(*erfa.c2s(itrs @ state.cirs_to_itrs), state.astrom)
-    assert (a.ra, a.dec) == pytest.approx((ra, dec), abs=4 * ARCSEC)  # 0.1 px
+    # 0.1 px.
+    assert (a.ra, a.dec) == pytest.approx((ra, dec), abs=4 * ARCSEC)
     assert a.focal_px == pytest.approx(FOCAL_PX, rel=3e-3)
     assert not a.mirrored
     state_free = solver.identify(replace(stars, mid_unix_s=None))

@@ -60,7 +60,8 @@ def test_time_outside_the_tables(utc, night):
     assert "check the frame's clock" in message
 
 
-@pytest.mark.parametrize("utc", [-6.3e8, 0.0, 2.05e9])  # 1950, 1970, 2034
+# 1950, 1970, 2034.
+@pytest.mark.parametrize("utc", [-6.3e8, 0.0, 2.05e9])
 def test_a_pointing_needs_no_tables(utc, night):
     _, stars, _, solver = night
     s = solver.identify(replace(stars, mid_unix_s=utc))
@@ -77,7 +78,8 @@ def test_a_pointing_of_an_impossible_date(utc, night):
 
 def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng, capsys):
     scene, stars, tilt, solver = night
-    within = replace(solver.solve(stars, tilt), extrapolated_days=0.0)  # whatever table is installed
+    # Whatever table is installed.
+    within = replace(solver.solve(stars, tilt), extrapolated_days=0.0)
     now = earth_state(START).orientation.extrapolated_days
     later = START + (700 - now) * 86400
     s = solver.solve(stars_of(scene, catalogue, rng, later), tilt_of(scene, rng, later))

@@ -37,7 +37,8 @@ def test_over_random_points_it_rises_no_further_than_chance_allows(catalogue, rn
     for x in (1, 2, 3, 4):
         allowed = np.exp(-x)
         assert np.mean(best > x) < allowed + 3 * np.sqrt(allowed / len(best))
-    assert np.mean(best > -8) > 0.05  # or the test would not see anything
+    # Otherwise the test would not see anything.
+    assert np.mean(best > -8) > 0.05
 
 
 @pytest.mark.montecarlo
@@ -103,7 +104,8 @@ def test_each_star_that_was_passed_over_counts_against_it(rng):
     pose, w, xy = scene(rng)
     all_seen = evidence(pose, w, xy)
     one_missed = evidence(pose, w, xy, rank=np.r_[0:6, 7:13])
-    assert all_seen - one_missed == pytest.approx(6 * np.log(3))  # of six stars one brighter was not seen
+    # One brighter than six stars was not seen.
+    assert all_seen - one_missed == pytest.approx(6 * np.log(3))
 
 
 def test_a_false_star_costs_and_a_crowd_of_them_costs_little_more(rng):
@@ -212,7 +214,8 @@ def test_what_is_no_number_is_not_accepted(catalogue, rng, monkeypatch):
 
 def test_what_lies_beyond_the_frame_does_not_make_chance_rarer(rng):
     xy = rng.uniform(0, [299, 224], (20, 2))
-    xy[3] = -40.0, 100.0  # as a lens that draws in does
+    # As a lens that draws in does.
+    xy[3] = -40.0, 100.0
     field = search.frame_stars(SMALL.directions(*xy.T), np.full(20, SIGMA_PX), SMALL)
     assert (field.half > [150, 112.5]).all()
     assert field.area_px2 == AREA_PX2

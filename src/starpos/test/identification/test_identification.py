@@ -10,7 +10,8 @@ from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
 
 FIELDS = {
     "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),
-    "4 deg": (Camera.from_focal(1404, 936, 23437.5), 9.5),  # the paper's field, pixels binned by four
+    # The paper's field, pixels binned by four.
+    "4 deg": (Camera.from_focal(1404, 936, 23437.5), 9.5),
 }
 
 
@@ -220,9 +221,8 @@ def test_coarse_centroids_are_searched_with_their_own_error(catalogue, rng):
         attitude = random_attitude(rng)
         xy, _ = seen(sky, camera, attitude, limit, rng, sigma=error_px)
         tight = [stage for stage in search.STAGES if stage[1] < 1.0]
-        with (
-            pytest.MonkeyPatch.context() as only
-        ):  # the loose stages, made for lenses that distort, would help out
+        # The loose stages, made for lenses that distort, would help out.
+        with pytest.MonkeyPatch.context() as only:
             only.setattr(search, "STAGES", tight)
             answer = identify(xy, np.full(len(xy), error_px), camera, sky)
         if answer is not None:

@@ -45,7 +45,8 @@ def test_the_printed_angles(catalogue):
 def test_triangles_by_brute_force(side_deg, rng):
     v = rng.normal((0, 0, 4), 1, (40, 3))
     v /= np.linalg.norm(v, axis=1, keepdims=True)
-    v[7] = v[3]  # a pair in one place counts as two stars
+    # A pair in one place counts as two stars.
+    v[7] = v[3]
     longest = np.radians(side_deg)
     near = triangles.sides(v[:, None], v) < longest
     expected = sum(near[i, j] and near[i, k] and near[j, k] for i, j, k in combinations(range(40), 3))

@@ -57,10 +57,12 @@ def test_as_many_stars_as_astrometry_net_and_of_as_many_residuals_no_larger(answ
         plane = there @ np.stack([centre, east, np.cross(centre, east)], 1)
         design, seen = plane / plane[:, :1], np.stack([stars.x, stars.y], 1)[s.star[first]]
         residual = seen - design @ np.linalg.lstsq(design, seen, rcond=None)[0]
-        assert np.sqrt(np.mean(residual**2)) < float(row["rms_px"]) + 0.005, row["file"]  # theirs is rounded
+        # Theirs is rounded.
+        assert np.sqrt(np.mean(residual**2)) < float(row["rms_px"]) + 0.005, row["file"]
 
 
-@pytest.mark.parametrize("answers", ["openstartracker"], indirect=True)  # the others have none
+# The others have none.
+@pytest.mark.parametrize("answers", ["openstartracker"], indirect=True)
 def test_nothing_is_invented_for_the_rest(answers):
     """What astrometry.net could not solve is refused, or answered with stars as bright as they should be."""
     rows, _, solutions, _ = answers

@@ -16,8 +16,10 @@ from starpos.instrument.camera import Camera
 from starpos.rotation import shortest_turn
 from starpos_testing.patience import WAIT_S
 
-WIDE = np.radians(7.5)  # half the diagonal of a 15 deg field
-BROAD = np.radians(25)  # its table is built in a second
+# Half the diagonal of a 15 deg field.
+WIDE = np.radians(7.5)
+# Its table is built in a second.
+BROAD = np.radians(25)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +110,8 @@ def queries(v, error_rad):
 
 def test_what_is_looked_up_is_what_brute_force_finds(table, places, rng):
     camera, known, answers = Camera.from_focal(1000, 700, 610.3 / np.tan(WIDE)), shapes(table, places), 0
-    rounding = 1e-4  # of the shapes as they are kept
+    # Which shapes, as they are kept.
+    rounding = 1e-4
     for triangle in rng.integers(0, len(known), 60):
         v = places[table.corners[triangle]]
         xy = camera.project(v @ shortest_turn(unit_sum(v), np.array([0.0, 0.0, 1.0])).T)
@@ -139,7 +142,8 @@ def test_triangles_are_those_of_their_corners(table, places, rng):
     pick = rng.integers(0, len(table.corners), 2000)
     v = places[table.corners[pick]]
     found = angles(v)
-    assert np.all(np.diff(found, axis=1) <= 1e-12)  # the largest's corner first, the smallest's last
+    # The largest's corner first, the smallest's last.
+    assert np.all(np.diff(found, axis=1) <= 1e-12)
     turn = np.einsum("ni,ni->n", np.cross(v[:, 0], v[:, 1]), v[:, 2])
     np.testing.assert_array_equal(table.counter_clockwise[pick], turn < 0)
     longest = (table.shape[pick, 2] + 0.5) * (table.longest_allowed[0] / triangles.CODES)
@@ -245,7 +249,8 @@ def test_a_broken_cache_is_built_anew(damage, own_cache, catalogue):
     kept = {path.name: path.read_bytes() for path in folder.iterdir()}
     triangle_cache._in_use.clear()
     path = folder / f"{column}.npy"
-    path.unlink()  # or the harm would reach what is still mapped
+    # Otherwise the harm would reach what is still mapped.
+    path.unlink()
     path.write_bytes(kept[path.name])
     harm(path)
     again = triangle_cache.cached(catalogue, BROAD)
@@ -290,4 +295,5 @@ def test_two_processes_at_once(own_cache):
     said = [p.communicate(timeout=WAIT_S)[0] for p in running]
     assert [p.returncode for p in running] == [0, 0]
     assert said[0] == said[1] != ""
-    assert len(list(own_cache.iterdir())) == 1  # nothing half made is left
+    # Nothing half made is left.
+    assert len(list(own_cache.iterdir())) == 1
