@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A log of tilt readings: the tilt of an exposure from it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 
@@ -165,7 +165,7 @@ class TiltLog:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
         if not self._finite.all():
             raise TiltError("some tilts have two axes and some three: give those of one inclinometer")
-        return self._mean(np.arange(len(self.utc_unix_s)))
+        return self._mean(np.argsort(self.utc_unix_s, kind="stable"))
 
     @property
     def _finite(self) -> np.ndarray:
@@ -209,7 +209,7 @@ class TiltLog:
         return stuck
 
     def _mean(self, use: np.ndarray) -> Tilt:
-        """The mean tilt of the readings `use` (indices)."""
+        """The mean tilt of the readings `use` (indices, in order of time)."""
         theta = self.theta[use]
         noise = self.excess * np.sqrt(self.variance[use].mean())
         from_middle = np.abs(theta - np.median(theta, axis=0))
@@ -218,6 +218,7 @@ class TiltLog:
         wild = np.flatnonzero(~sane)
         # wild readings differ from each other; neighbours that agree are of another lean
         turned = any(self._agree(use[k], use[k + 1]) for k in wild[:-1] if not sane[k + 1])
+        turned = turned or any(self._agree(a, b) for a, b in self._edges(use) if not sane[use == a].all())
         if turned or spread.max() > REST * noise:
             # angles that cannot be, as in another unit, scatter as well
             _check_possible(theta[from_middle.max(1).argmin()])
@@ -248,6 +249,15 @@ class TiltLog:
             temperature_c=float(self.temperature_c[use].mean()),
             times=tuple(self.utc_unix_s[use].tolist()),
         )
+
+    def _edges(self, use: np.ndarray) -> Iterator[tuple[int, int]]:
+        """The first and the last reading of `use`, each with the one beyond it, where that is near in time."""
+        order = self._once
+        for edge, step in ((use[0], -1), (use[-1], 1)):
+            for k in np.flatnonzero(order == edge) + step:
+                near = 0 <= k < len(order) and abs(self.utc_unix_s[order[k]] - self.utc_unix_s[edge]) <= BRACKET_S
+                if near:
+                    yield int(edge), int(order[k])
 
     def _of_exposure(self, mid_unix_s: float, exposure_s: float, spread_s: float) -> np.ndarray:
         """Indices of the readings that `average` takes, in order of time, one for each time.
@@ -289,17 +299,17 @@ class TiltLog:
     ) -> None:
         """TiltError if no readings tell whether the instrument was at rest in a part of the exposure.
 
-        Such a part is longer than half of the exposure, and than is usual. It is also an end of the exposure longer than
-        OPEN_END of it where the reading beyond disagrees: nobody knows when the turn began.
+        Such a part lies between two readings and is longer than half of the exposure, and than is usual; or it is an end
+        of the exposure: longer than half of it where no reading follows beyond, and longer than OPEN_END of it where that
+        reading disagrees, because nobody knows when the turn began.
         """
         t = self.utc_unix_s[index]
         begin, over = mid_unix_s - exposure_s / 2, mid_unix_s + exposure_s / 2
-        usual = max(exposure_s / 2, USUAL_GAPS * self.period_s)
-        gaps = [(float(gap), usual) for gap in np.diff(t[first:end])]
+        usual_s = USUAL_GAPS * self.period_s
+        gaps = [(float(gap), max(exposure_s / 2, usual_s)) for gap in np.diff(t[first:end])]
         for gap, one in ((t[first] - begin, first - 1), (over - t[end - 1], end - 1)):
-            beyond = 0 <= one < len(t) - 1 and t[one + 1] - t[one] <= BRACKET_S
-            if not beyond:
-                gaps.append((gap, usual))
+            if not (0 <= one < len(t) - 1 and t[one + 1] - t[one] <= max(BRACKET_S, usual_s)):
+                gaps.append((gap, exposure_s / 2))
             elif not self._agree(index[one], index[one + 1]):
                 gaps.append((gap, OPEN_END * exposure_s))
         open_s = [gap for gap, most in gaps if gap > most + TOUCH_S]

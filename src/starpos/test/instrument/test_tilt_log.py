@@ -157,6 +157,33 @@ def test_a_turn_beside_the_only_reading_of_an_exposure_gives_no_tilt(mid):
         TiltLog.of(t, turned, np.zeros(10), np.zeros(10)).average(mid, 0.5)
 
 
+def test_no_readings_at_all_hide_a_turn_as_the_exposure_begins(rng):
+    """Any rate, any losses, a reading at the very edge, and a log that ends anywhere: the new lean, or none."""
+    told = 0
+    for _ in range(2000):
+        period_s, exposure_s = rng.choice([0.1, 0.1, 0.5, 1.0]), rng.choice([0.2, 0.5, 1.0])
+        t = np.arange(-4, 5, period_s) + rng.uniform(0, period_s)
+        t = t[rng.random(len(t)) < rng.choice([0.2, 0.5, 0.9, 1.0])]
+        turn_s = rng.uniform(-1.0, 0.01)
+        if rng.random() < 0.5:
+            turn_s = rng.uniform(-0.05, 0.01)
+            t = np.append(t, turn_s)
+        if rng.random() < 0.3:
+            t = t[(t <= turn_s) | (t > exposure_s - 0.02)]
+        t = np.sort(t)[: rng.integers(1, 2 * len(t) + 2)]
+        noise = rng.normal(0, SCA100T_NOISE_RAD, (2, len(t)))
+        log = TiltLog.of(
+            t, np.where(t <= turn_s, 0.0, 0.05) + noise[0], noise[1], np.full(len(t), 8.0), SCA100T_NOISE_RAD
+        )
+        try:
+            tilt = log.average(exposure_s / 2, exposure_s)
+        except TiltError:
+            continue
+        told += 1
+        assert tilt.theta_x == pytest.approx(0.05, abs=6 * SCA100T_NOISE_RAD)
+    assert told > 500
+
+
 @pytest.mark.parametrize("mid", [990.0, 1020.0, float("nan"), float("inf")])
 def test_no_reading_near_the_exposure(mid):
     with pytest.raises(TiltError, match="no tilt reading in the exposure"):
