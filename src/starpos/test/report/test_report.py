@@ -98,7 +98,7 @@ def test_the_place_on_maps_comes_first_and_a_simulated_night_is_called_that(draw
     (link,) = [r for r in page.references if r.startswith("geo:")]
     assert abs(float(link[4:].split(",")[0]) - PLACE["latitude"]) < 0.1
     assert "Simulated: no camera took these frames." in page.text
-    assert page.text.count("Simulated. ") == len(page.pictures) == 7
+    assert page.text.count("Simulated. ") == len(page.pictures) == 8
     truth = json.loads((still / "truth.json").read_text())
     assert folder.truth_in(still).simulated
     (tmp_path / "truth.json").write_text(
@@ -110,7 +110,7 @@ def test_the_place_on_maps_comes_first_and_a_simulated_night_is_called_that(draw
 def test_pictures_are_drawn_and_lie_beside_the_page(drawn):
     page = Page(drawn / "index.html")
     names = {p.stem for p in drawn.glob("*.png")}
-    assert names == {"stability", "frames", "scatter", "budget", "residuals", "sky", "health"}
+    assert names == {"map", "stability", "frames", "scatter", "budget", "residuals", "sky", "health"}
     files = {(drawn / f"{n}.png").read_bytes() for n in names}
     assert files == set(page.pictures.values())
     for png in files:

@@ -240,6 +240,6 @@ render();
 document.addEventListener("visibilitychange", look);
 look();
 setInterval(render, TICK_MS);
-const answer = await fetch("/vendor/land-110m.json");
+const answer = await fetch("/land-110m.json");
 map = new EarthMap(await answer.json());
 render();
