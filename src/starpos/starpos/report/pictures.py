@@ -147,7 +147,7 @@ def _stability_caption(s: measures.Stability, text: str) -> str:
 def _scatter_caption(night: Night) -> str:
     count = len(night.fixed)
     about = "the average" if night.combined else "their mean, for they do not average"
-    text = f"Fixes in metres about {about}. Shaded: the errors that are new in every frame"
+    text = f"Fixes about {about}. Shaded: the errors that are new in every frame"
     if count > 1:
         near, far = (measures.share_inside(night, d) for d in (measures.INSIDE_1_SIGMA, measures.INSIDE_95))
         text += (

@@ -3,14 +3,15 @@
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from starpos.report.coast import coast_lines, draw_map
+
+figures = pytest.importorskip("matplotlib.figure")
 
 
 def points(latitude_deg, longitude_deg):
     """What globe and lens hold: graticule, coast, place, each (N, 2) in radii of the Earth."""
-    figure = Figure()
+    figure = figures.Figure()
     draw_map(figure, *np.radians([latitude_deg, longitude_deg]))
     [globe] = figure.axes
     return [[np.array(line.get_xydata()) for line in axes.lines] for axes in (globe, *globe.child_axes)]
