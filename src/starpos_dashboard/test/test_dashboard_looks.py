@@ -93,7 +93,7 @@ def test_no_card_is_empty_by_a_third_and_no_letter_too_small(page, width, height
     page.instrument.works(**{"/diagnostics": said.diagnostics(*lights)})
     with screen(page, width, height):
         page.until(lambda: len([lamp for lamp in page.run(LAMPS) if "Task" in lamp[0]]) == 9)
-        page.until(lambda: page.run("return document.images.frame.naturalWidth") == 800)
+        page.until(lambda: page.run("return document.images.frame.checkVisibility()"))
         assert max(page.run(EMPTY))[0] < 0.3
         assert min(page.run(LETTERS))[0] >= 11
         assert page.run("return document.documentElement.scrollWidth") <= width
