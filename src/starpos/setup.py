@@ -22,7 +22,7 @@ CORE = [
 setup(
     name=package,
     version="0.1.0",
-    license="Apache-2.0 AND BSD-2-Clause",
+    license="Apache-2.0 AND BSD-2-Clause AND ISC AND LicenseRef-Natural-Earth",
     license_files=["LICENSES/*"],
     python_requires=">=3.10",
     packages=find_packages(include=["starpos", "starpos.*"]),

@@ -10,14 +10,14 @@ REPOSITORY = PACKAGE.parents[1]
 
 def test_the_licences_of_what_is_shipped_go_with_it():
     kept = {f.name: f.read_bytes() for f in (PACKAGE / "LICENSES").iterdir()}
-    assert set(kept) == {"Apache-2.0.txt", "BSD-2-Clause.txt"}
+    assert set(kept) == {"Apache-2.0.txt", "BSD-2-Clause.txt", "ISC.txt", "LicenseRef-Natural-Earth.txt"}
     assert kept == {name: (REPOSITORY / "LICENSES" / name).read_bytes() for name in kept}
     assert (REPOSITORY / "LICENSE").read_bytes() == kept["Apache-2.0.txt"]
     assert b"Redistributions in binary form" in kept["BSD-2-Clause.txt"]
     assert b"Hog E., Fabricius C." in kept["BSD-2-Clause.txt"]
 
 
-def test_what_is_derived_from_tycho2_is_said_to_be():
+def test_who_made_the_data_is_said():
     said = (REPOSITORY / "REUSE.toml").read_text()
     for data in PACKAGE.glob("starpos/*/data"):
         assert f'"{data.relative_to(REPOSITORY).as_posix()}/**"' in said

@@ -24,6 +24,7 @@ from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 
 from starpos.errors import StarposError, one_line
+from starpos.report.coast import COAST_FILE
 from starpos_dashboard import access
 
 # For a page to take what is sent.
@@ -80,7 +81,10 @@ def listen(address: str, port: int) -> list[socket]:
 
 
 def files() -> dict[str, tuple[str, bytes]]:
-    """Read content type and content of all files, by path, so that no request can name any other file."""
+    """Read content type and content of all files, by path, so that no request can name any other file.
+
+    The coast lines are those of starpos's reports.
+    """
     root = resources.files(__package__) / "assets"
     found = {}
     for folder, prefix in ((root, "/"), (root / "vendor", "/vendor/")):
@@ -88,6 +92,7 @@ def files() -> dict[str, tuple[str, bytes]]:
             kind = TYPES.get("." + entry.name.rpartition(".")[2])
             if kind:
                 found[prefix + entry.name] = kind, entry.read_bytes()
+    found["/land-110m.json"] = TYPES[".json"], COAST_FILE.read_bytes()
     return found | {"/": found["/index.html"]}
 
 

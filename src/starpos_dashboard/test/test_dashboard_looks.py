@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the dashboard's page can be read and worked: by night, on a phone, by keyboard."""
 
+from contextlib import contextmanager
+
 import pytest
-from browser import ELLIPSES, LAMPS, metres_per_px
+import said
+from browser import ELLIPSES, LAMPS, OK, metres_per_px
 
 CONTRAST = """
 const parse = (c) => c.match(/[\\d.]+/g).map(Number);
@@ -41,13 +44,38 @@ const depth = (a, b) => Math.min(Math.min(a.right, b.right) - Math.max(a.left, b
 return texts.flatMap(([s, a], i) => texts.slice(i + 1).filter(([, b]) => depth(a, b) > 3).map(([t]) => [s, t]));
 """
 
+# In CSS pixels as they reach the eye: those of a drawing are scaled with it.
+LETTERS = """
+return [...document.querySelectorAll("body *")].filter((e) => e.checkVisibility() && !e.closest("noscript, sub")
+  && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())).map((e) => [
+    parseFloat(getComputedStyle(e).fontSize) * (e.getScreenCTM?.().a ?? 1), e.textContent, e.id || e.className]);
+"""
+# Of each card: the share of its height that lies empty below what it shows.
+EMPTY = """
+return [...document.querySelectorAll("section:not(#map-card)")].map((card) => {
+  const box = card.getBoundingClientRect();
+  const ends = [...card.querySelectorAll("*")].filter((e) => e.checkVisibility() && (e.tagName === "IMG"
+    || (e.textContent.trim() && !e.children.length))).map((e) => e.getBoundingClientRect().bottom);
+  return [(box.bottom - Math.max(...ends)) / box.height, card.id];
+});
+"""
+
+
+@contextmanager
+def screen(page, width, height, scale=1, mobile=False):
+    metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": mobile}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    try:
+        page.until(lambda: page.run("return innerWidth") == width)
+        yield
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
 
 @pytest.mark.parametrize("width", [360, 820, 1440])
 @pytest.mark.parametrize("speaks", [True, False])
 def test_no_text_lies_over_another(page, width, speaks):
-    metrics = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
-    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    try:
+    with screen(page, width, 800):
         page.until(lambda: page.is_dressed("missing") == [] and page.run(LAMPS))
         if not speaks:
             page.instrument.says = {}
@@ -57,8 +85,18 @@ def test_no_text_lies_over_another(page, width, speaks):
                 )
             )
         assert page.run(OVERLAPS) == []
-    finally:
-        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+@pytest.mark.parametrize("width, height", [(360, 740), (820, 1180), (1366, 768), (1920, 1080), (2560, 1440)])
+def test_no_card_is_empty_by_a_third_and_no_letter_too_small(page, width, height):
+    lights = [(f"solver: Task{k}", OK, "all is well") for k in range(9)]
+    page.instrument.works(**{"/diagnostics": said.diagnostics(*lights)})
+    with screen(page, width, height):
+        page.until(lambda: len([lamp for lamp in page.run(LAMPS) if "Task" in lamp[0]]) == 9)
+        page.until(lambda: page.run("return document.images.frame.checkVisibility()"))
+        assert max(page.run(EMPTY))[0] < 0.3
+        assert min(page.run(LETTERS))[0] >= 11
+        assert page.run("return document.documentElement.scrollWidth") <= width
 
 
 def test_the_night_is_red_and_is_remembered(page):
@@ -86,18 +124,13 @@ def test_every_text_can_be_read(page, night):
 
 
 def test_a_phone_scrolls_one_way_only(page):
-    metrics = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
-    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    try:
-        page.until(lambda: page.run("return innerWidth") == 360)
+    with screen(page, 360, 740, scale=2, mobile=True):
         assert page.run("return document.documentElement.scrollWidth") == 360
         wide = page.run(
             "return [...document.querySelectorAll('main *')].filter((e) => e.getBoundingClientRect().right > 361"
             " && !e.closest('svg')).map((e) => e.id || e.className)"
         )
         assert wide == []
-    finally:
-        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_it_is_worked_by_keyboard_and_told_to_a_screen_reader(page):

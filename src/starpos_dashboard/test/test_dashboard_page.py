@@ -38,6 +38,21 @@ def test_south_and_west_and_a_better_fix_have_their_letters_and_digits(page):
     page.shows(latitude="0°30′00.000″ S", longitude="179°59′59.964″ W", sigma_east="± 50.0 cm")
 
 
+def test_the_place_is_copied_and_opens_in_a_map(page):
+    page.instrument.works(fix=said.fix(-33.92487, 18.42406), fix_averaged=None)
+    link = "return document.getElementById('geo').getAttribute('href')"
+    page.until(lambda: page.run(link) == "geo:-33.924870,18.424060")
+    page.run(
+        "window.addEventListener('copy', (e) => (window.copied = e.clipboardData.getData('text/plain')))"
+    )
+    page.click("copy")
+    assert page.text("copy") == "Copied"
+    assert page.run("return window.copied") == "-33.924870, 18.424060"
+    page.shows(copy="Copy")
+    page.instrument.works(fix=said.fix(math.nan), fix_averaged=None)
+    page.until(lambda: not page.run("return document.getElementById('place-tools').checkVisibility()"))
+
+
 def test_the_needle_points_where_the_heading_is(page):
     tip = """
       const g = document.querySelector("#needle"), m = g.getScreenCTM();
@@ -163,7 +178,7 @@ def test_no_fix_looks_like_no_fix_and_nan_is_no_number(page):
     page.shows(status_word="No fix", status_sentence=sentence, latitude="—", longitude="—", sigma_east="—",
                theta_x="—", residual="—", position_age="no fix", budget_age="none")  # fmt: skip
     assert page.text("decimal").startswith("last fix 48.1373° 11.575°, ")
-    page.until(lambda: page.is_dressed("missing") == ["position-card", "tilt-card", "budget-card"])
+    page.until(lambda: page.is_dressed("missing") == ["position-card", "budget-card", "tilt-card"])
     page.until(lambda: "heading-card" in page.is_dressed("old"))
     assert page.run("return document.querySelector('.old > #ellipse-newest') !== null")
     assert page.run("return document.querySelector('#bubble-dot').checkVisibility()") is False

@@ -95,6 +95,7 @@ def test_the_page_and_all_it_names_are_there(server):
         ("/main.js", "text/javascript"),
         ("/style.css", "text/css"),
         ("/vendor/d3-geo.min.js", "text/"),
+        ("/land-110m.json", "application/json"),
     ):
         status, headers, _ = ask(server, path)
         assert status == 200 and headers["Content-Type"].startswith(kind)

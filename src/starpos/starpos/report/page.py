@@ -42,7 +42,8 @@ figure { margin: 0; padding: .8rem; background: var(--card); border: 1px solid v
 figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; }
 img { display: block; width: 100%; height: auto; background: #fff; }
 figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { cursor: pointer; }
-@media (max-width: 40rem) { th { width: 8rem; } body { padding: .7rem; } }
+@media (max-width: 40rem) { body { padding: .7rem; } th { width: 8rem; }
+  th, td { padding: .4rem .5rem; font-size: .92rem; } }
 @media print { img { filter: none; } }
 """
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
-from starpos.report import frame_figures, measures, place_figures, sky_figure
+from starpos.report import coast, frame_figures, measures, place_figures, sky_figure
 from starpos.report.night import Night
 from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
@@ -65,6 +65,9 @@ def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
 
 
 def _place_pictures(night: Night) -> Iterator[Picture]:
+    ground = (night.combined or night.places[0]).on_ground(night.vertical)
+    yield _drawn(night.simulated, "map", "Where on Earth", MAP, 6.6,
+                 lambda f: coast.draw_map(f, ground.latitude, ground.longitude))  # fmt: skip
     if night.steady is not None:
         s = measures.steadiness(night, night.steady)
         yield _drawn(night.simulated, "stability", "Stability: one tilt for all frames",
@@ -97,6 +100,10 @@ def _drawn(
     return Picture(name, title, caption, png_of(figure))
 
 
+MAP = (
+    "The place in the middle, north on top, a line every 30 degrees; the lens shows 1100 km around it, a line every 5. "
+    "Coast lines: Natural Earth 1:110m, public domain; small islands are left out. Suspicious: another country."
+)
 STEADY = (
     "The paper's stability test: the camera stood still, so all frames take the mean tilt of the night, and what is left "
     "is what stars and air do. The bars are the errors claimed for the stars. Suspicious: a slope (the tripod settles, "
@@ -140,7 +147,7 @@ def _stability_caption(s: measures.Stability, text: str) -> str:
 def _scatter_caption(night: Night) -> str:
     count = len(night.fixed)
     about = "the average" if night.combined else "their mean, for they do not average"
-    text = f"Fixes in metres about {about}. Shaded: the errors that are new in every frame"
+    text = f"Fixes about {about}. Shaded: the errors that are new in every frame"
     if count > 1:
         near, far = (measures.share_inside(night, d) for d in (measures.INSIDE_1_SIGMA, measures.INSIDE_95))
         text += (

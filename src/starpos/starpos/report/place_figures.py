@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # more points than this are drawn small, with a band instead of bars
 MANY = 150
+# A scatter that reaches farther is drawn in km.
+FAR_M = 10_000.0
 # In m or arcsec.
 SMALLEST_SHOWN = 1e-3
 DEFLECTION = "deflection (geodetic only)"
@@ -86,9 +88,18 @@ def draw_scatter(figure: "Figure", night: Night) -> None:
         axes.plot(*true, "P", color=GREEN, ms=11, mec="black", mew=0.6, label="truth", zorder=5)
         reach.append(np.abs(true).max())
     limit = 1.12 * max(*reach, 0.01)
-    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), xlabel="east, m", ylabel="north, m")
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit))
     axes.set_aspect("equal")
+    _name_lengths(axes, limit)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=9, frameon=False)
+
+
+def _name_lengths(axes: "Axes", limit_m: float) -> None:
+    """Label axes in m, in km where metres would need a power of ten."""
+    far = limit_m > FAR_M
+    for axis, name in ((axes.xaxis, "east"), (axes.yaxis, "north")):
+        axis.set_major_formatter(lambda metres, _: f"{metres / 1000 if far else metres:g}")
+        axis.set_label_text(f"{name}, {'km' if far else 'm'}")
 
 
 def _ellipses(axes: "Axes", covariance: np.ndarray, colour: str, label: str, fill: bool) -> None:

@@ -17,6 +17,7 @@ from starpos.earth.vertical import Deflection
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.report import folder, measures
+from starpos.report.place_figures import draw_scatter
 from starpos.report.working import Workshop, worked
 from starpos_testing.skies.reports import AIR, KNOWN, PLACE, Page, assert_drawn, run, simulate, solved
 
@@ -52,9 +53,9 @@ def report(capsys, night, out, *more):
     return status, (Page(out / "index.html") if said else None), errors
 
 
-def shop(catalogue):
+def shop(catalogue, calibration=KNOWN_A3):
     return Workshop(
-        instrument_for=lambda stars: Instrument(29.67e3 / 6.4, calibration=KNOWN_A3),
+        instrument_for=lambda stars: Instrument(29.67e3 / 6.4, calibration=calibration),
         catalogue=catalogue,
         atmosphere=Atmosphere(pressure_pa=100000.0, temperature_c=5.0, humidity=0.3),
         vertical=Deflection(),
@@ -98,7 +99,7 @@ def test_the_place_on_maps_comes_first_and_a_simulated_night_is_called_that(draw
     (link,) = [r for r in page.references if r.startswith("geo:")]
     assert abs(float(link[4:].split(",")[0]) - PLACE["latitude"]) < 0.1
     assert "Simulated: no camera took these frames." in page.text
-    assert page.text.count("Simulated. ") == len(page.pictures) == 7
+    assert page.text.count("Simulated. ") == len(page.pictures) == 8
     truth = json.loads((still / "truth.json").read_text())
     assert folder.truth_in(still).simulated
     (tmp_path / "truth.json").write_text(
@@ -110,7 +111,7 @@ def test_the_place_on_maps_comes_first_and_a_simulated_night_is_called_that(draw
 def test_pictures_are_drawn_and_lie_beside_the_page(drawn):
     page = Page(drawn / "index.html")
     names = {p.stem for p in drawn.glob("*.png")}
-    assert names == {"stability", "frames", "scatter", "budget", "residuals", "sky", "health"}
+    assert names == {"map", "stability", "frames", "scatter", "budget", "residuals", "sky", "health"}
     files = {(drawn / f"{n}.png").read_bytes() for n in names}
     assert files == set(page.pictures.values())
     for png in files:
@@ -131,6 +132,18 @@ def test_one_tilt_for_all_takes_the_inclinometers_noise_away(still, catalogue):
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.parametrize("sigma_deg, unit", [(0.001, "m"), (10.0, "km")])
+def test_a_scatter_of_many_kilometres_is_told_in_them(sigma_deg, unit, still, catalogue):
+    from matplotlib.figure import Figure
+
+    calibration = Calibration.of((0.0, 0.0, 0.0), (3600 * sigma_deg,) * 3)
+    night = worked(folder.exposures(still, SCA100T_NOISE_RAD), shop(catalogue, calibration))
+    figure = Figure()
+    draw_scatter(figure, night)
+    (axes,) = figure.axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (f"east, {unit}", f"north, {unit}")
+
+
 def test_a_turned_night_has_no_mean_heading_but_that_of_the_truth(turned, tmp_path, capsys):
     misalignment = ("--misalignment", 0.5, -0.3, 0.2)
     status, page, _ = report(capsys, turned, tmp_path / "out", *misalignment)

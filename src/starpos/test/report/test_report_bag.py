@@ -148,9 +148,13 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
     assert "as the solver recorded it" in page.text and "none of the sky fits <its> stars" in page.text
     assert "8: 6 with a fix, 1 not identified, 1 poor fit" in page.text and "1 two_skies" in page.text
     assert any("upper bound" in line for line in errors)
-    assert {"Each frame with its own tilt", "Scatter of the fixes", "Error budget", "Frame by frame"} == set(
-        page.pictures
-    )
+    assert {
+        "Where on Earth",
+        "Each frame with its own tilt",
+        "Scatter of the fixes",
+        "Error budget",
+        "Frame by frame",
+    } == set(page.pictures)
     for png in page.pictures.values():
         assert_drawn(png)
 

@@ -13,12 +13,12 @@ export class Bubble {
     this.labels = [1, 2, 3].map((third) => {
       const r = (RIM * third) / 3;
       if (third < 3) add(svg, "circle", { class: "ring", r });
-      return add(svg, "text", { class: "ring-label", x: 3, y: -r - 3 }, "");
+      return add(svg, "text", { class: "ring-label", x: 4, y: -r + 14 }, "");
     });
     this.scale(SCALES[0]);
     add(svg, "path", { class: "ring", d: `M${-RIM} 0H${RIM}M0 ${-RIM}V${RIM}` });
-    add(svg, "text", { class: "axis", x: RIM - 19, y: -5 }, "X′");
-    add(svg, "text", { class: "axis", x: -18, y: -RIM + 16 }, "Y′");
+    add(svg, "text", { class: "axis", x: RIM - 22, y: -6 }, "X′");
+    add(svg, "text", { class: "axis", x: -20, y: -RIM + 20 }, "Y′");
     add(svg, "circle", { class: "centre", r: 14 });
     this.dot = add(svg, "circle", { class: "dot hidden", r: 11, id: "bubble-dot" });
   }

@@ -6,7 +6,7 @@ const STEPS = [30, 15, 10, 5, 2, 1, ...[30, 20, 10, 5, 2, 1].map((m) => m / 60)]
   [30, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001].map((s) => s * SECOND),
 );
 const WIDE = 0.9; // rad from the centre to a corner, from which all there are are drawn
-const LEAST_PX = { parallels: 80, meridians: 120 };
+const LEAST_PX = { parallels: 80, meridians: 130 };
 const MOST_LINES = 80;
 
 const finest = (pxPerDegree, leastPx) => STEPS.filter((s) => s * pxPerDegree >= leastPx).pop() ?? STEPS[0];

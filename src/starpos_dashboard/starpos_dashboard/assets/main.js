@@ -7,6 +7,7 @@ import { Link } from "/link.js";
 import { showBudget, showLights } from "/lists.js";
 import { EarthMap } from "/map.js";
 import { dress, element, say } from "/page.js";
+import { offerPlace } from "/place.js";
 import * as text from "/text.js";
 
 const TICK_MS = 500;
@@ -115,6 +116,7 @@ function showPosition(fix, old) {
   say("sigma-north", good ? `± ${text.metres(s.north)}` : text.UNKNOWN);
   say("altitude", text.metres(good?.altitude));
   say("decimal", good ? plain(good, s) : last ? `last fix ${plain(last, sigmas(last))}, ${text.age(stampAge(last))} ago` : "");
+  offerPlace(good);
   const average = state.averaged?.good && !isOld(state.averaged) && !old && good ? state.averaged : null;
   const a = sigmas(average);
   const both = ["latitude", "longitude"].map((n, i) => text.sexagesimal(average?.[n], ["NS", "EW"][i], a[n]));
@@ -238,6 +240,6 @@ render();
 document.addEventListener("visibilitychange", look);
 look();
 setInterval(render, TICK_MS);
-const answer = await fetch("/vendor/land-110m.json");
+const answer = await fetch("/land-110m.json");
 map = new EarthMap(await answer.json());
 render();

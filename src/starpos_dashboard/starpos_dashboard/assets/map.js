@@ -148,23 +148,23 @@ export class EarthMap {
     const near = (list, value) => list.reduce((a, b) => (Math.abs(b - value) < Math.abs(a - value) ? b : a), list[0]);
     const flat = Math.hypot(this.width, this.height) / this.view.k < 0.1;
     const { lon, lat } = this.view;
-    const put = (point, at, said, anchor) => {
+    const put = (point, at, said, top) => {
       if (!this._isHere(point)) return;
       const [x, y] = this._project(point);
       const place = at(x, y);
       if (place[0] > this.width - 270 && place[1] < 48) return; // the buttons
-      if (place[0] < 0 || place[0] > this.width - 20 || place[1] < 12 || place[1] > this.height - 44) return;
-      if (place[0] < 150 && place[1] > this.height - 125) return; // the legend
-      add(this.labels, "text", { x: place[0], y: place[1], "text-anchor": anchor }, said);
+      if (place[0] < 0 || place[0] > this.width - 80 || place[1] < top || place[1] > this.height - 44) return;
+      if (place[0] < 175 && place[1] > this.height - 135) return; // the legend
+      add(this.labels, "text", { x: place[0], y: place[1] }, said);
     };
     const meridian = flat ? lon : near(g.meridians.at, lon);
     const parallel = flat ? lat : near(g.parallels.at, lat);
     for (const v of g.parallels.at) {
-      put([meridian, v], (x, y) => (flat ? [8, y - 4] : [x + 4, y - 4]), label(v, g.parallels.step, "NS"), "start");
+      put([meridian, v], (x, y) => (flat ? [8, y - 4] : [x + 4, y - 4]), label(v, g.parallels.step, "NS"), flat ? 30 : 12);
     }
     for (const v of g.meridians.at) {
       const at = flat ? (x) => [x + 4, 14] : (x, y) => [x + 4, y + 13];
-      put([v, parallel], at, label(v, g.meridians.step, "EW"), "start");
+      put([v, parallel], at, label(v, g.meridians.step, "EW"), 12);
     }
   }
 

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coast lines of the Earth, and the map that shows where on it a place is. The dashboard serves the same file.
+
+Natural Earth 1:110m as world-atlas has it: TopoJSON, lines of steps on a grid
+(https://github.com/topojson/topojson-specification).
+"""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starpos.report.style import BLUE, GREY, ORANGE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COAST_FILE = Path(__file__).with_name("data") / "land-110m.json"
+# radius of the lens, and steps of the graticule on the globe and in the lens, in degrees
+LENS, STEPS = 10, (30, 5)
+
+
+def coast_lines() -> list[np.ndarray]:
+    """Coast lines, each (N, 2): longitude and latitude in deg."""
+    topology = json.loads(COAST_FILE.read_text(encoding="utf-8"))
+    grid = topology["transform"]
+    return [np.cumsum(arc, axis=0) * grid["scale"] + grid["translate"] for arc in topology["arcs"]]
+
+
+def draw_map(figure: "Figure", latitude: float, longitude: float) -> None:
+    """Draw the Earth from above a place in rad, north on top, and a lens with the lands around."""
+    globe = figure.subplots()
+    lens = globe.inset_axes((0.64, 0.0, 0.36, 0.36))
+    coast = _joined(coast_lines())
+    for axes, reach, step in zip((globe, lens), (90, LENS), STEPS, strict=True):
+        _draw_disc(axes, np.sin(np.radians(reach)), *(
+            _seen_from(latitude, longitude, lines) for lines in (_graticule(step), coast)
+        ))  # fmt: skip
+
+
+def _draw_disc(axes: "Axes", radius: float, graticule: np.ndarray, coast: np.ndarray) -> None:
+    from matplotlib.patches import Circle
+
+    rim = axes.add_patch(Circle((0, 0), radius, fc="#eef4f8", ec=GREY, lw=1.0))
+    for lines, colour, width in ((graticule, "#c3cdd4", 0.6), (coast, BLUE, 1.0)):
+        (line,) = axes.plot(*lines.T, color=colour, lw=width)
+        line.set_clip_path(rim)
+    axes.plot(0, 0, "o", color=ORANGE, ms=8, mec="black", mew=0.8)
+    limits = (-1.01 * radius, 1.01 * radius)
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
+    axes.set_axis_off()
+
+
+def _seen_from(latitude: float, longitude: float, lines: np.ndarray) -> np.ndarray:
+    """Orthographic projection (N, 2), in radii of the Earth, of longitudes and latitudes (N, 2) in deg; NaN behind it."""
+    turn, lat = np.radians(lines[:, 0]) - longitude, np.radians(lines[:, 1])
+    east = np.cos(lat) * np.sin(turn)
+    north = np.cos(latitude) * np.sin(lat) - np.sin(latitude) * np.cos(lat) * np.cos(turn)
+    up = np.sin(latitude) * np.sin(lat) + np.cos(latitude) * np.cos(lat) * np.cos(turn)
+    return np.where(up[:, None] >= 0, np.column_stack([east, north]), np.nan)
+
+
+def _graticule(step: int) -> np.ndarray:
+    """Parallels and meridians (N, 2) in deg."""
+    around, upward = np.arange(-180.0, 181.0), np.arange(-90.0, 91.0)
+    parallels = [np.column_stack([around, np.full_like(around, at)]) for at in range(-90 + step, 90, step)]
+    meridians = [np.column_stack([np.full_like(upward, at), upward]) for at in range(-180, 180, step)]
+    return _joined(parallels + meridians)
+
+
+def _joined(lines: list[np.ndarray]) -> np.ndarray:
+    """Lines as one (N, 2), with a row of NaN after each."""
+    return np.concatenate([part for line in lines for part in (line, np.full((1, 2), np.nan))])
