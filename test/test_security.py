@@ -53,6 +53,7 @@ READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
     "starpos/parallel/same.py": "our own source",
     "starpos/identification/paper.py": "of the package",
+    "starpos/report/coast.py": "of the package",
     "starpos/recording/bag.py": "installed messages",
     "starpos/instrument/tilt_table.py": "MAX_CSV_BYTES",
     "starpos/navigation/table.py": "MOST_BYTES",

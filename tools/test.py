@@ -54,7 +54,8 @@ VERSIONS = "tools/setup/ubuntu-24.04.txt"
 OLD_TABLE = "astropy-iers-data==0.2024.2.26.0.28.55"
 ROTATING = [f"src/starpos/test/{room}" for room in ("earth", "fix", "session", "sky")]
 UNDERLAY = ROOT / ".underlay"
-# with the newest versions only: what waits for nodes or other processes, and what draws many nights (montecarlo)
+# with the newest versions only: what waits for nodes or other processes, what takes long and is
+# in other tests too, and what draws many nights (montecarlo)
 NEWEST_ONLY = [
     "starpos_inclinometer/test/test_faults.py",
     "starpos_inclinometer/test/test_fuzz.py",
@@ -62,8 +63,19 @@ NEWEST_ONLY = [
         f"starpos_camera/test/test_{name}.py"
         for name in ("annotator", "camera", "clock", "detector", "together", "v4l2")
     ),
-    "src/starpos/test/cli/test_cli_jobs.py",
-    "src/starpos/test/identification/test_real_frames.py",
+    *(
+        f"src/starpos/test/{name}.py"
+        for name in (
+            "averaging/test_average",
+            "calibration/test_fisheye_from_sky",
+            "cli/test_cli_jobs",
+            "identification/test_blind",
+            "identification/test_real_frames",
+            "report/test_report_bag",
+        )
+    ),
+    "src/starpos_bringup/test/test_driving_recipe.py",
+    "src/starpos_dashboard/test/test_dashboard_node.py",
 ]
 # programs that a bare machine has not: those that tools/setup/missing looks for
 COUNTERPARTS = {"avr-gcc", "indiserver", "indi_simulator_ccd", "ip", "xmllint", "chromium", "chromedriver"}

@@ -9,7 +9,7 @@ setup(
     description="One page in a browser that shows what the instrument says",
     maintainer="starpos maintainers",
     maintainer_email="maintainers@starpos.invalid",
-    license="Apache-2.0",
+    license="Apache-2.0 AND ISC AND MIT",
     packages=find_packages(include=[package, f"{package}.*"]),
     package_data={package: ["assets/*", "assets/vendor/*"]},
     data_files=[

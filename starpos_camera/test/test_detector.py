@@ -257,9 +257,11 @@ def test_newest_frame_wins_and_the_others_are_counted(feed, frame):
     feed.show(frame)
     sent = [feed.send(frame) for _ in range(40)]
     feed.wait_for(sent[-1])
-    state = feed.listener.wait_for_state("detector: Stars", OK, "stars in")
-    assert int(state["dropped"]) > 0
-    assert int(state["frames"]) + int(state["dropped"]) == 1 + len(sent)
+    # How good the state is, is not asked: on a busy machine the last frame is soon an old one.
+    values = feed.listener.values_of(
+        "detector: Stars", lambda v: int(v["frames"]) + int(v["dropped"]) == 1 + len(sent)
+    )
+    assert int(values["dropped"]) > 0
 
 
 @pytest.mark.parametrize("parameter", ["threshold:=2", "min_snr:=.nan", "max_stars:=0", "exposure:=-1.0"])

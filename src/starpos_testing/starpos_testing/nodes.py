@@ -76,6 +76,16 @@ class Listener:
         self.wait(come)
         return {v.key: v.value for v in self.states[name].values}
 
+    def values_of(self, name: str, condition) -> dict[str, str]:
+        """Wait until the values of a name's diagnostic, whatever its level, fulfil a condition; returns them."""
+
+        def values():
+            state = self.states.get(name)
+            return {v.key: v.value for v in state.values} if state else {}
+
+        self.wait(lambda: values() and condition(values()))
+        return values()
+
     def call(self, kind, name: str, request):
         """Call a service; returns its answer."""
         client = self.node.create_client(kind, name)

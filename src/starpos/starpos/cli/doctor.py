@@ -40,6 +40,8 @@ CV2 = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
 SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
 # interface class of a photo camera, in USB's list
 STILL_IMAGE = "06"
+# What the system tells of a device is far shorter.
+MOST_BYTES = 4096
 
 
 class State(str, Enum):
@@ -259,7 +261,8 @@ def _devices(paths: list[str], group: str, names: list[str] | None = None) -> Fi
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(errors="replace").strip()
+        with path.open("rb") as file:
+            return file.read(MOST_BYTES).decode(errors="replace").strip()
     except OSError:
         return ""
 

@@ -255,7 +255,10 @@ class TiltLog:
         order = self._once
         for edge, step in ((use[0], -1), (use[-1], 1)):
             for k in np.flatnonzero(order == edge) + step:
-                near = 0 <= k < len(order) and abs(self.utc_unix_s[order[k]] - self.utc_unix_s[edge]) <= BRACKET_S
+                near = (
+                    0 <= k < len(order)
+                    and abs(self.utc_unix_s[order[k]] - self.utc_unix_s[edge]) <= BRACKET_S
+                )
                 if near:
                     yield int(edge), int(order[k])
 
