@@ -197,9 +197,16 @@ class World:
         self.graph.tilt.wait_for_all_acked(Duration(seconds=ARRIVED_S))
         shot = shot_of(self.scene, self.now_s + LACKING_S, self.rng)
         self.stars(shot)
+        self.until_answered(shot)
+
+    def until_answered(self, lacking: SimulatedShot):
+        """Wait for the answer to a frame that lacks its tilts, which comes once those that were sent are read.
+
+        /clock goes on by more than the solver's patience, and by less than to the next exposure.
+        """
         for waited in range(1, 4):
             self.tick(self.now_s + EXPOSURE_S + LATENCY_S + waited * LACKING_S)
-            if self.graph.comes(lambda: shot.stamp in self.graph.solutions, ARRIVED_S / 3):
+            if self.graph.comes(lambda: lacking.stamp in self.graph.solutions, ARRIVED_S / 3):
                 break
 
     def spin(self, seconds: float):

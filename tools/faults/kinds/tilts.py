@@ -4,7 +4,7 @@
 import math
 from copy import deepcopy
 
-from accelerated import ANSWER_S, CADENCE_S, World
+from accelerated import CADENCE_S, World
 
 from kinds.registry import HOSTILE, kind, shift, some_time
 from starpos_interfaces.msg import Tilt
@@ -73,7 +73,7 @@ def tilts_of_a_clock_ahead(w: World):
             w.graph.tilt.publish(tilt)
         w.stars(shot)
         # the solver has read them before their time comes, also here, where a second takes 50 ms
-        w.graph.comes(lambda stamp=shot.stamp: stamp in w.graph.solutions, ANSWER_S)
+        w.until_answered(shot)
 
 
 @kind(2)
