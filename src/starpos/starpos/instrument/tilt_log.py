@@ -29,6 +29,8 @@ AGREE_SIGMA = 5.0
 USUAL_GAPS = 2.5
 # an end of the exposure longer than this share of it is open if the reading beyond disagrees
 OPEN_END = 0.25
+# Half of an exposure, and what a time that was rounded may miss; so many readings tell how rare they are.
+HALF, ENOUGH_TIMES = 0.6, 5
 # So many equal readings in a row are a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at 0.1
 # chance makes one such row in 10^9 readings.
 STUCK_READINGS, RARE = 10, 0.1
@@ -303,16 +305,17 @@ class TiltLog:
         """TiltError if no readings tell whether the instrument was at rest in a part of the exposure.
 
         Such a part lies between two readings and is longer than half of the exposure, and than is usual; or it is an end
-        of the exposure: longer than half of it where no reading follows beyond, and longer than OPEN_END of it where that
-        reading disagrees, because nobody knows when the turn began.
+        of the exposure. An end may be HALF of it where no reading is near beyond, and any where readings are that rare,
+        one a frame perhaps. It may be OPEN_END of it where the one beyond disagrees: nobody knows when the turn began.
         """
         t = self.utc_unix_s[index]
         begin, over = mid_unix_s - exposure_s / 2, mid_unix_s + exposure_s / 2
         usual_s = USUAL_GAPS * self.period_s
+        rare = len(t) >= ENOUGH_TIMES and self.period_s > BRACKET_S
         gaps = [(float(gap), max(exposure_s / 2, usual_s)) for gap in np.diff(t[first:end])]
         for gap, one in ((t[first] - begin, first - 1), (over - t[end - 1], end - 1)):
-            if not (0 <= one < len(t) - 1 and t[one + 1] - t[one] <= max(BRACKET_S, usual_s)):
-                gaps.append((gap, exposure_s / 2))
+            if not (0 <= one < len(t) - 1 and t[one + 1] - t[one] <= BRACKET_S):
+                gaps.append((gap, max(HALF * exposure_s, usual_s if rare else 0.0)))
             elif not self._agree(index[one], index[one + 1]):
                 gaps.append((gap, OPEN_END * exposure_s))
         open_s = [gap for gap, most in gaps if gap > most + TOUCH_S]
