@@ -241,7 +241,15 @@ def log_ratio(
     const double[:, ::1] xy, const double[::1] sigma_px, double area_px2, const double[:, ::1] attitude, double focal_px,
     const double[::1] width, const Py_ssize_t[::1] star, const Py_ssize_t[::1] rank, const double[:, ::1] w, Chances chances,
 ):
-    """The logarithm of the evidence of `evidence.log_evidence`, without the prior's density; width (4,): of the prior."""
+    """The logarithm of the evidence for a pose that was fitted to matched stars, without the prior's density.
+
+    xy, sigma_px         (N, 2), (N,): the brightest detections, brightest first, on a frame of area_px2
+    attitude, focal_px   of the pose
+    width                (4,): of the prior
+    star                 (M,): which of the detections are matched, in ascending order
+    rank                 (M,): brightness rank of their catalogue stars on the frame
+    w                    (M, 3): directions of these
+    """
     rows = np.arange(star.shape[0])
     cdef Py_ssize_t[::1] row = rows
     cdef int n = xy.shape[0], many = star.shape[0]

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.core.poses import Chances, log_ratio
+from starpos.core.poses import Chances
 from starpos.identification.pose import Pose
 from starpos.identification.triangles import SCALE_TOLERANCE
 
@@ -75,35 +75,3 @@ def any_scale(shortest_px: float, longest_px: float, log_share: float = 0.0) -> 
         return log_share + math.log(parity / (8 * math.pi**2 * logarithms)) if known else -math.inf
 
     return Prior(log_density, np.append(WIDTH[:3], logarithms))
-
-
-def log_evidence(
-    xy: np.ndarray,
-    sigma_px: np.ndarray,
-    area_px2: float,
-    pose: Pose,
-    prior: Prior,
-    star: np.ndarray,
-    rank: np.ndarray,
-    w: np.ndarray,
-) -> float:
-    """Logarithm of the evidence for a pose that was fitted to matched stars.
-
-    xy, sigma_px  (N, 2), (N,): the brightest detections, brightest first, on a frame of area_px2
-    star          (M,): which of them are matched, in ascending order
-    rank          (M,): brightness rank of their catalogue stars on the frame
-    w             (M, 3): directions of these
-    """
-    ratio = log_ratio(
-        xy,
-        sigma_px,
-        area_px2,
-        pose.attitude,
-        pose.focal_px,
-        prior.width,
-        star,
-        rank,
-        w,
-        CHANCES,
-    )
-    return ratio + prior.log_density(pose)

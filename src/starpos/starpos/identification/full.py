@@ -64,7 +64,7 @@ class Identification:
     focal_scale      factor on the camera's focal length
     residual_px      rms along one axis, with the weights of the fit
     mean_square_px2  of the residuals along one axis, all alike
-    log_odds         of the identification, by `log_evidence`
+    log_odds         of the identification: its evidence, as `evidence` defines it, with the prior
     expected         (E,): rows of the catalogue's stars well inside the frame, brightest first
     mirrored         whether the frame's rows run bottom-up; the attitude is that of the flipped frame
     """

@@ -6,8 +6,9 @@ import pytest
 from test_identification import random_attitude, seen, sky_for
 
 from starpos import rotation
+from starpos.core.poses import log_ratio
 from starpos.identification import PlumbPrior, PointingPrior, full, identify, search
-from starpos.identification.evidence import DOUBLE_PX, LOG_SHARES, WIDTH, Prior, anywhere, log_evidence
+from starpos.identification.evidence import CHANCES, DOUBLE_PX, LOG_SHARES, WIDTH, Prior, anywhere
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.instrument.camera import Camera
 from starpos.simulation.montecarlo_fields import Conditions, draw
@@ -67,7 +68,9 @@ def evidence(pose, w, xy, star=None, rank=None, prior=None):
     star = np.arange(len(w)) if star is None else star
     rank = np.arange(len(w)) if rank is None else rank
     sigma = np.full(len(xy), SIGMA_PX)
-    return log_evidence(xy, sigma, AREA_PX2, pose, prior or anywhere(2000.0), star, rank, w)
+    prior = prior or anywhere(2000.0)
+    ratio = log_ratio(xy, sigma, AREA_PX2, pose.attitude, pose.focal_px, prior.width, star, rank, w, CHANCES)
+    return ratio + prior.log_density(pose)
 
 
 def slopes(pose, w):
