@@ -20,9 +20,10 @@ HOSTILE = (NAN, INF, -INF, 1e300, -1e300, 0.0, -1.0)
 UNTOLD = """\
 Not injected, since no number tells it, and a fix from it is wrong: a stamp that is off already in the first frame of a
 pose (from then on the stars tell), or from the second on for ten frames; one that is off by less than 0.7 s (a mount
-creeps by as much); an inclinometer that is off steadily, or in the only reading near a frame; tilts of less than a second
-ahead; the stars of another instrument under one's own tilts; a `camera_info` of the right focal length and a wrong
-principal point; a valid parameter of a wrong value."""
+creeps by as much); an inclinometer that is off steadily, or in the only reading near a frame; tilts of a clock ahead by
+less than a second, or by no more than /clock ticks, where none of their true time follow; the stars of another instrument
+under one's own tilts; a `camera_info` of the right focal length and a wrong principal point; a valid parameter of a wrong
+value."""
 
 
 @dataclass(frozen=True)

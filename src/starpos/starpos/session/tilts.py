@@ -27,6 +27,9 @@ NOISE_CAPACITY = 2000
 TOGETHER = 20
 # Samples so near to an exposure may bracket it; a flagged one explains why it has no good one.
 NEAR_S = BRACKET_S
+# One inclinometer's samples come in the order of their times but for so much; one that comes after samples of later
+# times shows that these were stamped by a clock ahead.
+ORDER_S = 1.0
 # Time between samples if there are too few to tell, and the share of it by which the next may come early.
 USUAL_PERIOD_S, JITTER = 0.1, 0.9
 
@@ -71,6 +74,7 @@ class TiltBuffer:
         sample = message_to_tilt(message, unknown_stddev_rad)
         if self._good:
             self._note_step(self._good[-1][1], sample)
+        self.forget_after(sample.utc_unix_s + ORDER_S)
         self._came += 1
         self._good.append((self._came, sample))
         self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
@@ -80,7 +84,6 @@ class TiltBuffer:
         if self._latest_unix_s > unix_s:
             self._latest_unix_s = unix_s
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
-            self._steps = deque((s for s in self._steps if s[0] <= unix_s), maxlen=NOISE_CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether all samples that an exposure needs have arrived: none that may still come lies in it or bounds it."""
