@@ -4,8 +4,8 @@
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
 the versions that Ubuntu 24.04 has (tools/setup/ubuntu-24.04.txt), in an environment as bare as a newcomer's: without
-the counterparts that tools/setup/counterparts brings. `test.py --both` runs all, builds the documents' site and looks
-through the licences, which `test.py --docs` does alone: a warning is a failure.
+the counterparts that tools/setup/counterparts brings. `test.py --both` runs all, builds the documents' site, looks
+through the licences and checks the package, which `test.py --docs` does alone: a warning is a failure.
 """
 
 import os
@@ -30,11 +30,13 @@ LINTERS = [
     "mypy",
     f"{sys.executable} tools/walls.py",
 ]
-# the site of the documents, and whether each file has its licence, with what the first brings
+# the site of the documents, whether each file has its licence, and the package's metadata, with what the first brings
 DOCS = [
     "tools/setup/docs",
     ".underlay/docs/bin/python -m sphinx -W --keep-going -n -q -c docs . build/docs",
     ".underlay/docs/bin/python -m reuse lint --lines",
+    ".underlay/docs/bin/python -m build --sdist --no-isolation src/starpos --outdir build/sdist",
+    ".underlay/docs/bin/python -m twine check --strict build/sdist/*.tar.gz",
 ]
 # pytest's exit status where a -k left none.
 NO_TESTS = 5
