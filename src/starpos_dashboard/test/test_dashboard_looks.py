@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the dashboard's page can be read and worked: by night, on a phone, by keyboard."""
+"""Whether the dashboard's page, and that of a report, can be read and worked: by night, on a phone, by keyboard."""
 
 from contextlib import contextmanager
 
 import pytest
 import said
 from browser import ELLIPSES, LAMPS, OK, metres_per_px
+
+from starpos.cli import main
 
 CONTRAST = """
 const parse = (c) => c.match(/[\\d.]+/g).map(Number);
@@ -97,6 +99,24 @@ def test_no_card_is_empty_by_a_third_and_no_letter_too_small(page, width, height
         assert max(page.run(EMPTY))[0] < 0.3
         assert min(page.run(LETTERS))[0] >= 11
         assert page.run("return document.documentElement.scrollWidth") <= width
+
+
+def test_a_nights_report_fits_a_phone(driver, tmp_path):
+    wide = ("--focal-mm", "29.67", "--pixel-um", "6.4")
+    known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+    night, report = tmp_path / "night", tmp_path / "report"
+    assert main(["simulate", str(night), "-n", "2", "--stars-only", "--size", "1000", "700", *wide]) == 0
+    assert main(["report", str(night), *wide, *known, "-o", str(report)]) == 0
+    metrics = {"width": 360, "height": 740, "deviceScaleFactor": 3, "mobile": True}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    try:
+        driver.get((report / "index.html").as_uri())
+        shown = driver.execute_script("return [...document.images].map((e) => [e.naturalWidth, e.width])")
+        assert len(shown) > 5 and all(natural > 0 and 0 < width <= 360 for natural, width in shown)
+        assert driver.execute_script("return document.documentElement.scrollWidth") <= 360
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        driver.get("about:blank")
 
 
 def test_the_night_is_red_and_is_remembered(page):
