@@ -211,6 +211,7 @@ def tilt_terms(level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: fl
     )
     return (
         ErrorTerm("calibration", level @ calibration, shared=ALWAYS, posed=True),
+        ErrorTerm("remounting", level @ level_of(up) * mounting.remounted_rad, shared=ALWAYS, posed=True),
         *_inclinometer_terms(level @ levelling_of(up, tilt.slope), tilt, mounting, utc_unix_s),
         ErrorTerm(
             "tilt response",
@@ -246,7 +247,7 @@ def _turn_error(up: np.ndarray, mounting: Mounting) -> np.ndarray:
     A large turn also makes that lean shorter, by its cosine.
     """
     then = mounting.calibrated_up
-    variance = then @ mounting.calibration_covariance @ then
+    variance = then @ mounting.calibration_covariance @ then + mounting.remounted_rad**2
     # the mean of (1 - cos)^2 over a Gaussian turn
     shorter2 = 1.5 - 2 * np.exp(-variance / 2) + np.exp(-2 * variance) / 2
     return levelling_of(up, (up - then)[:, None] * np.sqrt(max(shorter2, 0.0)))

@@ -39,6 +39,8 @@ class Calibration:
 
     misalignment_deg    (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
     covariance_arcsec2  (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
+    remounted_arcsec    1 sigma about each axis of A3's turn since camera and inclinometer were taken apart and put
+                        together again; 0: they were not
     utc_unix_s          when it was found; NaN: unknown
     temperature_c       temperature of the inclinometer then; NaN: unknown
     tilt_deg            its two or three angles then; an error of the scale grows with the distance from them
@@ -50,6 +52,7 @@ class Calibration:
 
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     covariance_arcsec2: tuple = tuple(map(tuple, np.diag(UNKNOWN_ARCSEC) ** 2))
+    remounted_arcsec: float = 0.0
     utc_unix_s: float = float("nan")
     temperature_c: float = float("nan")
     tilt_deg: tuple[float, ...] = (0.0, 0.0)
@@ -92,6 +95,10 @@ class Calibration:
         if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
             raise InstrumentError("the calibration's covariance is none: a variance in it is negative")
         self._check_response()
+        if not 0 <= self.remounted_arcsec <= MOST_ARCSEC:
+            raise InstrumentError(
+                f"remounted_arcsec of the calibration is {self.remounted_arcsec:g}: give 0 to {MOST_ARCSEC:g}"
+            )
         if not self.valid_days > 0:
             raise InstrumentError(f"valid_days is {self.valid_days}: must be positive")
 
@@ -254,6 +261,7 @@ class Instrument:
             a3=c.a3,
             link_to_camera=np.asarray(self.link_to_camera, float),
             calibration_covariance=np.asarray(c.covariance_arcsec2, float) * ARCSEC**2,
+            remounted_rad=c.remounted_arcsec * ARCSEC,
             inclinometer=self.inclinometer,
             calibrated_unix_s=c.utc_unix_s,
             calibrated_temperature_c=c.temperature_c,

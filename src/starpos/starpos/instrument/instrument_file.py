@@ -48,6 +48,7 @@ KEYS = (
     "calibration_stddev_arcsec",
     "calibration_covariance_arcsec2",
     "calibrated",
+    "remounted_arcsec",
     "link_to_camera",
     "inclinometer",
     *INCLINOMETER,
@@ -71,6 +72,7 @@ def read(path: Path | str) -> Instrument:
     calibration_covariance_arcsec2: [[..], [..], [..]]
     calibrated: {utc, temperature_c, tilt_deg, frames, valid_days, response, response_covariance}
                                                          which `starpos calibrate` writes
+    remounted_arcsec: 0                                  1 sigma of A3's turn since the two were put together again
     link_to_camera: [[..], [..], [..]]
     inclinometer: {model: scl3300}                       fills the tilt_* keys that the file leaves out (sensors.py)
     tilt_noise_deg: 0.0035                               for one reading; the others are errors of zero and scale
@@ -117,6 +119,8 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
         content["camera"]["model"] = model
     content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
     content["calibration_covariance_arcsec2"] = np.asarray(c.covariance_arcsec2, float).tolist()
+    if c.remounted_arcsec:
+        content["remounted_arcsec"] = float(c.remounted_arcsec)
     if not math.isnan(c.utc_unix_s):
         content["calibrated"] = {"utc": utc_text(c.utc_unix_s), "frames": int(c.frames)}
         content["calibrated"]["tilt_deg"] = [float(t) for t in c.tilt_deg]
@@ -245,6 +249,8 @@ def _calibration(content: dict) -> Calibration:
         calibration = Calibration(
             misalignment_deg=angles, covariance_arcsec2=_matrix(content[keys[1]], keys[1])
         )
+    if "remounted_arcsec" in content:
+        calibration = replace(calibration, remounted_arcsec=_number(content, "remounted_arcsec"))
     about = content.get("calibrated")
     if about is None:
         return calibration

@@ -22,6 +22,7 @@ class Mounting:
     link_to_camera            (3, 3): base link into C
     calibration_covariance    (3, 3) rad2 of A3 as a small rotation about S's axes; it includes the inclinometer's zero,
                               because only the sum of the two matters
+    remounted_rad             1 sigma about each axis of a turn of A3 since then
     inclinometer              its errors
     calibrated_unix_s         time of the calibration; NaN: unknown, then the covariance includes the drift until now
     calibrated_temperature_c  temperature of the inclinometer then; NaN: unknown
@@ -34,6 +35,7 @@ class Mounting:
     a3: np.ndarray
     link_to_camera: np.ndarray
     calibration_covariance: np.ndarray
+    remounted_rad: float = 0.0
     inclinometer: InclinometerErrors = EXACT
     calibrated_unix_s: float = float("nan")
     calibrated_temperature_c: float = float("nan")

@@ -117,7 +117,7 @@ class Averaging:
 
 def _is_wide(fix: Fix) -> bool:
     """Whether A3 may be so wrong that a linear filter cannot separate its error from the place."""
-    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name == "calibration")
+    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name in ("calibration", "remounting"))
     return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)
 
 

@@ -188,12 +188,13 @@ def drawn(
     place=0.0,
     tilt=0.0,
     calibration=0.0,
+    remounting=0.0,
     clock=0.0,
     stamp=0.0,
     ut1=0.0,
     refraction=0.0,
 ):
-    """A fix whose every error is drawn from the sigma it was told: px, arcsec, arcsec, arcsec, s, s, s, fraction."""
+    """A fix whose every error is drawn from the sigma it was told: px, four in arcsec, s, s, s, fraction."""
     state = replace(STATE, orientation=replace(STATE.orientation, ut1_sigma_s=ut1, pole_sigma=0.0))
     true = replace(field, utc=field.utc + rng.normal(0, clock) + rng.normal(0, stamp) + rng.normal(0, ut1))
     air = Atmosphere(
@@ -207,7 +208,7 @@ def drawn(
     )
     true_air = replace(air, pressure_pa=air.pressure_pa * (1 + rng.normal(0, refraction)))
     # the true mount is the told one and a little more about the inclinometer's axes
-    slip = rotation.from_vector(rng.normal(0, calibration * ARCSEC, 3))
+    slip = rotation.from_vector(rng.normal(0, np.hypot(calibration, remounting) * ARCSEC, 3))
     up = slip @ field.a3 @ true.attitude[2]
     reading = np.arcsin(up[:2]) + rng.normal(0, tilt * ARCSEC, 2)
     xy, places = replace(true, air=true_air).places(earth_state(true.utc), rng)
@@ -219,7 +220,7 @@ def drawn(
         covariance_px2=np.eye(2)[None].repeat(len(xy), 0) * max(centroid, 1e-4) ** 2,
         place_sigma=np.full(len(xy), place * ARCSEC),
         tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, utc_unix_s=field.utc),
-        mounting=field.mounting(calibration),
+        mounting=replace(field.mounting(calibration), remounted_rad=remounting * ARCSEC),
         atmosphere=air,
         clock_stddev_s=clock,
         stamp_stddev_s=stamp,
@@ -231,6 +232,7 @@ SOURCES = {
     "catalogue": {"place": 0.3},
     "tilt": {"tilt": 12.6, "centroid": 0.01},
     "calibration": {"calibration": 20.0, "centroid": 0.01},
+    "remounting": {"remounting": 20.0, "centroid": 0.01},
     "refraction": {"refraction": 0.1, "centroid": 0.001},
     "clock": {"clock": 0.5, "centroid": 0.01},
     "time stamp": {"stamp": 0.5, "centroid": 0.01},
@@ -307,6 +309,7 @@ def test_the_budget_says_which_errors_are_common(rng):
     assert set(common) - new == {
         "catalogue",
         "calibration",
+        "remounting",
         "tilt drift",
         "tilt temperature",
         "tilt response",

@@ -211,6 +211,7 @@ REFUSED = {
         "beyond any turn",
     ),
     "an infinite covariance": (COVARIANCE % "[[1e400, 0, 0], [0, 1, 0], [0, 0, 1]]", "finite"),
+    "a turn below zero": (SIMPLE + "remounted_arcsec: -1\n", "give 0 to"),
     "an error beyond floats": (SIMPLE + "calibration_stddev_arcsec: [1e200, 1, 1]\n", "at most"),
     "both": (
         COVARIANCE % "[[1, 0, 0], [0, 1, 0], [0, 0, 1]]" + "calibration_stddev_arcsec: [1, 1, 1]\n",
@@ -275,6 +276,7 @@ def random_instrument(rng, full: bool) -> Instrument:
     calibration = Calibration(
         misalignment_deg=tuple(rng.uniform(-180, 180, 3).tolist()),
         covariance_arcsec2=tuple(map(tuple, (root @ root.T).tolist())),
+        remounted_arcsec=float(rng.choice([0.0, rng.uniform(0, 1000)])),
         utc_unix_s=round(float(rng.uniform(0, 2e9)), 3),
         temperature_c=float(rng.choice([np.nan, rng.uniform(-40, 60)])),
         tilt_deg=tuple(rng.uniform(-30, 30, 2).tolist()),
