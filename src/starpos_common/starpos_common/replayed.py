@@ -26,6 +26,8 @@ DEPTH = 5000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # How often it is looked at whether there is something new to say.
 HEARTBEAT_S, LOOK_S = 1.0, 0.1
+# A player that the graph has not shown for so long has ended; a busy machine may lose sight of one that has not.
+ENDED_S = 5.0
 
 
 class Replayed:
@@ -52,7 +54,9 @@ class Replayed:
         self._takes = {self._names[name]: take for name, take in takes.items()}
         self._makes = makes
         self._replay = self._index = 0
-        self._playing = self._player_there = False
+        self._playing = False
+        # when a player was last heard, or shown by the graph
+        self._player_s = 0.0
         self._turns: deque[Played] = deque()
         self._taking: Played | None = None
         self._held: dict[str, deque[tuple[Any, Mapping[str, Any]]]] = {}
@@ -86,7 +90,12 @@ class Replayed:
                 return
 
     def _on_played(self, turn: Played) -> None:
+        self._player_s = time.monotonic()
         if turn.kind == Played.BEGIN:
+            if turn.replay == self._replay and self._playing:
+                # the player has not heard that it was taken
+                self._say()
+                return
             self._leave()
             self._replay, self._playing = turn.replay, True
         if turn.replay == self._replay and self._playing:
@@ -137,9 +146,10 @@ class Replayed:
         self._held.clear()
 
     def _beat(self) -> None:
-        # A player that was killed will not end it. It may be heard before the graph knows it.
-        before, self._player_there = self._player_there, bool(self._node.count_publishers(PLAYED))
-        if self._playing and before and not self._player_there:
+        # a player that was killed will not end it
+        if self._node.count_publishers(PLAYED):
+            self._player_s = time.monotonic()
+        elif self._playing and time.monotonic() - self._player_s > ENDED_S:
             self._leave()
         listeners = sum(p.get_subscription_count() for p in self._makes)
         if listeners != self._listeners or time.monotonic() - self._said_s > HEARTBEAT_S:

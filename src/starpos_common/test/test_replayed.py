@@ -73,6 +73,15 @@ def test_messages_are_taken_in_the_order_and_at_the_time_they_were_played(taking
     assert taking.ended == 1 and not taking.replayed.playing
 
 
+def test_a_beginning_that_is_said_again_takes_nothing_back(taking):
+    taking.turn(0, kind=Played.BEGIN)
+    taking.tilt(1), taking.turn(1, 1)
+    taking.tilt(2)
+    taking.turn(0, kind=Played.BEGIN)
+    taking.turn(2, 2)
+    assert taking.took == [(1, 101.0), (2, 102.0)]
+
+
 def test_the_next_waits_while_the_node_works(taking):
     taking.turn(0, kind=Played.BEGIN)
     taking.tilt(1), taking.turn(1, 1)

@@ -90,6 +90,11 @@ class Participants:
         self._replay, self._index = random.getrandbits(63), -1
         self.tell(Played.BEGIN, 0, answer=True)
 
+    def begin_again(self) -> None:
+        """Say once more that the replay begins: a node that had not found the player yet has not heard it."""
+        self._index -= 1
+        self.tell(Played.BEGIN, 0, answer=True)
+
     def tell(
         self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool = False
     ) -> None:

@@ -27,7 +27,7 @@ ACKNOWLEDGED_S = 3.0
 BURST = 50
 # Where nobody takes part nobody says what is taken: at rate 0 listeners get so long to empty their queues.
 BURST_REST_S = 0.05
-BEGIN_S = 30.0
+BEGIN_S, AGAIN_S = 30.0, 1.0
 # Who is never found must not stop it.
 FOUND_S = 10.0
 # A listener that takes no part is found within so long of another, mostly within a tenth of that.
@@ -149,7 +149,11 @@ class Player:
         self._now_ns = None
         self._first_ns: int | None = None
         self._participants.begin()
-        self._taken(BEGIN_S)
+        end_s = time.monotonic() + BEGIN_S
+        while not self._spin(AGAIN_S, self._participants.have_taken_all) and not self._stopped:
+            if time.monotonic() > end_s:
+                break
+            self._participants.begin_again()
         self._begin_s = time.monotonic()
 
     def end_round(self) -> None:
@@ -208,11 +212,10 @@ class Player:
         assert self._now_ns is not None
         self._participants.tell(Played.MESSAGE, self._now_ns, topic, stamp, answer=answer)
 
-    def _taken(self, at_most_s: float | None = None) -> None:
+    def _taken(self) -> None:
         """Wait until the nodes have taken all that was played; one that hangs is given up, which ends the wait."""
-        while not self._participants.have_taken_all() and not self._stopped:
-            if not self._spin(at_most_s or 1.0, self._participants.have_taken_all) and at_most_s:
-                return
+        while not self._spin(1.0, self._participants.have_taken_all) and not self._stopped:
+            pass
 
     def _pace(self, log_ns: int) -> None:
         if self._first_ns is None:
