@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ROS domain of this session's own, the graph's other end, and a solver that a file's tests share."""
 
+from pathlib import Path
+
 import pytest
 
 from starpos_testing.graph.graph import Graph
 from starpos_testing.graph.shots import SOLVER
 from starpos_testing.graph.tf2_messages import built
 from starpos_testing.nodes import take_domain
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -47,8 +51,8 @@ def solver(graph, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def variables_of_tf2(tmp_path_factory):
-    return built(tmp_path_factory.mktemp("tf2_msgs"))
+def variables_of_tf2():
+    return built(ROOT / "build" / "tf2_msgs")
 
 
 @pytest.fixture

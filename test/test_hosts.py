@@ -76,7 +76,7 @@ def test_two_computers_give_the_fixes_of_one_to_the_last_bit(tmp_path):
 
 
 def test_only_stars_and_tilts_cross_the_cable(tmp_path):
-    seen = traffic(tmp_path, frames=5, cadence_s=1.0, quiet_s=4.0)
+    seen = traffic(tmp_path, frames=3, cadence_s=1.0, quiet_s=4.0)
     print(seen)
     # Bytes of the messages alone.
     star_bytes, tilt_bytes = 80 * seen.stars, 80 * TILT_RATE_HZ
@@ -122,7 +122,7 @@ def test_a_link_that_loses_a_fifth_of_the_packets_costs_time_but_no_fix_is_wrong
         # They have met.
         instrument.wait(lambda: len(ear.fixed) > 1, seconds=PATIENCE_S)
         before = set(ear.solutions)
-        instrument.wait(lambda: len(set(ear.solutions) - before) >= 15, seconds=PATIENCE_S)
+        instrument.wait(lambda: len(set(ear.solutions) - before) >= 10, seconds=PATIENCE_S)
         later = sorted(set(ear.solutions) - before)
         taken = 1 + round((seconds_of(later[-1]) - seconds_of(later[0])) / cadence_s)
         fixed = [s for s in later if s in ear.fixed]

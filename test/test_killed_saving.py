@@ -15,7 +15,7 @@ from starpos_common.messages import camera_to_message
 from starpos_interfaces.srv import SaveCalibration
 from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
 
-KILLS, KILLED_NODES = 100, 2
+KILLS, KILLED_NODES = 40, 2
 # That a service keeps.
 CALLS = 8
 # Forks a child that saves two contents in turn, kills it at a random moment, looks at the file; says how often which.

@@ -13,7 +13,7 @@ from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 from starpos_testing.graph.shots import focal_of
 
-SIZE = (2000, 1400)
+SIZE = (1000, 700)
 FOCAL_MM, PIXEL_UM = focal_of(SIZE) * 6.4e-3, 6.4
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12", "--humidity", "0.3")
 MISALIGNMENT = ("0.4", "-0.3", "0.7")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The walls of the house hold, and a breach of each kind is seen."""
+"""A breach of each kind of the walls of the house is seen; that they hold, `make lint` sees."""
 
 import importlib.util
 import sys
@@ -17,10 +17,6 @@ def walls():
     spec.loader.exec_module(module)
     yield module
     del sys.modules["walls"]
-
-
-def test_the_walls_hold(walls):
-    assert walls.breaches() == []
 
 
 FIELDS = "".join(f"    {name}: float\n" for name in "abcdef")

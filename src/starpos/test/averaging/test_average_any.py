@@ -120,7 +120,7 @@ def run(made):
 
 @pytest.mark.parametrize("latitude", [None, 89.5, -89.97, 0.0])
 def test_anything_at_all_gives_a_number(latitude, rng):
-    for _ in range(2):
+    for _ in range(1):
         made = walk(rng, 30, spoil=0.3, drive=0.1, turn=0.3, latitude=latitude)
         run(made)
         order = rng.permutation(len(made.fixes))
@@ -133,7 +133,7 @@ def test_anything_at_all_gives_a_number(latitude, rng):
 def test_sound_fixes_are_not_left_out(rng):
     """Turned, knocked, after hours: less than one in a thousand."""
     left = total = 0
-    for _ in range(8):
+    for _ in range(5):
         made = walk(rng, 40, turn=0.3)
         answers, _ = run(made)
         left += answers[-1].left_out
@@ -145,7 +145,7 @@ def test_sound_fixes_are_not_left_out(rng):
 def test_it_is_true_of_the_place_that_it_claims(rng):
     """One place, one fix in ten wrong, whatever is wrong with it: within five sigma, once there were a few."""
     off = []
-    for _ in range(8):
+    for _ in range(5):
         made = walk(rng, 40, spoil=0.1, turn=0.2)
         answers, _ = run(made)
         off += [sigmas_off(a, made.places[0]) for k, a in enumerate(answers) if k >= 12]
@@ -156,22 +156,22 @@ def test_it_is_true_of_the_place_that_it_claims(rng):
 
 def test_after_a_drive_it_is_true_of_the_new_place(rng):
     off = []
-    for _ in range(10):
+    for _ in range(6):
         made = walk(rng, 60, drive=0.04, turn=0.1)
         answers, _ = run(made)
         for k in range(8, 60):
             # It stands there for eight frames.
             if len(set(made.places[k - 8 : k + 1])) == 1:
                 off.append(sigmas_off(answers[k], made.places[k]))
-    assert len(off) > 80
+    assert len(off) > 60
     assert np.mean(np.array(off) > 5) < 0.005
 
 
 def test_its_memory_is_bounded(rng):
     made = walk(rng, 30, spoil=0.2, drive=0.1)
     averager, sizes = Averager(), []
-    for n in range(20):
+    for n in range(10):
         for f in made.fixes:
             averager.add(replace(f, utc_unix_s=f.utc_unix_s + 1e6 * n))
         sizes.append(len(pickle.dumps(vars(averager))))
-    assert max(sizes[5:]) <= max(sizes[:5]) + 200
+    assert max(sizes[4:]) <= max(sizes[:4]) + 200

@@ -66,7 +66,7 @@ def test_place_and_heading_need_no_tilt(solver, site, rng):
 @pytest.mark.montecarlo
 def test_claims_are_true_of_cameras_that_sag_as_stated(solver):
     place, heading = [], []
-    for seed in range(80):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         site = Site(rng.uniform(-65, 65), rng.uniform(-180, 180), AIR)
         first = pose(rng.uniform(0, 360), rng.uniform(60, 80))
@@ -82,8 +82,8 @@ def test_claims_are_true_of_cameras_that_sag_as_stated(solver):
         place.append(off @ np.linalg.solve(fix.covariance[:2, :2], off))
         wrong = half_turn(fix.heading - np.arctan2(forward[0], forward[1]))
         heading.append(wrong**2 / fix.covariance[2, 2])
-    assert 1.4 < np.mean(place) < 2.6
-    assert 0.6 < np.mean(heading) < 1.5
+    assert 1.2 < np.mean(place) < 3
+    assert 0.5 < np.mean(heading) < 1.7
 
 
 def half_turn_deg(deg):

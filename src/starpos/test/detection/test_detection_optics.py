@@ -86,11 +86,10 @@ def test_corners_without_a_star_to_learn_from_are_no_worse_than_the_rest(rng):
 
 
 @pytest.mark.montecarlo
-@pytest.mark.parametrize("electrons", [3000, 30000, 100000])
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize(("count", "electrons"), [(1, 3000), (1, 100000), (2, 30000), (3, 3000), (3, 100000)])
 def test_one_two_and_three_stars_are_measured_as_well_as_they_say(count, electrons, rng):
     error, pull = [], []
-    for _ in range(180 // count):
+    for _ in range(120 // count):
         x = 30 + 40 * np.arange(count) + rng.uniform(-5, 5, count)
         stars = np.stack([x, rng.uniform(25, 95, count), np.full(count, float(electrons))], 1)
         found = detect(Frame(noisy(field((120, 140), stars, trail=TRAIL), rng))).stars
@@ -99,4 +98,4 @@ def test_one_two_and_three_stars_are_measured_as_well_as_they_say(count, electro
         error.append(e)
         pull.append(p)
     assert rms(np.concatenate(error)) < 1.15 * rms(bound(electrons, trail=TRAIL))
-    assert 0.88 < rms(np.concatenate(pull)) < 1.12
+    assert 0.86 < rms(np.concatenate(pull)) < 1.14

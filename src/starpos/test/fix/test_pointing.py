@@ -77,14 +77,14 @@ def test_the_errors_are_exactly_those_stated(catalogue, rng):
 @pytest.mark.montecarlo
 def test_claims_are_true_over_many_nights(catalogue):
     place, heading = [], []
-    for seed in range(60):
+    for seed in range(30):
         night = pointed_night(np.random.default_rng(seed), frames=1)
         _, answers = solved(night, catalogue)
         whole = average([a.fix for a in answers])
         place.append(night.place_nees(whole))
         heading.append(half_turn(whole.heading - night.heading) ** 2 / whole.covariance[2, 2])
-    assert 1.2 < np.mean(place) < 2.7
-    assert 0.6 < np.mean(heading) < 1.5
+    assert 1 < np.mean(place) < 3
+    assert 0.5 < np.mean(heading) < 1.8
 
 
 def test_a_camera_with_intrinsics_points_with_its_frames_centre(catalogue, rng):

@@ -17,6 +17,7 @@ from starpos.earth.vertical import Deflection
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.report import folder, measures
+from starpos.report.pictures import nights_picture
 from starpos.report.place_figures import draw_scatter
 from starpos.report.working import Workshop, worked
 from starpos_testing.skies.reports import AIR, KNOWN, PLACE, Page, assert_drawn, run, simulate, solved
@@ -38,12 +39,30 @@ def turned(tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("turned") / "turned", *misaligned, frames=4)
 
 
+def settings_of_matplotlib():
+    import matplotlib
+
+    # A look at that one sets it.
+    return {k: v for k, v in matplotlib.rcParams.items() if k != "backend"}
+
+
 @pytest.fixture(scope="module")
-def drawn(still, tmp_path_factory):
+def touched():
+    """What the report that `drawn` makes has changed in matplotlib, by name."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def drawn(still, touched, tmp_path_factory):
     """The folder of the still night's report."""
     out = tmp_path_factory.mktemp("drawn") / "out"
+    before, pyplot = settings_of_matplotlib(), sys.modules.pop("matplotlib.pyplot", None)
     with redirect_stdout(io.StringIO()):
         assert main(["report", *map(str, (still, "-o", out, *KNOWN, *AIR))]) == 0
+    touched["pyplot"] = "matplotlib.pyplot" in sys.modules
+    touched["settings"] = settings_of_matplotlib() != before
+    if pyplot:
+        sys.modules["matplotlib.pyplot"] = pyplot
     return out
 
 
@@ -144,6 +163,7 @@ def test_a_scatter_of_many_kilometres_is_told_in_them(sigma_deg, unit, still, ca
     assert (axes.get_xlabel(), axes.get_ylabel()) == (f"east, {unit}", f"north, {unit}")
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_turned_night_has_no_mean_heading_but_that_of_the_truth(turned, tmp_path, capsys):
     misalignment = ("--misalignment", 0.5, -0.3, 0.2)
     status, page, _ = report(capsys, turned, tmp_path / "out", *misalignment)
@@ -162,7 +182,13 @@ def test_self_calibration_is_said(turned, tmp_path, capsys):
     assert f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°" in page.text
 
 
-def test_several_nights_are_held_against_their_truths(still, turned, tmp_path, capsys):
+def test_the_errors_of_several_nights_are_drawn(still, catalogue):
+    night = worked(folder.exposures(still, SCA100T_NOISE_RAD), shop(catalogue))
+    assert_drawn(nights_picture([(1, night), (2, night)]).png)
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_several_nights_are_held_against_their_truths(still, tmp_path, capsys):
     other = simulate(tmp_path / "other", "--seed", 5, place={"latitude": -33.9, "longitude": 18.4}, frames=2)
     status, page, errors = report(capsys, [still, other], tmp_path / "out")
     assert (status, errors) == (0, [])
@@ -170,13 +196,12 @@ def test_several_nights_are_held_against_their_truths(still, turned, tmp_path, c
     assert {"night1-scatter.png", "night2-scatter.png", "nights.png"} <= {
         p.name for p in (tmp_path / "out").iterdir()
     }
-    for png in page.pictures.values():
-        assert_drawn(png)
     for night in (still, other):
         want = solved(capsys, night, *KNOWN, *AIR)
         assert page.text.count(f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°") >= 2
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_names_from_files_are_text_only(still, tmp_path, capsys):
     evil = tmp_path / '<img src=x onerror="alert(1)"> & <b>'
     shutil.copytree(still, evil)
@@ -255,6 +280,7 @@ def test_a_file_of_somebody_else_is_not_overwritten(still, tmp_path, capsys):
     assert (out / "index.html").read_text() == "<h1>mine</h1>"
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_its_own_report_is_overwritten_whole(drawn, turned, tmp_path, capsys):
     out = shutil.copytree(drawn, tmp_path / "out")
     first = (out / "scatter.png").read_bytes()
@@ -282,14 +308,6 @@ def test_without_matplotlib_the_pip_line_is_said(still, tmp_path, capsys, monkey
     assert "pip install matplotlib rosbags" in errors[0]
 
 
-def test_a_report_leaves_matplotlib_as_it_was(still, tmp_path, capsys):
-    import matplotlib
-
-    # A look at that one sets it.
-    settings = {k: v for k, v in matplotlib.rcParams.items() if k != "backend"}
-    pyplot = sys.modules.pop("matplotlib.pyplot", None)
-    report(capsys, still, tmp_path / "out")
-    assert "matplotlib.pyplot" not in sys.modules
-    assert {k: v for k, v in matplotlib.rcParams.items() if k != "backend"} == settings
-    if pyplot:
-        sys.modules["matplotlib.pyplot"] = pyplot
+@pytest.mark.usefixtures("drawn")
+def test_a_report_leaves_matplotlib_as_it_was(touched):
+    assert touched == {"pyplot": False, "settings": False}

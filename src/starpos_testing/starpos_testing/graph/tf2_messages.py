@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package tf2_msgs, which PyPI's ROS lacks: its TFMessage, built from the definition that geometry2 has."""
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -34,22 +35,39 @@ ament_package()
 
 
 def built(folder: Path) -> dict[str, str]:
-    """Variables that let a process import tf2_msgs: those of a build in this folder, none where it is installed."""
+    """Variables that let a process import tf2_msgs: those of a build in this folder, none where it is installed.
+
+    It is built once: a whole build of the same files, which stands there already, is taken.
+    """
     if find_spec("tf2_msgs"):
         return {}
+    folder.mkdir(parents=True, exist_ok=True)
+    stamp, wanted = folder / "stamp", repr((FILES, sys.executable))
+    with (folder / "lock").open("w") as lock:
+        # another part of the tests may be at it
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not stamp.is_file() or stamp.read_text() != wanted:
+            _build(folder)
+            stamp.write_text(wanted)
+    return dict(_variables(folder / "install"))
+
+
+def _build(folder: Path) -> None:
     for name, text in FILES.items():
         path = folder / "source" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    prefix = folder / "install"
-    options = {"CMAKE_INSTALL_PREFIX": prefix, "Python3_EXECUTABLE": sys.executable, "CMAKE_CXX_FLAGS": "-O0"}
+    options = {
+        "CMAKE_INSTALL_PREFIX": folder / "install",
+        "Python3_EXECUTABLE": sys.executable,
+        "CMAKE_CXX_FLAGS": "-O0",
+    }
     for command in (
         ["cmake", "-S", "source", "-B", "build", *(f"-D{name}={value}" for name, value in options.items())],
         ["cmake", "--build", "build", "--target", "install"],
     ):
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    return dict(_variables(prefix))
 
 
 def _variables(prefix: Path) -> Iterator[tuple[str, str]]:
