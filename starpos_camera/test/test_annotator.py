@@ -17,6 +17,7 @@ from starpos.frames.annotate import DETECTED, IDENTIFIED
 from starpos.recording.messages import message_to_frame
 from starpos_camera.detector import DetectorNode
 from starpos_interfaces.msg import Solution, StarArray
+from starpos_testing.nodes import Listener, Process
 
 TOPIC = "detector/image_annotated"
 
@@ -26,109 +27,6 @@ def has(picture, star, colour) -> bool:
     rows, columns = np.nonzero(np.abs(picture.astype(int) - colour).max(2) < 40)
     away = np.hypot(columns - star.x, rows - star.y)
     return np.count_nonzero((away > 4) & (away < 10)) > 8
-
-
-class Viewer:
-    """Somebody who looks at the annotated images of a feed."""
-
-    def __init__(self, feed):
-        self.feed = feed
-        self.images = feed.listener.hear(Image, TOPIC)
-        self.solver = None
-        feed.listener.wait(lambda: feed.listener.node.count_publishers(TOPIC))
-
-    def start_solver(self):
-        """A topic of solutions that the detector listens to; it does so from the first frame that is looked at."""
-        self.solver = self.feed.listener.node.create_publisher(Solution, "solver/solution", 10)
-        self.feed.show(self.feed.frame)
-        self.feed.listener.wait(self.solver.get_subscription_count)
-
-    def see(self, changes=None):
-        """The picture and the stars of a frame; changes: of the solution, None for no solution at all.
-
-        Frames pass by while an earlier one waits or is drawn, so it is shown until its picture comes.
-        """
-        shown = []
-
-        def show():
-            message = self.feed.message(self.feed.frame)
-            shown.append(message.header)
-            self.feed.images.publish(message)
-            self.feed.wait_for(message)
-            if changes is not None:
-                said = {"ids": ["HIP 11"], "indices": [0], "magnitudes": [4.5], "status": Solution.NO_TILT}
-                self.solver.publish(Solution(**{"header": message.header, **said, **changes}))
-
-        def seen():
-            return [image for image in self.images if image.header in shown]
-
-        self.feed.listener.wait(lambda: seen() or show())
-        image = seen()[-1]
-        stars = next(s.stars for s in self.feed.stars if s.header == image.header)
-        return message_to_frame(image).pixels, stars
-
-
-@pytest.fixture
-def feed(listener, start, frame):
-    feed = Feed(listener, start)
-    feed.frame = frame
-    return feed
-
-
-@pytest.fixture
-def viewer(feed):
-    viewer = Viewer(feed)
-    # images are made from when the detector knows of the viewer
-    feed.listener.wait(lambda: feed.show(feed.frame) and viewer.images)
-    return viewer
-
-
-def test_without_a_solver_every_star_is_circled_under_the_header_of_the_frame(viewer):
-    picture, stars = viewer.see()
-    assert picture.shape[1] == 640 and picture.shape[0] > 480
-    clean = [s for s in stars if not s.flags]
-    assert len(clean) > 10 and all(has(picture[:480], s, DETECTED) for s in clean)
-
-
-def test_the_solution_of_the_frame_names_its_stars(viewer):
-    viewer.start_solver()
-    plain, stars = viewer.see({"ids": [], "indices": [], "magnitudes": []})
-    row = next(k for k, s in enumerate(stars) if not s.flags and 100 < s.x < 500 and 50 < s.y < 430)
-    named, _ = viewer.see({"indices": [row]})
-    assert has(plain[:480], stars[row], DETECTED) and has(named[:480], stars[row], IDENTIFIED)
-    rows, columns = np.nonzero((named[:480] != plain[:480]).any(2))
-    away = np.hypot(columns - stars[row].x, rows - stars[row].y)
-    # A text beside it, and nothing elsewhere.
-    assert 30 < away.max() < 150
-
-
-def test_a_solution_that_does_not_hold_together_or_is_of_another_frame_names_nobody(viewer):
-    viewer.start_solver()
-    for changes in (
-        {"indices": [4_000_000_000]},
-        {"indices": [0, 1]},
-        {"magnitudes": []},
-        {"ids": ["HIP 1"] * 50_000},
-        {"header": Header()},
-    ):
-        picture, stars = viewer.see(changes)
-        assert not has(picture[:480], stars[0], IDENTIFIED), changes.keys()
-
-
-def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer):
-    viewer.start_solver()
-    for unknown in (float("nan"), -1.0):
-        picture, stars = viewer.see(
-            {
-                "ids": ["\N{SNOWMAN}\n%s" * 10_000],
-                "magnitudes": [float("inf")],
-                "status": Solution.OK,
-                "status_text": "x" * 100_000,
-                "heading": float("nan"),
-                "covariance_geodetic": [unknown] * 9,
-            }
-        )
-        assert stars[0].flags or has(picture[:480], stars[0], IDENTIFIED)
 
 
 class Inside:
@@ -204,3 +102,114 @@ def test_one_frame_waits_for_its_solution_and_none_once_the_viewer_has_gone(insi
     inside.wait(lambda: inside.show() or solver.get_subscription_count() == 0)
     inside.show()
     assert inside.kept() == 0
+
+
+class Viewer:
+    """Somebody who looks at the annotated images of a feed."""
+
+    def __init__(self, feed):
+        self.feed = feed
+        self.images = feed.listener.hear(Image, TOPIC)
+        self.solver = None
+        feed.listener.wait(lambda: feed.listener.node.count_publishers(TOPIC))
+
+    def start_solver(self):
+        """A topic of solutions that the detector listens to; it does so from the first frame that is looked at."""
+        if self.solver:
+            return
+        self.solver = self.feed.listener.node.create_publisher(Solution, "solver/solution", 10)
+        self.feed.show(self.feed.frame)
+        self.feed.listener.wait(self.solver.get_subscription_count)
+
+    def see(self, changes=None):
+        """The picture and the stars of a frame; changes: of the solution, None for no solution at all.
+
+        Frames pass by while an earlier one waits or is drawn, so it is shown until its picture comes.
+        """
+        shown = []
+
+        def show():
+            message = self.feed.message(self.feed.frame)
+            shown.append(message.header)
+            self.feed.images.publish(message)
+            self.feed.wait_for(message)
+            if changes is not None:
+                said = {"ids": ["HIP 11"], "indices": [0], "magnitudes": [4.5], "status": Solution.NO_TILT}
+                self.solver.publish(Solution(**{"header": message.header, **said, **changes}))
+
+        def seen():
+            return [image for image in self.images if image.header in shown]
+
+        self.feed.listener.wait(lambda: seen() or show())
+        image = seen()[-1]
+        stars = next(s.stars for s in self.feed.stars if s.header == image.header)
+        return message_to_frame(image).pixels, stars
+
+
+# After the detectors in this process, which would hear its solver.
+@pytest.fixture(scope="module")
+def viewer(domain, frame):
+    """Somebody who looks at the images of a detector that these tests share."""
+    listener, started = Listener(), []
+
+    def start(executable, *parameters):
+        started.append(Process("starpos_camera.main", executable, parameters))
+        return started[-1]
+
+    feed = Feed(listener, start)
+    feed.frame = frame
+    viewer = Viewer(feed)
+    # images are made from when the detector knows of the viewer
+    listener.wait(lambda: feed.show(frame) and viewer.images)
+    yield viewer
+    for process in started:
+        process.kill()
+    listener.close()
+
+
+def test_without_a_solver_every_star_is_circled_under_the_header_of_the_frame(viewer):
+    picture, stars = viewer.see()
+    assert picture.shape[1] == 640 and picture.shape[0] > 480
+    clean = [s for s in stars if not s.flags]
+    assert len(clean) > 10 and all(has(picture[:480], s, DETECTED) for s in clean)
+
+
+def test_the_solution_of_the_frame_names_its_stars(viewer):
+    viewer.start_solver()
+    plain, stars = viewer.see({"ids": [], "indices": [], "magnitudes": []})
+    row = next(k for k, s in enumerate(stars) if not s.flags and 100 < s.x < 500 and 50 < s.y < 430)
+    named, _ = viewer.see({"indices": [row]})
+    assert has(plain[:480], stars[row], DETECTED) and has(named[:480], stars[row], IDENTIFIED)
+    rows, columns = np.nonzero((named[:480] != plain[:480]).any(2))
+    away = np.hypot(columns - stars[row].x, rows - stars[row].y)
+    # A text beside it, and nothing elsewhere.
+    assert 30 < away.max() < 150
+
+
+def test_a_solution_that_does_not_hold_together_or_is_of_another_frame_names_nobody(viewer):
+    viewer.start_solver()
+    for changes in (
+        {"indices": [4_000_000_000]},
+        {"indices": [0, 1]},
+        {"magnitudes": []},
+        {"ids": ["HIP 1"] * 50_000},
+        {"header": Header()},
+    ):
+        picture, stars = viewer.see(changes)
+        assert not has(picture[:480], stars[0], IDENTIFIED), changes.keys()
+
+
+def test_strange_numbers_and_endless_names_are_drawn_all_the_same(viewer):
+    viewer.start_solver()
+    for unknown in (float("nan"), -1.0):
+        picture, stars = viewer.see(
+            {
+                "ids": ["\N{SNOWMAN}\n%s" * 10_000],
+                "magnitudes": [float("inf")],
+                "status": Solution.OK,
+                "status_text": "x" * 100_000,
+                "heading": float("nan"),
+                "covariance_geodetic": [unknown] * 9,
+            }
+        )
+        assert stars[0].flags or has(picture[:480], stars[0], IDENTIFIED)

@@ -38,7 +38,7 @@ def node(listener):
     assert status == 0 and "Traceback" not in output, output
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def driver(tmp_path_factory):
     require("selenium")
     for program, package in (("chromium", "chromium"), ("chromedriver", "chromium-driver")):

@@ -233,6 +233,11 @@ def workers_of(pid):
     return [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
 
 
+def complaints(err):
+    """Lines of standard error but those of progress, which come where a busy machine takes long."""
+    return [line for line in err.splitlines() if not line.endswith("% done")]
+
+
 def gone(pidfd):
     """Whether the process ends within the test's patience."""
     return bool(select.select([pidfd], [], [], 30)[0])
@@ -244,7 +249,7 @@ def test_a_worker_killed_on_the_way_changes_no_answer(archive, capfd):
         assert len(workers) == 2
         os.kill(workers[0], signal.SIGKILL)
         rest, err = process.communicate(timeout=WAIT_S)
-    assert (process.returncode, err) == (0, "")
+    assert (process.returncode, complaints(err)) == (0, [])
     *each, combined = (first + rest).splitlines()
     assert len(each) == len(many)
     known = {}
@@ -264,7 +269,7 @@ def test_workers_end_with_their_parent(ends, archive):
         else:
             process.kill()
         _, err = process.communicate(timeout=WAIT_S)
-        assert (process.returncode, err) == ((130, "") if ends == signal.SIGINT else (-ends, ""))
+        assert (process.returncode, complaints(err)) == (130 if ends == signal.SIGINT else -ends, [])
         assert len(fds) == 2
         assert all(gone(fd) for fd in fds)
         for fd in fds:
@@ -276,7 +281,7 @@ def test_workers_end_where_nobody_reads_on(archive):
         fds = [os.pidfd_open(w) for w in workers_of(process.pid)]
         process.stdout.close()
         assert process.wait(timeout=WAIT_S) == 0
-        assert process.stderr.read() == ""
+        assert complaints(process.stderr.read()) == []
         assert all(gone(fd) for fd in fds)
         for fd in fds:
             os.close(fd)
