@@ -134,9 +134,9 @@ def grown(feed, rounds):
 
 
 def test_the_drivers_memory_does_not_grow():
-    """A leak of five bytes a sample would show: 12 rounds of 500 samples, a third of the lines spoiled."""
+    """A leak of five bytes a sample would show: 12 rounds of 1000 samples, a third of the lines spoiled."""
     rng, host = random.Random(4), Host()
-    per_round = 500
+    per_round = 1000
 
     def feed(k):
         sent = lines(per_round, np.random.default_rng(k), per_round * k)
@@ -152,10 +152,10 @@ def test_the_ascii_decoders_memory_does_not_grow():
     rng = random.Random(5)
 
     def feed(k):
-        for i in range(1000):
+        for i in range(2000):
             line = b"1.%03d,-2.%03d\r\n" % (rng.randrange(20), rng.randrange(20))
             if rng.random() < 0.3:
                 line = mutated(line, rng)
-            decoder.feed(line, Moment(100.0 * k + 0.1 * i, 0))
+            decoder.feed(line, Moment(200.0 * k + 0.1 * i, 0))
 
-    assert grown(feed, 10) < 5 * 5 * 1000
+    assert grown(feed, 10) < 5 * 5 * 2000
