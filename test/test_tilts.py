@@ -93,7 +93,7 @@ def test_tilts_of_a_minute_before_do_not_matter(graph, solver):
 
 
 def test_tilts_before_an_earlier_one_are_of_a_clock_ahead_and_none(graph, solver):
-    """To and fro by a minute: each earlier sample shows that the later ones before it were stamped ahead."""
+    """Back by a minute and ahead again: each earlier sample shows that the later ones before it were stamped ahead."""
     shot = shoot()
     mixed = [t for pair in zip(shot.tilts, others(shot, -60), strict=True) for t in pair]
     graph.send(replace(shot, tilts=mixed))
