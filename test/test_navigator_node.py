@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `navigator`: a rover's messages become the command line's answer, and what cannot be is said."""
 
+import json
+import subprocess
+import sys
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -24,7 +27,20 @@ from starpos_interfaces.msg import Attitude
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL, made
 
-SECONDS, TAIL_S = 60, 1.0
+LISTEN = """
+import json, rclpy
+from tf2_msgs.msg import TFMessage
+rclpy.init()
+node = rclpy.create_node("listener")
+def tell(message):
+    for t in message.transforms:
+        at, p, q = t.header.stamp, t.transform.translation, t.transform.rotation
+        names, numbers = [t.header.frame_id, t.child_frame_id], [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+        print(json.dumps([[at.sec, at.nanosec], names, numbers]), flush=True)
+node.create_subscription(TFMessage, "/tf", tell, 1000)
+rclpy.spin(node)
+"""
+SECONDS = 60
 EARTH_M = 6.37e6
 
 
@@ -34,7 +50,19 @@ def record():
 
 
 @pytest.fixture
-def ears(graph, run, tmp_path):
+def transforms(graph, tf2, tmp_path):
+    """What is told on /tf: stamp, names of the frames, translation and quaternion, one after another."""
+    said = tmp_path / "tf"
+    with said.open("w") as out, subprocess.Popen([sys.executable, "-c", LISTEN], stdout=out) as listener:
+        graph.wait(lambda: graph.node.count_subscribers("/tf") == 1)
+        yield lambda: [
+            json.loads(line) for line in said.read_text().splitlines(keepends=True) if line[-1] == "\n"
+        ]
+        listener.kill()
+
+
+@pytest.fixture
+def ears(graph, tf2, run, tmp_path):
     """A navigator that knows its IMU, who feeds it, and what it publishes."""
     model = tmp_path / "imu.yaml"
     model.write_text(yaml.safe_dump({name: float(value) for name, value in asdict(INDUSTRIAL).items()}))
@@ -48,7 +76,9 @@ def ears(graph, run, tmp_path):
         "navigator",
         f"imu_model:={model}",
         "vehicle:=rover",
+        "publish_tf:=true",
         "rate:=2.0",
+        "adjust_period:=1.0",
         "refraction.pressure:=0.0",
         "clock_stddev:=1e-4",
         "deflection.stddev:=0.0",
@@ -66,6 +96,7 @@ def ears(graph, run, tmp_path):
         lambda: (
             all(p.get_subscription_count() == 1 for p in publishers.values())
             and all(graph.node.count_publishers(f"navigator/{n}") for n in ("fix", "heading", "odometry"))
+            and graph.node.count_publishers("/tf") == 1
         )
     )
     yield heard
@@ -125,18 +156,21 @@ def adjusted(graph, times):
     graph.wait(lambda: int(value(graph, "Navigation", "adjustments")) >= times, f"for {times} adjustments")
 
 
-def test_a_rovers_place_is_the_command_lines(graph, ears, record):
+def test_a_rovers_place_is_the_command_lines(graph, transforms, ears, record):
     send_stars_and_wheels(ears, record)
     graph.wait(
         lambda: value(graph, "Navigation", "velocities in the window") == str(len(record.velocity.utc_unix_s))
     )
-    # the first adjustment may be of a part only; the next is of all that has come by then
-    send_readings(ears, record, 0, SECONDS - 2 * TAIL_S)
-    adjusted(graph, 1)
-    before = int(value(graph, "Navigation", "adjustments"))
-    send_readings(ears, record, SECONDS - 2 * TAIL_S, SECONDS - TAIL_S)
-    adjusted(graph, before + 1)
-    send_readings(ears, record, SECONDS - TAIL_S, SECONDS)
+    begin_s = 0
+    # the first adjustments may be of a part only: on until one is of nearly all
+    for end_s in range(SECONDS - 6, SECONDS):
+        before = int(value(graph, "Navigation", "adjustments"))
+        send_readings(ears, record, begin_s, end_s)
+        adjusted(graph, before + 1)
+        begin_s = end_s
+        if float(value(graph, "Navigation", "time since the newest frame that is adjusted (s)")) < 2.5:
+            break
+    send_readings(ears, record, begin_s, SECONDS)
     stamp = stamp_of(reading(record.frames_s[-1]))
     graph.wait(lambda: stamp in map(stamp_of, ears.odometry), "for the output of the last frame")
     assert value(graph, "Inputs", "refused") == "0"
@@ -168,6 +202,10 @@ def test_a_rovers_place_is_the_command_lines(graph, ears, record):
     assert abs(turn) < 5 * heading.orientation_covariance[8] ** 0.5 < np.radians(1)
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "starpos_link")
     assert odometry.pose.pose.orientation == q
+    pose = odometry.pose.pose
+    at = [pose.position.x, pose.position.y, pose.position.z, q.x, q.y, q.z, q.w]
+    moment = [odometry.header.stamp.sec, odometry.header.stamp.nanosec]
+    graph.wait(lambda: [moment, ["map", "starpos_link"], at] in transforms(), "for the pose on /tf")
     assert abs(odometry.twist.twist.linear.x - record.velocity.velocity[-1][0]) < 0.2
     state = graph.state("navigator: Navigation", "place to")
     assert {"place (m, 1 sigma an axis)", "heading (deg, 1 sigma)"} <= {v.key for v in state.values}

@@ -119,7 +119,7 @@ def hold(graph, *enclaves: str):
 def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
     secured("starpos_solver", "solver", sim)
-    secured("starpos_solver", "navigator", sim)
+    secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
     secured("starpos_camera", "detector", sim)
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")

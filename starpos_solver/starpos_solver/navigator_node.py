@@ -67,6 +67,7 @@ class NavigatorNode(Node):
     def _adopted(self, names: frozenset[str]) -> None:
         self._settings.adopt()
         self._diagnostics.hardware_id = self._settings.values["frame_id"]
+        self._outputs.parameters_set()
         self._session.parameters_set()
 
     def _now(self) -> Now:

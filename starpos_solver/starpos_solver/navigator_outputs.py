@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator's topics: `navigator/fix`, `navigator/heading` and `navigator/odometry` of an output."""
+"""The navigator's topics: `navigator/fix`, `navigator/heading`, `navigator/odometry` and `/tf` of an output."""
 
 import numpy as np
 from geometry_msgs.msg import Point, Vector3
@@ -15,6 +15,7 @@ from starpos.session.navigator_parameters import NavigatorSettings
 from starpos_common.messages import unix_to_stamp
 from starpos_common.topics import publisher
 from starpos_solver import outputs
+from starpos_solver.transforms import MovingTransform
 
 
 class NavigatorPublishers:
@@ -25,6 +26,12 @@ class NavigatorPublishers:
         self._fix = publisher(node, NavSatFix, "navigator/fix", 10)
         self._heading = publisher(node, Imu, "navigator/heading", 10)
         self._odometry = publisher(node, Odometry, "navigator/odometry", 10)
+        self._transform = MovingTransform(node)
+        self.parameters_set()
+
+    def parameters_set(self) -> None:
+        """Have the topics that the parameters want."""
+        self._transform.open(self._values["publish_tf"])
 
     def publish(self, output: Navigated) -> None:
         """Publish one output; without support it is a NO_FIX alone."""
@@ -38,7 +45,9 @@ class NavigatorPublishers:
         if output.position is None:
             return
         start = Header(stamp=header.stamp, frame_id=self._values["odometry_frame_id"])
-        self._odometry.publish(odometry(start, frame, output.fix, output.ground, output.position))
+        message = odometry(start, frame, output.fix, output.ground, output.position)
+        self._odometry.publish(message)
+        self._transform.publish(message)
 
 
 def odometry(header: Header, child: str, fix: VoyageFix, ground: Geodetic, position: Position) -> Odometry:

@@ -44,6 +44,12 @@ PARAMETERS = (
         form=FRAME_NAME,
     ),
     Parameter(
+        "publish_tf",
+        False,
+        "Publish on /tf where frame_id is in odometry_frame_id; false where a filter tells that, or frame_id hangs on "
+        "base_link: a frame with two parents breaks the tree.",
+    ),
+    Parameter(
         "calibration_url",
         "",
         "Instrument file (YAML) whose link_to_camera says how the camera sits on the IMU; '' for its axis along z and "
