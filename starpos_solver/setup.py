@@ -17,5 +17,10 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
-    entry_points={"console_scripts": ["solver = starpos_solver.main:solver"]},
+    entry_points={
+        "console_scripts": [
+            "navigator = starpos_solver.main:navigator",
+            "solver = starpos_solver.main:solver",
+        ]
+    },
 )

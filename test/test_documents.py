@@ -22,6 +22,7 @@ OF_NODES = {
     "dashboard": "src/starpos_dashboard",
     "detector": "starpos_camera",
     "inclinometer": "starpos_inclinometer",
+    "navigator": "starpos_solver",
     "solver": "starpos_solver",
 }
 ROOMS = (ROOT / "docs", ROOT / "test", ROOT / "tools", *PACKAGES)

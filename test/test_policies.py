@@ -119,6 +119,7 @@ def hold(graph, *enclaves: str):
 def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
     secured("starpos_solver", "solver", sim)
+    secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
     secured("starpos_camera", "detector", sim)
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
@@ -127,7 +128,7 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     graph.wait(lambda: "http://" in dashboard.output)
     address = "http://" + dashboard.output.split("http://")[1].split()[0]
     with urllib.request.urlopen(f"{address}/events?frame", timeout=WAIT_S):
-        names = ("solver", "camera", "detector", "inclinometer", "record", "dashboard")
+        names = ("solver", "navigator", "camera", "detector", "inclinometer", "record", "dashboard")
         hold(graph, *(f"/starpos/{name}" for name in names))
 
 

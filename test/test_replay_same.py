@@ -17,8 +17,9 @@ from starpos.session.frames import Answered
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
 from starpos_bringup.recording.bag import Bag
-from starpos_common.messages import unix_to_stamp
-from starpos_interfaces.msg import Tilt
+from starpos_common.messages import attitude_to_message, unix_to_stamp
+from starpos_interfaces.msg import Attitude, Tilt
+from starpos_testing.graph.graph import stamp_of
 from starpos_testing.patience import WAIT_S
 from starpos_testing.skies.bags import part_of
 
@@ -44,18 +45,21 @@ class Quiet:
 
 @pytest.fixture(scope="module")
 def expected(bag):
-    """(fixes, averages) of the bag without ROS, by stamp; angles in deg."""
-    fixes, averages = {}, {}
+    """(fixes, averages, attitudes) of the bag without ROS, by stamp; angles in deg, attitudes as messages."""
+    fixes, averages, attitudes = {}, {}, {}
     for made in Replay(settings_of(None, KNOWN), Quiet(), Quiet()).play(bag):
         kept = fixes if isinstance(made, Answered) else averages
         ground = made.ground
+        if isinstance(made, Answered):
+            attitude = attitude_to_message(made.attitude)
+            attitudes[made.stamp.sec, made.stamp.nanosec] = attitude
         kept[made.stamp.sec, made.stamp.nanosec] = (
             math.degrees(ground.latitude),
             math.degrees(ground.longitude),
             *ground.covariance[:2, :2].ravel().tolist(),
         )
-    assert len(fixes) == len(averages) == 2
-    return fixes, averages
+    assert len(fixes) == len(averages) == len(attitudes) == 2
+    return fixes, averages, attitudes
 
 
 def told(message: NavSatFix):
@@ -73,15 +77,22 @@ def averages(graph, tmp_path_factory):
     return heard
 
 
+@pytest.fixture(scope="module")
+def attitudes(graph):
+    return graph.hear(Attitude, "attitude")
+
+
 @pytest.fixture
-def nothing_known(graph, averages):
+def nothing_known(graph, averages, attitudes):
     assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
-    graph.solutions.clear(), graph.fixes.clear(), averages.clear()
+    graph.solutions.clear(), graph.fixes.clear(), averages.clear(), attitudes.clear()
 
 
-def check(graph, averages, expected):
-    fixes, means = expected
-    graph.wait(lambda: len(graph.fixes) == len(fixes) and len(averages) == len(means), "for all fixes")
+def check(graph, averages, attitudes, expected):
+    fixes, means, turns = expected
+    kept = (graph.fixes, fixes), (averages, means), (attitudes, turns)
+    graph.wait(lambda: all(len(heard) == len(wanted) for heard, wanted in kept), "for all fixes")
+    assert {stamp_of(m): m for m in attitudes} == turns
     assert {stamp: told(messages[0]) for stamp, messages in graph.fixes.items()} == fixes
     stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for m in averages]
     assert dict(zip(stamps, map(told, averages), strict=True)) == means
@@ -89,11 +100,13 @@ def check(graph, averages, expected):
 
 @pytest.mark.usefixtures("nothing_known")
 @pytest.mark.parametrize("rate", ["0", "10"])
-def test_the_player_and_the_command_line_agree_to_the_last_bit(graph, run, bag, averages, expected, rate):
+def test_the_player_and_the_command_line_agree_to_the_last_bit(
+    graph, run, bag, averages, attitudes, expected, rate
+):
     replay = run("starpos_bringup", "replay", arguments=(str(bag), "--rate", rate, "--inputs", "stars"))
     assert replay.wait() == 0, replay.output
     assert "2 frames, 2 answers, 2 fixes" in replay.output
-    check(graph, averages, expected)
+    check(graph, averages, attitudes, expected)
 
 
 def play_as_others_do(graph, bag, rate):
@@ -123,9 +136,11 @@ def play_as_others_do(graph, bag, rate):
 
 
 @pytest.mark.usefixtures("nothing_known")
-def test_a_player_who_asks_nobody_gives_the_same_where_nothing_is_dropped(graph, bag, averages, expected):
+def test_a_player_who_asks_nobody_gives_the_same_where_nothing_is_dropped(
+    graph, bag, averages, attitudes, expected
+):
     play_as_others_do(graph, bag, 10.0)
-    check(graph, averages, expected)
+    check(graph, averages, attitudes, expected)
 
 
 def test_what_such_a_player_loses_is_named(graph, run):

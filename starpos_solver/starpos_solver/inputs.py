@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of the solver: when messages came, and which were refused."""
+"""Inputs of a node: when messages came, and which were refused."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rclpy.node import Node
 
@@ -10,14 +10,17 @@ from starpos_common.diagnostics import Diagnosis, Level
 from starpos_common.troubles import Troubles
 
 STALE_S = 5.0
-NAMES = ("camera_info", "stars", "tilt")
 
 
 class Inputs:
-    """Keeps account of the messages, by the relative name of their topic."""
+    """Keeps account of the messages, by the relative name of their topic.
 
-    def __init__(self, node: Node) -> None:
+    needed: names without which there is no output.
+    """
+
+    def __init__(self, node: Node, needed: Sequence[str]) -> None:
         self.refused = 0
+        self._needed = needed
         self._came_s: dict[str, float] = {}
         self._troubles = Troubles(node)
 
@@ -32,17 +35,17 @@ class Inputs:
         self.refused += 1
         self._troubles.wrong(name, sentence)
 
-    def report(self, tilts_kept: int, dropped: Mapping[str, int]) -> Diagnosis:
-        """Make the diagnostic `Inputs`; dropped: messages that were lost on the way, by topic."""
+    def report(self, kept: Mapping[str, int], dropped: Mapping[str, int]) -> Diagnosis:
+        """Make the diagnostic `Inputs`; kept: what the node has of them; dropped: what was lost on the way, by topic."""
         now = time.monotonic()
         ages_s = {name: now - came for name, came in self._came_s.items()}
-        missing = [name for name in NAMES if ages_s.get(name, STALE_S) >= STALE_S]
+        missing = [name for name in self._needed if ages_s.get(name, STALE_S) >= STALE_S]
         values: dict[str, object] = {f"{name} age (s)": age for name, age in ages_s.items()}
-        values |= {"tilts kept": tilts_kept, "refused": self.refused}
+        values |= {**kept, "refused": self.refused}
         values |= {f"{name} dropped": count for name, count in dropped.items()}
         refusals = self._troubles.lately(STALE_S)
-        if missing:
-            return Diagnosis(Level.WARN, f"nothing on {', '.join(missing)} for {STALE_S:g} s", values)
-        if refusals:
-            return Diagnosis(Level.WARN, f"refused: {'; '.join(refusals)}", values)
+        said = [f"nothing on {', '.join(missing)} for {STALE_S:g} s"] if missing else []
+        said += [f"refused: {'; '.join(refusals)}"] if refusals else []
+        if said:
+            return Diagnosis(Level.WARN, "; ".join(said), values)
         return Diagnosis(Level.OK, "all inputs arrive", values)

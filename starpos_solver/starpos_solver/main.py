@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable. Its imports are heavy, so they come after the signal handlers (see starpos_common)."""
+"""The executables. Their imports are heavy, so they come after the signal handlers (see starpos_common)."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -25,4 +25,26 @@ def solver() -> int:
         return node_help("starpos_solver", "solver", about, {"solver": PARAMETERS})
 
     # A thread may still build triangles.
+    return leave(run(make_nodes, help_text=help_text))
+
+
+def navigator() -> int:
+    """Run the node."""
+    from starpos_common.node_main import leave, run
+
+    def make_nodes() -> "Iterator[Node]":
+        from starpos_solver.navigator_node import NavigatorNode
+
+        yield NavigatorNode()
+
+    def help_text() -> str:
+        from starpos.session.navigator_parameters import PARAMETERS
+        from starpos_common.node_help import node_help
+
+        about = (
+            "An IMU, attitudes and velocities in, position, heading and velocity under way out, until Ctrl-C."
+        )
+        return node_help("starpos_solver", "navigator", about, {"navigator": PARAMETERS})
+
+    # A thread may still adjust.
     return leave(run(make_nodes, help_text=help_text))

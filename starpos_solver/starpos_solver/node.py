@@ -8,7 +8,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
@@ -28,6 +27,7 @@ from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
 from starpos_solver.inputs import Inputs
+from starpos_solver.node_log import NodeLog
 from starpos_solver.publishing import SolutionPublishers
 from starpos_solver.settings import SolverSettings
 from starpos_solver.transforms import StaticTransforms
@@ -48,7 +48,7 @@ class SolverNode(Node):
         self._settings = SolverSettings(self, self._camera, self._apply)
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._inputs = Inputs(self)
+        self._inputs = Inputs(self, ("camera_info", "stars", "tilt"))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(
@@ -96,7 +96,7 @@ class SolverNode(Node):
         self._tick = self.get_clock().create_jump_callback(TICK, post_callback=lambda _: self._go_on())
         tasks = {
             "Solution": self._report_solution,
-            "Inputs": lambda: self._inputs.report(len(session.tilts), self._dropped.counts),
+            "Inputs": lambda: self._inputs.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
             "Clock": self._report_clock,
             "Conditions": self._report_conditions,
             "Calibration": session.calibrating.report,
@@ -222,22 +222,6 @@ class SolverNode(Node):
         latest, solver = self._session.latest, self._session.instrument.solver
         shutter = solver.shutter(latest.stars) if latest and solver else None
         return reports.of_conditions(self._values, calibration, tilt, shutter)
-
-
-class NodeLog:
-    """The node's logger for a session.  rclpy ties a severity to the calling line, so each has its own line."""
-
-    def __init__(self, logger: RcutilsLogger) -> None:
-        self._logger = logger
-
-    def info(self, message: str) -> None:
-        self._logger.info(message)
-
-    def warning(self, message: str) -> None:
-        self._logger.warning(message)
-
-    def error(self, message: str) -> None:
-        self._logger.error(message, throttle_duration_sec=60.0)
 
 
 def _sent(info: Mapping[str, Any]) -> Sent:

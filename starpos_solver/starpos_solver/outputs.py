@@ -2,14 +2,15 @@
 """Messages of a solution: NavSatFix, Imu, Solution."""
 
 import math
+from typing import Protocol
 
 import numpy as np
+from geometry_msgs.msg import Quaternion
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
-from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Status
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
@@ -54,15 +55,30 @@ def nav_sat_fix(
     return message
 
 
-def imu(header: Header, fix: Fix, ground: Geodetic) -> Imu:
-    """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
+class Oriented(Protocol):
+    """A fix with an attitude: (3, 3) of the base link into east, north, up, its covariance (3, 3) about these."""
+
+    @property
+    def link_to_enu(self) -> np.ndarray: ...
+
+    @property
+    def attitude_covariance(self) -> np.ndarray: ...
+
+
+def attitude(fix: Oriented, ground: Geodetic) -> tuple[Quaternion, np.ndarray]:
+    """The attitude of the base link in true-north ENU, and its covariance (3, 3)."""
     # Azimuths grow clockwise.
     to_geodetic_north = rotation.about_axis(2, -ground.azimuth_turn)
     x, y, z, w = rotation.to_quaternion(to_geodetic_north @ fix.link_to_enu).tolist()
-    message = Imu(header=header)
-    message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w = x, y, z, w
     covariance = to_geodetic_north @ fix.attitude_covariance @ to_geodetic_north.T
     covariance[2, 2] += ground.deflection_covariance[2, 2]
+    return Quaternion(x=x, y=y, z=z, w=w), covariance
+
+
+def imu(header: Header, fix: Oriented, ground: Geodetic) -> Imu:
+    """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
+    message = Imu(header=header)
+    message.orientation, covariance = attitude(fix, ground)
     message.orientation_covariance = covariance.ravel()
     message.angular_velocity_covariance[0] = -1.0
     message.linear_acceleration_covariance[0] = -1.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's topics: `fix`, `heading/imu` and `solver/solution` for each frame, `fix_averaged` for the average."""
+"""The solver's topics: `fix`, `heading/imu`, `attitude`, `solver/solution` of frames, `fix_averaged` of the average."""
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
@@ -9,6 +9,7 @@ from std_msgs.msg import Header
 
 from starpos.earth.vertical import Geodetic
 from starpos.session.frames import Answered, Averaged, Output
+from starpos_common.messages import attitude_to_message
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
 from starpos_solver import outputs
@@ -23,12 +24,13 @@ class SolutionPublishers:
         self._fix = publisher(node, NavSatFix, "fix", 10)
         self._fix_averaged = publisher(node, NavSatFix, "fix_averaged", 10)
         self._imu = publisher(node, Imu, "heading/imu", 10)
+        self._attitude = publisher(node, msg.Attitude, "attitude", 10)
         self._solution = publisher(node, msg.Solution, "solver/solution", 10)
 
     @property
     def publishers(self) -> tuple[Publisher, ...]:
         """Those of all topics, the solution's first."""
-        return self._solution, self._fix, self._fix_averaged, self._imu
+        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude
 
     def publish(self, output: Output) -> None:
         """Publish what a session made."""
@@ -40,6 +42,8 @@ class SolutionPublishers:
         fix = output.solution.fix
         if fix is not None and output.ground is not None:
             self._imu.publish(outputs.imu(header, fix, output.ground))
+        if output.attitude is not None:
+            self._attitude.publish(attitude_to_message(output.attitude))
         self._solution.publish(self.solution(output))
 
     def solution(self, answered: Answered) -> msg.Solution:

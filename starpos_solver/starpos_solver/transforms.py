@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`/tf_static`: how camera and inclinometer are turned against the base link, latched, and again when that changes."""
+"""The instrument in the robot's tree of frames.
+
+`/tf_static`: how camera and inclinometer are turned against the base link, latched, and again when that changes; `/tf`:
+where the base link is under way.
+"""
 
 from importlib.util import find_spec
 
-from geometry_msgs.msg import Quaternion, TransformStamped
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -11,13 +16,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from starpos.instrument.instrument import Instrument
 from starpos.session.transforms import Transform, transforms_of
 
-TOPIC = "/tf_static"
-# as tf2_ros has it
-QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LACKING = (
-    "tf2_msgs is not installed, so there is no /tf_static: sudo apt install ros-jazzy-tf2-msgs, or set publish_tf "
-    "to false"
-)
+STATIC, MOVING = "/tf_static", "/tf"
+# as tf2_ros has them
+STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MOVING_QOS = QoSProfile(depth=100)
 
 
 class StaticTransforms:
@@ -39,9 +41,7 @@ class StaticTransforms:
         """
         if not wanted:
             self._close()
-        elif find_spec("tf2_msgs") is None:
-            self._node.get_logger().info(LACKING, once=True)
-        else:
+        elif _can_be_told(self._node, STATIC):
             self._publish(
                 transforms_of(instrument, link, self.camera, self.inclinometer) if instrument else ()
             )
@@ -50,7 +50,7 @@ class StaticTransforms:
         from tf2_msgs.msg import TFMessage
 
         if self._publisher is None:
-            self._publisher = self._node.create_publisher(TFMessage, TOPIC, QOS)
+            self._publisher = self._node.create_publisher(TFMessage, STATIC, STATIC_QOS)
         if transforms != self._published:
             self._published = transforms
             self._publisher.publish(TFMessage(transforms=[self._message(t) for t in transforms]))
@@ -68,3 +68,46 @@ class StaticTransforms:
         x, y, z, w = transform.quaternion
         message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
         return message
+
+
+class MovingTransform:
+    """Publishes where the child frame of an Odometry is in the frame of its header."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher: Publisher | None = None
+
+    def open(self, wanted: bool) -> None:
+        """Have the topic if it is wanted and can be told, before there is a pose; take it back if it is not."""
+        if not wanted:
+            if self._publisher is not None:
+                self._node.destroy_publisher(self._publisher)
+                self._publisher = None
+        elif self._publisher is None and _can_be_told(self._node, MOVING):
+            from tf2_msgs.msg import TFMessage
+
+            self._publisher = self._node.create_publisher(TFMessage, MOVING, MOVING_QOS)
+
+    def publish(self, odometry: Odometry) -> None:
+        """Publish a pose if the topic is open."""
+        if self._publisher is None:
+            return
+        from tf2_msgs.msg import TFMessage
+
+        pose = odometry.pose.pose
+        message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
+        message.transform.translation = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
+        message.transform.rotation = pose.orientation
+        self._publisher.publish(TFMessage(transforms=[message]))
+
+
+def _can_be_told(node: Node, topic: str) -> bool:
+    """Whether there are messages of tf; says in the log if not."""
+    if find_spec("tf2_msgs") is not None:
+        return True
+    node.get_logger().info(
+        f"tf2_msgs is not installed, so there is no {topic}: sudo apt install ros-jazzy-tf2-msgs, or set publish_tf to "
+        "false",
+        once=True,
+    )
+    return False

@@ -4,9 +4,9 @@
     python tools/soaks/soak_replay.py [--runs 50] [--busy 8] [--rates 0 1 10] [--processes 1 4] [--lanes 2]
 
 Plays the first 10 s of the tests' night (--inputs images: 10 s of its images, by the detector), records what comes of
-them by a listener that listens to the inputs too, and compares `fix`, `solver/solution` and `fix_averaged`.  In 4
-processes: solver, detector, player, listener; in 1: all but the listener.  Exit status 0 only if all runs agree and every
-frame was answered.
+them by a listener that listens to the inputs too, and compares `fix`, `attitude`, `solver/solution` and
+`fix_averaged`.  In 4 processes: solver, detector, player, listener; in 1: all but the listener.  Exit status 0 only if
+all runs agree and every frame was answered.
 """
 
 import argparse
@@ -35,6 +35,7 @@ OUTPUTS = {
     "fix": "sensor_msgs/msg/NavSatFix",
     "solver/solution": "starpos_interfaces/msg/Solution",
     "fix_averaged": "sensor_msgs/msg/NavSatFix",
+    "attitude": "starpos_interfaces/msg/Attitude",
 }
 
 
@@ -126,7 +127,7 @@ def _run(graph, folder: Path, bag: Path, inputs: str, rate: float, processes: in
     answers = int(output.rsplit(" answers", 1)[0].rsplit(" ", 1)[1])
     if not graph.comes(lambda: len(listener.kept["solver/solution"]) >= answers, WAIT_S):
         return Outcome(trouble=f"{answers} answers, {len(listener.kept['solver/solution'])} of them heard")
-    # fix and fix_averaged may come after the solution of their frame
+    # the others may come after the solution of their frame
     graph.comes(lambda: False, 0.5)
     return listener.outcome()
 

@@ -101,3 +101,10 @@ def to_quaternion(r: np.ndarray) -> np.ndarray:
     k = np.block([[r + r.T - trace * np.eye(3), twist[:, None]], [twist, trace]])
     q = np.linalg.eigh(k)[1][:, 3]
     return q if q[3] >= 0 else -q
+
+
+def from_quaternion(q: ArrayLike) -> np.ndarray:
+    """Rotation matrix (3, 3) of a quaternion (x, y, z, w) that is not zero, of whatever length."""
+    x, y, z, w = np.asarray(q, float) / np.linalg.norm(q)
+    spin = cross_matrix([x, y, z])
+    return np.eye(3) + 2 * w * spin + 2 * spin @ spin

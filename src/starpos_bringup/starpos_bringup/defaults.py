@@ -9,6 +9,7 @@ import starpos_camera.detector_parameters
 import starpos_dashboard.parameters
 import starpos_inclinometer.parameters
 import starpos_solver.settings
+from starpos.session import navigator_parameters
 from starpos_common.parameters import to_yaml
 
 NODES = {
@@ -16,6 +17,7 @@ NODES = {
     "detector": starpos_camera.detector_parameters.PARAMETERS,
     "inclinometer": starpos_inclinometer.parameters.PARAMETERS,
     "solver": starpos_solver.settings.PARAMETERS,
+    "navigator": navigator_parameters.PARAMETERS,
     "dashboard": starpos_dashboard.parameters.PARAMETERS,
 }
 

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
+from starpos import rotation
 from starpos.errors import TimeError
+from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
@@ -83,6 +86,20 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
         flags=flags,
         z=float(tilt.theta_z),
         z_variance=float(tilt.variance_z),
+    )
+
+
+def attitude_to_message(attitude: CameraAttitude) -> msg.Attitude:
+    """Convert the attitude of a camera to starpos_interfaces/Attitude."""
+    x, y, z, w = rotation.to_quaternion(attitude.camera_to_gcrs).tolist()
+    return msg.Attitude(
+        header=Header(stamp=unix_to_stamp(attitude.utc_unix_s), frame_id=attitude.frame_id),
+        orientation=Quaternion(x=x, y=y, z=z, w=w),
+        covariance=attitude.covariance.ravel(),
+        stars_matched=attitude.stars,
+        log_odds=float(attitude.log_odds),
+        stamp_stddev=float(attitude.stamp_stddev_s),
+        clock_stddev=float(attitude.clock_stddev_s),
     )
 
 

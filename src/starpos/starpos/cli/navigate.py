@@ -24,7 +24,8 @@ from starpos.navigation.laws import LAWS
 from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.velocity import read_velocity
 from starpos.navigation.vessel import Vessel
-from starpos.navigation.voyage import Voyage, VoyageFix, navigate
+from starpos.navigation.voyage import Voyage, navigate
+from starpos.navigation.voyage_fix import VoyageFix
 from starpos.sky import catalogue
 
 NO_ANSWER = 1

@@ -90,6 +90,7 @@ class Solution:
     extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
     warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
     explained: how much of the frame the identification explains.
+    found: the identification itself, whose rows are those of the input's stars.
     hint: helps to identify the next frame.
     """
 
@@ -111,6 +112,7 @@ class Solution:
     hint: Hint | None = None
     warnings: tuple[str, ...] = ()
     explained: Explained | None = None
+    found: Identification | None = None
 
     @classmethod
     def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
@@ -178,6 +180,7 @@ class Solver:
             identify_s=time.perf_counter() - begin,
             warnings=warnings,
             explained=explained,
+            found=found,
         )
 
     def solve(
@@ -224,6 +227,7 @@ class Solver:
             magnitudes=magnitudes,
             warnings=warnings,
             explained=explained,
+            found=found,
         )
         try:
             if TWO_SKIES in warnings:
@@ -386,7 +390,8 @@ def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
 def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
     """Solution for all stars from that for the rows `inside` of them."""
     star = None if s.star is None else inside[s.star]
-    return replace(s, star=star, stars_detected=len(stars))
+    found = s.found and replace(s.found, star=inside[s.found.star])
+    return replace(s, star=star, found=found, stars_detected=len(stars))
 
 
 def _failure(stars: Stars | Pointing, error: StarposError) -> Solution:

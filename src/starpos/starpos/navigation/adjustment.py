@@ -27,7 +27,7 @@ from starpos.navigation.measures import (
 from starpos.navigation.motion import BY_LAW, CONSTANTS, MEASURED, PLACE, Motion
 from starpos.navigation.odometry import Odometry
 from starpos.navigation.preintegration import Pieces, Sums, summed
-from starpos.navigation.sightings import IdentifiedFrame, rough_attitude, star_attitude
+from starpos.navigation.sightings import FrameUnderWay
 from starpos.navigation.start import first_motion
 from starpos.navigation.velocity import VelocityLog
 from starpos.navigation.vessel import Vessel
@@ -59,7 +59,7 @@ class Adjustment:
 
     def __init__(
         self,
-        frames: Sequence[IdentifiedFrame],
+        frames: Sequence[FrameUnderWay],
         nodes: np.ndarray,
         pieces: Pieces,
         velocity: VelocityLog | None,
@@ -188,7 +188,7 @@ class Adjustment:
         for frame in self.frames:
             try:
                 air = self.vessel.atmosphere
-                found.append(rough_attitude(frame) if zenith is None else star_attitude(frame, zenith, air))
+                found.append(frame.rough() if zenith is None else frame.under(zenith, air))
                 used.append(frame)
             except FixError:
                 pass

@@ -50,6 +50,11 @@ class Motion:
     def __len__(self) -> int:
         return len(self.utc_unix_s)
 
+    def part(self, nodes: np.ndarray) -> "Motion":
+        """Copies of some of its nodes (K,), by their numbers."""
+        names = ("utc_unix_s", "attitude", "place", "velocity", "gyro_bias", "accel_bias", "speed", "drift")
+        return replace(self, **{name: getattr(self, name)[nodes] for name in names})
+
     def moved(self, nodes: np.ndarray, constants: np.ndarray) -> "Motion":
         """The voyage after small changes of its nodes (K, n) and its constants (m,)."""
         turned = Rotation.from_rotvec(nodes[:, TURN]).as_matrix() @ self.attitude

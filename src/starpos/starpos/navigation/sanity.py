@@ -15,8 +15,8 @@ from starpos.navigation.preintegration import Pieces, Sums
 GRAVITY = 9.8
 # the mean force may differ from gravity by this, and by so many sigmas of what the model allows
 MOST_OFF, SIGMAS = 0.5, 6.0
-# frames with stars see the sky no lower than so far from the plumb line, deg
-LOWEST_DEG = 88.0
+# so low, in the mean, no camera on a vehicle looks for stars: so far from the plumb line, deg
+LOWEST_DEG = 80.0
 # turns that are seen so far above their noise show the gyro's axes; and what part of them may be off
 CLEARLY, MOST_SHARE = 20.0, 0.3
 # a frame strays whose turn is so much off, rad, and so many in a row at most

@@ -5,11 +5,12 @@ No level is needed: only refraction and the diurnal aberration depend on the zen
 """
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import earth_state, station_velocity
+from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
@@ -18,15 +19,31 @@ from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.unidentified import why_unidentified
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
-from starpos.identification import Sky, wide
+from starpos.identification import Identification, Sky, wide
 from starpos.identification.pose import Pose
 from starpos.identification.search import frame_stars, identify_frame
+from starpos.instrument.camera import Camera
+from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
 
 FEWEST, ROUNDS, STEPS = 4, 6, 3
 # of an attitude without refraction; 1 sigma
 ROUGH = 20 * ARCSEC
 STEP_REFRACTION = 0.01
+
+
+class FrameUnderWay(Protocol):
+    """A frame under way: its time, and the attitude of the camera by its stars, roughly and under a zenith."""
+
+    @property
+    def utc_unix_s(self) -> float: ...
+
+    @property
+    def stamp_stddev_s(self) -> float: ...
+
+    def rough(self) -> "StarAttitude": ...
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> "StarAttitude": ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,6 +64,30 @@ class IdentifiedFrame:
     focal_px: float
     camera_to_itrs: np.ndarray
 
+    def rough(self) -> "StarAttitude":
+        """The attitude as it was when the stars were identified."""
+        return roughly(self.camera_to_itrs)
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> "StarAttitude":
+        """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
+        fit = _fit(self, _seen(self, zenith, atmosphere.refraction()))
+        stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
+        shift = (fit.pose.project(stronger) - fit.pixel)[fit.keep] / STEP_REFRACTION
+        return StarAttitude(
+            camera_to_itrs=fit.pose.attitude.T,
+            covariance=fit.covariance[:3, :3],
+            by_refraction=(fit.covariance @ np.einsum("nki,nk->i", fit.weighted, shift))[:3],
+        )
+
+    def placeless(self) -> "StarAttitude":
+        """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
+        fit = _fit(self, self.itrs)
+        return StarAttitude(
+            camera_to_itrs=fit.pose.attitude.T,
+            covariance=fit.covariance[:3, :3],
+            by_refraction=np.zeros(3),
+        )
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StarAttitude:
@@ -59,6 +100,13 @@ class StarAttitude:
     camera_to_itrs: np.ndarray
     covariance: np.ndarray
     by_refraction: np.ndarray
+
+
+def roughly(camera_to_itrs: np.ndarray) -> StarAttitude:
+    """An attitude (3, 3) that is good to ROUGH."""
+    return StarAttitude(
+        camera_to_itrs=camera_to_itrs, covariance=np.eye(3) * ROUGH**2, by_refraction=np.zeros(3)
+    )
 
 
 def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
@@ -86,15 +134,24 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
         )
     if found.mirrored:
         raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
+    return sighted(stars, found, (camera, catalogue), state)
+
+
+def sighted(
+    stars: Stars, found: Identification, view: tuple[Camera, Catalogue], state: EarthState
+) -> IdentifiedFrame:
+    """The identified stars of a frame; found.star are rows of stars, view the camera and the catalogue."""
+    camera, catalogue = view
     use = sound_matches(stars, found, solver.ENOUGH_SOUND)
     star, index = found.star[use], found.catalogue[use]
+    directions = camera.directions(stars.x[star], stars.y[star])
     squeeze = np.array([1.0, camera.fx / camera.fy])
     catalogue_px = np.hypot(catalogue.sigma(index, state.year) * camera.fx, found.blend_px[use])
     return IdentifiedFrame(
-        utc_unix_s=mid_unix_s,
+        utc_unix_s=state.utc_unix_s,
         stamp_stddev_s=stars.stamp_stddev_s,
         source=stars.place,
-        xy=directions[star, :2] / directions[star, 2:] * camera.fx,
+        xy=directions[:, :2] / directions[:, 2:] * camera.fx,
         covariance_px2=stars.covariance[star] * np.outer(squeeze, squeeze)
         + np.eye(2) * (catalogue_px**2)[:, None, None],
         itrs=state.to_itrs(catalogue.directions(index, state.year)),
@@ -103,16 +160,21 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     )
 
 
-def rough_attitude(frame: IdentifiedFrame) -> StarAttitude:
-    """The attitude as it was when the stars were identified."""
-    return StarAttitude(
-        camera_to_itrs=frame.camera_to_itrs, covariance=np.eye(3) * ROUGH**2, by_refraction=np.zeros(3)
-    )
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Fit:
+    """A pose that fits the N stars keep (N,): their pixels (N, 2) by it, and covariance (4, 4) of turns and scale.
+
+    weighted (M, 2, 4): the kept stars' derivatives over their errors.
+    """
+
+    pose: Pose
+    keep: np.ndarray
+    pixel: np.ndarray
+    covariance: np.ndarray
+    weighted: np.ndarray
 
 
-def star_attitude(sighting: IdentifiedFrame, zenith: np.ndarray, atmosphere: Atmosphere) -> StarAttitude:
-    """Fit attitude and plate scale to a frame's stars under a zenith (3,) in ITRS; FixError if they disagree."""
-    seen = _seen(sighting, zenith, atmosphere.refraction())
+def _fit(sighting: IdentifiedFrame, seen: np.ndarray) -> _Fit:
     keep, extra = np.ones(len(seen), bool), 0.0
     v = np.column_stack([sighting.xy, np.full(len(seen), sighting.focal_px)])
     pose = Pose(rotation.best_rotation(seen, rotation.normalised(v)), sighting.focal_px, False)
@@ -132,13 +194,12 @@ def star_attitude(sighting: IdentifiedFrame, zenith: np.ndarray, atmosphere: Atm
     slope, covariance = slope[keep], sighting.covariance_px2[keep]
     wide = covariance + np.eye(2) * expected_extra((pixel - sighting.xy)[keep], covariance, share)
     weighted = np.linalg.solve(wide, slope)
-    normal = np.linalg.inv(np.einsum("nki,nkj->ij", slope, weighted))
-    stronger = _seen(sighting, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
-    shift = (pose.project(stronger) - pixel)[keep] / STEP_REFRACTION
-    return StarAttitude(
-        camera_to_itrs=pose.attitude.T,
-        covariance=normal[:3, :3],
-        by_refraction=(normal @ np.einsum("nki,nk->i", weighted, shift))[:3],
+    return _Fit(
+        pose=pose,
+        keep=keep,
+        pixel=pixel,
+        covariance=np.linalg.inv(np.einsum("nki,nkj->ij", slope, weighted)),
+        weighted=weighted,
     )
 
 

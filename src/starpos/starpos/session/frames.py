@@ -6,6 +6,7 @@ from typing import Any
 
 from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution
 from starpos.frames.stars import Stars
@@ -16,12 +17,14 @@ class Answered:
     """What became of a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
 
     no_camera: no camera calibration has arrived.
+    attitude: the camera's, by its stars; None where they tell none.
     """
 
     stamp: Any
     solution: Solution
     ground: Geodetic | None
     no_camera: bool
+    attitude: CameraAttitude | None = None
 
 
 @dataclass(frozen=True)

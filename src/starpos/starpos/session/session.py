@@ -15,6 +15,7 @@ from typing import Any
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
+from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
@@ -22,6 +23,7 @@ from starpos.identification.hint import Hint
 from starpos.instrument.camera import Camera
 from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.session import reports
+from starpos.session.attitude import attitude_of
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
@@ -265,10 +267,22 @@ class SolverSession:
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
-        made: list[Output] = [self._answered(frame.message.header.stamp, answer, now)]
+        header = frame.message.header
+        answered = self._answered(header.stamp, answer, now)
+        attitude = self._attitude(frame.stars, answer, header.frame_id)
+        made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
+
+    def _attitude(self, stars: Stars, answer: Solution, frame_id: str) -> CameraAttitude | None:
+        solver = self.instrument.solver
+        try:
+            return None if solver is None else attitude_of(solver, stars, answer, frame_id)
+        except Exception:
+            # A defect costs this attitude only.
+            self._log.error(traceback.format_exc())
+            return None
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""

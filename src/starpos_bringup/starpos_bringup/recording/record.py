@@ -21,6 +21,7 @@ TOPICS = {
     "camera/capture": "starpos_interfaces/msg/Capture",
     "stars": "starpos_interfaces/msg/StarArray",
     "tilt": "starpos_interfaces/msg/Tilt",
+    "attitude": "starpos_interfaces/msg/Attitude",
     "fix": "sensor_msgs/msg/NavSatFix",
     "fix_averaged": "sensor_msgs/msg/NavSatFix",
     "heading/imu": "sensor_msgs/msg/Imu",

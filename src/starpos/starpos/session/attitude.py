@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera's attitude among the stars, of each frame that is identified, whether there is a tilt or not."""
+
+from starpos.earth.orientation import earth_state
+from starpos.errors import StarposError
+from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.solver import Solution, Solver, Status
+from starpos.frames.stars import Stars
+from starpos.identification import wide
+from starpos.navigation.sightings import sighted
+
+# what the stars are not asked before
+UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
+
+
+def attitude_of(solver: Solver, stars: Stars, answer: Solution, frame_id: str) -> CameraAttitude | None:
+    """The attitude of a frame that a solver has answered, None where its stars tell none.
+
+    That is where they are not identified beyond suspicion, or seen through a fisheye or a mirror.
+    """
+    if answer.found is None and answer.status in UNASKED:
+        answer = solver.identify(stars)
+    found = answer.found
+    if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
+        return None
+    try:
+        camera, catalogue, _ = solver.view(stars.width, stars.height)
+        if wide.is_wide(camera):
+            return None
+        state = earth_state(stars.mid_unix_s)
+        seen = sighted(stars, found, (camera, catalogue), state).placeless()
+    except StarposError:
+        return None
+    return CameraAttitude(
+        utc_unix_s=stars.mid_unix_s,
+        stamp_stddev_s=stars.stamp_stddev_s,
+        clock_stddev_s=solver.clock_stddev_s(stars),
+        frame_id=frame_id,
+        camera_to_gcrs=state.gcrs_to_itrs.T @ seen.camera_to_itrs,
+        covariance=seen.covariance,
+        stars=len(found.star),
+        log_odds=found.log_odds,
+    )

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is told.
+
+A state machine without a clock or a thread of its own, as session.py is for frames: it is told each message with the
+time it came at, and returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the last
+one on.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.gravity import geodetic_place
+from starpos.earth.vertical import Geodetic, geodetic
+from starpos.errors import StarposError, VoyageError
+from starpos.navigation.adjustment import FEWEST_FRAMES
+from starpos.navigation.estimate import Estimate
+from starpos.navigation.motion import PLACE
+from starpos.navigation.observability import Observability, observability
+from starpos.navigation.placeless import PlacelessFrame
+from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
+from starpos.navigation.vessel import PARKED
+from starpos.navigation.voyage import Voyage
+from starpos.navigation.voyage_fix import VoyageFix
+from starpos.recording.messages import message_to_attitude, stamp_to_unix
+from starpos.session.diagnosis import Diagnosis, Level
+from starpos.session.gnss import OLDEST_S, GnssPlace, contradiction, message_to_gnss
+from starpos.session.job import Jobs, Outcome
+from starpos.session.log import Heard, Log
+from starpos.session.navigator_parameters import NavigatorSettings
+from starpos.session.now import Now
+from starpos.session.reports import AHEAD_S
+
+# the window holds so much at least before it is adjusted, s, and so many frames a second of the period
+SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
+# a claim is wide beyond, m an axis
+WIDE_M = 1000.0
+STARTING = "no frame with stars yet"
+APART = "all frames with stars are stamped later than the IMU's readings: set their clocks by one source"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Position:
+    """Displacement (3,) in m east, north, up of the origin, along the axes there, and its covariance (3, 3).
+
+    The origin is the first place that is known to WIDE_M.
+    """
+
+    enu: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Navigated:
+    """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support."""
+
+    utc_unix_s: float
+    fix: VoyageFix | None = None
+    ground: Geodetic | None = None
+    position: Position | None = None
+
+
+class NavigatorSession:
+    """Messages of an IMU, a camera's attitudes and velocities to places under way.
+
+    jobs: makes who runs the adjustment.
+    """
+
+    def __init__(self, settings: NavigatorSettings, jobs: Callable[[], Jobs], heard: Heard, log: Log) -> None:
+        self.counts = {"adjustments": 0, "fixes": 0}
+        self._settings, self._values = settings, settings.values
+        self._heard, self._log = heard, log
+        self._jobs = jobs()
+        self._told = ""
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new voyage."""
+        self._recent = Recent()
+        self._estimate: Estimate | None = None
+        self._known: Observability | None = None
+        self._origin: np.ndarray | None = None
+        self._trouble = STARTING
+        self._faults: tuple[str, ...] = ()
+        self._next_s = self._adjusted_s = -math.inf
+        # of the newest frame that the estimate is made of
+        self._seen_s = -math.inf
+        self._clock_stddev_s = 0.0
+        self._gnss: GnssPlace | None = None
+        # an outcome of a job that began before counts no more
+        self._voyage = object()
+
+    @property
+    def busy(self) -> bool:
+        """Whether an adjustment runs."""
+        return self._jobs.busy
+
+    def parameters_set(self) -> None:
+        """Adjust anew with other parameters as soon as may be."""
+        self._adjusted_s = -math.inf
+
+    # inputs ----------------------------------------------------------------------------------------------------------
+
+    def take_imu(self, message: Any, now: Now) -> list[Navigated]:
+        """Take a sensor_msgs/Imu; returns an output where one is due."""
+        w, f, stamp = message.angular_velocity, message.linear_acceleration, message.header.stamp
+        row = (stamp.sec + stamp.nanosec * 1e-9, w.x, w.y, w.z, f.x, f.y, f.z)
+        try:
+            if (
+                message.angular_velocity_covariance[0] == -1
+                or message.linear_acceleration_covariance[0] == -1
+            ):
+                raise VoyageError(
+                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: take one that does"
+                )
+            self._check_time(row[0], now, "an inertial reading")
+            self._begin_anew(row[0])
+            self._recent.readings.add(row)
+        except StarposError as e:
+            self._heard.refuse("imu/data", str(e))
+            return []
+        self._heard.came("imu/data")
+        return self._tick(row[0]) if row[0] >= self._next_s else []
+
+    def take_attitude(self, message: Any, now: Now) -> list[Navigated]:
+        """Take a starpos_interfaces/Attitude."""
+        try:
+            attitude = message_to_attitude(message)
+            self._check_time(attitude.utc_unix_s, now, "an attitude")
+            self._recent.add_frame(PlacelessFrame.of(attitude))
+        except StarposError as e:
+            self._heard.refuse("attitude", str(e))
+            return []
+        self._clock_stddev_s = attitude.clock_stddev_s
+        self._heard.came("attitude")
+        return []
+
+    def take_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
+        """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
+        v = message.twist.twist.linear
+        variance = np.asarray(message.twist.covariance, float)[[0, 7, 14]]
+        try:
+            time_s = stamp_to_unix(message.header.stamp)
+            self._check_time(time_s, now, "a velocity")
+            assert time_s is not None
+            if not variance.min() >= 0:
+                raise VoyageError(
+                    "a velocity's variance is NaN or below 0: state it, or zeros for velocity_stddev"
+                )
+            # an axis that states none moves as little as the others, or is not measured
+            sigma = math.sqrt(variance.max()) or self._values["velocity_stddev"]
+            self._recent.add_velocity(time_s, (v.x, v.y, v.z), sigma)
+        except StarposError as e:
+            self._heard.refuse(name, str(e))
+            return []
+        self._heard.came(name)
+        return []
+
+    def take_gnss(self, message: Any, now: Now) -> list[Navigated]:
+        """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
+        self._gnss = message_to_gnss(message)
+        self._heard.came("gnss/fix")
+        return []
+
+    def _check_time(self, unix_s: float | None, now: Now, what: str) -> None:
+        if not unix_s:
+            raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
+        if now.ahead_s(unix_s) > AHEAD_S:
+            raise VoyageError(
+                f"{what} is stamped {now.ahead_s(unix_s):.3g} s before its time: set the clocks of camera, IMU and "
+                "navigator by one source"
+            )
+
+    def _begin_anew(self, time_s: float) -> None:
+        """Begin a new voyage where an IMU was away or its clock was set: what happened meanwhile is not known."""
+        away_s = time_s - self._recent.readings.last_s
+        if math.isfinite(away_s) and (away_s > LONGEST_GAP_S or away_s < -BACK_S):
+            self._log.warning(
+                f"the IMU's stamps {'jump by' if away_s > 0 else 'go back by'} {abs(away_s):.3g} s: begun anew"
+            )
+            self.reset()
+
+    # work ------------------------------------------------------------------------------------------------------------
+
+    def _tick(self, time_s: float) -> list[Navigated]:
+        rate = self._values["rate"]
+        # at round times, whatever the rate of the readings
+        self._next_s = (math.floor(time_s * rate + 1e-3) + 1) / rate
+        recent = self._recent
+        recent.readings.close()
+        recent.forget(time_s - self._values["window"])
+        if self._estimate is not None:
+            self._estimate = self._carried_on(self._estimate)
+        self._adjust(time_s)
+        return [self._output(time_s)]
+
+    def _adjust(self, time_s: float) -> None:
+        """Begin an adjustment if one is due."""
+        recent, values = self._recent, self._values
+        period_s = max(values["adjust_period"], recent.frames / FRAMES_PER_S)
+        if self._jobs.busy or time_s < self._adjusted_s + period_s or recent.newest_frame_s <= self._seen_s:
+            return
+        record = recent.record()
+        inside = [f for f in record.frames if f.utc_unix_s <= time_s]
+        if len(inside) < FEWEST_FRAMES or time_s - record.blocks[0][0, 0] < SHORTEST_S:
+            return
+        self._adjusted_s = time_s
+        vessel, voyage = self._settings.vessel(self._clock_stddev_s), self._voyage
+        self._jobs.run(lambda: record.adjusted(vessel)).add_done_callback(
+            lambda f: self._adjusted(f.result(), voyage)
+        )
+
+    def _adjusted(self, made: Outcome, voyage: object) -> None:
+        if voyage is not self._voyage:
+            return
+        self.counts["adjustments"] += 1
+        self._trouble, self._faults = made.trouble, ()
+        if made.trouble:
+            self._estimate = self._known = None
+            self._tell(made.trouble)
+            return
+        found: Voyage = made.value
+        self._faults = found.faults
+        self._seen_s = found.last.utc_unix_s
+        self._known = observability(found.last, self._is_measured)
+        self._estimate = self._carried_on(found.last)
+        self._tell("")
+
+    def _carried_on(self, estimate: Estimate) -> Estimate:
+        """An estimate at the last output's time."""
+        readings = self._recent.readings
+        if readings.closed_s <= estimate.utc_unix_s:
+            return estimate
+        return estimate.carried_on(readings.since(estimate.utc_unix_s), readings.closed_s)
+
+    @property
+    def _is_measured(self) -> bool:
+        return self._recent.velocities > 0 or self._values["vehicle"] == PARKED
+
+    def _tell(self, trouble: str) -> None:
+        if trouble != self._told:
+            self._told = trouble
+            if trouble:
+                self._log.warning(trouble)
+            else:
+                self._log.info("fixes are coming")
+
+    # outputs ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def _stars_missing(self) -> bool:
+        return self._recent.readings.last_s - self._seen_s > self._values["stars_timeout"]
+
+    def _output(self, time_s: float) -> Navigated:
+        estimate = self._estimate
+        if estimate is None or self._stars_missing:
+            return Navigated(utc_unix_s=time_s)
+        self.counts["fixes"] += 1
+        fix = estimate.fix
+        return Navigated(
+            utc_unix_s=time_s,
+            fix=fix,
+            ground=self._ground(fix),
+            position=self._position(estimate),
+        )
+
+    def _ground(self, fix: VoyageFix) -> Geodetic:
+        return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, self._settings.vertical)
+
+    def _position(self, estimate: Estimate) -> Position | None:
+        """Where an estimate lies from the first place that was known well enough; None before there is one."""
+        place = estimate.motion.place[0]
+        if self._origin is None and self._known is not None and self._known.sigma_m < WIDE_M:
+            self._origin = place
+        if self._origin is None:
+            return None
+        latitude, longitude, _ = (float(x) for x in geodetic_place(self._origin))
+        axes = enu_axes(latitude, longitude)
+        return Position(
+            enu=axes @ (place - self._origin),
+            covariance=axes @ estimate.covariance[PLACE, PLACE] @ axes.T,
+        )
+
+    def report(self) -> Diagnosis:
+        """Make the diagnostic `Navigation`: what is known, what is missing, how good it is."""
+        estimate, known, recent = self._estimate, self._known, self._recent
+        values: dict[str, object] = {
+            **self.counts,
+            "frames in the window": recent.frames,
+            "velocities in the window": recent.velocities,
+        }
+        if estimate is None or known is None:
+            apart = recent.frames >= FEWEST_FRAMES and recent.newest_frame_s == -math.inf
+            return Diagnosis(Level.WARN, APART if apart else self._trouble, values)
+        since_s = recent.readings.last_s - self._seen_s
+        speed = float(np.sqrt(np.trace(estimate.fix.velocity_covariance) / 3))
+        heading_deg = math.degrees(math.sqrt(estimate.fix.covariance[2, 2]))
+        values |= {
+            "place (m, 1 sigma an axis)": known.sigma_m,
+            "heading (deg, 1 sigma)": heading_deg,
+            "velocity (m/s, 1 sigma an axis)": speed,
+            "time since the newest frame that is adjusted (s)": since_s,
+        }
+        if self._stars_missing:
+            return Diagnosis(Level.WARN, f"no frame with stars for {since_s:.0f} s: no fix", values)
+        faults = list(self._faults)
+        if self._gnss is not None and abs(estimate.utc_unix_s - self._gnss.utc_unix_s) < OLDEST_S:
+            fix = estimate.fix
+            moving = float(np.linalg.norm(fix.velocity))
+            apart_m, wrong = contradiction(self._gnss, self._ground(fix), fix.utc_unix_s, moving)
+            values["GNSS from here (m)"] = apart_m
+            faults += [wrong] if wrong else []
+        said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]
+        level = Level.WARN if known.sigma_m > WIDE_M or faults else Level.OK
+        return Diagnosis(level, "; ".join([*said, *faults]), values)

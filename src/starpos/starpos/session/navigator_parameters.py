@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the navigator, and what they and their files say of the vehicle."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from starpos.earth.geoid import Geoid
+from starpos.earth.vertical import Vertical
+from starpos.errors import StarposError
+from starpos.files import path_of
+from starpos.instrument.instrument import Instrument
+from starpos.navigation.imu import ImuModel, read_imu_model
+from starpos.navigation.laws import LAWS
+from starpos.navigation.vessel import Vessel
+from starpos.session import parameters
+from starpos.session.parameter import FRAME_NAME, Parameter
+
+SHARED = (
+    "refraction.pressure",
+    "refraction.temperature",
+    "refraction.humidity",
+    "refraction.wavelength",
+    "altitude",
+    "altitude_stddev",
+    "clock_stddev",
+    "deflection.xi",
+    "deflection.eta",
+    "deflection.stddev",
+    "deflection.geoid",
+)
+PARAMETERS = (
+    Parameter(
+        "frame_id",
+        "starpos_link",
+        "Frame of the IMU's axes, x forward, y left, z up, whose place and attitude is told.",
+        form=FRAME_NAME,
+    ),
+    Parameter(
+        "odometry_frame_id",
+        "map",
+        "Frame of navigator/odometry: east, north, up at the first place that was found.",
+        form=FRAME_NAME,
+    ),
+    Parameter(
+        "publish_tf",
+        False,
+        "Publish on /tf where frame_id is in odometry_frame_id; false where a filter tells that, or frame_id hangs on "
+        "base_link: a frame with two parents breaks the tree.",
+    ),
+    Parameter(
+        "calibration_url",
+        "",
+        "Instrument file (YAML) whose link_to_camera says how the camera sits on the IMU; '' for its axis along z and "
+        "the top of the frame forward.",
+    ),
+    Parameter(
+        "mount_stddev",
+        1.0,
+        "How well the camera sits so, an axis. Too small makes a place that is wrong by up to 111 km a degree, until the "
+        "vehicle has turned.",
+        unit="deg",
+        minimum=1e-4,
+        maximum=20.0,
+    ),
+    Parameter(
+        "imu_model",
+        "",
+        "kalibr's imu.yaml, with the sigma of the biases; '' for a cheap IMU. A bias beyond its sigma makes a place that "
+        "is wrong by up to that: 1 mg is 6 km until the vehicle has turned.",
+    ),
+    Parameter(
+        "vehicle",
+        "",
+        "parked: it stands; where no velocity comes the law by which its speed changes; '' for anything that moves, "
+        "whose fix is wide. A law that the vehicle does not keep makes a fix that claims too much.",
+        choices=("", *LAWS),
+    ),
+    Parameter(
+        "velocity_stddev",
+        0.05,
+        "Error of a velocity whose message states none, an axis; 0.05 m/s over 20 minutes is 27 m.",
+        unit="m/s",
+        minimum=1e-4,
+        maximum=100.0,
+    ),
+    Parameter(
+        "drift_stddev",
+        0.0,
+        "Of current or wind, an axis, where the velocity is not over ground but through water or air; half of it may "
+        "change in an hour. A drift that nobody states is an error of the place.",
+        unit="m/s",
+        minimum=0.0,
+        maximum=50.0,
+    ),
+    Parameter("rate", 10.0, "Outputs a second.", unit="Hz", minimum=0.1, maximum=100.0),
+    Parameter(
+        "window",
+        1200.0,
+        "Time that is adjusted at once; what is older is forgotten. A short one knows the place less well.",
+        unit="s",
+        minimum=30.0,
+        maximum=7200.0,
+    ),
+    Parameter(
+        "adjust_period",
+        10.0,
+        "How often it is adjusted anew, and more rarely where the window holds much; between, the IMU carries on.",
+        unit="s",
+        minimum=1.0,
+        maximum=600.0,
+    ),
+    Parameter(
+        "stars_timeout",
+        120.0,
+        "How long the IMU carries on without stars; then there is no fix.",
+        unit="s",
+        minimum=1.0,
+        maximum=3600.0,
+    ),
+    *(p for p in parameters.PARAMETERS if p.name in SHARED),
+)
+# of a stated altitude: the vehicle goes up and down by more than its file says
+LEAST_HEIGHT_STDDEV_M = 10.0
+ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=parameters.LEAST_CLOCK_S)
+
+
+class NavigatorSettings:
+    """The parameters as `values` by name, and what is made from them and from their files.
+
+    A file is read once, when its parameter is checked.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.values = values
+        # those in use, and those of the last check
+        self._files: tuple[Instrument, ImuModel, Geoid | None] = ANY_INSTRUMENT, ImuModel(), None
+        self._read: tuple[Instrument, ImuModel, Geoid | None] = self._files
+
+    def check(self, values: Mapping[str, Any], names: frozenset[str]) -> str | None:
+        """Say in a sentence why values cannot be, such as with a broken file; None if they can.
+
+        names: of those that are set.
+        """
+        known, model, grid = self._files
+        try:
+            if "calibration_url" in names:
+                known = parameters.known_instrument(values["calibration_url"]) or ANY_INSTRUMENT
+            if "imu_model" in names:
+                name = values["imu_model"]
+                model = read_imu_model(path_of(name)) if name else ImuModel()
+            if "deflection.geoid" in names:
+                grid = parameters.geoid_file(values["deflection.geoid"])
+            parameters.atmosphere_of(values)
+            parameters.vertical_of(values, grid)
+        except StarposError as e:
+            return str(e)
+        self._read = known, model, grid
+        return None
+
+    def adopt(self) -> None:
+        """Use the files that the last check has read."""
+        self._files = self._read
+
+    @property
+    def vertical(self) -> Vertical:
+        """The deflection of the vertical, or the geoid that tells it."""
+        return parameters.vertical_of(self.values, self._files[2])
+
+    def vessel(self, clock_stddev_s: float) -> Vessel:
+        """Instrument and vehicle, of which the frames' clock states its error."""
+        values, (known, model, _) = self.values, self._files
+        clock = values["clock_stddev"]
+        height = values["altitude"]
+        stated = (
+            {}
+            if np.isnan(height)
+            else {
+                "height_m": height,
+                "height_stddev_m": max(values["altitude_stddev"], LEAST_HEIGHT_STDDEV_M),
+            }
+        )
+        return Vessel(
+            vehicle=values["vehicle"] or None,
+            model=model,
+            camera_to_body=np.asarray(known.link_to_camera, float).T,
+            mount_stddev=float(np.radians(values["mount_stddev"])),
+            atmosphere=parameters.atmosphere_of(values),
+            clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
+            drift_stddev=values["drift_stddev"],
+            **stated,
+        )

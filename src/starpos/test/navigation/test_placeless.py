@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An attitude that nobody knew the place of, under a zenith: as the stars themselves would tell it there."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starpos import rotation
+from starpos.earth.orientation import earth_state, station_velocity
+from starpos.earth.refraction import Atmosphere
+from starpos.fix.camera_attitude import CameraAttitude
+from starpos.navigation.placeless import PlacelessFrame
+from starpos.navigation.sightings import IdentifiedFrame
+from starpos.units import ARCSEC
+
+AIR = Atmosphere()
+FOCAL_PX, HALF_PX, STARS = 4266.0, (968.0, 608.0), 25
+BEGIN_S = 1.7937e9
+
+
+def frame_at(zenith_distance_deg, seed):
+    """Stars of a 25 mm lens that looks so far from the zenith, where the air shows them, and the zenith (3,)."""
+    rng = np.random.default_rng(seed)
+    camera = Rotation.random(random_state=seed).as_matrix()
+    zenith = camera @ Rotation.from_euler("x", zenith_distance_deg, degrees=True).as_matrix()[:, 2]
+    itrs = rotation.normalised(
+        np.column_stack([rng.uniform(-1, 1, (STARS, 2)) * HALF_PX, np.full(STARS, FOCAL_PX)])
+    )
+    itrs = itrs @ camera.T
+    level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+    seen = (
+        AIR.refraction().bend(rotation.normalised(itrs + station_velocity(zenith)) @ level.T) @ level @ camera
+    )
+    frame = IdentifiedFrame(
+        utc_unix_s=BEGIN_S,
+        stamp_stddev_s=0.0,
+        source="frame",
+        xy=seen[:, :2] / seen[:, 2:] * FOCAL_PX,
+        covariance_px2=np.tile(np.eye(2) * 0.1**2, (STARS, 1, 1)),
+        itrs=itrs,
+        focal_px=FOCAL_PX,
+        camera_to_itrs=camera,
+    )
+    return frame, zenith
+
+
+def told(frame):
+    """The frame as an attitude tells it."""
+    seen = frame.placeless()
+    return PlacelessFrame.of(
+        CameraAttitude(
+            utc_unix_s=frame.utc_unix_s,
+            stamp_stddev_s=0.0,
+            clock_stddev_s=0.0,
+            frame_id="camera",
+            camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.camera_to_itrs,
+            covariance=seen.covariance,
+            stars=STARS,
+            log_odds=50.0,
+        )
+    )
+
+
+def apart(a, b):
+    return Rotation.from_matrix(a.camera_to_itrs.T @ b.camera_to_itrs).as_rotvec()
+
+
+@pytest.mark.parametrize(("zenith_distance_deg", "limit_arcsec"), [(0, 0.1), (15, 0.1), (30, 0.3), (45, 1.0)])
+def test_it_is_the_attitude_by_the_stars_within_its_claim(zenith_distance_deg, limit_arcsec):
+    """In the mean, of where the camera looks: that moves the place."""
+    turns = []
+    for seed in range(6):
+        frame, zenith = frame_at(zenith_distance_deg, seed)
+        by_stars, by_attitude = (f.under(zenith, AIR) for f in (frame, told(frame)))
+        off = apart(by_stars, by_attitude)
+        turns.append(off)
+        assert off @ np.linalg.solve(by_attitude.covariance, off) < 16
+        # without it the camera would be off by all of the refraction
+        if zenith_distance_deg:
+            assert np.linalg.norm(apart(by_stars, frame.placeless())) > 10 * ARCSEC
+    assert np.linalg.norm(np.mean(turns, 0)[:2]) < limit_arcsec * ARCSEC
+
+
+def test_stronger_air_turns_it_as_it_turns_the_stars():
+    frame, zenith = frame_at(30.0, 1)
+    by_stars, by_attitude = (f.under(zenith, AIR).by_refraction for f in (frame, told(frame)))
+    assert np.linalg.norm(by_stars) > 25 * ARCSEC
+    assert np.linalg.norm((by_stars - by_attitude)[:2]) < 1 * ARCSEC

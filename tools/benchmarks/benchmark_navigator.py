@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CPU time of the node `navigator` by an IMU of so many Hz, in real time, with a frame and ten velocities a second.
+
+    benchmark_navigator.py [--rate 400] [--seconds 120] [--outputs 10]
+
+Prints the share of a core that the node takes, second half alone, how many readings it refused, and what it says at the
+end.  The voyage is a rover's of starpos_testing.voyages, that began before now.
+"""
+
+import argparse
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import yaml
+from geometry_msgs.msg import TwistWithCovarianceStamped, Vector3
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Header
+
+from starpos.earth.orientation import earth_state
+from starpos.fix.camera_attitude import CameraAttitude
+from starpos.navigation.sightings import IdentifiedFrame
+from starpos_common.messages import attitude_to_message, unix_to_stamp
+from starpos_interfaces.msg import Attitude
+from starpos_testing.graph.graph import Graph
+from starpos_testing.nodes import take_domain
+from starpos_testing.processes import cpu_s
+from starpos_testing.voyages import INDUSTRIAL, MadeVoyage, made
+
+Event = tuple[float, str, object]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rate", type=float, default=400.0, help="of the IMU, Hz")
+    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--outputs", type=float, default=10.0, help="a second")
+    args = parser.parse_args()
+    events = messages(made("rover", args.seconds, 1, rate_hz=args.rate))
+    take_domain()
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder) / "imu.yaml"
+        model.write_text(yaml.safe_dump({k: float(v) for k, v in asdict(INDUSTRIAL).items()}))
+        graph = Graph()
+        try:
+            measure(graph, Path(folder), args, events, model)
+        finally:
+            graph.close()
+
+
+def measure(graph: Graph, folder: Path, args: argparse.Namespace, events: list[Event], model: Path) -> None:
+    """Play the messages in real time and print what the node took."""
+    node = graph.start(
+        folder / "log",
+        "starpos_solver",
+        "navigator",
+        f"imu_model:={model}",
+        f"rate:={args.outputs}",
+        "vehicle:=rover",
+        "refraction.pressure:=0.0",
+    )
+    qos = QoSProfile(depth=1000)
+    publishers = {
+        topic: graph.node.create_publisher(kind, topic, qos)
+        for topic, kind in (("imu/data", Imu), ("attitude", Attitude), ("twist", TwistWithCovarianceStamped))
+    }
+    graph.wait(lambda: all(p.get_subscription_count() for p in publishers.values()))
+    begin, first = time.monotonic(), events[0][0]
+    half_s, halfway = args.seconds / 2, 0.0
+    for at, topic, message in events:
+        while (rest := at - first - (time.monotonic() - begin)) > 0:
+            graph.comes(lambda: False, min(rest, 0.05))
+        if not halfway and at - first > half_s:
+            halfway = cpu_s(node.process.pid)
+        publishers[topic].publish(message)
+    share = (cpu_s(node.process.pid) - halfway) / (time.monotonic() - begin - half_s)
+    said = graph.state("navigator: Navigation", "").message
+    inputs = {v.key: v.value for v in graph.state("navigator: Inputs", "").values}
+    print(f"{args.rate:g} Hz: {100 * share:.1f} % of a core; {inputs['refused']} messages refused; {said}")
+
+
+def messages(record: MadeVoyage) -> list[Event]:
+    """What a rover's IMU, solver and wheels publish, by the time they come."""
+    imu, log = record.imu, record.velocity
+    events: list[Event] = [
+        (t, "imu/data", reading(t, gyro, force))
+        for t, gyro, force in zip(imu.utc_unix_s, imu.gyro.tolist(), imu.force.tolist(), strict=True)
+    ]
+    events += [(f.utc_unix_s + 0.5, "attitude", attitude(f)) for f in record.frames]
+    for t, v, sigma in zip(log.utc_unix_s, log.velocity.tolist(), log.sigma, strict=True):
+        twist = TwistWithCovarianceStamped(header=Header(stamp=unix_to_stamp(t)))
+        twist.twist.twist.linear = Vector3(x=v[0], y=v[1], z=v[2])
+        twist.twist.covariance = (np.eye(6) * sigma**2).ravel()
+        events.append((t, "twist", twist))
+    return sorted(events, key=lambda e: e[0])
+
+
+def reading(unix_s: float, gyro: list[float], force: list[float]) -> Imu:
+    """Make the message of a reading."""
+    message = Imu(header=Header(stamp=unix_to_stamp(unix_s)))
+    message.angular_velocity = Vector3(x=gyro[0], y=gyro[1], z=gyro[2])
+    message.linear_acceleration = Vector3(x=force[0], y=force[1], z=force[2])
+    return message
+
+
+def attitude(frame: IdentifiedFrame) -> Attitude:
+    """Make the message of a frame, as the solver publishes it."""
+    seen = frame.placeless()
+    found = CameraAttitude(
+        utc_unix_s=frame.utc_unix_s,
+        stamp_stddev_s=0.0,
+        clock_stddev_s=1e-3,
+        frame_id="camera",
+        camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.camera_to_itrs,
+        covariance=seen.covariance,
+        stars=len(frame.xy),
+        log_odds=50.0,
+    )
+    return attitude_to_message(found)
+
+
+if __name__ == "__main__":
+    main()
