@@ -96,14 +96,20 @@ PRINTING, MAKING = threading.Lock(), threading.Lock()
 
 @dataclass
 class Outcome:
-    """What came of tests: how many passed, failed, were skipped; what each took; why which were skipped."""
+    """What came of tests: how many passed, failed, were skipped; what each took; why which were skipped; which failed."""
 
     counts: Counter = field(default_factory=Counter)
     seconds: list[tuple[float, str]] = field(default_factory=list)
     skipped: Counter = field(default_factory=Counter)
+    failed: list[str] = field(default_factory=list)
 
     def __add__(self, other: "Outcome") -> "Outcome":
-        return Outcome(self.counts + other.counts, self.seconds + other.seconds, self.skipped + other.skipped)
+        return Outcome(
+            self.counts + other.counts,
+            self.seconds + other.seconds,
+            self.skipped + other.skipped,
+            self.failed + other.failed,
+        )
 
 
 # By name: what runs them, given a file for their output; an Outcome.
@@ -118,9 +124,25 @@ def run(command: list[str], out=None, environment: dict[str, str] | None = None)
     return result.returncode
 
 
-def lint(linters: list[str], out=None) -> Outcome:
-    """Run linters."""
-    return Outcome(Counter("failed" if run(shlex.split(linter), out) else "passed" for linter in linters))
+def lint(linters: list[str], out) -> Outcome:
+    """Run linters; of those that pass only the names are shown."""
+    total = Outcome()
+    for linter in linters:
+        with tempfile.TemporaryFile("w+") as said:
+            failed = run(shlex.split(linter), said) != 0
+            said.seek(0)
+            print(
+                f"{linter}: {'failed' if failed else 'passed'}\n{said.read() if failed else ''}",
+                end="",
+                file=out,
+            )
+        total += broken(linter) if failed else Outcome(Counter(passed=1))
+    return total
+
+
+def broken(what: str) -> Outcome:
+    """The outcome of one thing that failed."""
+    return Outcome(Counter(failed=1), failed=[what])
 
 
 def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
@@ -130,12 +152,12 @@ def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
     """
     if not path.is_file() or path.stat().st_mtime < since:
         print(f"{path}: the tests ended without a result", file=out)
-        return Outcome(Counter(failed=1))
+        return broken(f"{path.stem}: no result")
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         print(f"{path}: the tests ended with half a result ({error})", file=out)
-        return Outcome(Counter(failed=1))
+        return broken(f"{path.stem}: half a result")
     counts = Counter()
     for suite in root.iter("testsuite"):
         failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
@@ -143,12 +165,14 @@ def outcome_of(path: Path, since: float, status: int, out) -> Outcome:
         counts += Counter(
             passed=int(suite.get("tests", 0)) - failed - skipped, failed=failed, skipped=skipped
         )
-    counts += Counter(failed=int(status not in (0, NO_TESTS) and counts["failed"] == 0))
-    seconds = [
-        (float(case.get("time", 0)), f"{path.stem}: {case.get('classname')}::{case.get('name')}")
-        for case in root.iter("testcase")
+    cases = [
+        (case, f"{path.stem}: {case.get('classname')}::{case.get('name')}") for case in root.iter("testcase")
     ]
-    return Outcome(counts, seconds, Counter(skip.get("message") for skip in root.iter("skipped")))
+    seconds = [(float(case.get("time", 0)), name) for case, name in cases]
+    failed = [name for case, name in cases if {"failure", "error"} & {child.tag for child in case}]
+    if status not in (0, NO_TESTS) and not counts["failed"]:
+        counts["failed"], failed = 1, [f"{path.stem}: exit status {status}"]
+    return Outcome(counts, seconds, Counter(skip.get("message") for skip in root.iter("skipped")), failed)
 
 
 def pytest(
@@ -249,7 +273,7 @@ def older(
     ubuntu = UNDERLAY / "ubuntu"
     if not made(ubuntu, out):
         print("Ubuntu 24.04's versions could not be installed", file=out)
-        return Outcome(Counter(failed=1))
+        return broken(f"{report}: no environment")
     python = ubuntu / "bin" / "python"
     with tempfile.TemporaryDirectory() as programs:
         # Some tests become another user.
@@ -315,6 +339,8 @@ def main(args: list[str]) -> int:
         print(f"{count:4d} skipped: {reason}")
     for seconds, name in sorted(total.seconds, reverse=True)[:SHOWN]:
         print(f"{seconds:6.1f} s  {name}")
+    for name in total.failed:
+        print(f"failed: {name}")
     print(
         f"{total.counts['passed']} passed, {total.counts['failed']} failed, {total.counts['skipped']} skipped"
     )
