@@ -93,6 +93,13 @@ class OtherClient:
         text = f'<new{kind}Vector device="{device}" name="{vector}">{inner}</new{kind}Vector>'
         self._socket.sendall(text.encode())
 
+    def meet(self, device: str):
+        """Wait until the device has said what it is made of: its driver has started."""
+        while f'device="{device}"'.encode() not in self._heard:
+            data = self._socket.recv(65536)
+            assert data, "the server has gone"
+            self._heard += data
+
     def hear(self, vector: str, state: str, first: str = ""):
         """Wait until the device sets the vector with this state, and its first member so; what was said is forgotten."""
         pattern = rf'<set\w+Vector[^>]*name="{vector}"[^>]*state="{state}"[^>]*>\s*<\w+[^>]*>\s*{first}'

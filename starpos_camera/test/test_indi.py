@@ -265,6 +265,9 @@ def liar(tmp_path):
 
     def start(**lies):
         server.start(**lies)
+        client = OtherClient(server)
+        client.meet("Liar")
+        client.close()
         sources.append(make(server, indi__device="Liar"))
         return sources[-1]
 

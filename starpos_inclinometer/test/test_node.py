@@ -129,11 +129,13 @@ def test_frozen_converter_and_steep_tilt_are_flagged_and_reported(bench, start, 
     mcu = Mcu(lambda now: (0.55, 0.0), seed=1)
     bench.plug(mcu)
     node = start(f"port:={bench.path}", "rate:=50")
-    listener.wait(lambda: listener.tilts and listener.links and "beyond" in listener.links[-1].message)
-    assert listener.tilts[-1].flags & Tilt.OUT_OF_RANGE and listener.links[-1].level == b"\x01"
+    listener.wait(lambda: listener.links and "beyond" in listener.links[-1].message)
+    assert listener.links[-1].level == b"\x01"
+    listener.wait(lambda: listener.tilts and listener.tilts[-1].flags & Tilt.OUT_OF_RANGE)
     mcu.frozen = True
     listener.wait(lambda: "stuck" in listener.links[-1].message)
-    assert listener.tilts[-1].flags & Tilt.STUCK and listener.links[-1].level == b"\x02"
+    assert listener.links[-1].level == b"\x02"
+    listener.wait(lambda: listener.tilts[-1].flags & Tilt.STUCK)
     assert node.end(signal.SIGINT)[0] == 0
 
 
