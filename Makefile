@@ -2,9 +2,10 @@
 # make demo    the whole instrument on a simulated night      make test    linters, unit tests, whole-graph tests
 # make emulated   firmware on an emulated MCU, INDI camera under a sky, nodes: tools/demo/emulated_instrument.py
 # make build   set-up (once) and build                        make lint    linters only
+# make bench   what everything takes, beside other programs: tools/benchmarks/bench.py      ARGS=--quick: in a minute
 # make docs    the documents as a site: build/docs/index.html
 # make clean   removes what was built                         make distclean   and the set-up
-# PYTHON=python3.12 chooses the interpreter of the set-up; ARGS goes to the demo, to emulated or to pytest.
+# PYTHON=python3.12 chooses the interpreter of the set-up; ARGS goes to the demo, to emulated, to bench or to pytest.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
@@ -17,7 +18,7 @@ INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/packag
   $(p)/layouts $(p)/layouts/* $(p)/sros2 $(p)/sros2/* $(p)/urdf $(p)/urdf/* $(p)/resource/* \
   $(p)/$(notdir $(p))/core $(p)/$(notdir $(p))/core/*.pyx $(p)/$(notdir $(p))/core/*.pxd))
 
-.PHONY: build demo docs emulated test lint clean distclean FORCE
+.PHONY: build demo bench docs emulated test lint clean distclean FORCE
 build: install/.built
 
 install/.built: .underlay/stamp $(INPUTS)
@@ -36,6 +37,9 @@ emulated: build
 test: build
 	@tools/setup/counterparts
 	@. tools/env.sh && python tools/test.py $(ARGS)
+
+bench: build
+	@. tools/env.sh && python tools/benchmarks/bench.py $(ARGS)
 
 docs: build
 	@. tools/env.sh && python tools/test.py --docs

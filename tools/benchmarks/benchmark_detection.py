@@ -1,22 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time and memory of detection against the frame's size, the number of stars and the share of hot pixels.
 
-`benchmark_detection.py [--repeat N]`.  sep with windowed positions works on the same frames if it can be imported
-(`pip install sep`).  Memory is the growth of the process at its peak, over the frame's own bytes (Linux only).
+`benchmark_detection.py [--repeat N] [--peers FOLDER]`: medians of N.  sep with windowed positions works on the same
+frames, by turns, if it can be imported (peers.py).  Memory is the growth of the process at its peak, over the frame's
+own bytes (Linux only).
 """
 
 import argparse
-import importlib.util
 import multiprocessing
 import os
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 # CPU time is compared, so each program gets one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+import peers
+from table import Cost, Row
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame
@@ -30,61 +36,130 @@ SIZES = {
     60: (9488, 6324),
 }
 STARS_PER_MPX, STAR_COUNTS, HOT = 15, (10, 100, 1000, 5000), (0.0001, 0.001, 0.003)
+# Mpx, stars, share of hot pixels
+CASES = [
+    *((mpx, round(STARS_PER_MPX * mpx), 0.0) for mpx in SIZES),
+    *((21, n, 0.0) for n in STAR_COUNTS),
+    *((21, 315, hot) for hot in HOT),
+]
+QUICK = [CASES[1], CASES[3]]
 # DN; px; px: half a second of the sky.
 SKY, SIGMA, TRAIL = 600, 1.02, np.array([2.6, -2.2])
+# A detection this close to a star is of it. A program that has taken so long on a frame gets it no more.
+NEAR_PX, ENOUGH_S = 2.0, 5.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A detection: how many stars, CPU time, peak memory over the frame's bytes, and how far off the bright half is."""
+
+    found: int
+    ms: float
+    memory: float
+    off_px: float
+
+    @property
+    def cost(self) -> Cost:
+        """As a cell of the table."""
+        return Cost(self.ms, f"{self.found} found, {self.off_px:.3f} px off")
 
 
 def exposure(size, count, rng, hot=0.0):
     """Make a 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, most of them faint.
 
     hot: the share of hot pixels, which have 100 DN more or above, 2000 on average.
+    Returns the frame and the places (count, 2) of its stars in px, the brightest first.
     """
     columns, rows = size
     pixels = rng.normal(SKY, 7.0, (rows, columns)).astype(np.float32)
     grid, steps = np.arange(-14, 15), (np.arange(12) + 0.5) / 12 - 0.5
     place = rng.uniform(20, np.array(size) - 20, (count, 2))
-    for (x, y), flux in zip(place, np.minimum(500 * (1 + rng.pareto(1, count)), 1e5), strict=True):
+    light = np.minimum(500 * (1 + rng.pareto(1, count)), 1e5)
+    for (x, y), flux in zip(place, light, strict=True):
         u, v = (grid - (p % 1) - steps[:, None] * t for p, t in zip((x, y), TRAIL, strict=True))
         star = np.exp(-0.5 * (v / SIGMA) ** 2).T @ np.exp(-0.5 * (u / SIGMA) ** 2)
         stamp = np.s_[int(y) - 14 : int(y) + 15, int(x) - 14 : int(x) + 15]
         pixels[stamp] += rng.poisson(star * (flux / star.sum()))
     which = np.flatnonzero(rng.random(pixels.size) < hot)
     pixels.flat[which] += 100 + rng.exponential(2000, len(which))
-    return np.clip(np.rint(pixels), 0, 65535).astype(np.uint16)
+    return np.clip(np.rint(pixels), 0, 65535).astype(np.uint16), place[np.argsort(-light)]
 
 
 def with_starpos(pixels):
-    return len(detect(Frame(pixels)).stars)
+    """Places (N, 2) px by starpos."""
+    stars = detect(Frame(pixels)).stars
+    return np.stack([stars.x, stars.y], 1)
 
 
-def with_sep(pixels):
-    import sep
-
-    plane = pixels.astype(np.float32)
-    background = sep.Background(plane)
-    plane -= background
-    found = sep.extract(plane, 5, err=background.globalrms)
-    sep.winpos(plane, found["x"], found["y"], np.full(len(found), 2.0))
-    return len(found)
+def off_px(found, place) -> float:
+    """The median distance of the brighter half of the stars from what was found; NaN if none was."""
+    if not len(found):
+        return float("nan")
+    bright = place[: (len(place) + 1) // 2]
+    nearest = np.array([np.hypot(*(found - star).T).min() for star in bright])
+    near = nearest[nearest < NEAR_PX]
+    return float(np.median(near)) if len(near) else float("nan")
 
 
 def memory_kb(name):
     return int(Path("/proc/self/status").read_text().split(name + ":")[1].split()[0])
 
 
-def measured(work, path, repeat):
-    """Detect; return the number of stars, CPU ms (the quickest of `repeat`), and peak memory over the frame's bytes."""
+def measured(work: Callable, path: Path) -> Measured:
+    """Detect the stars of the frame that is kept at `path`, in a process of its own."""
     # The first call loads modules, which should not count. A small frame leaves little memory for the ones that follow.
-    work(exposure((200, 200), 5, np.random.default_rng(1)))
-    pixels = np.load(path)
+    work(exposure((200, 200), 5, np.random.default_rng(1))[0])
+    kept = np.load(path)
+    pixels, place = kept["pixels"], kept["place"]
     # This resets the peak of memory.
     Path("/proc/self/clear_refs").write_text("5")
-    before, times = memory_kb("VmRSS"), []
-    for _ in range(repeat):
-        begin = time.process_time()
-        count = work(pixels)
-        times.append(time.process_time() - begin)
-    return count, 1e3 * min(times), 1024 * (memory_kb("VmHWM") - before) / pixels.nbytes
+    before, begin = memory_kb("VmRSS"), time.process_time()
+    found = work(pixels)
+    ms = 1e3 * (time.process_time() - begin)
+    memory = 1024 * (memory_kb("VmHWM") - before) / pixels.nbytes
+    return Measured(len(found), ms, memory, off_px(found, place))
+
+
+def compared(programs: dict[str, Callable], path: Path, repeat: int) -> dict[str, Measured]:
+    """The medians of `repeat` detections by each program, each in its process, by turns."""
+    taken: dict[str, list[Measured]] = {name: [] for name in programs}
+    with ExitStack() as stack:
+        spawn = multiprocessing.get_context("spawn")
+        pools = {name: stack.enter_context(spawn.Pool(1)) for name in programs}
+        for _ in range(repeat):
+            for name, work in programs.items():
+                if sum(m.ms for m in taken[name]) < 1e3 * ENOUGH_S:
+                    taken[name].append(pools[name].apply(measured, (work, path)))
+    return {
+        name: Measured(m[0].found, median(k.ms for k in m), max(k.memory for k in m), m[0].off_px)
+        for name, m in taken.items()
+    }
+
+
+def cases(programs: dict[str, Callable], which, repeat: int) -> Iterator[tuple[float, int, float, dict]]:
+    """Each case, as in CASES, with what each program makes of it."""
+    rng = np.random.default_rng(1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frame.npz"
+        for mpx, count, hot in which:
+            pixels, place = exposure(SIZES[mpx], count, rng, hot)
+            np.savez(path, pixels=pixels, place=place)
+            yield mpx, count, hot, compared(programs, path, repeat)
+
+
+def rows(options) -> Iterator[Row]:
+    """The rows of bench.py: on the frames of QUICK beside all peers, on the others beside sep."""
+    here = {name: work for name, work in peers.DETECTORS.items() if peers.is_here(name)}
+    sep = {name: work for name, work in here.items() if name == "sep"}
+    rest = [] if options.quick else [case for case in CASES if case not in QUICK]
+    for beside, which in ((here, QUICK), (sep, rest)):
+        for mpx, count, hot, found in cases({"starpos": with_starpos} | beside, which, options.rounds):
+            what = f"detection, {mpx:g} Mpx, {count} stars" + f", {100 * hot:g} % hot pixels" * (hot > 0)
+            ours = found.pop("starpos").cost
+            for name, theirs in found.items():
+                yield Row(what, ours, name, theirs.cost)
+            if not found:
+                yield Row(what, ours)
 
 
 def main():
@@ -92,29 +167,21 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--repeat", type=int, default=3)
-    repeat = parser.parse_args().repeat
+    parser.add_argument("--peers", type=Path, default=peers.folder(), metavar="FOLDER", help="of peers")
+    options = parser.parse_args()
+    peers.look_in(options.peers)
     programs = {"starpos": with_starpos}
-    if importlib.util.find_spec("sep"):
-        programs["sep"] = with_sep
+    if peers.is_here("sep"):
+        programs["sep"] = peers.with_sep
     print(
         f"{'Mpx':>6} {'stars':>6} {'hot':>6}"
         + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs)
     )
-    rng = np.random.default_rng(1)
-    cases = [(mpx, round(STARS_PER_MPX * mpx), 0.0) for mpx in SIZES] + [(21, n, 0.0) for n in STAR_COUNTS]
-    cases += [(21, 315, hot) for hot in HOT]
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool,
-    ):
-        path = Path(folder) / "frame.npy"
-        for mpx, count, hot in cases:
-            np.save(path, exposure(SIZES[mpx], count, rng, hot))
-            line = f"{mpx:6g} {count:6d} {hot:6g}"
-            for work in programs.values():
-                found, ms, memory = pool.apply(measured, (work, path, repeat))
-                line += f" | {found:14d} {ms:7.1f} {ms / mpx:6.1f} {memory:6.2f}"
-            print(line, flush=True)
+    for mpx, count, hot, found in cases(programs, CASES, options.repeat):
+        line = f"{mpx:6g} {count:6d} {hot:6g}"
+        for m in found.values():
+            line += f" | {m.found:14d} {m.ms:7.1f} {m.ms / mpx:6.1f} {m.memory:6.2f}"
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -12,10 +12,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from table import Cost, Row
 
 from starpos.cli import main as starpos
 from starpos.parallel.processes import Processes, processors
@@ -33,8 +35,8 @@ def timed(command: list[str]) -> tuple[np.ndarray, bytes]:
     return np.array([wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime]), done.stdout
 
 
-def compare(what: str, folder: Path, number: int, jobs: int, rounds: int) -> None:
-    """Print a line of the table."""
+def best_of(folder: Path, number: int, jobs: int, rounds: int) -> tuple[dict[int, np.ndarray], bool]:
+    """The least wall and CPU time (s) of a night on 1 and on so many processes, and whether the answers are the same."""
     some = sorted(str(p) for p in folder.iterdir() if p.stem.startswith(("frame", "stars")))
     given = [some[k % len(some)] for k in range(number)]
     command = ["solve", *given, "--tilt", str(folder / "tilt.csv"), *OPTICS, "--json", "--jobs"]
@@ -47,10 +49,16 @@ def compare(what: str, folder: Path, number: int, jobs: int, rounds: int) -> Non
             spent, out = timed([*command, str(n)])
             best[n] = np.minimum(best[n], spent)
             answers.add(out)
+    return best, len(answers) == 1
+
+
+def compare(what: str, folder: Path, number: int, jobs: int, rounds: int) -> None:
+    """Print a line of the table."""
+    best, same = best_of(folder, number, jobs, rounds)
     (wall, cpu), (wall_of_many, cpu_of_many) = best[1], best[jobs]
     print(
         f"{what:<12}{number:6d}{wall:11.2f}{wall_of_many:9.2f}{wall_of_many / wall:8.2f}{cpu:10.2f}{cpu_of_many:9.2f}"
-        f"   {'yes' if len(answers) == 1 else 'NO'}",
+        f"   {'yes' if same else 'NO'}",
         flush=True,
     )
 
@@ -72,6 +80,22 @@ def overhead_ms(jobs: int, calls: int = 2000) -> tuple[float, float]:
     return 1000 * (ready - begin), 1000 * (end - ready) / calls
 
 
+def simulated(folder: Path, number: int, *more: str) -> Path:
+    """Make a night of so many frames, AT_ONCE at most."""
+    starpos(["simulate", str(folder), "-n", str(min(number, AT_ONCE)), *OPTICS, *more])
+    return folder
+
+
+def rows(options) -> Iterator[Row]:
+    """The rows of bench.py."""
+    number, jobs = 100, 2
+    with tempfile.TemporaryDirectory() as scratch:
+        best, same = best_of(simulated(Path(scratch) / "lists", number, "--stars-only"), number, jobs, 1)
+    note = "the same answers" if same else "OTHER ANSWERS"
+    ours, alone = Cost(1000 * best[jobs][1], note), Cost(1000 * best[1][1])
+    yield Row(f"{number} star lists solved on {jobs} processes, all their CPU", ours, "on one process", alone)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -90,8 +114,7 @@ def main() -> None:
             ("frames", args.frames, ()),
             ("star lists", args.lists, ("--stars-only",)),
         ):
-            folder = Path(scratch) / what.replace(" ", "")
-            starpos(["simulate", str(folder), "-n", str(min(number, AT_ONCE)), *OPTICS, *more])
+            folder = simulated(Path(scratch) / what.replace(" ", ""), number, *more)
             compare(what, folder, number, args.jobs, args.rounds)
 
 

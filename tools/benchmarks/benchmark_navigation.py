@@ -8,8 +8,10 @@ place (2 where claims hold), error of the heading; CPU time of a voyage without 
 
 import argparse
 import time
+from collections.abc import Iterator
 
 import numpy as np
+from table import Cost, Row
 
 from starpos.earth.refraction import Atmosphere
 from starpos.navigation.imu import ImuModel
@@ -21,6 +23,8 @@ from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL, TACTICAL, MadeVo
 EARTH_M = 6.37e6
 GRADES = {"industrial": INDUSTRIAL, "tactical": TACTICAL}
 CADENCE_S, RATE_HZ = 2.0, 50.0
+# of a voyage in the table of bench.py
+VOYAGE_S = 300.0
 
 
 def navigated(record: MadeVoyage, vehicle: str, model: ImuModel) -> Voyage:
@@ -52,6 +56,23 @@ def scores(record: MadeVoyage, voyage: Voyage) -> np.ndarray:
     return np.mean(rows, axis=0)
 
 
+def scored(vehicle: str, grade: str, seconds: float, seed: int) -> tuple[np.ndarray, float]:
+    """The scores of one voyage, and its CPU time in s."""
+    model = GRADES[grade]
+    record = made(vehicle, seconds, 1000 + seed, model=model, rate_hz=RATE_HZ, cadence_s=CADENCE_S)
+    begin = time.process_time()
+    found = scores(record, navigated(record, vehicle, model))
+    return found, time.process_time() - begin
+
+
+def rows(options) -> Iterator[Row]:
+    """The rows of bench.py: one voyage of each vehicle."""
+    for vehicle in ("rover",) if options.quick else ("rover", "ship", "drone", "parked"):
+        _, spent_s = scored(vehicle, "industrial", VOYAGE_S, 0)
+        what = f"a voyage of {VOYAGE_S:g} s, {vehicle}"
+        yield Row(what, Cost(1000 * spent_s), "real time", Cost(1000 * VOYAGE_S))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -65,19 +86,13 @@ def main() -> None:
         sep="\n",
     )
     for vehicle in ("rover", "ship", "drone", "parked"):
-        for grade, model in GRADES.items():
-            found, spent = [], 0.0
-            for seed in range(args.voyages):
-                record = made(
-                    vehicle, args.seconds, 1000 + seed, model=model, rate_hz=RATE_HZ, cadence_s=CADENCE_S
-                )
-                begin = time.process_time()
-                found.append(scores(record, navigated(record, vehicle, model)))
-                spent += time.process_time() - begin
-            error, claimed, nees, heading = np.mean(found, axis=0)
+        for grade in GRADES:
+            voyages = [scored(vehicle, grade, args.seconds, seed) for seed in range(args.voyages)]
+            error, claimed, nees, heading = np.mean([found for found, _ in voyages], axis=0)
+            spent_s = np.mean([spent for _, spent in voyages])
             print(
                 f"| {vehicle} | {grade} | {error:.0f} | {claimed:.0f} | {nees:.2f} | {heading:.0f} "
-                f"| {spent / args.voyages:.1f} |",
+                f"| {spent_s:.1f} |",
                 flush=True,
             )
 

@@ -10,7 +10,8 @@ end.  The voyage is a rover's of starpos_testing.voyages, that began before now.
 import argparse
 import tempfile
 import time
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped, Vector3
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
+from table import Cost, Row
 
 from starpos.earth.orientation import earth_state
 from starpos.fix.camera_attitude import CameraAttitude
@@ -33,6 +35,22 @@ from starpos_testing.voyages import INDUSTRIAL, MadeVoyage, made
 Event = tuple[float, str, object]
 
 
+@dataclass(frozen=True)
+class Load:
+    """The share of a core that the node took, how many messages it refused, and what it says at the end."""
+
+    share: float
+    refused: str
+    said: str
+
+
+def rows(options) -> Iterator[Row]:
+    """The rows of bench.py; with --quick none."""
+    if not options.quick:
+        load = measured(400.0, 30.0, 10.0)
+        yield Row("navigator, a second at 400 Hz", Cost(1000 * load.share), "real time", Cost(1000.0))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -41,26 +59,36 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--outputs", type=float, default=10.0, help="a second")
     args = parser.parse_args()
-    events = messages(made("rover", args.seconds, 1, rate_hz=args.rate))
+    load = measured(args.rate, args.seconds, args.outputs)
+    print(
+        f"{args.rate:g} Hz: {100 * load.share:.1f} % of a core; {load.refused} messages refused; {load.said}"
+    )
+
+
+def measured(rate_hz: float, seconds: float, outputs_hz: float) -> Load:
+    """Start the node and play a rover's voyage of so many seconds."""
+    events = messages(made("rover", seconds, 1, rate_hz=rate_hz))
     take_domain()
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "imu.yaml"
         model.write_text(yaml.safe_dump({k: float(v) for k, v in asdict(INDUSTRIAL).items()}))
         graph = Graph()
         try:
-            measure(graph, Path(folder), args, events, model)
+            return played(graph, Path(folder), seconds, outputs_hz, events, model)
         finally:
             graph.close()
 
 
-def measure(graph: Graph, folder: Path, args: argparse.Namespace, events: list[Event], model: Path) -> None:
-    """Play the messages in real time and print what the node took."""
+def played(
+    graph: Graph, folder: Path, seconds: float, outputs_hz: float, events: list[Event], model: Path
+) -> Load:
+    """Play the messages in real time."""
     node = graph.start(
         folder / "log",
         "starpos_solver",
         "navigator",
         f"imu_model:={model}",
-        f"rate:={args.outputs}",
+        f"rate:={outputs_hz}",
         "vehicle:=rover",
         "refraction.pressure:=0.0",
     )
@@ -71,7 +99,7 @@ def measure(graph: Graph, folder: Path, args: argparse.Namespace, events: list[E
     }
     graph.wait(lambda: all(p.get_subscription_count() for p in publishers.values()))
     begin, first = time.monotonic(), events[0][0]
-    half_s, halfway = args.seconds / 2, 0.0
+    half_s, halfway = seconds / 2, 0.0
     for at, topic, message in events:
         while (rest := at - first - (time.monotonic() - begin)) > 0:
             graph.comes(lambda: False, min(rest, 0.05))
@@ -81,7 +109,7 @@ def measure(graph: Graph, folder: Path, args: argparse.Namespace, events: list[E
     share = (cpu_s(node.process.pid) - halfway) / (time.monotonic() - begin - half_s)
     said = graph.state("navigator: Navigation", "").message
     inputs = {v.key: v.value for v in graph.state("navigator: Inputs", "").values}
-    print(f"{args.rate:g} Hz: {100 * share:.1f} % of a core; {inputs['refused']} messages refused; {said}")
+    return Load(share, inputs["refused"], said)
 
 
 def messages(record: MadeVoyage) -> list[Event]:

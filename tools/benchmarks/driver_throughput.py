@@ -8,6 +8,9 @@ Exit status 0; 1 if it is less than 100 times real time.
 
 import sys
 import time
+from collections.abc import Iterator
+
+from table import Cost, Row
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.host_clock import Moment
@@ -24,14 +27,28 @@ COMPENSATED = {
 }
 
 
+def each(samples: int) -> Iterator[tuple[str, float]]:
+    """What is measured, and its CPU time a sample in us."""
+    values = {p.name: p.default for p in PARAMETERS}
+    yield "serial, as it is", serial(samples, values)
+    yield "serial, compensated", serial(samples, values | COMPENSATED)
+    yield "ascii, lines alone", ascii_lines(samples, values["ascii.pattern"])
+
+
+def rows(options) -> Iterator[Row]:
+    """The rows of bench.py."""
+    for what, us in each(5_000):
+        yield Row(
+            f"inclinometer, a sample, {what}",
+            Cost(us / 1000),
+            f"real time at {RATE_HZ} Hz",
+            Cost(1000 / RATE_HZ),
+        )
+
+
 def main() -> int:
     samples = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
-    values = {p.name: p.default for p in PARAMETERS}
-    slowest_us = max(
-        report("serial, as it is", serial(samples, values)),
-        report("serial, compensated", serial(samples, values | COMPENSATED)),
-        report("ascii, lines alone", ascii_lines(samples, values["ascii.pattern"])),
-    )
+    slowest_us = max(report(what, us) for what, us in each(samples))
     return int(1e6 / RATE_HZ / slowest_us < WANTED)
 
 
