@@ -127,15 +127,18 @@ def encoding_of(frame: Frame) -> str:
 def frame_to_message(frame: Frame, frame_id: str) -> Image:
     """Convert a frame to an Image; the pixels are copied once."""
     pixels = np.ascontiguousarray(frame.pixels)
-    # rclpy takes an array of bytes as it is; anything else it copies, or checks byte by byte.
     data = array.array("B")
     data.frombytes(pixels.data.cast("B"))
-    return Image(
+    message = Image(
+        # a message that checks its fields takes an array of bytes as it is; one that does not copies it, its
+        # constructor twice
+        check_fields=True,
         header=Header(stamp=unix_to_stamp(frame.mid_unix_s), frame_id=frame_id),
         width=frame.width,
         height=frame.height,
         encoding=encoding_of(frame),
         is_bigendian=int(HOST_IS_BIG_ENDIAN),
         step=pixels.strides[0],
-        data=data,
     )
+    message.data = data
+    return message
