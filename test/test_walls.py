@@ -30,6 +30,14 @@ BREACHES = [
     ("layers", {"starpos.fix.new": "from sensor_msgs.msg import Image"}, "which is ROS"),
     ("layers", {"starpos_solver.new": "import starpos_camera.camera"}, "does not allow"),
     ("layers", {"starpos_common.new": "import starpos_testing.nodes"}, "does not allow"),
+    (
+        "circles",
+        {
+            "starpos.fix.a": "from starpos.fix.b import x",
+            "starpos.fix.b": "def f():\n    from starpos.fix import a",
+        },
+        "in a circle",
+    ),
     ("aliases", {"starpos.fix.new": "from starpos.fix.solver import Solution as Answer"}, "as Answer"),
     ("twins", {"starpos.fix.a": "class Two: ...", "starpos_solver.b": "class Two: ..."}, "2 things"),
     ("keywords", {"starpos.fix.new": f"@dataclass(frozen=True)\nclass Six:\n{FIELDS}"}, "6 fields"),

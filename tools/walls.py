@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -150,6 +151,21 @@ def layers(house: list[Module]) -> Iterator[str]:
                     yield module.at(node, f"{module.room} (floor {own}) imports {room} (floor {above})")
 
 
+def circles(house: list[Module]) -> Iterator[str]:
+    """Modules that import each other in a circle, also where a function does when it is called."""
+    by_name = {module.name: module for module in house}
+    needs: dict[str, set[str]] = {}
+    for module in house:
+        # of starpos.cli.solve.run the module is starpos.cli.solve; a package's own name is a door, not a room
+        found = {t if t in by_name else t.rpartition(".")[0] for _, t in imports(module)}
+        needs[module.name] = {t for t in found & set(by_name) if by_name[t].path.name != "__init__.py"}
+    try:
+        TopologicalSorter(needs).prepare()
+    except CycleError as error:
+        circle = error.args[1]
+        yield by_name[circle[0]].at(by_name[circle[0]].tree, f"imports in a circle: {', '.join(circle)}")
+
+
 def core() -> Iterator[str]:
     """What the compiled core may not import, and its files of two topics."""
     folder = packages()["starpos"] / "core"
@@ -235,7 +251,7 @@ def breaches() -> list[str]:
     """All that is against the rules."""
     house = modules()
     everything = house + beside()
-    return [line for rule in (layers, aliases, twins, keywords) for line in rule(house)] + [
+    return [line for rule in (layers, circles, aliases, twins, keywords) for line in rule(house)] + [
         *words(everything),
         *comments(everything),
         *core(),

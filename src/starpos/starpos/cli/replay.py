@@ -22,7 +22,7 @@ from starpos.cli.fix_output import (
     put_combined,
 )
 from starpos.cli.output import Output, add_formats
-from starpos.cli.solve import NO_FIX
+from starpos.cli.solved_night import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solver import Solution

@@ -14,7 +14,7 @@ from starpos.cli.doubts import Near, checked_tilts, far, near_of
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
 from starpos.cli.frame_work import NO_CAMERA
 from starpos.cli.output import Output
-from starpos.cli.solve import NO_FIX, solved_by_turning, tell
+from starpos.cli.solved_night import NO_FIX, solved_by_turning, tell
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.pointing import IDEAL
