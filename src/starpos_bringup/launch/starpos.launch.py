@@ -19,6 +19,7 @@ ARGUMENTS = (
     ("use_sim_time", "", "true: time from /clock"),
     ("camera", "", "source of frames: files, simulated, gphoto2, indi, alpaca, video"),
     ("port", "", "serial port of the inclinometer; prefer a path under /dev/serial/by-id"),
+    ("navigator", "false", "true: also the place under way, by an IMU on imu/data"),
     ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
     ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
 )
@@ -31,6 +32,8 @@ def nodes(context):
     port = {"port": told["port"]} if told["port"] else {}
     common = Common.of(told)
     processes = instrument(common, {"**": clock, "camera": source, "inclinometer": port})
+    if is_true(told, "navigator"):
+        processes.append(process("starpos_solver", "navigator", common, {"**": clock}))
     if is_true(told, "dashboard"):
         processes.append(process("starpos_dashboard", "dashboard", common, {"**": clock}))
     return processes

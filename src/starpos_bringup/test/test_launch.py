@@ -81,19 +81,25 @@ def test_the_instrument_takes_the_arguments_it_names():
     # What is not given, the file says.
     assert all(over == {} for over, _ in silent.values())
     told = started(
-        "starpos", port="/dev/x", use_sim_time="true", camera="indi", log_level="warn", dashboard="true"
+        "starpos",
+        port="/dev/x",
+        use_sim_time="true",
+        camera="indi",
+        log_level="warn",
+        dashboard="true",
+        navigator="true",
     )
     assert told["camera_detector"][0] == {"/**": {"use_sim_time": True}, "/**/camera": {"source": "indi"}}
     assert told["inclinometer"][0]["/**/inclinometer"] == {"port": "/dev/x"}
     assert told["solver"][1] == ["--ros-args", "--log-level", "warn", "--enclave", "/starpos/solver"]
-    assert "dashboard" in told
+    assert told["dashboard"][0] == told["navigator"][0] == {"/**": {"use_sim_time": True}}
 
 
 def test_each_process_is_in_its_enclave_of_the_policy():
     policy = ElementTree.parse(FOLDER.parent / "sros2" / "policies.xml")
     enclaves = {e.attrib["path"] for e in policy.iter("enclave")}
     for name, given in (
-        ("starpos", {"dashboard": "true"}),
+        ("starpos", {"dashboard": "true", "navigator": "true"}),
         ("replay", {"bag": str(NIGHT), "detector": "true"}),
         ("demo", {}),
     ):
