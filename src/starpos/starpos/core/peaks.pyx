@@ -7,14 +7,10 @@ from libc.string cimport memset
 
 import numpy as np
 
+cimport starpos.core.wide
+
 cdef extern from *:
     """
-    /* With wider registers where the machine that runs has them: chosen when the module is loaded, with the same results. */
-    #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-    #define STARPOS_WIDE __attribute__((target_clones("avx2", "default")))
-    #else
-    #define STARPOS_WIDE
-    #endif
     /* Add to a row three pairs of others, each times its weight. */
     STARPOS_WIDE static void starpos_add(float *restrict out, const float *restrict w, Py_ssize_t n,
                             const float *restrict a, const float *restrict b, const float *restrict c,

@@ -83,8 +83,8 @@ class Background:
 
 
 def phase_of(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Number 0..3 of a pixel within the 2 x 2 pattern of a colour mosaic."""
-    return 2 * (rows & 1) + (columns & 1)
+    """Number 0..3 (uint8) of a pixel within the 2 x 2 pattern of a colour mosaic."""
+    return (2 * (rows & 1)).astype(np.uint8) + (columns & 1).astype(np.uint8)
 
 
 def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None) -> Background:

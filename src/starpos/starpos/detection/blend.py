@@ -93,7 +93,7 @@ def with_companions(
     )  # fmt: skip
     stamps = _with_rows(stamps, odd, replace(both, signal=both.signal - models[1]))
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
-    light = psf.at(x[0], y[0]).evaluate(*second_stamps.offsets(x[0], y[0]))[0]
+    light = psf.at(x[0], y[0]).evaluate(*second_stamps.corner(x[0], y[0]), stamps.size)[0]
     light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
     noise = np.sqrt(response.variance(second_stamps.noise, light))
     second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
@@ -130,7 +130,7 @@ def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
     flux = np.full((2, n), np.nan)
     for round_ in range(ROUNDS + 1):
         places = [stamps.offsets(x[k], y[k]) for k in (0, 1)]
-        shapes = [local.evaluate(*place) for place in places]
+        shapes = [local.evaluate(*stamps.corner(x[k], y[k]), stamps.size) for k in (0, 1)]
         gains = response.gain * (1 + colour)
         own = [gains_at(gains[k], stamps.phase) for k in (0, 1)]
         inside = local.within(*places[0], FIT_WIDTHS) | local.within(*places[1], FIT_WIDTHS)

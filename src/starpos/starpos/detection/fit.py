@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.core.fit import Rules, fitted
 from starpos.detection.psf import Psf
 from starpos.detection.stamps import Stamps
 
@@ -62,7 +63,7 @@ class Response:
         return noise**2 + np.float32(self.dn_per_photon) * light + np.float32(self.misfit**2) * light**2
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """N fitted stars.
 
@@ -102,70 +103,14 @@ def fit_stars(
     phase nor the star's colour moves the position. The weights come from the model: the pixels' own noise would bias
     the fit.
     """
-    x, y, local = x.copy(), y.copy(), psf.at(x, y)
-    n = len(x)
-    inverse_noise2 = stamps.good / stamps.noise**2
-    # each star's gains over the frame's, minus 1
-    colour = np.zeros((n, len(response.gain)))
-    own = gains_at(response.gain * (1 + colour), stamps.phase)
-    flux = np.full(n, np.nan)
-    outlier = np.zeros(stamps.signal.shape, bool)
-    for round_ in range(rounds):
-        last = round_ == rounds - 1
-        dx, dy = stamps.offsets(x, y)
-        shape = local.evaluate(dx, dy)
-        inside = local.within(dx, dy, FIT_WIDTHS)
-        unit = shape[0] * own
-        if not np.isfinite(flux).all():
-            weight = inverse_noise2 * inside
-            with np.errstate(divide="ignore", invalid="ignore"):
-                flux = (weight * unit * stamps.signal).sum((1, 2)) / (weight * unit * unit).sum((1, 2))
-            flux = np.nan_to_num(flux)
-        amount = flux.astype(np.float32)[:, None, None]
-        variance = response.variance(stamps.noise, amount * unit)
-        used = stamps.good & inside & ~outlier
-        root = np.sqrt(used / variance)
-        columns = response.columns(shape, amount, own, stamps.phase)
-        design = np.stack([(c * root).reshape(n, -1) for c in columns], 2)
-        residual = stamps.signal - amount * unit
-        normal = (design.transpose(0, 2, 1) @ design).astype(np.float64)
-        right = (design.transpose(0, 2, 1) @ (residual * root).reshape(n, -1, 1))[..., 0].astype(np.float64)
-        response.hold(normal, right, colour)
-        covariance = inverse(normal)
-        if last:
-            break
-        if round_ >= 1:
-            # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
-            outlier = (residual > OUTLIER * np.sqrt(variance)) & (
-                residual > 0.15 * amount * unit.max((1, 2), keepdims=True)
-            )
-        step = (covariance @ right[..., None])[..., 0]
-        x += np.clip(step[:, 0], -1, 1)
-        y += np.clip(step[:, 1], -1, 1)
-        flux += step[:, 2]
-        if response.own_gains:
-            colour = np.clip(colour + step[:, 3:], -0.9, 3.0)
-            own = gains_at(response.gain * (1 + colour), stamps.phase)
-    freedom = np.maximum(used.sum((1, 2)) - 3, 1)
-    chi2 = ((residual * root) ** 2).sum((1, 2)) / freedom
-    leverage = ((design @ np.nan_to_num(covariance).astype(np.float32)) * design).sum(2).reshape(used.shape)
-    with np.errstate(divide="ignore"):
-        # the sigma at known place and colour, which a detection does not depend on; sqrt, because numpy 1.26 rounds a
-        # power differently by the array's place in memory, and several processes must give the same answers
-        flux_sigma = 1 / np.sqrt(normal[:, 2, 2])
+    local, rules = psf.at(x, y), Rules(
+        response.gain, response.colour_spread, response.dn_per_photon, response.misfit, FIT_WIDTHS, OUTLIER
+    )
+    signal, noise = (np.ascontiguousarray(a, np.float32) for a in (stamps.signal, stamps.noise))
+    corner = np.stack([stamps.x - stamps.reach, stamps.y - stamps.reach], 1).astype(float)
+    first = np.stack([x, y], 1)
     return Fit(
-        x=x,
-        y=y,
-        flux=flux,
-        flux_sigma=flux_sigma,
-        covariance=covariance[:, :2, :2],
-        gains=response.gain * (1 + colour),
-        chi2=chi2,
-        residual=residual,
-        model=amount * unit,
-        used=used,
-        outlier=outlier & stamps.good & inside,
-        leverage=leverage,
+        *fitted(signal, noise, stamps.good, stamps.phase, corner, first, local.axes, local.series, rules, rounds)
     )
 
 

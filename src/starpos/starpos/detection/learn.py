@@ -249,7 +249,7 @@ def _respond(
     used = fit.used[sound]
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
-        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.offsets(x, y))[0], before)
+        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)[0], before)
     noise2 = (stamps.noise**2)[used]
     light, square = np.maximum(fit.model[sound][used], 0), fit.residual[sound][used] ** 2
     square = square / np.maximum(1 - fit.leverage[sound][used], 0.1)
@@ -307,9 +307,9 @@ def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Re
     """Refine the PSF once, by the sound stars of a fit, which are those in stamps."""
     x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
     scale = gains_at(fit.gains[sound], stamps.phase) * flux[:, None, None]
-    dx, dy = stamps.offsets(x, y)
-    light = scale * psf.at(x, y).evaluate(dx, dy)[0]
+    left, top = stamps.corner(x, y)
+    light = scale * psf.at(x, y).evaluate(left, top, stamps.size)[0]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
     variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
     weight = fit.used[sound] * scale**2 / variance
-    return refine(psf, x, y, dx, dy, stamps.signal / scale, weight, stamps.phase, terms)
+    return refine(psf, x, y, left, top, stamps.signal / scale, weight, stamps.phase, terms)

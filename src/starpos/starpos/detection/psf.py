@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starpos.core.psf import evaluated, terms
+
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
 # Limits of the squared widths at a place of the field over the mean ones.
@@ -37,45 +39,22 @@ class LocalPsf:
 
     def within(self, dx: np.ndarray, dy: np.ndarray, widths: float) -> np.ndarray:
         """Whether pixels at the offsets dx, dy px from the stars' centres lie within so many widths of them."""
-        u, v = self._scaled(dx, dy)
+        axes = self.axes.astype(np.float32)[..., None, None]
+        u, v = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy, axes[:, 1, 0] * dx + axes[:, 1, 1] * dy
         return u * u + v * v < widths**2
 
-    def evaluate(self, dx: np.ndarray, dy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The PSF at the offsets dx, dy px and its derivatives by the star's x and y: three arrays (N, S, S)."""
-        u, v = self._scaled(dx, dy)
-        place, u, v = u.shape, u.reshape(len(u), -1), v.reshape(len(v), -1)
-        _, i, j = self.series.shape
-        fu, fv = _hermites(u, i), _hermites(v, j)
-        gauss = self._gauss(u, v)
-        # -d/du of h_i exp(-u^2 / 2) is sqrt(i + 1) h_i+1 exp(-u^2 / 2)
-        series = self.series.astype(np.float32)
-        by_u, by_v = (np.sqrt(np.arange(1, n + 1, dtype=np.float32)) for n in (i, j))
-        across = series @ fv[:, :-1]
-        value = np.einsum("nip,nip->np", fu[:, :-1], across) * gauss
-        across *= by_u[:, None]
-        du = np.einsum("nip,nip->np", fu[:, 1:], across) * gauss
-        across = (series * by_v) @ fv[:, 1:]
-        dv = np.einsum("nip,nip->np", fu[:, :-1], across) * gauss
-        axes = self.axes.astype(np.float32)[..., None]
-        by_x, by_y = (axes[:, 0, k] * du + axes[:, 1, k] * dv for k in (0, 1))
-        return value.reshape(place), by_x.reshape(place), by_y.reshape(place)
+    def evaluate(
+        self, left: np.ndarray, top: np.ndarray, size: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The PSF and its derivatives by the star's x and y at the pixels of N stamps: three arrays (N, size, size).
 
-    def terms(self, dx: np.ndarray, dy: np.ndarray, orders: np.ndarray) -> np.ndarray:
-        """Values (N, T, P) of the single terms h_i(u) h_j(v), (i, j) in `orders` (T, 2), at P = S S pixels."""
-        u, v = (w.reshape(len(w), -1) for w in self._scaled(dx, dy))
-        i, j = np.transpose(orders)
-        terms = _hermites(u, max(1, i.max()))[:, i]
-        terms *= _hermites(v, max(1, j.max()))[:, j]
-        terms *= self._gauss(u, v)[:, None]
-        return terms
+        left, top (N,) px: of each stamp's first column and row from its star's centre.
+        """
+        return evaluated(self.axes, self.series, left, top, size)
 
-    def _scaled(self, dx: np.ndarray, dy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        axes = self.axes.astype(np.float32)[..., None, None]
-        return axes[:, 0, 0] * dx + axes[:, 0, 1] * dy, axes[:, 1, 0] * dx + axes[:, 1, 1] * dy
-
-    def _gauss(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        norm = np.abs(np.linalg.det(self.axes)).astype(np.float32)[:, None] / np.float32(2 * np.pi)
-        return np.exp(-0.5 * (u * u + v * v)) * norm
+    def terms(self, left: np.ndarray, top: np.ndarray, size: int, orders: np.ndarray) -> np.ndarray:
+        """Values (N, T, P) of the single terms h_i(u) h_j(v), (i, j) in `orders` (T, 2), at P = size size pixels."""
+        return terms(self.axes, left, top, size, orders.astype(np.int32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +91,7 @@ class Psf:
             axes = power(np.tensordot(self.monomials(x, y), self.widths, 1), -0.5) @ self.axes
         if len(self.series) > 1:
             series = np.tensordot(self.monomials(x, y), self.series, 1)
-        return LocalPsf(axes, series)
+        return LocalPsf(np.ascontiguousarray(axes), np.ascontiguousarray(series))
 
     def monomials(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Monomials (N, 6) of x, y scaled to -1..1 over the box; all but the first have zero mean over it."""
@@ -144,17 +123,3 @@ def power(widths: np.ndarray, exponent: float) -> np.ndarray:
     values, vectors = np.linalg.eigh(widths)
     values = np.clip(values, NARROW, BROAD) ** exponent
     return (vectors * values[:, None]) @ vectors.transpose(0, 2, 1)
-
-
-def _hermites(u: np.ndarray, order: int) -> np.ndarray:
-    """Hermite polynomials (N, order + 1, P) h_0(u) .. h_order(u) of u (N, P), order >= 1.
-
-    They are the probabilists' ones over sqrt(n!), which keeps their values near 1.
-    """
-    values = np.empty((len(u), order + 1, u.shape[1]), u.dtype)
-    values[:, 0], values[:, 1] = 1, u
-    for n in range(1, order):
-        values[:, n + 1] = (u * values[:, n] - np.float32(n**0.5) * values[:, n - 1]) * np.float32(
-            (n + 1) ** -0.5
-        )
-    return values

@@ -100,8 +100,8 @@ def refine(
     psf: Psf,
     x: np.ndarray,
     y: np.ndarray,
-    dx: np.ndarray,
-    dy: np.ndarray,
+    left: np.ndarray,
+    top: np.ndarray,
     brightness: np.ndarray,
     weight: np.ndarray,
     phase: np.ndarray,
@@ -110,13 +110,13 @@ def refine(
     """The Psf whose series fits N stars best, by weighted linear least squares with free positions and gains.
 
     x, y        (N,) px: the stars' places
-    dx, dy      (N, S, S) px, or shapes that broadcast to it: offsets of the pixels from their stars' centres
+    left, top   (N,) px: of each stamp's first column and row from its star's centre
     brightness  (N, S, S): the pixels over their stars' fluxes and gains
     weight      (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
     phase       (N, S, S): the pixels' numbers in the mosaic
     terms       the terms that are tried; they are taken if they are worth their price
     """
-    normal, right = _marginal(psf.at(x, y), dx, dy, brightness, weight, phase, terms.orders)
+    normal, right = _marginal(psf.at(x, y), left, top, brightness, weight, phase, terms.orders)
     count, places = terms.candidates.shape[1:]
     field = psf.monomials(x, y)[:, :places]
     normal = np.einsum("nab,nk,nl->akbl", normal, field, field, optimize=True).reshape(count * places, -1)
@@ -139,20 +139,20 @@ def refine(
 
 def _marginal(
     local: LocalPsf,
-    dx: np.ndarray,
-    dy: np.ndarray,
+    left: np.ndarray,
+    top: np.ndarray,
     brightness: np.ndarray,
     weight: np.ndarray,
     phase: np.ndarray,
     orders: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations (N, T, T) and (N, T) of each star for the terms, with its position and gains eliminated."""
-    n, count = len(brightness), len(orders)
+    (n, size, _), count = brightness.shape, len(orders)
     weight = weight.reshape(n, 1, -1)
-    value, by_x, by_y = (a.reshape(n, 1, -1) for a in local.evaluate(dx, dy))
-    mean = local.terms(dx, dy, np.zeros((1, 2), int))
+    value, by_x, by_y = (a.reshape(n, 1, -1) for a in local.evaluate(left, top, size))
+    mean = local.terms(left, top, size, np.zeros((1, 2), int))
     gains = value * (phase.reshape(n, 1, -1) == np.arange(phase.max() + 1)[:, None])
-    design = np.concatenate([local.terms(dx, dy, orders), gains, by_x, by_y], axis=1)
+    design = np.concatenate([local.terms(left, top, size, orders), gains, by_x, by_y], axis=1)
     weighted = design * weight
     normal = (weighted @ design.transpose(0, 2, 1)).astype(np.float64)
     left = brightness.reshape(n, 1, -1) - mean

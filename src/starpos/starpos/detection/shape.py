@@ -32,9 +32,7 @@ def moments(
     would be biased away from the edge.
     """
     signal = np.ascontiguousarray(stamps.signal, np.float32)
-    left, top = (
-        np.asarray(whole - stamps.reach - place, float) for whole, place in ((stamps.x, x), (stamps.y, y))
-    )
+    left, top = stamps.corner(x, y)
     return windowed(signal, left, top, np.linalg.inv(window).reshape(-1, 2, 2))
 
 

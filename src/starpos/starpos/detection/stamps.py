@@ -24,7 +24,7 @@ class Stamps:
     noise   (N, S, S) float32, DN rms of the background, including the correlation of neighbouring pixels
     good    (N, S, S) bool: on the frame and not saturated
     full    (N, S, S) bool: saturated
-    phase   (N, S, S) int: number 0..3 in the colour mosaic's 2 x 2 pattern; 0 everywhere without a mosaic
+    phase   (N, S, S) uint8: number 0..3 in the colour mosaic's 2 x 2 pattern; 0 everywhere without a mosaic
     """
 
     x: np.ndarray
@@ -36,6 +36,11 @@ class Stamps:
     phase: np.ndarray
 
     @property
+    def size(self) -> int:
+        """Pixels along a side, S."""
+        return self.signal.shape[1]
+
+    @property
     def reach(self) -> int:
         """Pixels from the centre to the edge, (S - 1) / 2."""
         return self.signal.shape[1] // 2
@@ -43,6 +48,10 @@ class Stamps:
     def take(self, index: np.ndarray | slice) -> "Stamps":
         """The stamps that index selects."""
         return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def corner(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets (N,) px of the first column and row from the points x, y (N,) px."""
+        return self.x - self.reach - x, self.y - self.reach - y
 
     def offsets(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offsets of every pixel from the points x, y (N,) px: float32 (N, 1, S) and (N, S, 1)."""
@@ -63,7 +72,7 @@ def cut(
     pixels = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
     rows, columns = rows[:, :, None], columns[:, None, :]
     level, noise = background.of_pixels(x, y, rows, columns)
-    phase = phase_of(rows, columns) if background.is_mosaic else np.zeros(pixels.shape, np.int8)
+    phase = phase_of(rows, columns) if background.is_mosaic else np.zeros(pixels.shape, np.uint8)
     full = on & (pixels >= saturation)
     return Stamps(x=x, y=y, signal=pixels - level, noise=noise, good=on & ~full, full=full, phase=phase)
 

@@ -1,0 +1,381 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Weighted least-squares fit of a star's place, flux and gains to its stamp, by Gauss-Newton, one star after the other."""
+
+from libc.math cimport NAN, isfinite, log, sqrt
+from libc.stdlib cimport free, malloc
+from libc.string cimport memset
+
+import numpy as np
+
+from starpos.core.algebra cimport factored, solved
+from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
+
+cdef enum:
+    # Parameters: x, y, flux, and a gain for each phase of a mosaic.
+    MOST = 7
+    PHASES = 4
+    # Numbers kept of each pixel.
+    COLUMNS = 9
+
+# Equations whose scaled determinant is smaller have no solution.
+cdef double SINGULAR = log(1e-9)
+# A pixel whose light is below this share of the star's brightest is no outlier.
+cdef double FAINT = 0.15
+
+
+cdef class Rules:
+    """What `fitted` goes by: `detection.fit` explains each.
+
+    gain                             (P,): of each phase, P = 1 or 4
+    colour_spread                    of a star's gains, 1 sigma
+    dn_per_photon, misfit            of the light's noise
+    widths                           within which pixels are fitted
+    outlier                          in sigmas
+    """
+
+    cdef int phases, own, parameters
+    cdef double[PHASES] gain
+    cdef double held, dn_per_photon, misfit2, widths2, outlier2
+
+    def __init__(self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier):
+        cdef int k
+        if len(gain) not in (1, PHASES):
+            raise ValueError(f"{len(gain)} gains: a frame has 1, a colour mosaic {PHASES}")
+        self.phases, self.own = len(gain), len(gain) if len(gain) > 1 else 0
+        self.parameters = 3 + self.own
+        for k in range(self.phases):
+            self.gain[k] = gain[k]
+        self.held, self.dn_per_photon, self.misfit2 = colour_spread**-2, dn_per_photon, misfit * misfit
+        self.widths2, self.outlier2 = widths * widths, outlier * outlier
+
+
+cdef struct Pixels:
+    # Pixels of a stamp, one after the other: places in the stamp, offsets px from the star, the light and the sky's
+    # variance, the PSF and its derivatives times the star's gain, and the weight in the fit.
+    int count
+    int *place
+    double *dx
+    double *dy
+    double *signal
+    double *noise2
+    double *value
+    double *by_x
+    double *by_y
+    double *weight
+    double *residual
+
+
+cdef struct Star:
+    double x
+    double y
+    double flux
+    double[PHASES] gain
+    double[PHASES] colour
+    double[MOST * MOST] covariance
+    double[MOST] right
+    # Of the flux at known place and gains.
+    double information
+    bint solved
+
+
+cdef struct Stamp:
+    # Of one star: its first column and row, size, and pixels; `outlier` is written.
+    double left
+    double top
+    int size
+    const float *signal
+    const float *noise
+    const unsigned char *good
+    const unsigned char *phase
+    unsigned char *outlier
+
+
+cdef int _begin(Pixels *p, int area) except -1:
+    """Take memory for so many pixels, and for whole blocks of them."""
+    cdef int room = blocks(area) * BLOCK
+    cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
+    p.place = <int *>malloc(room * sizeof(int))
+    if columns == NULL or p.place == NULL:
+        free(columns)
+        free(p.place)
+        raise MemoryError
+    p.count = 0
+    p.dx, p.dy, p.signal, p.noise2 = columns, columns + room, columns + 2 * room, columns + 3 * room
+    p.value, p.by_x, p.by_y = columns + 4 * room, columns + 5 * room, columns + 6 * room
+    p.weight, p.residual = columns + 7 * room, columns + 8 * room
+    return 0
+
+
+cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
+    """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
+    cdef int row, column, place, n = 0
+    cdef double dx, dy, u, v
+    cdef bint inside
+    for row in range(s.size):
+        dy = s.top + row - star.y
+        for column in range(s.size):
+            dx = s.left + column - star.x
+            u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
+            inside = u * u + v * v < rules.widths2
+            if not (inside or all_pixels):
+                continue
+            place = row * s.size + column
+            p.place[n], p.dx[n], p.dy[n], p.signal[n] = place, dx, dy, s.signal[place]
+            p.noise2[n] = <double>s.noise[place] * s.noise[place]
+            if not (inside and s.good[place]):
+                s.outlier[place] = False
+            p.weight[n] = 1.0 if inside and s.good[place] and not s.outlier[place] else 0.0
+            n += 1
+    p.count = n
+    evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
+
+
+cdef double _first_flux(const Stamp *s, const Star *star, const Pixels *p) noexcept nogil:
+    """The flux that explains the light at the first place, weighted by the sky's noise."""
+    cdef double above = 0.0, below = 0.0, unit
+    cdef int k
+    for k in range(p.count):
+        if p.weight[k] > 0:
+            unit = p.value[k] * star.gain[s.phase[p.place[k]]]
+            above += unit * p.signal[k] / p.noise2[k]
+            below += unit * unit / p.noise2[k]
+    return above / below if below > 0 and isfinite(above) else 0.0
+
+
+cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint mark) noexcept nogil:
+    """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
+    cdef double light, most = 0.0, variance
+    cdef int k, place
+    if mark:
+        memset(s.outlier, 0, s.size * s.size)
+        for k in range(p.count):
+            most = max(most, p.value[k] * star.gain[s.phase[p.place[k]]])
+    for k in range(p.count):
+        place = p.place[k]
+        light = star.flux * p.value[k] * star.gain[s.phase[place]]
+        p.residual[k] = p.signal[k] - light
+        light = max(light, 0.0)
+        variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
+        p.weight[k] /= variance
+        if mark:
+            s.outlier[place] = (
+                p.residual[k] > 0 and p.residual[k] * p.residual[k] > rules.outlier2 * variance
+                and p.residual[k] > FAINT * star.flux * most
+            )
+
+
+cdef inline void _slopes(const Stamp *s, const Star *star, Rules rules, const Pixels *p, int k, double *slope) noexcept nogil:
+    """Derivatives (4,) of a pixel by the star's x, y, flux, and by the gain of the pixel's own phase."""
+    cdef int phase = s.phase[p.place[k]]
+    slope[0], slope[1] = star.flux * p.by_x[k] * star.gain[phase], star.flux * p.by_y[k] * star.gain[phase]
+    slope[2], slope[3] = p.value[k] * star.gain[phase], star.flux * p.value[k] * rules.gain[phase]
+
+
+cdef void _sum_up(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
+    """Set the normal equations, normal (K, K) and star.right (K,); a star's own gains are held near the frame's."""
+    cdef double[4] slope
+    cdef double[MOST * PHASES] of_phase
+    cdef double weighted
+    cdef int k, a, b, phase, n = rules.parameters, most = 4 if rules.own else 3
+    # of each phase: the sums of products of four slopes, lower half; a pixel knows the gain of its phase alone
+    cdef double[PHASES][14] sums
+    memset(&sums[0][0], 0, sizeof(sums))
+    for k in range(p.count):
+        if p.weight[k] == 0:
+            continue
+        _slopes(s, star, rules, p, k, slope)
+        phase = s.phase[p.place[k]]
+        for a in range(most):
+            weighted = slope[a] * p.weight[k]
+            for b in range(a + 1):
+                sums[phase][a * (a + 1) // 2 + b] += weighted * slope[b]
+            sums[phase][10 + a] += weighted * p.residual[k]
+    memset(normal, 0, n * n * sizeof(double))
+    memset(star.right, 0, sizeof(star.right))
+    for phase in range(rules.phases):
+        for a in range(3):
+            for b in range(a + 1):
+                normal[a * n + b] += sums[phase][a * (a + 1) // 2 + b]
+            star.right[a] += sums[phase][10 + a]
+    star.information = normal[2 * n + 2]
+    for phase in range(rules.own):
+        for b in range(3):
+            normal[(3 + phase) * n + b] = sums[phase][6 + b]
+        normal[(3 + phase) * n + 3 + phase] = sums[phase][9] + rules.held
+        star.right[3 + phase] = sums[phase][13] - star.colour[phase] * rules.held
+
+
+cdef bint _invert(double *normal, int n, double *out) noexcept nogil:
+    """Set `out` (n, n) to the inverse of the lower half of normal (n, n), NaN if singular; whether it is not.
+
+    It is scaled first, because fluxes are a million times larger than pixels.
+    """
+    cdef double[MOST] scale
+    cdef double[MOST] column
+    cdef double volume
+    cdef int a, b
+    for a in range(n):
+        scale[a] = sqrt(normal[a * n + a])
+    for a in range(n):
+        for b in range(a + 1):
+            normal[a * n + b] /= scale[a] * scale[b]
+    volume = factored(normal, n)
+    if not volume > SINGULAR:
+        for a in range(n * n):
+            out[a] = NAN
+        return False
+    for a in range(n):
+        for b in range(n):
+            column[b] = 1.0 if a == b else 0.0
+        solved(normal, column, n)
+        for b in range(n):
+            out[b * n + a] = column[b] / (scale[a] * scale[b])
+    return True
+
+
+cdef void _step(Star *star, Rules rules) noexcept nogil:
+    """Move the star to where its equations say, at most 1 px."""
+    cdef double[MOST] step
+    cdef int a, b, n = rules.parameters
+    for a in range(n):
+        step[a] = 0.0
+        for b in range(n):
+            step[a] += star.covariance[a * n + b] * star.right[b]
+    star.x += max(-1.0, min(step[0], 1.0))
+    star.y += max(-1.0, min(step[1], 1.0))
+    star.flux += step[2]
+    for a in range(rules.own):
+        star.colour[a] = max(-0.9, min(star.colour[a] + step[3 + a], 3.0))
+        star.gain[a] = rules.gain[a] * (1 + star.colour[a])
+
+
+cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels *p, Star *star) noexcept nogil:
+    """Fit a star that has a first place; the pixels are those of the last round, all of the stamp."""
+    cdef double[MOST * MOST] normal
+    cdef int round_, k
+    for k in range(rules.phases):
+        star.colour[k], star.gain[k] = 0.0, rules.gain[k]
+    memset(s.outlier, 0, s.size * s.size)
+    for round_ in range(rounds):
+        _gather(s, star, psf, rules, round_ == rounds - 1, p)
+        if round_ == 0:
+            star.flux = _first_flux(s, star, p)
+        # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
+        _weigh(s, star, rules, p, 1 <= round_ < rounds - 1)
+        _sum_up(s, star, rules, p, normal)
+        star.solved = _invert(normal, rules.parameters, star.covariance)
+        if not star.solved:
+            star.x = star.y = star.flux = NAN
+            return
+        if round_ < rounds - 1:
+            _step(star, rules)
+
+
+cdef double _leverage(const Stamp *s, const Star *star, Rules rules, const Pixels *p, int k) noexcept nogil:
+    """How far (0 to 1) a fitted pixel decides what the model has there."""
+    cdef double[4] slope
+    cdef double total = 0.0
+    cdef int a, b, n = rules.parameters, most = 4 if rules.own else 3, gain = 3 + s.phase[p.place[k]]
+    _slopes(s, star, rules, p, k, slope)
+    for a in range(most):
+        for b in range(most):
+            total += slope[a] * slope[b] * star.covariance[(a if a < 3 else gain) * n + (b if b < 3 else gain)]
+    return total * p.weight[k]
+
+
+def fitted(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first,
+    const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds,
+):
+    """Fit N stars to their stamps (N, S, S), as `detection.fit.fit_stars` explains.
+
+    corner  (N, 2) px: x and y of each stamp's first pixel
+    first   (N, 2) px: first places of the stars
+    axes    (N, 2, 2) or (1, 2, 2), and
+    series  (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
+
+    Returns the columns of `detection.fit.Fit`, in their order. A star whose equations are singular has NaN.
+    """
+    cdef int n = signal.shape[0], size = signal.shape[1], area = size * size, most, k, a, b
+    cdef Pixels p
+    cdef Local psf
+    cdef Star star
+    cdef Stamp s
+    _check(signal, noise, good, phase, corner, first, rules, rounds)
+    sound(axes, series, n)
+    stars_, covariances, gains_ = np.empty((n, 5)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
+    images_, marks_ = np.zeros((3, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
+    cdef double[:, ::1] column = stars_
+    cdef double[:, :, ::1] covariance = covariances
+    cdef double[:, ::1] gains = gains_
+    cdef float[:, :, ::1] image = images_.reshape(3, n, area)
+    cdef unsigned char[:, :, ::1] mark = marks_.reshape(2, n, area)
+    _begin(&p, area)
+    s.size, most = size, rules.parameters
+    with nogil:
+        for k in range(n):
+            s.left, s.top = corner[k, 0], corner[k, 1]
+            s.signal, s.noise, s.good = &signal[k, 0, 0], &noise[k, 0, 0], &good[k, 0, 0]
+            s.phase, s.outlier = &phase[k, 0, 0], &mark[1, k, 0]
+            star.x, star.y = first[k, 0], first[k, 1]
+            local_of(axes, series, k, &psf)
+            _fit(&s, &psf, rules, rounds, &p, &star)
+            column[k, 0], column[k, 1], column[k, 2] = star.x, star.y, star.flux
+            column[k, 3] = 1 / sqrt(star.information)
+            for a in range(2):
+                for b in range(2):
+                    covariance[k, a, b] = star.covariance[a * most + b]
+            for a in range(rules.phases):
+                gains[k, a] = star.gain[a]
+            column[k, 4] = _told(&s, &star, rules, &p, &image[0, k, 0], &image[1, k, 0], &image[2, k, 0], &mark[0, k, 0])
+    free(p.dx)
+    free(p.place)
+    x, y, flux, sigma, chi2 = np.ascontiguousarray(stars_.T)
+    residual, model, leverage = images_
+    used, outlier = marks_.view(bool)
+    return x, y, flux, sigma, covariances, gains_, chi2, residual, model, used, outlier, leverage
+
+
+cdef double _told(
+    const Stamp *s, const Star *star, Rules rules, const Pixels *p, float *residual, float *model, float *leverage,
+    unsigned char *used,
+) noexcept nogil:
+    """Set what is told of each pixel; chi-square per degree of freedom."""
+    cdef double chi2 = 0.0
+    cdef int k, count = 0
+    cdef double u, v
+    if not star.solved:
+        for k in range(s.size * s.size):
+            residual[k] = model[k] = leverage[k] = NAN
+            s.outlier[k] = False
+        return NAN
+    for k in range(p.count):
+        residual[k], model[k], used[k] = <float>p.residual[k], <float>(p.signal[k] - p.residual[k]), p.weight[k] > 0
+        if used[k]:
+            leverage[k] = <float>_leverage(s, star, rules, p, k)
+            chi2 += p.residual[k] * p.residual[k] * p.weight[k]
+            count += 1
+    return chi2 / max(count - 3, 1)
+
+
+cdef int _check(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first, Rules rules, int rounds,
+) except -1:
+    """Raise ValueError unless shapes and phases are what `fitted` reads."""
+    cdef Py_ssize_t n = signal.shape[0], size = signal.shape[1]
+    for name, height, width, depth in (
+        ("signal", n, size, signal.shape[2]),
+        ("noise", noise.shape[0], noise.shape[1], noise.shape[2]),
+        ("good", good.shape[0], good.shape[1], good.shape[2]),
+        ("phase", phase.shape[0], phase.shape[1], phase.shape[2]),
+    ):
+        if (height, width, depth) != (n, size, size):
+            raise ValueError(f"{name} has the shape {(height, width, depth)}; {(n, size, size)} is needed")
+    if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
+        raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
+    if n and size and np.max(phase) >= rules.phases:
+        raise ValueError(f"a pixel of phase {np.max(phase)}: there are {rules.phases}")
+    return 0

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
+
+from libc.math cimport M_PI, exp, fabs
+
+import numpy as np
+
+cimport starpos.core.wide
+
+cdef extern from *:
+    """
+    #include <math.h>
+    #define STARPOS_BLOCK 64
+    #define STARPOS_ORDERS 32
+    /* Hermite polynomials over sqrt(k!), k = 0 .. order, of a block's numbers u. */
+    static inline void starpos_hermites(const double *u, int order, double (*out)[STARPOS_BLOCK]) {
+        for (int p = 0; p < STARPOS_BLOCK; p++) {
+            out[0][p] = 1;
+            out[1][p] = u[p];
+        }
+        for (int k = 1; k < order; k++) {
+            const double before = sqrt(k), over = 1 / sqrt(k + 1);
+            for (int p = 0; p < STARPOS_BLOCK; p++)
+                out[k + 1][p] = (u[p] * out[k][p] - before * out[k - 1][p]) * over;
+        }
+    }
+    /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
+    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v,
+                                            double *restrict value, double *restrict by_u, double *restrict by_v) {
+        double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
+        starpos_hermites(u, rows, fu);
+        starpos_hermites(v, columns, fv);
+        for (int p = 0; p < STARPOS_BLOCK; p++)
+            value[p] = by_u[p] = by_v[p] = 0;
+        for (int i = 0; i < rows; i++)
+            for (int j = 0; j < columns; j++) {
+                const double c = series[i * columns + j], cu = c * sqrt(i + 1), cv = c * sqrt(j + 1);
+                if (c == 0)
+                    continue;
+                for (int p = 0; p < STARPOS_BLOCK; p++) {
+                    value[p] += c * fu[i][p] * fv[j][p];
+                    by_u[p] += cu * fu[i + 1][p] * fv[j][p];
+                    by_v[p] += cv * fu[i][p] * fv[j + 1][p];
+                }
+            }
+    }
+    /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian. */
+    STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
+                                           const double *gauss, int n, Py_ssize_t stride, float *out) {
+        double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
+        starpos_hermites(u, highest, fu);
+        starpos_hermites(v, highest, fv);
+        for (int t = 0; t < count; t++) {
+            const double *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
+            for (int p = 0; p < n; p++)
+                out[t * stride + p] = (float)(a[p] * b[p] * gauss[p]);
+        }
+    }
+    """
+    void series_at "starpos_series"(
+        const double *series, int rows, int columns, const double *u, const double *v, double *value, double *by_u,
+        double *by_v,
+    ) noexcept nogil
+    void terms_at "starpos_terms"(
+        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, int n,
+        Py_ssize_t stride, float *out,
+    ) noexcept nogil
+
+
+cdef int sound(const double[:, :, ::1] axes, const double[:, :, ::1] series, int n) except -1:
+    """Raise ValueError unless axes (n or 1, 2, 2) and series (n or 1, I, J) have the shapes that `evaluate` needs."""
+    if axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2 or series.shape[0] not in (1, n):
+        raise ValueError(f"{axes.shape[0]} axes and {series.shape[0]} series for {n} stars: each must be one or as many")
+    if not (0 < series.shape[1] <= ORDERS and 0 < series.shape[2] <= ORDERS):
+        raise ValueError(f"{series.shape[1]} x {series.shape[2]} terms of a PSF: at most {ORDERS} along an axis")
+    return 0
+
+
+cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series, int k, Local *out) noexcept nogil:
+    """Set `out` to the PSF of star k; a single PSF serves any star."""
+    cdef int a = k if axes.shape[0] > 1 else 0, s = k if series.shape[0] > 1 else 0
+    out.axes[0], out.axes[1], out.axes[2], out.axes[3] = axes[a, 0, 0], axes[a, 0, 1], axes[a, 1, 0], axes[a, 1, 1]
+    out.peak = fabs(out.axes[0] * out.axes[3] - out.axes[1] * out.axes[2]) / (2 * M_PI)
+    out.series, out.rows, out.columns = &series[s, 0, 0], <int>series.shape[1], <int>series.shape[2]
+
+
+cdef void _scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
+    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is 0."""
+    cdef int p
+    for p in range(n):
+        u[p], v[p] = psf.axes[0] * dx[p] + psf.axes[1] * dy[p], psf.axes[2] * dx[p] + psf.axes[3] * dy[p]
+        gauss[p] = psf.peak * exp(-0.5 * (u[p] * u[p] + v[p] * v[p]))
+    for p in range(n, BLOCK):
+        u[p] = v[p] = gauss[p] = 0.0
+
+
+cdef void evaluate(
+    const Local *psf, const double *dx, const double *dy, int n, double *value, double *by_x, double *by_y
+) noexcept nogil:
+    """The PSF at n offsets (px) from a star, and its derivatives by the star's x and y; room for whole blocks."""
+    cdef double[BLOCK] u
+    cdef double[BLOCK] v
+    cdef double[BLOCK] gauss
+    cdef double[BLOCK] by_u
+    cdef double[BLOCK] by_v
+    cdef int block, first, p
+    for block in range(blocks(n)):
+        first = block * BLOCK
+        _scaled(psf, dx + first, dy + first, min(BLOCK, n - first), u, v, gauss)
+        series_at(psf.series, psf.rows, psf.columns, u, v, value + first, by_u, by_v)
+        for p in range(BLOCK):
+            value[first + p] *= gauss[p]
+            by_x[first + p] = (psf.axes[0] * by_u[p] + psf.axes[2] * by_v[p]) * gauss[p]
+            by_y[first + p] = (psf.axes[1] * by_u[p] + psf.axes[3] * by_v[p]) * gauss[p]
+
+
+def evaluated(
+    const double[:, :, ::1] axes, const double[:, :, ::1] series, const double[::1] left, const double[::1] top, int size
+):
+    """The PSFs of N stars at the pixels of their stamps, and the derivatives by the stars' x and y: (N, size, size) each.
+
+    axes       (N, 2, 2) or (1, 2, 2), and
+    series     (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
+    left, top  (N,) px: of the first column and the first row from each star's centre
+    """
+    cdef int n = left.shape[0], area = size * size, k, block, first, p, place
+    cdef double[BLOCK] dx
+    cdef double[BLOCK] dy
+    cdef double[3][BLOCK] found
+    cdef Local psf
+    sound(axes, series, n)
+    if top.shape[0] != n or size < 1:
+        raise ValueError(f"{n} stars, {top.shape[0]} rows, stamps of {size} px: as many rows as stars, and at least a pixel")
+    out = np.empty((3, n, size, size), np.float32)
+    cdef float[:, :, ::1] image = out.reshape(3, n, area)
+    with nogil:
+        for k in range(n):
+            local_of(axes, series, k, &psf)
+            for block in range(blocks(area)):
+                first = block * BLOCK
+                for p in range(min(BLOCK, area - first)):
+                    dx[p], dy[p] = left[k] + (first + p) % size, top[k] + (first + p) // size
+                evaluate(&psf, dx, dy, min(BLOCK, area - first), found[0], found[1], found[2])
+                for place in range(3):
+                    for p in range(min(BLOCK, area - first)):
+                        image[place, k, first + p] = <float>found[place][p]
+    return out[0], out[1], out[2]
+
+
+def terms(const double[:, :, ::1] axes, const double[::1] left, const double[::1] top, int size, const int[:, ::1] orders):
+    """Single terms h_i(u) h_j(v) of the series times the Gaussian, (N, T, size size), at the pixels of N stamps.
+
+    orders (T, 2): i, j of each; the others as in `evaluated`.
+    """
+    cdef int n = left.shape[0], area = size * size, count = orders.shape[0], k, block, first, p, highest = 1
+    cdef double[BLOCK] dx
+    cdef double[BLOCK] dy
+    cdef double[BLOCK] u
+    cdef double[BLOCK] v
+    cdef double[BLOCK] gauss
+    cdef double[:, :, ::1] constant = np.ones((1, 1, 1))
+    cdef Local psf
+    sound(axes, constant, n)
+    if top.shape[0] != n or orders.shape[1] != 2 or size < 1:
+        raise ValueError("as many rows as stars, two orders of each term, and stamps of at least a pixel are needed")
+    for k in range(count):
+        highest = max(highest, max(orders[k, 0], orders[k, 1]))
+        if not (0 <= orders[k, 0] <= ORDERS and 0 <= orders[k, 1] <= ORDERS):
+            raise ValueError(f"a term of orders {orders[k, 0]} and {orders[k, 1]}: they must be 0 to {ORDERS}")
+    out = np.empty((n, count, area), np.float32)
+    cdef float[:, :, ::1] term = out
+    with nogil:
+        for k in range(n):
+            local_of(axes, constant, k, &psf)
+            for block in range(blocks(area)):
+                first = block * BLOCK
+                for p in range(min(BLOCK, area - first)):
+                    dx[p], dy[p] = left[k] + (first + p) % size, top[k] + (first + p) // size
+                _scaled(&psf, dx, dy, min(BLOCK, area - first), u, v, gauss)
+                if count:
+                    terms_at(&orders[0, 0], count, highest, u, v, gauss, min(BLOCK, area - first), area, &term[k, 0, first])
+    return out
