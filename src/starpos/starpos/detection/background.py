@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
+from starpos.core.background import between, sampled
 from starpos.normal import SIGMA_PER_MAD
 
 # Neighbouring cells that differ by more than so many times their error lie at an edge, a roof's for example.
@@ -45,11 +46,7 @@ class Background:
     def at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
         place = self.cell(x, y)
-        level, noise = (
-            np.stack([ndimage.map_coordinates(m, place, order=1, mode="nearest") for m in mesh], -1)
-            for mesh in (self.level, self.noise)
-        )
-        return level, noise
+        return between(self.level, *place), between(self.noise, *place)
 
     def cell(self, x: np.ndarray | int, y: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
         """Row and column in the meshes, with fractions, of the pixels x, y."""
@@ -93,16 +90,14 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     mosaic says whether the plane is a colour mosaic; None: it is one if the four phases see different skies.
     """
     rows, columns = (_sample(n, cell_px) for n in plane.shape)
-    sample = plane[rows.ravel()][:, columns.ravel()].astype(np.float32)
-    (ny, sy), (nx, sx) = rows.shape, columns.shape
-    # (cell row, block row, 2, cell column, block column, 2) -> (phase, cell row, cell column, samples)
-    sample = sample.reshape(ny, sy // 2, 2, nx, sx // 2, 2).transpose(2, 5, 0, 3, 1, 4).reshape(4, ny, nx, -1)
-    level, noise = _beside_lamps(sample, *_clipped(sample))
+    level, noise, highest, count = sampled(plane, rows, columns, SIGMA_PER_MAD)
+    samples = rows.shape[1] * columns.shape[1] // 4
+    level, noise = _beside_lamps(np.where(highest == highest.max(), count, 0).mean(0) / samples, level, noise)
     if mosaic is None:
-        mosaic = _phases_differ(level, noise, sample.shape[-1])
+        mosaic = _phases_differ(level, noise, samples)
     if not mosaic:
         level, noise = level.mean(0, keepdims=True), np.sqrt((noise**2).mean(0, keepdims=True))
-    error = np.maximum(noise, QUANTISATION) * sample.shape[-1] ** -0.5
+    error = np.maximum(noise, QUANTISATION) * samples**-0.5
     level, noise = (
         np.stack([_smooth(m, e) for m, e in zip(mesh, error, strict=True)]) for mesh in (level, noise)
     )
@@ -111,12 +106,12 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
 
 
-def _beside_lamps(sample: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _beside_lamps(white: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and noise (P, rows, columns) with those of the nearest dark cell in cells that are partly white.
 
-    sample (P, rows, columns, samples). Else the sky beside a white wall would be too bright, and its stars lost.
+    white (rows, columns): the share of pixels with the frame's largest value. Else the sky beside a white wall would be
+    too bright, and its stars lost.
     """
-    white = (sample == sample.max()).mean((0, 3))
     if white.mean() < WHITE or not (white < WHITE).any():
         return level, noise
     row, column = ndimage.distance_transform_edt(white >= WHITE, return_distances=False, return_indices=True)
@@ -151,31 +146,7 @@ def _sample(length: int, cell_px: int) -> np.ndarray:
     starts = np.round(np.linspace(0, length - size, cells)).astype(int) // 2 * 2
     pairs = np.arange(0, size, 8 if size >= 32 else 2)
     inside = (pairs[:, None] + np.arange(2)).ravel()
-    return starts[:, None] + inside
-
-
-def _clipped(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and rms over the last axis without stars and defects: only what lies within 3.5 sigma of the median.
-
-    If more than half of the pixels are equal (a sky cut off at 0), sigma comes from the 75 and 90 % quantiles.
-    """
-    count = sample.shape[-1]
-    median = np.partition(sample, count // 2, axis=-1)[..., count // 2, None]
-    deviation = sample - median
-    spread = SIGMA_PER_MAD * np.partition(np.abs(deviation), count // 2, axis=-1)[..., count // 2, None]
-    if np.any(spread == 0):
-        upper, high = np.quantile(sample, (0.75, 0.9), axis=-1)[..., None]
-        spread = np.where(spread > 0, spread, (high - upper) / 0.607)
-    limit = np.maximum(3.5 * spread, 1.0)
-    inside = np.abs(deviation) <= limit
-    count = inside.sum(-1, keepdims=True)
-    deviation *= inside
-    mean = deviation.sum(-1, keepdims=True) / count
-    square = np.einsum("...i,...i->...", deviation, deviation)[..., None] / count
-    variance = np.maximum(square - mean**2, 0) * (count / np.maximum(count - 1, 1))
-    # clipping at 3.5 sigma leaves 0.9969 of a Gaussian's rms
-    rms = np.sqrt(variance) / 0.9969
-    return (median + mean)[..., 0], rms[..., 0]
+    return (starts[:, None] + inside).astype(np.int32)
 
 
 def _phases_differ(level: np.ndarray, noise: np.ndarray, samples: int) -> bool:

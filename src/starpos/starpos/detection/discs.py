@@ -43,14 +43,27 @@ def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dic
         return _columns([], fwhm_px, 0.0)
     top = float(height.max())
     limit = level + FLAT * (top - level)
-    mask = np.zeros(sample.shape, np.uint8)
-    mask[row, column] = height >= limit
-    _, _, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    boxes = boxes[1:][np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")]
+    bright = height >= limit
+    boxes = _groups(row[bright], column[bright])
     most = WIDEST * min(plane.shape)
     fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
     discs = [_disc(plane, box[:4] * step, 2 * step, limit) for box in boxes[fits][:MOST]]
     return _columns([d for d in discs if d is not None and least < d[2] < most], fwhm_px, top - level)
+
+
+def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Boxes (left, top, width, height) of the groups of places row, column (N,) side by side, the largest group first.
+
+    Of rows and columns without any place only those beside others are looked at: most frames have a few places.
+    """
+    kept = [np.unique(np.stack([place, place + 1])) for place in (row, column)]
+    mask = np.zeros([len(places) for places in kept], np.uint8)
+    mask[np.searchsorted(kept[0], row), np.searchsorted(kept[1], column)] = 1
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    boxes = boxes[1:][np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")]
+    boxes[:, cv2.CC_STAT_LEFT] = kept[1][boxes[:, cv2.CC_STAT_LEFT]]
+    boxes[:, cv2.CC_STAT_TOP] = kept[0][boxes[:, cv2.CC_STAT_TOP]]
+    return boxes
 
 
 def _disc(plane: np.ndarray, box: np.ndarray, around: int, limit: float) -> tuple[float, float, float] | None:

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The sky in the cells of a mesh, by clipped means of a sample of the 8- or 16-bit pixels, and between the cells."""
+
+from libc.math cimport sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+cimport starpos.core.wide
+
+cdef extern from *:
+    """
+    /* How many of n numbers are at most `limit`. */
+    STARPOS_WIDE static int starpos_count(const unsigned short *v, int n, unsigned short limit) {
+        int count = 0;
+        for (int first = 0; first < n; first += 4096) {
+            const int last = n < first + 4096 ? n : first + 4096;
+            unsigned short some = 0;
+            for (int i = first; i < last; i++)
+                some += v[i] <= limit;
+            count += some;
+        }
+        return count;
+    }
+    /* How far n numbers are from the middle; of those within a limit their number, the sum of the differences and of squares. */
+    STARPOS_WIDE static void starpos_away(const unsigned short *v, int n, unsigned short middle, unsigned short *away) {
+        for (int i = 0; i < n; i++)
+            away[i] = v[i] > middle ? v[i] - middle : middle - v[i];
+    }
+    STARPOS_WIDE static void starpos_sums(const unsigned short *v, int n, int middle, int limit, long long *out) {
+        long long sum = 0, square = 0;
+        int count = 0;
+        for (int i = 0; i < n; i++) {
+            const int off = v[i] - middle, kept = off <= limit && -off <= limit ? off : 0;
+            count += off <= limit && -off <= limit;
+            sum += kept;
+            square += (long long)kept * kept;
+        }
+        out[0] = count;
+        out[1] = sum;
+        out[2] = square;
+    }
+    """
+    int count_of "starpos_count"(const unsigned short *v, int n, unsigned short limit) noexcept nogil
+    void away_from "starpos_away"(const unsigned short *v, int n, unsigned short middle, unsigned short *away) noexcept nogil
+    void sums_of "starpos_sums"(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil
+
+ctypedef fused pixel_t:
+    unsigned char
+    unsigned short
+
+# Sigma over the distance of the 75 and 90 % quantiles of a Gaussian.
+cdef double PER_TAIL = 1 / 0.607
+# What lies within so many sigma is the sky; it has this share of a Gaussian's rms.
+cdef double CLIP = 3.5, CLIPPED = 0.9969
+
+
+cdef unsigned short _ranked(const unsigned short *v, int n, int k) noexcept nogil:
+    """The value (n,) that would stand at k if they were sorted: halving the range takes few looks at whole numbers."""
+    cdef int low = 65535, high = 0, middle, i
+    for i in range(n):
+        low, high = min(low, <int>v[i]), max(high, <int>v[i])
+    while low < high:
+        middle = (low + high) // 2
+        if count_of(v, n, <unsigned short>middle) > k:
+            high = middle
+        else:
+            low = middle + 1
+    return <unsigned short>low
+
+
+cdef double _quantile(const unsigned short *v, int n, double share) noexcept nogil:
+    """A quantile of values (n,), linear between them."""
+    cdef double place = share * (n - 1)
+    cdef int k = <int>place
+    cdef double low = _ranked(v, n, k), high = _ranked(v, n, min(k + 1, n - 1))
+    return low + (place - k) * (high - low)
+
+
+cdef void _clipped(
+    const unsigned short *v, int n, double per_mad, unsigned short *away, double *level, double *noise
+) noexcept nogil:
+    """Mean and rms of values (n,) without stars and defects; away (n,): to work in.
+
+    If more than half of them are equal (a sky cut off at 0), sigma comes from the quantiles above.
+    """
+    cdef unsigned short middle = _ranked(v, n, n // 2)
+    cdef long long[3] sums
+    cdef double spread, mean
+    away_from(v, n, middle, away)
+    spread = per_mad * _ranked(away, n, n // 2)
+    if spread == 0:
+        spread = PER_TAIL * (_quantile(v, n, 0.9) - _quantile(v, n, 0.75))
+    sums_of(v, n, middle, <int>max(CLIP * spread, 1.0), sums)
+    mean = sums[1] / <double>sums[0]
+    level[0] = middle + mean
+    noise[0] = sqrt(max(sums[2] / <double>sums[0] - mean * mean, 0.0) * sums[0] / max(sums[0] - 1, 1)) / CLIPPED
+
+
+def sampled(const pixel_t[:, ::1] plane, const int[:, ::1] rows, const int[:, ::1] columns, double per_mad):
+    """The sky's level and noise in cells of a plane (h, w), for each phase of its 2 x 2 pattern, from a sample.
+
+    rows     (cells down, rows of each), and
+    columns  (cells across, columns of each): pairs of neighbours, the first even
+    per_mad  sigma over the median of the absolute differences
+
+    Returns level and noise, and the sample's highest value and how many pixels have it, (4, cells down, cells across).
+    """
+    cdef int down = rows.shape[0], across = columns.shape[0], tall = rows.shape[1], wide = columns.shape[1]
+    cdef int n = tall // 2 * (wide // 2), i, j, phase, k, y, x, top
+    cdef const pixel_t *row
+    if not n or tall % 2 or wide % 2 or np.min(rows) < 0 or np.min(columns) < 0:
+        raise ValueError("a cell's rows and columns must be pairs")
+    if np.max(rows) >= plane.shape[0] or np.max(columns) >= plane.shape[1]:
+        raise ValueError(f"a cell lies beyond the {plane.shape[1]} x {plane.shape[0]} px of the frame")
+    found, tops = np.empty((2, 4, down, across)), np.empty((2, 4, down, across), np.int32)
+    cdef double[:, :, :, ::1] sky = found
+    cdef int[:, :, :, ::1] highest = tops
+    cdef unsigned short *value = <unsigned short *>malloc(2 * n * sizeof(unsigned short))
+    if value == NULL:
+        raise MemoryError
+    with nogil:
+        for i in range(down):
+            for j in range(across):
+                for phase in range(4):
+                    k = top = 0
+                    for y in range(phase // 2, tall, 2):
+                        row = &plane[rows[i, y], 0]
+                        for x in range(phase % 2, wide, 2):
+                            value[k] = row[columns[j, x]]
+                            top = max(top, <int>value[k])
+                            k += 1
+                    _clipped(value, n, per_mad, value + n, &sky[0, phase, i, j], &sky[1, phase, i, j])
+                    highest[0, phase, i, j] = top
+                    highest[1, phase, i, j] = n - count_of(value, n, <unsigned short>(top - 1)) if top else n
+    free(value)
+    return found[0], found[1], tops[0], tops[1]
+
+
+def between(const double[:, :, ::1] mesh, const double[::1] row, const double[::1] column):
+    """Values (N, P) of P meshes (P, rows, columns) at the places row, column (N,), bilinear; beyond the edges as on them."""
+    cdef Py_ssize_t n = row.shape[0], height = mesh.shape[1], width = mesh.shape[2], k, p, i, j
+    cdef double y, x
+    if column.shape[0] != n or height < 2 or width < 2:
+        raise ValueError(f"{n} rows and {column.shape[0]} columns in meshes of {height} x {width}: as many, in 2 x 2 or more")
+    out = np.empty((n, mesh.shape[0]))
+    cdef double[:, ::1] value = out
+    with nogil:
+        for k in range(n):
+            # what is not a number is 0
+            y, x = row[k] if row[k] > 0 else 0.0, column[k] if column[k] > 0 else 0.0
+            y, x = min(y, height - 1.0), min(x, width - 1.0)
+            i, j = min(<Py_ssize_t>y, height - 2), min(<Py_ssize_t>x, width - 2)
+            y, x = y - i, x - j
+            for p in range(mesh.shape[0]):
+                value[k, p] = (
+                    (1 - y) * ((1 - x) * mesh[p, i, j] + x * mesh[p, i, j + 1])
+                    + y * ((1 - x) * mesh[p, i + 1, j] + x * mesh[p, i + 1, j + 1])
+                )
+    return out
