@@ -12,6 +12,8 @@ CORE = [
         f"starpos.core.{Path(source).stem}",
         [source],
         depends=[*SHARED, "setup.py"],
+        # else the loader takes the oldest exp, which is slow
+        libraries=["m"],
         extra_compile_args=["-O3", "-fno-math-errno"],
     )
     for source in sorted(glob("starpos/core/*.pyx"))

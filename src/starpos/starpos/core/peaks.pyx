@@ -11,17 +11,20 @@ cimport starpos.core.wide
 
 cdef extern from *:
     """
-    /* Add to a row three pairs of others, each times its weight. */
+    /* Set a row to another times its weight and three pairs of others, each times its weight, or add three more pairs. */
+    STARPOS_WIDE static void starpos_begin(float *restrict out, const float *restrict w, Py_ssize_t n, const float *restrict m,
+                            const float *restrict a, const float *restrict b, const float *restrict c,
+                            const float *restrict d, const float *restrict e, const float *restrict f) {
+        const float s = w[0], u = w[1], v = w[2], t = w[3];
+        for (Py_ssize_t i = 0; i < n; i++)
+            out[i] = s * m[i] + (u * (a[i] + b[i]) + v * (c[i] + d[i]) + t * (e[i] + f[i]));
+    }
     STARPOS_WIDE static void starpos_add(float *restrict out, const float *restrict w, Py_ssize_t n,
                             const float *restrict a, const float *restrict b, const float *restrict c,
                             const float *restrict d, const float *restrict e, const float *restrict f) {
         const float u = w[0], v = w[1], t = w[2];
         for (Py_ssize_t i = 0; i < n; i++)
             out[i] += u * (a[i] + b[i]) + v * (c[i] + d[i]) + t * (e[i] + f[i]);
-    }
-    STARPOS_WIDE static void starpos_scale(float *restrict out, const float *restrict in, float w, Py_ssize_t n) {
-        for (Py_ssize_t i = 0; i < n; i++)
-            out[i] = w * in[i];
     }
     /* Whether a pixel of the row is above its limit. */
     STARPOS_WIDE static int starpos_any_above(const float *restrict row, const float *restrict limit, Py_ssize_t n) {
@@ -35,7 +38,10 @@ cdef extern from *:
         float *out, const float *weight, Py_ssize_t n, const float *a, const float *b, const float *c,
         const float *d, const float *e, const float *f,
     ) noexcept nogil
-    void scale "starpos_scale"(float *out, const float *row, float weight, Py_ssize_t n) noexcept nogil
+    void begin "starpos_begin"(
+        float *out, const float *weight, Py_ssize_t n, const float *middle, const float *a, const float *b,
+        const float *c, const float *d, const float *e, const float *f,
+    ) noexcept nogil
     bint any_above "starpos_any_above"(const float *row, const float *limit, Py_ssize_t n) noexcept nogil
 
 ctypedef fused pixel_t:
@@ -81,7 +87,7 @@ cdef int _begin(Rolling *r, Py_ssize_t width, const float[::1] weight) except -1
     """Take memory for smoothing rows."""
     cdef int k
     r.reach = weight.shape[0] - 1
-    r.padded, r.rows, r.loaded = (r.reach + 2) // 3 * 3, 2 * r.reach + 1, 0
+    r.padded, r.rows, r.loaded = max(3, (r.reach + 2) // 3 * 3), 2 * r.reach + 1, 0
     r.raw = <float *>malloc((r.rows * width + width + 2 * r.padded + r.padded + 1) * sizeof(float))
     if r.raw == NULL:
         raise MemoryError
@@ -171,14 +177,13 @@ cdef void _across_rows(const Rolling *r, Py_ssize_t width, Py_ssize_t height, Py
     """Smooth a row with those above and below it."""
     cdef const float *pair[2 * TOGETHER]
     cdef int k, j, near
-    scale(out, r.raw + (row % r.rows) * width, r.weight[0], width)
     for k in range(1, r.padded + 1, 3):
         for j in range(TOGETHER):
             # a weight of 0 takes any row
             near = k + j if k + j <= r.reach else 0
             pair[2 * j] = r.raw + (_mirrored(row - near, height) % r.rows) * width
             pair[2 * j + 1] = r.raw + (_mirrored(row + near, height) % r.rows) * width
-        _add_three(out, &r.weight[k], width, pair)
+        _add_three(out, &r.weight[k], width, r.raw + (row % r.rows) * width if k == 1 else NULL, pair)
 
 
 cdef void _along_row(const Rolling *r, Py_ssize_t width, float *out) noexcept nogil:
@@ -188,15 +193,18 @@ cdef void _along_row(const Rolling *r, Py_ssize_t width, float *out) noexcept no
     cdef int k, j
     for k in range(1, r.padded + 1):
         row[-k], row[width - 1 + k] = row[_mirrored(-k, width)], row[_mirrored(width - 1 + k, width)]
-    scale(out, row, r.weight[0], width)
     for k in range(1, r.padded + 1, 3):
         for j in range(TOGETHER):
             pair[2 * j], pair[2 * j + 1] = row - (k + j), row + (k + j)
-        _add_three(out, &r.weight[k], width, pair)
+        _add_three(out, &r.weight[k], width, row if k == 1 else NULL, pair)
 
 
-cdef inline void _add_three(float *out, const float *w, Py_ssize_t width, const float **pair) noexcept nogil:
-    add(out, w, width, pair[0], pair[1], pair[2], pair[3], pair[4], pair[5])
+cdef inline void _add_three(float *out, const float *w, Py_ssize_t width, const float *middle, const float **pair) noexcept nogil:
+    """Add three pairs of rows, or with the middle one begin with them; `w` points to the weight of the first pair."""
+    if middle == NULL:
+        add(out, w, width, pair[0], pair[1], pair[2], pair[3], pair[4], pair[5])
+    else:
+        begin(out, w - 1, width, middle, pair[0], pair[1], pair[2], pair[3], pair[4], pair[5])
 
 
 cdef int _take_peaks(
@@ -206,15 +214,16 @@ cdef int _take_peaks(
     """Add the peaks of a row to their groups."""
     cdef const float *own = smooth + (row % kept) * width
     cdef const float *other
-    cdef Py_ssize_t begin, x, i, y
+    cdef Py_ssize_t block, first, x, i, y
     cdef float value
     cdef bint highest
     g.here, g.above = g.above, g.here
     memset(g.here, 0xFF, (width + 2) * sizeof(int))
-    for begin in range(0, width, 256):
-        if not any_above(own + begin, limit + begin, min(BLOCK, width - begin)):
+    for block in range((width + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        if not any_above(own + first, limit + first, min(BLOCK, width - first)):
             continue
-        for x in range(begin, min(begin + BLOCK, width)):
+        for x in range(first, min(first + BLOCK, width)):
             value = own[x]
             if not value > limit[x]:
                 continue

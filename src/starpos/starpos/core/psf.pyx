@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
 
-from libc.math cimport M_PI, exp, fabs
+from libc.math cimport M_PI, exp, fabs, sqrt
 
 import numpy as np
 
@@ -10,9 +10,12 @@ cimport starpos.core.wide
 
 cdef extern from *:
     """
-    #include <math.h>
     #define STARPOS_BLOCK 64
     #define STARPOS_ORDERS 32
+    /* Pixels that are summed in registers. */
+    #define STARPOS_LANES 8
+    /* Of 0, 1, 2 ...; set when the module is loaded. */
+    static double starpos_root[STARPOS_ORDERS + 2];
     /* Hermite polynomials over sqrt(k!), k = 0 .. order, of a block's numbers u. */
     static inline void starpos_hermites(const double *u, int order, double (*out)[STARPOS_BLOCK]) {
         for (int p = 0; p < STARPOS_BLOCK; p++) {
@@ -20,7 +23,7 @@ cdef extern from *:
             out[1][p] = u[p];
         }
         for (int k = 1; k < order; k++) {
-            const double before = sqrt(k), over = 1 / sqrt(k + 1);
+            const double before = starpos_root[k], over = 1 / starpos_root[k + 1];
             for (int p = 0; p < STARPOS_BLOCK; p++)
                 out[k + 1][p] = (u[p] * out[k][p] - before * out[k - 1][p]) * over;
         }
@@ -31,19 +34,31 @@ cdef extern from *:
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
         starpos_hermites(u, rows, fu);
         starpos_hermites(v, columns, fv);
-        for (int p = 0; p < STARPOS_BLOCK; p++)
-            value[p] = by_u[p] = by_v[p] = 0;
-        for (int i = 0; i < rows; i++)
-            for (int j = 0; j < columns; j++) {
-                const double c = series[i * columns + j], cu = c * sqrt(i + 1), cv = c * sqrt(j + 1);
-                if (c == 0)
-                    continue;
-                for (int p = 0; p < STARPOS_BLOCK; p++) {
-                    value[p] += c * fu[i][p] * fv[j][p];
-                    by_u[p] += cu * fu[i + 1][p] * fv[j][p];
-                    by_v[p] += cv * fu[i][p] * fv[j + 1][p];
+        for (int first = 0; first < STARPOS_BLOCK; first += STARPOS_LANES) {
+            double sum[STARPOS_LANES] = {0}, sum_u[STARPOS_LANES] = {0}, sum_v[STARPOS_LANES] = {0};
+            for (int i = 0; i < rows; i++) {
+                double across[STARPOS_LANES] = {0}, steeper[STARPOS_LANES] = {0};
+                for (int j = 0; j < columns; j++) {
+                    const double c = series[i * columns + j], d = c * starpos_root[j + 1];
+                    if (c == 0)
+                        continue;
+                    for (int p = 0; p < STARPOS_LANES; p++) {
+                        across[p] += c * fv[j][first + p];
+                        steeper[p] += d * fv[j + 1][first + p];
+                    }
+                }
+                for (int p = 0; p < STARPOS_LANES; p++) {
+                    sum[p] += fu[i][first + p] * across[p];
+                    sum_u[p] += starpos_root[i + 1] * fu[i + 1][first + p] * across[p];
+                    sum_v[p] += fu[i][first + p] * steeper[p];
                 }
             }
+            for (int p = 0; p < STARPOS_LANES; p++) {
+                value[first + p] = sum[p];
+                by_u[first + p] = sum_u[p];
+                by_v[first + p] = sum_v[p];
+            }
+        }
     }
     /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian. */
     STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
@@ -58,6 +73,7 @@ cdef extern from *:
         }
     }
     """
+    double[ORDERS + 2] root "starpos_root"
     void series_at "starpos_series"(
         const double *series, int rows, int columns, const double *u, const double *v, double *value, double *by_u,
         double *by_v,
@@ -66,6 +82,9 @@ cdef extern from *:
         const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, int n,
         Py_ssize_t stride, float *out,
     ) noexcept nogil
+
+for order in range(ORDERS + 2):
+    root[order] = sqrt(order)
 
 
 cdef int sound(const double[:, :, ::1] axes, const double[:, :, ::1] series, int n) except -1:
