@@ -12,7 +12,7 @@ cimport starpos.core.wide
 cdef extern from *:
     """
     /* How many of n numbers are at most `limit`. */
-    STARPOS_WIDE static int starpos_count(const unsigned short *v, int n, unsigned short limit) {
+    static inline int starpos_count(const unsigned short *v, int n, unsigned short limit) {
         int count = 0;
         for (int first = 0; first < n; first += 4096) {
             const int last = n < first + 4096 ? n : first + 4096;
@@ -21,6 +21,30 @@ cdef extern from *:
                 some += v[i] <= limit;
             count += some;
         }
+        return count;
+    }
+    /* The number that would stand at k of n if they were sorted: halving the range takes few looks at whole numbers. */
+    STARPOS_WIDE static int starpos_ranked(const unsigned short *v, int n, int k) {
+        unsigned short least = 65535, most = 0;
+        for (int i = 0; i < n; i++) {
+            least = v[i] < least ? v[i] : least;
+            most = v[i] > most ? v[i] : most;
+        }
+        int low = least, high = most;
+        while (low < high) {
+            const int middle = (low + high) / 2;
+            if (starpos_count(v, n, middle) > k)
+                high = middle;
+            else
+                low = middle + 1;
+        }
+        return low;
+    }
+    /* How many of n numbers are a given one. */
+    STARPOS_WIDE static int starpos_equal(const unsigned short *v, int n, int number) {
+        int count = 0;
+        for (int i = 0; i < n; i++)
+            count += v[i] == number;
         return count;
     }
     /* How far n numbers are from the middle; of those within a limit their number, the sum of the differences and of squares. */
@@ -42,7 +66,8 @@ cdef extern from *:
         out[2] = square;
     }
     """
-    int count_of "starpos_count"(const unsigned short *v, int n, unsigned short limit) noexcept nogil
+    int ranked "starpos_ranked"(const unsigned short *v, int n, int k) noexcept nogil
+    int equal "starpos_equal"(const unsigned short *v, int n, int number) noexcept nogil
     void away_from "starpos_away"(const unsigned short *v, int n, unsigned short middle, unsigned short *away) noexcept nogil
     void sums_of "starpos_sums"(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil
 
@@ -56,25 +81,11 @@ cdef double PER_TAIL = 1 / 0.607
 cdef double CLIP = 3.5, CLIPPED = 0.9969
 
 
-cdef unsigned short _ranked(const unsigned short *v, int n, int k) noexcept nogil:
-    """The value (n,) that would stand at k if they were sorted: halving the range takes few looks at whole numbers."""
-    cdef int low = 65535, high = 0, middle, i
-    for i in range(n):
-        low, high = min(low, <int>v[i]), max(high, <int>v[i])
-    while low < high:
-        middle = (low + high) // 2
-        if count_of(v, n, <unsigned short>middle) > k:
-            high = middle
-        else:
-            low = middle + 1
-    return <unsigned short>low
-
-
 cdef double _quantile(const unsigned short *v, int n, double share) noexcept nogil:
     """A quantile of values (n,), linear between them."""
     cdef double place = share * (n - 1)
     cdef int k = <int>place
-    cdef double low = _ranked(v, n, k), high = _ranked(v, n, min(k + 1, n - 1))
+    cdef double low = ranked(v, n, k), high = ranked(v, n, min(k + 1, n - 1))
     return low + (place - k) * (high - low)
 
 
@@ -85,11 +96,11 @@ cdef void _clipped(
 
     If more than half of them are equal (a sky cut off at 0), sigma comes from the quantiles above.
     """
-    cdef unsigned short middle = _ranked(v, n, n // 2)
+    cdef int middle = ranked(v, n, n // 2)
     cdef long long[3] sums
     cdef double spread, mean
-    away_from(v, n, middle, away)
-    spread = per_mad * _ranked(away, n, n // 2)
+    away_from(v, n, <unsigned short>middle, away)
+    spread = per_mad * ranked(away, n, n // 2)
     if spread == 0:
         spread = PER_TAIL * (_quantile(v, n, 0.9) - _quantile(v, n, 0.75))
     sums_of(v, n, middle, <int>max(CLIP * spread, 1.0), sums)
@@ -133,7 +144,7 @@ def sampled(const pixel_t[:, ::1] plane, const int[:, ::1] rows, const int[:, ::
                             k += 1
                     _clipped(value, n, per_mad, value + n, &sky[0, phase, i, j], &sky[1, phase, i, j])
                     highest[0, phase, i, j] = top
-                    highest[1, phase, i, j] = n - count_of(value, n, <unsigned short>(top - 1)) if top else n
+                    highest[1, phase, i, j] = equal(value, n, top)
     free(value)
     return found[0], found[1], tops[0], tops[1]
 

@@ -11,21 +11,25 @@ cimport starpos.core.wide
 
 cdef extern from *:
     """
-    /* Set a row to another times its weight and three pairs of others, each times its weight, or add three more pairs. */
-    STARPOS_WIDE static void starpos_begin(float *restrict out, const float *restrict w, Py_ssize_t n, const float *restrict m,
-                            const float *restrict a, const float *restrict b, const float *restrict c,
-                            const float *restrict d, const float *restrict e, const float *restrict f) {
-        const float s = w[0], u = w[1], v = w[2], t = w[3];
-        for (Py_ssize_t i = 0; i < n; i++)
-            out[i] = s * m[i] + (u * (a[i] + b[i]) + v * (c[i] + d[i]) + t * (e[i] + f[i]));
-    }
-    STARPOS_WIDE static void starpos_add(float *restrict out, const float *restrict w, Py_ssize_t n,
-                            const float *restrict a, const float *restrict b, const float *restrict c,
-                            const float *restrict d, const float *restrict e, const float *restrict f) {
-        const float u = w[0], v = w[1], t = w[2];
-        for (Py_ssize_t i = 0; i < n; i++)
-            out[i] += u * (a[i] + b[i]) + v * (c[i] + d[i]) + t * (e[i] + f[i]);
-    }
+    /* Set `out` to a row times its weight and three pairs of others, each times its weight; or add three pairs. */
+    #define STARPOS_SMOOTH(kind, pixel, sum) \\
+        STARPOS_WIDE static void starpos_begin_##kind( \\
+                float *restrict out, const float *w, Py_ssize_t n, const pixel *m, const pixel *const *p) { \\
+            const float s = w[0], t = w[1], u = w[2], v = w[3]; \\
+            const pixel *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5]; \\
+            for (Py_ssize_t i = 0; i < n; i++) \\
+                out[i] = s * m[i] + (t * ((sum)a[i] + b[i]) + u * ((sum)c[i] + d[i]) + v * ((sum)e[i] + f[i])); \\
+        } \\
+        STARPOS_WIDE static void starpos_add_##kind( \\
+                float *restrict out, const float *w, Py_ssize_t n, const pixel *const *p) { \\
+            const float t = w[0], u = w[1], v = w[2]; \\
+            const pixel *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5]; \\
+            for (Py_ssize_t i = 0; i < n; i++) \\
+                out[i] += t * ((sum)a[i] + b[i]) + u * ((sum)c[i] + d[i]) + v * ((sum)e[i] + f[i]); \\
+        }
+    STARPOS_SMOOTH(8, unsigned char, int)
+    STARPOS_SMOOTH(16, unsigned short, int)
+    STARPOS_SMOOTH(float, float, float)
     /* Whether a pixel of the row is above its limit. */
     STARPOS_WIDE static int starpos_any_above(const float *restrict row, const float *restrict limit, Py_ssize_t n) {
         int any = 0;
@@ -34,18 +38,18 @@ cdef extern from *:
         return any;
     }
     """
-    void add "starpos_add"(
-        float *out, const float *weight, Py_ssize_t n, const float *a, const float *b, const float *c,
-        const float *d, const float *e, const float *f,
-    ) noexcept nogil
-    void begin "starpos_begin"(
-        float *out, const float *weight, Py_ssize_t n, const float *middle, const float *a, const float *b,
-        const float *c, const float *d, const float *e, const float *f,
-    ) noexcept nogil
+    void begin_8 "starpos_begin_8"(float *out, const float *w, Py_ssize_t n, const unsigned char *middle, const unsigned char **p) noexcept nogil
+    void add_8 "starpos_add_8"(float *out, const float *w, Py_ssize_t n, const unsigned char **p) noexcept nogil
+    void begin_16 "starpos_begin_16"(float *out, const float *w, Py_ssize_t n, const unsigned short *middle, const unsigned short **p) noexcept nogil
+    void add_16 "starpos_add_16"(float *out, const float *w, Py_ssize_t n, const unsigned short **p) noexcept nogil
+    void begin_float "starpos_begin_float"(float *out, const float *w, Py_ssize_t n, const float *middle, const float **p) noexcept nogil
+    void add_float "starpos_add_float"(float *out, const float *w, Py_ssize_t n, const float **p) noexcept nogil
     bint any_above "starpos_any_above"(const float *row, const float *limit, Py_ssize_t n) noexcept nogil
 
+ctypedef unsigned char unsigned_char
+
 ctypedef fused pixel_t:
-    unsigned char
+    unsigned_char
     unsigned short
 
 cdef enum:
@@ -72,43 +76,32 @@ cdef struct Groups:
     int *above
 
 
-cdef struct Rolling:
-    # Of the plane's rows those before `loaded`, as floats, each at its number modulo their count; weights; a row with margins.
-    float *raw
-    int rows
-    int loaded
+cdef struct Smoother:
+    # Weights from the middle outwards, with 0 up to whole triples; a row with margins.
     float *weight
     int reach
     int padded
     float *margined
 
 
-cdef int _begin(Rolling *r, Py_ssize_t width, const float[::1] weight) except -1:
+cdef int _begin(Smoother *s, Py_ssize_t width, const float[::1] weight) except -1:
     """Take memory for smoothing rows."""
     cdef int k
-    r.reach = weight.shape[0] - 1
-    r.padded, r.rows, r.loaded = max(3, (r.reach + 2) // 3 * 3), 2 * r.reach + 1, 0
-    r.raw = <float *>malloc((r.rows * width + width + 2 * r.padded + r.padded + 1) * sizeof(float))
-    if r.raw == NULL:
+    s.reach = weight.shape[0] - 1
+    s.padded = max(3, (s.reach + 2) // 3 * 3)
+    s.margined = <float *>malloc((width + 3 * s.padded + 1) * sizeof(float))
+    if s.margined == NULL:
         raise MemoryError
-    r.margined = r.raw + r.rows * width
-    r.weight = r.margined + width + 2 * r.padded
-    for k in range(r.padded + 1):
-        r.weight[k] = weight[k] if k <= r.reach else 0.0
+    s.weight = s.margined + width + 2 * s.padded
+    for k in range(s.padded + 1):
+        s.weight[k] = weight[k] if k <= s.reach else 0.0
     return 0
 
 
-cdef void _smooth_row(const pixel_t[:, ::1] plane, Rolling *r, int row, float *out) noexcept nogil:
-    """Set `out` (w,) to a row of the smoothed plane; the rows before it have been asked for."""
-    cdef Py_ssize_t x, width = plane.shape[1]
-    cdef int height = plane.shape[0]
-    r.loaded = max(r.loaded, row - r.reach)
-    while r.loaded < min(row + r.reach + 1, height):
-        for x in range(width):
-            r.raw[(r.loaded % r.rows) * width + x] = <float>plane[r.loaded, x]
-        r.loaded += 1
-    _across_rows(r, width, height, row, r.margined + r.padded)
-    _along_row(r, width, out)
+cdef void _smooth_row(const pixel_t[:, ::1] plane, const Smoother *s, Py_ssize_t row, float *out) noexcept nogil:
+    """Set `out` (w,) to a row of the smoothed plane."""
+    _across_rows(plane, s, row, s.margined + s.padded)
+    _along_row(s, plane.shape[1], out)
 
 
 def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, int first, int last):
@@ -116,15 +109,15 @@ def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, int first, in
 
     Beyond its edges the plane continues as in a mirror.
     """
-    cdef Rolling r
+    cdef Smoother s
     cdef int row
     out = np.empty((max(last - first, 0), plane.shape[1]), np.float32)
     cdef float[:, ::1] smooth = out
-    _begin(&r, plane.shape[1], weight)
+    _begin(&s, plane.shape[1], weight)
     with nogil:
         for row in range(first, last):
-            _smooth_row(plane, &r, row, &smooth[row - first, 0])
-    free(r.raw)
+            _smooth_row(plane, &s, row, &smooth[row - first, 0])
+    free(s.margined)
     return out
 
 
@@ -142,9 +135,9 @@ def peaks(
     cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1]
     cdef int kept = 2 * flat + 1, row, done = max(first - flat, 0)
     cdef Groups g
-    cdef Rolling r
+    cdef Smoother s
     g.each, g.count, g.room = NULL, 0, 0
-    _begin(&r, width, weight)
+    _begin(&s, width, weight)
     cdef float *smooth = <float *>malloc(kept * width * sizeof(float))
     cdef int *marks = <int *>malloc(2 * (width + 2) * sizeof(int))
     try:
@@ -155,14 +148,14 @@ def peaks(
             memset(marks, 0xFF, 2 * (width + 2) * sizeof(int))
             for row in range(first, last):
                 while done < min(row + flat + 1, <int>height):
-                    _smooth_row(plane, &r, done, smooth + (done % kept) * width)
+                    _smooth_row(plane, &s, done, smooth + (done % kept) * width)
                     done += 1
                 _take_peaks(smooth, kept, width, height, row, flat, &limit[row // strip, 0], &g)
         return _columns(&g)
     finally:
         free(smooth)
         free(marks)
-        free(r.raw)
+        free(s.margined)
         free(g.each)
 
 
@@ -173,38 +166,43 @@ cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
     return k if n > 1 else 0
 
 
-cdef void _across_rows(const Rolling *r, Py_ssize_t width, Py_ssize_t height, Py_ssize_t row, float *out) noexcept nogil:
+cdef void _across_rows(const pixel_t[:, ::1] plane, const Smoother *s, Py_ssize_t row, float *out) noexcept nogil:
     """Smooth a row with those above and below it."""
-    cdef const float *pair[2 * TOGETHER]
+    cdef const pixel_t *pair[2 * TOGETHER]
+    cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1]
     cdef int k, j, near
-    for k in range(1, r.padded + 1, 3):
+    for k in range(1, s.padded + 1, 3):
         for j in range(TOGETHER):
             # a weight of 0 takes any row
-            near = k + j if k + j <= r.reach else 0
-            pair[2 * j] = r.raw + (_mirrored(row - near, height) % r.rows) * width
-            pair[2 * j + 1] = r.raw + (_mirrored(row + near, height) % r.rows) * width
-        _add_three(out, &r.weight[k], width, r.raw + (row % r.rows) * width if k == 1 else NULL, pair)
+            near = k + j if k + j <= s.reach else 0
+            pair[2 * j] = &plane[_mirrored(row - near, height), 0]
+            pair[2 * j + 1] = &plane[_mirrored(row + near, height), 0]
+        if pixel_t is unsigned_char:
+            if k == 1:
+                begin_8(out, s.weight, width, &plane[row, 0], pair)
+            else:
+                add_8(out, &s.weight[k], width, pair)
+        else:
+            if k == 1:
+                begin_16(out, s.weight, width, &plane[row, 0], pair)
+            else:
+                add_16(out, &s.weight[k], width, pair)
 
 
-cdef void _along_row(const Rolling *r, Py_ssize_t width, float *out) noexcept nogil:
-    """Smooth along itself the row in r.margined."""
+cdef void _along_row(const Smoother *s, Py_ssize_t width, float *out) noexcept nogil:
+    """Smooth along itself the row in s.margined."""
     cdef const float *pair[2 * TOGETHER]
-    cdef float *row = r.margined + r.padded
+    cdef float *row = s.margined + s.padded
     cdef int k, j
-    for k in range(1, r.padded + 1):
+    for k in range(1, s.padded + 1):
         row[-k], row[width - 1 + k] = row[_mirrored(-k, width)], row[_mirrored(width - 1 + k, width)]
-    for k in range(1, r.padded + 1, 3):
+    for k in range(1, s.padded + 1, 3):
         for j in range(TOGETHER):
             pair[2 * j], pair[2 * j + 1] = row - (k + j), row + (k + j)
-        _add_three(out, &r.weight[k], width, row if k == 1 else NULL, pair)
-
-
-cdef inline void _add_three(float *out, const float *w, Py_ssize_t width, const float *middle, const float **pair) noexcept nogil:
-    """Add three pairs of rows, or with the middle one begin with them; `w` points to the weight of the first pair."""
-    if middle == NULL:
-        add(out, w, width, pair[0], pair[1], pair[2], pair[3], pair[4], pair[5])
-    else:
-        begin(out, w - 1, width, middle, pair[0], pair[1], pair[2], pair[3], pair[4], pair[5])
+        if k == 1:
+            begin_float(out, s.weight, width, row, pair)
+        else:
+            add_float(out, &s.weight[k], width, pair)
 
 
 cdef int _take_peaks(

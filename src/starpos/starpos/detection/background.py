@@ -54,17 +54,20 @@ class Background:
         column = (np.asarray(x) + 0.5) * (self.level.shape[2] - 2) / self.width + 0.5
         return row, column
 
+    def near(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Level and noise (N, P) float32, DN, for sums over pixels around x, y (N,): with the correlation."""
+        level, noise = (v.astype(np.float32) for v in self.at(x, y))
+        return level, noise * np.float32(self.correlation)
+
     def of_pixels(
         self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
 
-        Level and noise of the sky are taken at x, y. The noise includes the correlation, so it is right for sums over
-        neighbouring pixels.
+        Level and noise of the sky are those `near` x, y.
         """
         shape = np.broadcast_shapes(rows.shape, columns.shape)
-        level, noise = (v.astype(np.float32) for v in self.at(x, y))
-        noise *= np.float32(self.correlation)
+        level, noise = self.near(x, y)
         if self.is_mosaic:
             each = np.arange(len(x)).reshape(-1, *[1] * (len(shape) - 1))
             phase = phase_of(rows, columns)

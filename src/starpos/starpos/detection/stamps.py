@@ -5,7 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.detection.background import Background, phase_of
+from starpos.core.stamps import around
+from starpos.detection.background import Background
 from starpos.normal import SIGMA_PER_MAD
 
 # Around a star the sky counts as brighter or less even than the mesh says where about 50 pixels lie so far above it, or
@@ -65,16 +66,13 @@ def cut(
     plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int, saturation: float
 ) -> Stamps:
     """The Stamps of (2 reach + 1) px around the pixels x, y (N,) int of plane (h, w)."""
-    height, width = plane.shape
+    x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
+    signal, noise, good, full, phase = around(plane, x, y, reach, *background.near(x, y), saturation)
     grid = np.arange(-reach, reach + 1)
-    columns, rows = x[:, None] + grid, y[:, None] + grid
-    on = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
-    pixels = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
-    rows, columns = rows[:, :, None], columns[:, None, :]
-    level, noise = background.of_pixels(x, y, rows, columns)
-    phase = phase_of(rows, columns) if background.is_mosaic else np.zeros(pixels.shape, np.uint8)
-    full = on & (pixels >= saturation)
-    return Stamps(x=x, y=y, signal=pixels - level, noise=noise, good=on & ~full, full=full, phase=phase)
+    for streak in background.streaks:
+        more, least = streak.at((y[:, None] + grid)[:, :, None], (x[:, None] + grid)[:, None, :])
+        signal, noise = (signal - more).astype(np.float32), np.maximum(noise, least).astype(np.float32)
+    return Stamps(x=x, y=y, signal=signal, noise=noise, good=good, full=full, phase=phase)
 
 
 def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
