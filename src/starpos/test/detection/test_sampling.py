@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells of the background and pixels around stars, of the compiled core, beside their plain forms."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from starpos.core.background import between, sampled
+from starpos.core.stamps import around
+from starpos.normal import SIGMA_PER_MAD
+
+
+def plain_cell(values):
+    """Clipped mean and rms of values (n,)."""
+    middle = np.sort(values)[len(values) // 2]
+    spread = SIGMA_PER_MAD * np.sort(np.abs(values - middle))[len(values) // 2]
+    if spread == 0:
+        spread = np.subtract(*np.quantile(values, (0.9, 0.75))) / 0.607
+    kept = values[np.abs(values - middle) <= max(3.5 * spread, 1.0)]
+    return kept.mean(), kept.std(ddof=1 if len(kept) > 1 else 0) / 0.9969
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_cells_are_those_of_sorted_values(kind, rng):
+    plane = np.clip(np.rint(rng.normal(100, 9, (40, 56))), 0, 255).astype(kind)
+    # a star, and a sky cut off at 0
+    plane[4:8, 4:8] = 255
+    plane[20:, 28:] = np.where(rng.random((20, 28)) < 0.7, 0, plane[20:, 28:])
+    rows = np.stack([np.arange(0, 20), np.arange(20, 40)]).astype(np.int32)
+    columns = np.stack([np.arange(0, 28), np.arange(28, 56)]).astype(np.int32)
+    level, noise, highest, count = sampled(plane, rows, columns, SIGMA_PER_MAD)
+    for i, j, phase in np.ndindex(2, 2, 4):
+        values = plane[rows[i, phase // 2 :: 2]][:, columns[j, phase % 2 :: 2]].ravel().astype(float)
+        expected = *plain_cell(values), values.max(), (values == values.max()).sum()
+        found = [a[phase, i, j] for a in (level, noise, highest, count)]
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_between_cells_the_sky_is_linear_and_beyond_them_as_on_the_edge(rng):
+    mesh, (row, column) = rng.normal(0, 1, (3, 5, 7)), rng.uniform(-1, 8, (2, 50))
+    expected = [ndimage.map_coordinates(m, (row, column), order=1, mode="nearest") for m in mesh]
+    np.testing.assert_allclose(between(mesh, row, column), np.transpose(expected), rtol=1e-12, atol=1e-12)
+    assert np.isfinite(between(mesh, np.full(1, np.nan), np.full(1, np.inf))).all()
+
+
+@pytest.mark.parametrize("phases", [1, 4])
+def test_stamps_are_the_pixels_around_stars(phases, rng):
+    """Also where they lie partly, or wholly, beyond the frame."""
+    plane = rng.integers(0, 1000, (30, 20)).astype(np.uint16)
+    x, y = rng.integers(-9, 29, (2, 40))
+    level, noise = rng.uniform(0, 9, (2, 40, phases)).astype(np.float32)
+    columns, rows = x[:, None, None] + np.arange(-3, 4), y[:, None, None] + np.arange(-3, 4)[:, None]
+    columns, rows = np.broadcast_arrays(columns, rows)
+    pixels = plane[np.clip(rows, 0, 29), np.clip(columns, 0, 19)]
+    on = (rows >= 0) & (rows < 30) & (columns >= 0) & (columns < 20)
+    phase = (2 * (rows % 2) + columns % 2) * (phases > 1)
+    each = np.arange(40)[:, None, None]
+    expected = pixels - level[each, phase], noise[each, phase], on & (pixels < 900), on & (pixels >= 900), phase
+    for found, plain in zip(around(plane, x, y, 3, level, noise, 900), expected, strict=True):
+        np.testing.assert_array_equal(found, plain)
+
+
+def test_what_lies_beyond_the_frame_is_refused():
+    plane, rows = np.zeros((8, 8), np.uint16), np.array([[0, 1, 8, 9]], np.int32)
+    with pytest.raises(ValueError, match="beyond"):
+        sampled(plane, rows, rows, SIGMA_PER_MAD)
+    with pytest.raises(ValueError, match="pairs"):
+        sampled(plane, rows[:, :3].copy(), rows, SIGMA_PER_MAD)
+    with pytest.raises(ValueError, match="2 x 2"):
+        between(np.zeros((1, 1, 5)), np.zeros(3), np.zeros(3))
+    with pytest.raises(ValueError, match="phases"):
+        around(plane, np.zeros(2, int), np.zeros(1, int), 1, *np.zeros((2, 2, 1), np.float32), 1.0)
