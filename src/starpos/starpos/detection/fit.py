@@ -35,6 +35,10 @@ class Response:
         """Number of gains that are fitted for each star: P, or 0 without a mosaic."""
         return len(self.gain) if len(self.gain) > 1 else 0
 
+    def of_phase(self, phase: np.ndarray) -> np.ndarray:
+        """The frame's gain (float32) of pixels of these phases; 1 without a mosaic."""
+        return self.gain.astype(np.float32)[phase] if self.own_gains else np.ones(1, np.float32)
+
     def columns(
         self,
         shape: tuple[np.ndarray, np.ndarray, np.ndarray],

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core.stamps import around
+from starpos.core.stamps import around, scatter
 from starpos.detection.background import Background
 from starpos.normal import SIGMA_PER_MAD
 
@@ -107,7 +107,5 @@ def uneven(signal: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
     0 and 1 where a difference may be chance. Beside a roof, among twigs or under a cloud the sky is brighter and less
     even than the background's mesh says.
     """
-    score = signal / noise
-    level = np.median(score, axis=1)
-    scatter = SIGMA_PER_MAD * np.median(np.abs(score - level[:, None]), axis=1)
-    return np.where(level > RAISED, level, 0), np.where(scatter > UNEVEN, scatter, 1)
+    level, spread = scatter(*(np.ascontiguousarray(a, np.float32) for a in (signal, noise)), SIGMA_PER_MAD)
+    return np.where(level > RAISED, level, 0), np.where(spread > UNEVEN, spread, 1)

@@ -4,7 +4,7 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage, spatial
+from scipy import spatial
 
 from starpos.detection.background import Background
 from starpos.detection.blend import with_companions
@@ -100,9 +100,10 @@ def _levelled(stamps: Stamps) -> Stamps:
     """Stamps with level and noise of the sky corrected by what the pixels at their rims show."""
     rim = np.ones(stamps.signal.shape[1:], bool)
     rim[1:-1, 1:-1] = False
-    level, noise = uneven(stamps.signal[:, rim], stamps.noise[:, rim])
+    signal, noise = stamps.signal[:, rim], stamps.noise[:, rim]
     # the rim of a very bright star is its own light
-    own = 0.01 * stamps.signal.max((1, 2)) / np.median(stamps.noise[:, rim], axis=1)
+    own = 0.01 * stamps.signal.max((1, 2)) / np.median(noise, axis=1)
+    level, noise = uneven(signal, noise)
     level, noise = (np.where(v > own, v, least)[:, None, None] for v, least in ((level, 0), (noise, 1)))
     level, noise = (v.astype(np.float32) for v in (level, noise))
     return replace(stamps, signal=stamps.signal - level * stamps.noise, noise=stamps.noise * noise)
@@ -112,14 +113,20 @@ def _spikes(stamps: Stamps, lesson: Lesson) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, S, S) bool much brighter than their neighbours, as in no star, and the mean of their neighbours."""
     beside = np.full(len(stamps.x), -1.0)
     star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)[0]
-    four = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
-    top, beside = star[:, 1, 1], (star * four).sum((1, 2))
+    top, beside = star[:, 1, 1], _four(star)[:, 1, 1]
     # at least 1, because a ring has a dark middle
     sharpest = np.maximum(1.0, top / np.maximum(beside, 1e-3 * np.abs(top)))[:, None, None].astype(np.float32)
-    grey = stamps.signal / lesson.response.gain.astype(np.float32)[stamps.phase]
-    around = ndimage.convolve(grey, four[None], mode="nearest")
+    gain = lesson.response.of_phase(stamps.phase)
+    grey = stamps.signal / gain
+    around = _four(grey)
     spike = (grey > SPIKE * sharpest * (around + stamps.noise)) & (stamps.signal > OUTLIER * stamps.noise)
-    return spike, around * lesson.response.gain.astype(np.float32)[stamps.phase]
+    return spike, around * gain
+
+
+def _four(image: np.ndarray) -> np.ndarray:
+    """The mean of the four pixels beside each of images (N, S, S); beyond the edges the image goes on as on them."""
+    wide = np.pad(image, ((0, 0), (1, 1), (1, 1)), "edge")
+    return (wide[:, :-2, 1:-1] + wide[:, 2:, 1:-1] + wide[:, 1:-1, :-2] + wide[:, 1:-1, 2:]) * np.float32(0.25)
 
 
 def _own_light(stamps: Stamps, fit: Fit, spike: np.ndarray) -> Stamps:
