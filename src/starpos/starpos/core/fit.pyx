@@ -109,8 +109,8 @@ cdef int _begin(Pixels *p, int area) except -1:
 
 cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
     """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, place, n = 0
-    cdef double dx, dy, u, v
+    cdef int row, column, place, k, n = 0
+    cdef double dx, dy, u, v, gain
     cdef bint inside
     for row in range(s.size):
         dy = s.top + row - star.y
@@ -129,81 +129,83 @@ cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rule
             n += 1
     p.count = n
     evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
+    if rules.own:
+        for k in range(n):
+            gain = star.gain[s.phase[p.place[k]]]
+            p.value[k], p.by_x[k], p.by_y[k] = p.value[k] * gain, p.by_x[k] * gain, p.by_y[k] * gain
 
 
-cdef double _first_flux(const Stamp *s, const Star *star, const Pixels *p) noexcept nogil:
+cdef double _first_flux(const Pixels *p) noexcept nogil:
     """The flux that explains the light at the first place, weighted by the sky's noise."""
-    cdef double above = 0.0, below = 0.0, unit
+    cdef double above = 0.0, below = 0.0
     cdef int k
     for k in range(p.count):
         if p.weight[k] > 0:
-            unit = p.value[k] * star.gain[s.phase[p.place[k]]]
-            above += unit * p.signal[k] / p.noise2[k]
-            below += unit * unit / p.noise2[k]
+            above += p.value[k] * p.signal[k] / p.noise2[k]
+            below += p.value[k] * p.value[k] / p.noise2[k]
     return above / below if below > 0 and isfinite(above) else 0.0
 
 
 cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint mark) noexcept nogil:
     """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
     cdef double light, most = 0.0, variance
-    cdef int k, place
+    cdef int k
     if mark:
         memset(s.outlier, 0, s.size * s.size)
         for k in range(p.count):
-            most = max(most, p.value[k] * star.gain[s.phase[p.place[k]]])
+            most = max(most, p.value[k])
     for k in range(p.count):
-        place = p.place[k]
-        light = star.flux * p.value[k] * star.gain[s.phase[place]]
+        light = star.flux * p.value[k]
         p.residual[k] = p.signal[k] - light
         light = max(light, 0.0)
         variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
         p.weight[k] /= variance
-        if mark:
-            s.outlier[place] = (
-                p.residual[k] > 0 and p.residual[k] * p.residual[k] > rules.outlier2 * variance
-                and p.residual[k] > FAINT * star.flux * most
-            )
-
-
-cdef inline void _slopes(const Stamp *s, const Star *star, Rules rules, const Pixels *p, int k, double *slope) noexcept nogil:
-    """Derivatives (4,) of a pixel by the star's x, y, flux, and by the gain of the pixel's own phase."""
-    cdef int phase = s.phase[p.place[k]]
-    slope[0], slope[1] = star.flux * p.by_x[k] * star.gain[phase], star.flux * p.by_y[k] * star.gain[phase]
-    slope[2], slope[3] = p.value[k] * star.gain[phase], star.flux * p.value[k] * rules.gain[phase]
+        # most pixels are far from it
+        if mark and p.residual[k] > FAINT * star.flux * most:
+            s.outlier[p.place[k]] = p.residual[k] > 0 and p.residual[k] * p.residual[k] > rules.outlier2 * variance
 
 
 cdef void _sum_up(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
-    """Set the normal equations, normal (K, K) and star.right (K,); a star's own gains are held near the frame's."""
-    cdef double[4] slope
-    cdef double[MOST * PHASES] of_phase
-    cdef double weighted
-    cdef int k, a, b, phase, n = rules.parameters, most = 4 if rules.own else 3
-    # of each phase: the sums of products of four slopes, lower half; a pixel knows the gain of its phase alone
-    cdef double[PHASES][14] sums
-    memset(&sums[0][0], 0, sizeof(sums))
+    """Set the normal equations, normal (K, K), lower half, and star.right (K,)."""
+    cdef double xx = 0.0, xy = 0.0, yy = 0.0, xf = 0.0, yf = 0.0, ff = 0.0, rx = 0.0, ry = 0.0, rf = 0.0
+    cdef double x, y, f, w
+    cdef int k, n = rules.parameters
     for k in range(p.count):
-        if p.weight[k] == 0:
-            continue
-        _slopes(s, star, rules, p, k, slope)
-        phase = s.phase[p.place[k]]
-        for a in range(most):
-            weighted = slope[a] * p.weight[k]
-            for b in range(a + 1):
-                sums[phase][a * (a + 1) // 2 + b] += weighted * slope[b]
-            sums[phase][10 + a] += weighted * p.residual[k]
-    memset(normal, 0, n * n * sizeof(double))
-    memset(star.right, 0, sizeof(star.right))
-    for phase in range(rules.phases):
-        for a in range(3):
-            for b in range(a + 1):
-                normal[a * n + b] += sums[phase][a * (a + 1) // 2 + b]
-            star.right[a] += sums[phase][10 + a]
-    star.information = normal[2 * n + 2]
-    for phase in range(rules.own):
-        for b in range(3):
-            normal[(3 + phase) * n + b] = sums[phase][6 + b]
-        normal[(3 + phase) * n + 3 + phase] = sums[phase][9] + rules.held
-        star.right[3 + phase] = sums[phase][13] - star.colour[phase] * rules.held
+        w = p.weight[k]
+        x, y, f = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
+        xx, xy, yy = xx + w * x * x, xy + w * x * y, yy + w * y * y
+        xf, yf, ff = xf + w * x * f, yf + w * y * f, ff + w * f * f
+        w *= p.residual[k]
+        rx, ry, rf = rx + w * x, ry + w * y, rf + w * f
+    normal[0], normal[n], normal[n + 1] = xx, xy, yy
+    normal[2 * n], normal[2 * n + 1], normal[2 * n + 2] = xf, yf, ff
+    star.right[0], star.right[1], star.right[2] = rx, ry, rf
+    star.information = ff
+    if rules.own:
+        _sum_up_gains(s, star, rules, p, normal)
+
+
+cdef void _sum_up_gains(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
+    """Set the rows of the star's own gains, which are held near the frame's. A pixel knows the gain of its phase alone."""
+    cdef double g, w
+    cdef int k, a, row, n = rules.parameters
+    for a in range(rules.own):
+        row = 3 + a
+        memset(&normal[row * n], 0, n * sizeof(double))
+        normal[row * n + row], star.right[row] = rules.held, -star.colour[a] * rules.held
+    for k in range(p.count):
+        row = 3 + s.phase[p.place[k]]
+        g, w = _by_gain(star, rules, p, k, row - 3), p.weight[k]
+        normal[row * n] += w * g * star.flux * p.by_x[k]
+        normal[row * n + 1] += w * g * star.flux * p.by_y[k]
+        normal[row * n + 2] += w * g * p.value[k]
+        normal[row * n + row] += w * g * g
+        star.right[row] += w * g * p.residual[k]
+
+
+cdef inline double _by_gain(const Star *star, Rules rules, const Pixels *p, int k, int phase) noexcept nogil:
+    """The derivative of a pixel by the star's gain at its phase, over the frame's."""
+    return star.flux * p.value[k] * rules.gain[phase] / star.gain[phase]
 
 
 cdef bint _invert(double *normal, int n, double *out) noexcept nogil:
@@ -260,7 +262,7 @@ cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels
     for round_ in range(rounds):
         _gather(s, star, psf, rules, round_ == rounds - 1, p)
         if round_ == 0:
-            star.flux = _first_flux(s, star, p)
+            star.flux = _first_flux(p)
         # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
         _weigh(s, star, rules, p, 1 <= round_ < rounds - 1)
         _sum_up(s, star, rules, p, normal)
@@ -276,8 +278,10 @@ cdef double _leverage(const Stamp *s, const Star *star, Rules rules, const Pixel
     """How far (0 to 1) a fitted pixel decides what the model has there."""
     cdef double[4] slope
     cdef double total = 0.0
-    cdef int a, b, n = rules.parameters, most = 4 if rules.own else 3, gain = 3 + s.phase[p.place[k]]
-    _slopes(s, star, rules, p, k, slope)
+    cdef int a, b, n = rules.parameters, most = 3, phase = s.phase[p.place[k]], gain = 3 + phase
+    slope[0], slope[1], slope[2] = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
+    if rules.own:
+        slope[3], most = _by_gain(star, rules, p, k, phase), 4
     for a in range(most):
         for b in range(most):
             total += slope[a] * slope[b] * star.covariance[(a if a < 3 else gain) * n + (b if b < 3 else gain)]
