@@ -35,8 +35,8 @@ def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dic
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
     sample = plane[:-1:step, :-1:step]
-    # whole numbers: pixels would become floating-point ones
-    row, column = np.nonzero(sample > int(level + CLEAR * noise))
+    # whole numbers, else pixels would become floating-point ones; flat, because two axes take longer
+    row, column = np.divmod(np.flatnonzero(sample > int(level + CLEAR * noise)), sample.shape[1])
     y, x = step * row, step * column
     # no single hot pixel
     height = np.minimum.reduce([plane[y + i, x + j] for i in (0, 1) for j in (0, 1)]).astype(float)
