@@ -75,10 +75,14 @@ ctypedef fused pixel_t:
     unsigned char
     unsigned short
 
-# Sigma over the distance of the 75 and 90 % quantiles of a Gaussian.
-cdef double PER_TAIL = 1 / 0.607
-# What lies within so many sigma is the sky; it has this share of a Gaussian's rms.
-cdef double CLIP = 3.5, CLIPPED = 0.9969
+
+cdef struct Clip:
+    # Sigma over the median of absolute differences, and over the distance of the 75 and 90 % quantiles; what lies within so
+    # many sigma is the sky, and has this share of a Gaussian's rms.
+    double per_mad
+    double per_tail
+    double sigmas
+    double share
 
 
 cdef double _quantile(const unsigned short *v, int n, double share) noexcept nogil:
@@ -90,7 +94,7 @@ cdef double _quantile(const unsigned short *v, int n, double share) noexcept nog
 
 
 cdef void _clipped(
-    const unsigned short *v, int n, double per_mad, unsigned short *away, double *level, double *noise
+    const unsigned short *v, int n, const Clip *clip, unsigned short *away, double *level, double *noise
 ) noexcept nogil:
     """Mean and rms of values (n,) without stars and defects; away (n,): to work in.
 
@@ -100,27 +104,34 @@ cdef void _clipped(
     cdef long long[3] sums
     cdef double spread, mean
     away_from(v, n, <unsigned short>middle, away)
-    spread = per_mad * ranked(away, n, n // 2)
+    spread = clip.per_mad * ranked(away, n, n // 2)
     if spread == 0:
-        spread = PER_TAIL * (_quantile(v, n, 0.9) - _quantile(v, n, 0.75))
-    sums_of(v, n, middle, <int>max(CLIP * spread, 1.0), sums)
+        spread = clip.per_tail * (_quantile(v, n, 0.9) - _quantile(v, n, 0.75))
+    sums_of(v, n, middle, <int>max(clip.sigmas * spread, 1.0), sums)
     mean = sums[1] / <double>sums[0]
     level[0] = middle + mean
-    noise[0] = sqrt(max(sums[2] / <double>sums[0] - mean * mean, 0.0) * sums[0] / max(sums[0] - 1, 1)) / CLIPPED
+    noise[0] = sqrt(max(sums[2] / <double>sums[0] - mean * mean, 0.0) * sums[0] / max(sums[0] - 1, 1)) / clip.share
 
 
-def sampled(const pixel_t[:, ::1] plane, const int[:, ::1] rows, const int[:, ::1] columns, double per_mad):
+def sampled(
+    const pixel_t[:, ::1] plane, const int[:, ::1] rows, const int[:, ::1] columns, double per_mad, double per_tail,
+    double sigmas, double share,
+):
     """The sky's level and noise in cells of a plane (h, w), for each phase of its 2 x 2 pattern, from a sample.
 
     rows     (cells down, rows of each), and
     columns  (cells across, columns of each): pairs of neighbours, the first even
-    per_mad  sigma over the median of the absolute differences
+    per_mad  sigma of a Gaussian over the median of the absolute differences, and
+    per_tail  over the distance of its 75 and 90 % quantiles
+    sigmas   within which a pixel is of the sky
+    share    of a Gaussian's rms that these pixels have
 
     Returns level and noise, and the sample's highest value and how many pixels have it, (4, cells down, cells across).
     """
     cdef int down = rows.shape[0], across = columns.shape[0], tall = rows.shape[1], wide = columns.shape[1]
     cdef int n = tall // 2 * (wide // 2), i, j, phase, k, y, x, top
     cdef const pixel_t *row
+    cdef Clip clip = Clip(per_mad, per_tail, sigmas, share)
     if not n or tall % 2 or wide % 2 or np.min(rows) < 0 or np.min(columns) < 0:
         raise ValueError("a cell's rows and columns must be pairs")
     if np.max(rows) >= plane.shape[0] or np.max(columns) >= plane.shape[1]:
@@ -142,7 +153,7 @@ def sampled(const pixel_t[:, ::1] plane, const int[:, ::1] rows, const int[:, ::
                             value[k] = row[columns[j, x]]
                             top = max(top, <int>value[k])
                             k += 1
-                    _clipped(value, n, per_mad, value + n, &sky[0, phase, i, j], &sky[1, phase, i, j])
+                    _clipped(value, n, &clip, value + n, &sky[0, phase, i, j], &sky[1, phase, i, j])
                     highest[0, phase, i, j] = top
                     highest[1, phase, i, j] = equal(value, n, top)
     free(value)

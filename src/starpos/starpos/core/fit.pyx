@@ -20,8 +20,6 @@ cdef enum:
 
 # Equations whose scaled determinant is smaller have no solution.
 cdef double SINGULAR = log(1e-9)
-# A pixel whose light is below this share of the star's brightest is no outlier.
-cdef double FAINT = 0.15
 
 
 cdef class Rules:
@@ -31,14 +29,16 @@ cdef class Rules:
     colour_spread                    of a star's gains, 1 sigma
     dn_per_photon, misfit            of the light's noise
     widths                           within which pixels are fitted
-    outlier                          in sigmas
+    outlier, faint                   sigmas, and the share of the star's brightest pixel, above which a pixel is one
     """
 
     cdef int phases, own, parameters
     cdef double[PHASES] gain
-    cdef double held, dn_per_photon, misfit2, widths2, outlier2
+    cdef double held, dn_per_photon, misfit2, widths2, outlier2, faint
 
-    def __init__(self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier):
+    def __init__(
+        self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier, double faint
+    ):
         cdef int k
         if len(gain) not in (1, PHASES):
             raise ValueError(f"{len(gain)} gains: a frame has 1, a colour mosaic {PHASES}")
@@ -47,7 +47,7 @@ cdef class Rules:
         for k in range(self.phases):
             self.gain[k] = gain[k]
         self.held, self.dn_per_photon, self.misfit2 = colour_spread**-2, dn_per_photon, misfit * misfit
-        self.widths2, self.outlier2 = widths * widths, outlier * outlier
+        self.widths2, self.outlier2, self.faint = widths * widths, outlier * outlier, faint
 
 
 cdef struct Pixels:
@@ -161,7 +161,7 @@ cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint 
         variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
         p.weight[k] /= variance
         # most pixels are far from it
-        if mark and p.residual[k] > FAINT * star.flux * most:
+        if mark and p.residual[k] > rules.faint * star.flux * most:
             s.outlier[p.place[k]] = p.residual[k] > 0 and p.residual[k] * p.residual[k] > rules.outlier2 * variance
 
 

@@ -14,6 +14,9 @@ from starpos.normal import SIGMA_PER_MAD
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
 QUANTISATION = 12**-0.5
+# The sky is what lies within 3.5 sigma of a cell's median, which leaves 0.9969 of a Gaussian's rms; sigma comes from the
+# median of the differences, or where most pixels are equal (a sky cut off at 0) from the 75 and 90 % quantiles.
+CLIP = (SIGMA_PER_MAD, 1 / 0.607, 3.5, 0.9969)
 # A cell is partly white where this share of its pixels has the frame's largest value.
 WHITE = 0.03
 # A JPEG has smoothed the sky where this share of blocks is flat; a block of the smallest step is then a peak of 4 sigma.
@@ -93,7 +96,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     mosaic says whether the plane is a colour mosaic; None: it is one if the four phases see different skies.
     """
     rows, columns = (_sample(n, cell_px) for n in plane.shape)
-    level, noise, highest, count = sampled(plane, rows, columns, SIGMA_PER_MAD)
+    level, noise, highest, count = sampled(plane, rows, columns, *CLIP)
     samples = rows.shape[1] * columns.shape[1] // 4
     level, noise = _beside_lamps(np.where(highest == highest.max(), count, 0).mean(0) / samples, level, noise)
     if mosaic is None:

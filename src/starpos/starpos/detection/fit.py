@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weighted least-squares fit of position and flux of many stars at once, with the frame's PSF."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from starpos.core.fit import Rules, fitted
 from starpos.detection.psf import Psf
 from starpos.detection.stamps import Stamps
 
-# In sigmas.
-OUTLIER = 6.0
+# Sigmas above the model, and that share of the star's brightest pixel, from which a pixel is not the star's alone.
+OUTLIER, FAINT = 6.0, 0.15
 # Pixels within so many widths of the star are fitted; farther out there are only noise and neighbours.
 FIT_WIDTHS = 4.0
 
@@ -67,7 +67,7 @@ class Response:
         return noise**2 + np.float32(self.dn_per_photon) * light + np.float32(self.misfit**2) * light**2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit:
     """N fitted stars.
 
@@ -107,15 +107,25 @@ def fit_stars(
     phase nor the star's colour moves the position. The weights come from the model: the pixels' own noise would bias
     the fit.
     """
-    local, rules = psf.at(x, y), Rules(
-        response.gain, response.colour_spread, response.dn_per_photon, response.misfit, FIT_WIDTHS, OUTLIER
+    local, rules = (
+        psf.at(x, y),
+        Rules(
+            response.gain,
+            response.colour_spread,
+            response.dn_per_photon,
+            response.misfit,
+            FIT_WIDTHS,
+            OUTLIER,
+            FAINT,
+        ),
     )
     signal, noise = (np.ascontiguousarray(a, np.float32) for a in (stamps.signal, stamps.noise))
     corner = np.stack([stamps.x - stamps.reach, stamps.y - stamps.reach], 1).astype(float)
     first = np.stack([x, y], 1)
-    return Fit(
-        *fitted(signal, noise, stamps.good, stamps.phase, corner, first, local.axes, local.series, rules, rounds)
+    columns = fitted(
+        signal, noise, stamps.good, stamps.phase, corner, first, local.axes, local.series, rules, rounds
     )
+    return Fit(**dict(zip((f.name for f in fields(Fit)), columns, strict=True)))
 
 
 def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:

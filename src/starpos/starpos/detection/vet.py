@@ -126,7 +126,9 @@ def _spikes(stamps: Stamps, lesson: Lesson) -> tuple[np.ndarray, np.ndarray]:
 def _four(image: np.ndarray) -> np.ndarray:
     """The mean of the four pixels beside each of images (N, S, S); beyond the edges the image goes on as on them."""
     wide = np.pad(image, ((0, 0), (1, 1), (1, 1)), "edge")
-    return (wide[:, :-2, 1:-1] + wide[:, 2:, 1:-1] + wide[:, 1:-1, :-2] + wide[:, 1:-1, 2:]) * np.float32(0.25)
+    return (wide[:, :-2, 1:-1] + wide[:, 2:, 1:-1] + wide[:, 1:-1, :-2] + wide[:, 1:-1, 2:]) * np.float32(
+        0.25
+    )
 
 
 def _own_light(stamps: Stamps, fit: Fit, spike: np.ndarray) -> Stamps:

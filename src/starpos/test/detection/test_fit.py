@@ -7,7 +7,7 @@ from numpy.polynomial import hermite_e
 
 from starpos.core.fit import Rules, fitted
 from starpos.core.psf import evaluated, terms
-from starpos.detection.fit import FIT_WIDTHS, OUTLIER
+from starpos.detection.fit import FAINT, FIT_WIDTHS, OUTLIER
 
 SIZE = 15
 MISFIT, DN_PER_PHOTON, SPREAD = 0.01, 0.4, 0.3
@@ -73,7 +73,7 @@ def plain_fit(signal, noise, good, phase, corner, first, axes, series, gain, rou
             break
         if round_ > 0:
             most = (unit * inside).max((1, 2), keepdims=True)
-            outlier = (residual > OUTLIER * np.sqrt(variance)) & (residual > 0.15 * amount * most) & inside
+            outlier = (residual > OUTLIER * np.sqrt(variance)) & (residual > FAINT * amount * most) & inside
         step = (covariance @ right[..., None])[..., 0]
         x, y, flux = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1), flux + step[:, 2]
         if own_gains:
@@ -116,7 +116,7 @@ def stamps(rng, n, gain):
 
 
 def rules(gain):
-    return Rules(gain, SPREAD, DN_PER_PHOTON, MISFIT, FIT_WIDTHS, OUTLIER)
+    return Rules(gain, SPREAD, DN_PER_PHOTON, MISFIT, FIT_WIDTHS, OUTLIER, FAINT)
 
 
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
@@ -166,5 +166,5 @@ def test_a_star_without_light_has_no_place(rng):
 def test_what_does_not_fit_together_is_refused(which, change, rng):
     given = list(stamps(rng, 3, np.ones(1)))
     given[which] = change(given[which])
-    with pytest.raises(ValueError, match="px|shape|needed|phase|pairs|terms|axes"):
+    with pytest.raises(ValueError, match=r"px|shape|needed|phase|pairs|terms|axes"):
         fitted(*given, rules(np.ones(1)), 5)

@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from starpos.core.background import between, sampled
 from starpos.core.stamps import around
+from starpos.detection.background import CLIP
 from starpos.normal import SIGMA_PER_MAD
 
 
@@ -28,7 +29,7 @@ def test_cells_are_those_of_sorted_values(kind, rng):
     plane[20:, 28:] = np.where(rng.random((20, 28)) < 0.7, 0, plane[20:, 28:])
     rows = np.stack([np.arange(0, 20), np.arange(20, 40)]).astype(np.int32)
     columns = np.stack([np.arange(0, 28), np.arange(28, 56)]).astype(np.int32)
-    level, noise, highest, count = sampled(plane, rows, columns, SIGMA_PER_MAD)
+    level, noise, highest, count = sampled(plane, rows, columns, *CLIP)
     for i, j, phase in np.ndindex(2, 2, 4):
         values = plane[rows[i, phase // 2 :: 2]][:, columns[j, phase % 2 :: 2]].ravel().astype(float)
         expected = *plain_cell(values), values.max(), (values == values.max()).sum()
@@ -55,7 +56,13 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
     on = (rows >= 0) & (rows < 30) & (columns >= 0) & (columns < 20)
     phase = (2 * (rows % 2) + columns % 2) * (phases > 1)
     each = np.arange(40)[:, None, None]
-    expected = pixels - level[each, phase], noise[each, phase], on & (pixels < 900), on & (pixels >= 900), phase
+    expected = (
+        pixels - level[each, phase],
+        noise[each, phase],
+        on & (pixels < 900),
+        on & (pixels >= 900),
+        phase,
+    )
     for found, plain in zip(around(plane, x, y, 3, level, noise, 900), expected, strict=True):
         np.testing.assert_array_equal(found, plain)
 
@@ -63,10 +70,10 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
 def test_what_lies_beyond_the_frame_is_refused():
     plane, rows = np.zeros((8, 8), np.uint16), np.array([[0, 1, 8, 9]], np.int32)
     with pytest.raises(ValueError, match="beyond"):
-        sampled(plane, rows, rows, SIGMA_PER_MAD)
+        sampled(plane, rows, rows, *CLIP)
     with pytest.raises(ValueError, match="pairs"):
-        sampled(plane, rows[:, :3].copy(), rows, SIGMA_PER_MAD)
-    with pytest.raises(ValueError, match="2 x 2"):
+        sampled(plane, rows[:, :3].copy(), rows, *CLIP)
+    with pytest.raises(ValueError, match="in 2 x 2 or more"):
         between(np.zeros((1, 1, 5)), np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="phases"):
         around(plane, np.zeros(2, int), np.zeros(1, int), 1, *np.zeros((2, 2, 1), np.float32), 1.0)
