@@ -174,12 +174,10 @@ def _peaks_of(
     left_out = max(0, len(height) - 4 * limit)
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
     x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
-    starlike = ~are_alone(plane, background, x, y)
+    alone = [are_alone(plane, background, x[c], y[c]) for c in _chunks(len(x))]
+    starlike = ~np.concatenate([*alone, np.zeros(0, bool)])
     x, y, height = x[starlike], y[starlike], height[starlike]
-    near = [
-        surroundings(plane, background, x[c], y[c], round(6.7 * kernel.sigma))
-        for c in (slice(i, i + CHUNK) for i in range(0, len(x), CHUNK))
-    ]
+    near = [surroundings(plane, background, x[c], y[c], round(6.7 * kernel.sigma)) for c in _chunks(len(x))]
     raised, uneven = np.concatenate(near, 1) if near else np.zeros((2, 0))
     height = (height - raised / (kernel.norm * correlation)) / uneven
     keep = np.flatnonzero(height > _above_tail(height, threshold))
@@ -187,6 +185,11 @@ def _peaks_of(
     x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
     left_out += max(0, len(x) - limit)
     return Peaks(x[:limit], y[:limit], height[:limit], correlation, left_out)
+
+
+def _chunks(count: int) -> list[slice]:
+    """Peaks that are looked at together, of so many."""
+    return [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
 
 
 def _in_parts(
