@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from starpos.core.background import between, sampled
-from starpos.core.stamps import around
+from starpos.core.stamps import around, scatter
 from starpos.detection.background import CLIP
 from starpos.normal import SIGMA_PER_MAD
 
@@ -65,6 +65,15 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
     )
     for found, plain in zip(around(plane, x, y, 3, level, noise, 900), expected, strict=True):
         np.testing.assert_array_equal(found, plain)
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 55, 56])
+def test_scatter_is_that_of_medians(pixels, rng):
+    signal, noise = rng.uniform(1, 9, (2, 20, pixels)).astype(np.float32)
+    score = signal.astype(float) / noise
+    level = np.median(score, axis=1)
+    spread = SIGMA_PER_MAD * np.median(np.abs(score - level[:, None]), axis=1)
+    np.testing.assert_allclose(scatter(signal, noise, SIGMA_PER_MAD), (level, spread), rtol=1e-12, atol=1e-12)
 
 
 def test_what_lies_beyond_the_frame_is_refused():
