@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of the README and of the tutorials, typed one after another, do what their pages say.
+"""The commands of the README, of the tutorials and of how A3 is found, typed one after another, do what their pages say.
 
 Some seconds of CPU: two nights of ten frames, which are the first that a newcomer sees.
 """
@@ -26,13 +26,21 @@ def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:
     for line in shown(ROOT / page):
         if not line.startswith("starpos ") or line.startswith(ELSEWHERE):
             continue
-        _, command, *rest = words(line)
+        _, command, *rest = expanded(words(line), folder)
         lists = {"simulate": LISTS[:1], "solve": LISTS[1:]}.get(command, ())
-        more = [] if set(lists) & set(rest) else lists
+        more = [] if {*lists, "--instrument"} & set(rest) else lists
         status, out, errors = run(capsys, command, *rest, *more)
         assert status == 0, (line, errors)
         said[line] = out
     return said
+
+
+def expanded(line: list[str], folder) -> list[str]:
+    """The words of a line, as a shell makes them where there are lists instead of frames."""
+    found = ([str(f) for f in sorted(folder.glob(w.replace("*.fits", "stars_*.csv")))] for w in line)
+    return [
+        name for word, names in zip(line, found, strict=True) for name in (names if "*" in word else [word])
+    ]
 
 
 def test_the_readmes_commands_make_a_night_and_its_place(tmp_path, monkeypatch, capsys):
@@ -49,6 +57,21 @@ def test_the_disks_commands_print_what_the_page_says(tmp_path, monkeypatch, caps
     # of frames instead of lists the last digits are others
     [night] = re.findall(r"^    (night: 10 frames together: .*)$", page, re.MULTILINE)
     assert any(numbers(line) == pytest.approx(numbers(night), rel=0.05) for line in lines(said))
+
+
+def test_a3_is_found_by_the_commands_that_say_how(tmp_path, monkeypatch, capsys):
+    mounted = ("--misalignment", "0.9", "-0.5", "20", *LISTS[:1])
+    for folder, more in {
+        "known": ("-n", "2"),
+        "night": ("-n", "2"),
+        "turn": ("-n", "4", "--turn", "90"),
+    }.items():
+        assert run(capsys, "simulate", tmp_path / folder, *more, *mounted)[0] == 0
+    said = typed("docs/how-to/calibrate.md", tmp_path, monkeypatch, capsys)
+    [night] = [out for line, out in said.items() if line.startswith("starpos solve night")]
+    [where] = [line for line in night.splitlines() if "2 frames together" in line]
+    assert numbers(where)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
+    assert {f.name for f in tmp_path.glob("*.yaml")} == {"mine.yaml", "pillar.yaml"}
 
 
 def lines(said: dict[str, str]) -> list[str]:
