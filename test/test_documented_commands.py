@@ -151,15 +151,29 @@ def test_the_notebook_is_that_of_the_page_and_runs(monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == "35.7044 51.4104"
 
 
+WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700")
+
+
+def python_of(page: str) -> str:
+    [code] = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
+    return code
+
+
 def test_the_tutorials_python_solves_a_night(tmp_path, monkeypatch):
-    page = (ROOT / "docs" / "tutorials" / "disk.md").read_text()
-    [code] = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    wide = ("--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700")
-    assert main(["simulate", "night", "-n", "1", *wide]) == 0
+    assert main(["simulate", "night", "-n", "1", *WIDE]) == 0
     names = {}
-    exec(code.replace("night.solve()", "solved = night.solve()"), names)
+    exec(python_of("docs/tutorials/disk.md").replace("night.solve()", "solved = night.solve()"), names)
     assert "1 of 1 frames fixed" in repr(names["solved"])
+
+
+def test_the_readmes_python_prints_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "night", "-n", "3", *WIDE]) == 0
+    page = python_of("README.md").replace("10 of 10 frames", "3 of 3 frames")
+    example = doctest.DocTestParser().get_doctest(page, {}, "README.md", None, 0)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    assert runner.run(example).failed == 0 and len(example.examples) == 3
 
 
 def test_the_instrument_file_that_is_shown_can_be_read(tmp_path):

@@ -70,6 +70,24 @@ def test_the_readme_is_short():
     assert len(lines) <= 120
 
 
+def test_the_readme_is_read_with_ease():
+    """Its prose, without tables, code and pictures: words a sentence."""
+    text = re.sub(r"```.*?```", "", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    prose = re.sub(r"^(?:    |\||#|!).*$", "", text, flags=re.MULTILINE)
+    prose = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", prose)
+    paragraphs = re.split(r"\n\s*\n|\n- ", prose)
+    sentences = [s for p in paragraphs for s in re.split(r"(?<=[.?!])\s+", p) if s.strip()]
+    long = [s for s in sentences if len(s.split()) > 35]
+    assert not long and len(prose.split()) < 18 * len(sentences)
+
+
+def test_the_readme_says_what_a_newcomer_asks_first():
+    text = (ROOT / "README.md").read_text()
+    asked = ("**Status**", "never run on hardware", "## How accurate", "## What it is not for", "(**A3**)")
+    assert [words for words in asked if words not in text] == []
+    assert [page for page in ("parts", "install", "calibrate") if f"docs/how-to/{page}.md" not in text] == []
+
+
 def test_every_page_is_in_the_sites_table_of_contents():
     """A page that is in none is a warning of Sphinx, which is a failure; this says so without Sphinx."""
     folder = ROOT / "docs"

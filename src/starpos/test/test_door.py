@@ -63,10 +63,13 @@ def night(tmp_path_factory):
     return simulated(tmp_path_factory.mktemp("door") / "night")
 
 
-def test_the_readmes_example_solves_a_night(night):
-    [example] = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    program = example.replace("600e3 / 6.4", "29.67e3 / 6.4").replace("night/", f"{night}/")
-    assert said(program).startswith("Status.OK")
+def test_the_readmes_examples_solve_a_night(night, monkeypatch, capsys):
+    monkeypatch.chdir(night.parent)
+    examples = "\n".join(re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL))
+    exec(examples.replace("600e3 / 6.4", "29.67e3 / 6.4"), {})
+    said = capsys.readouterr().out
+    assert said.startswith("<night: 5 of 5 frames fixed; +35.70") and said.count("\n<frame_") == 5
+    assert "<Fix: +35.70" in said
 
 
 def test_the_doors_own_example_is_what_comes_of_it(night, monkeypatch):

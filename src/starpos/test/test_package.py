@@ -17,6 +17,15 @@ def test_the_licences_of_what_is_shipped_go_with_it():
     assert b"Hog E., Fabricius C." in kept["BSD-2-Clause.txt"]
 
 
+def test_the_metadata_is_whole():
+    """What `twine check` does not ask for."""
+    text = (PACKAGE / "pyproject.toml").read_text()
+    for key in ("description", "readme", "authors", "maintainers", "keywords", "classifiers"):
+        assert re.search(rf"^{key} = .", text, re.MULTILINE), key
+    assert re.search(r'^\[project\.urls\]\n".*" = "https://', text, re.MULTILINE)
+    assert 'license_files=["LICENSES/*"]' in (PACKAGE / "setup.py").read_text()
+
+
 def test_who_made_the_data_is_said():
     said = (REPOSITORY / "REUSE.toml").read_text()
     for data in PACKAGE.glob("starpos/*/data"):

@@ -148,7 +148,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         "--misalignment-stddev",
         type=number(0, 360_000),
         metavar="ARCSEC",
-        help="error of A3 about each axis; without it A3 is not known (10 deg, 1100 km)",
+        help="error of A3 about each axis; without it A3 is not known (10 deg and any turn, over 1000 km)",
     )
     parser.add_argument(
         "--inclinometer",

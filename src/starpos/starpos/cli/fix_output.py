@@ -125,7 +125,7 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
     """The line of a frame; turning: its place waits for the other headings."""
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
-    # one frame of a turn does not tell A3, so its own place would be 1100 km wide
+    # one frame of a turn does not tell A3, so its own place would be over 1000 km wide
     where = "its place waits for the whole turn" if turning else str(s.fix.in_degrees)
     stars = f", {len(s.names)} of {s.stars_detected} stars" if s.stars_detected else ""
     return f"{path}: {where}{stars}"
@@ -170,8 +170,9 @@ def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
     turned = f" (the last of {together.poses} poses)" if together.poses > 1 else ""
     folder = "" if night.folder is None else f"{night.folder}: "
     on_ground = InDegrees.of(ground.latitude, ground.longitude, 0.0, ground.covariance)
+    frames = "1 frame" if together.frames == 1 else f"{together.frames} frames together"
     lines = [
-        f"{folder}{together.frames} frames together: {together.in_degrees}{turned} (astronomic)",
+        f"{folder}{frames}: {together.in_degrees}{turned} (astronomic)",
         f"geodetic, WGS 84: {on_ground.where} (the deflection of the vertical included)",
         "where the error comes from, 1 sigma of each source in the place and the heading:",
     ]

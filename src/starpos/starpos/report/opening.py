@@ -78,8 +78,8 @@ def open_night(
     """A night: a folder of FITS frames, or else of CSV lists of stars, with tilt.csv; not read yet.
 
     instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
-    calibration: A3 in place of the instrument's; while nobody knows A3 the place is 1100 km wide, unless the night is
-    solved with self_calibrate=True.  atmosphere: None: not measured.  vertical: its deflection; None: not known.
+    calibration: A3 in place of the instrument's; while nobody knows A3 the place is over 1000 km wide, unless the night
+    is solved with self_calibrate=True.  atmosphere: None: not measured.  vertical: its deflection; None: not known.
     Raises StarposError if there is no frame, or the instrument's file cannot be used.
     """
     folder = Path(folder)

@@ -27,8 +27,8 @@ from starpos.sky.site import Site
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
 TURN_IT = "turn it on the spot"
 CALIBRATE_IT = (
-    "fixes are 1100 km wide. Set calibration_url or misalignment_stddev, call solver/calibrate at a known place, or set "
-    "self_calibration and turn it on the spot"
+    "fixes are over 1000 km wide. Set calibration_url or misalignment_stddev, call solver/calibrate at a known place, or "
+    "set self_calibration and turn it on the spot"
 )
 # So many old frames in a row, in order, are not late: a bag is played again.
 LATE_FRAMES = 3

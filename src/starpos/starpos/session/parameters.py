@@ -52,7 +52,7 @@ PARAMETERS = (
         "misalignment_stddev",
         NAN,
         "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. Too small "
-        "makes fixes claim more than they hold; unset, the misalignment is not known: 10 deg, 1100 km.",
+        "makes fixes claim more than they hold; unset, the misalignment is not known: over 1000 km.",
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,

@@ -62,7 +62,7 @@ def test_solve_without_json(night, capsys):
 @pytest.mark.parametrize(
     "given", [(), ("--misalignment", "0", "0", "0")], ids=["not given", "without its error"]
 )
-def test_an_a3_that_nobody_vouches_for_is_1100_km_and_said_in_a_sentence(given, lists, capsys):
+def test_an_a3_that_nobody_vouches_for_is_over_1000_km_and_said_in_a_sentence(given, lists, capsys):
     status, out, errors = solve(capsys, lists, *WIDE, *given, "--json", frames="stars_0000.csv")
     assert status == 0
     (said,) = errors

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of the README, of the tutorials and of how A3 is found, typed one after another, do what their pages say.
+
+Some seconds of CPU: two nights of ten frames, which are the first that a newcomer sees.
+"""
+
+import json
+import re
+
+import pytest
+from test_documented_commands import shown, words
+from test_documents import ROOT
+
+from starpos_testing.command_line import run
+
+# frames are written as lists of their stars, which is quick and gives the same answers to some metres
+LISTS = ("--stars-only", "--focal-mm", "600", "--pixel-um", "6.4")
+# a photo that is identified with no option, and a painted report, have tests of their own
+ELSEWHERE = ("starpos identify photo.jpg", "starpos report", "starpos doctor")
+
+
+def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:
+    """What each command of a page prints, typed in an empty folder."""
+    monkeypatch.chdir(folder)
+    said = {}
+    for line in shown(ROOT / page):
+        if not line.startswith("starpos ") or line.startswith(ELSEWHERE):
+            continue
+        _, command, *rest = expanded(words(line), folder)
+        lists = {"simulate": LISTS[:1], "solve": LISTS[1:]}.get(command, ())
+        more = [] if {*lists, "--instrument"} & set(rest) else lists
+        status, out, errors = run(capsys, command, *rest, *more)
+        assert status == 0, (line, errors)
+        said[line] = out
+    return said
+
+
+def expanded(line: list[str], folder) -> list[str]:
+    """The words of a line, as a shell makes them where there are lists instead of frames."""
+    found = ([str(f) for f in sorted(folder.glob(w.replace("*.fits", "stars_*.csv")))] for w in line)
+    return [
+        name for word, names in zip(line, found, strict=True) for name in (names if "*" in word else [word])
+    ]
+
+
+def test_the_readmes_commands_make_a_night_and_its_place(tmp_path, monkeypatch, capsys):
+    *_, solved = typed("README.md", tmp_path, monkeypatch, capsys).values()
+    assert "night: 10 frames together: +35.70" in solved
+
+
+def test_the_disks_commands_print_what_the_page_says(tmp_path, monkeypatch, capsys):
+    said = typed("docs/tutorials/disk.md", tmp_path, monkeypatch, capsys)
+    page = (ROOT / "docs" / "tutorials" / "disk.md").read_text()
+    [turned] = re.findall(r"^    (turn: 12 frames together: .*)$", page, re.MULTILINE)
+    assert any(turned in out.splitlines() for out in said.values())
+    assert (tmp_path / "mine.yaml").is_file()
+    # of frames instead of lists the last digits are others
+    [night] = re.findall(r"^    (night: 10 frames together: .*)$", page, re.MULTILINE)
+    assert any(numbers(line) == pytest.approx(numbers(night), rel=0.05) for line in lines(said))
+
+
+def test_a3_is_found_by_the_commands_that_say_how(tmp_path, monkeypatch, capsys):
+    mounted = ("--misalignment", "0.9", "-0.5", "20", *LISTS[:1])
+    for folder, more in {
+        "known": ("-n", "2"),
+        "night": ("-n", "2"),
+        "turn": ("-n", "4", "--turn", "90"),
+    }.items():
+        assert run(capsys, "simulate", tmp_path / folder, *more, *mounted)[0] == 0
+    said = typed("docs/how-to/calibrate.md", tmp_path, monkeypatch, capsys)
+    [night] = [out for line, out in said.items() if line.startswith("starpos solve night")]
+    [where] = [line for line in night.splitlines() if "2 frames together" in line]
+    assert numbers(where)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
+    assert {f.name for f in tmp_path.glob("*.yaml")} == {"mine.yaml", "pillar.yaml"}
+
+
+def lines(said: dict[str, str]) -> list[str]:
+    return [line for out in said.values() for line in out.splitlines() if line.startswith("night: ")]
+
+
+def numbers(line: str) -> list[float]:
+    return [float(n) for n in re.findall(r"[-+]?\d+(?:\.\d+)?", line)]
+
+
+def test_the_methods_commands_give_the_numbers_it_begins_with(tmp_path, monkeypatch, capsys):
+    said = typed("docs/tutorials/method.md", tmp_path, monkeypatch, capsys)
+    page = (ROOT / "docs" / "tutorials" / "method.md").read_text()
+    [pointing] = [json.loads(out) for out in said.values() if out.startswith("{")]
+    told = f"{pointing['ra']:.6f}, {pointing['dec']:.6f}, {pointing['roll']:.6f}"
+    assert f"ra, dec, top = {told}" in page
+    assert f"{pointing['stars_matched']} of {pointing['stars_detected']} stars" in page
+    _, reading, *_ = (tmp_path / "one" / "tilt.csv").read_text().splitlines()
+    assert all(f"radians({angle})" in page for angle in reading.split(",")[1:3])
