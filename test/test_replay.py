@@ -11,6 +11,9 @@ import make_bag
 import numpy as np
 import pytest
 import yaml
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -19,7 +22,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from starpos_bringup.recording.bag_writer import offered_qos
-from starpos_interfaces.msg import Solution, StarArray
+from starpos_bringup.recording.participants import Participants
+from starpos_common import replayed
+from starpos_interfaces.msg import Played, Solution, StarArray, Taken
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import photograph
 from starpos_testing.patience import WAIT_S
@@ -32,6 +37,37 @@ S = 10**9
 @pytest.fixture(scope="module")
 def truth():
     return json.loads(NIGHT.with_suffix(".json").read_text())
+
+
+def test_nodes_that_speak_at_once_are_all_heard(graph):
+    said = []
+    seat = Node("player", context=graph.node.context)
+    executor = SingleThreadedExecutor(context=seat.context)
+    executor.add_node(seat)
+    player, names = Participants(seat, said.append), ("/one", "/other")
+    played = [graph.hear(Played, replayed.PLAYED) for _ in names]
+    nodes = [graph.node.create_publisher(Taken, replayed.TAKEN, replayed.LATCHED) for _ in names]
+
+    def speak(**words):
+        for node, name in zip(nodes, names, strict=True):
+            node.publish(Taken(node=name, **words))
+        assert all(node.wait_for_all_acked(Duration(seconds=WAIT_S)) for node in nodes)
+
+    def until(condition):
+        graph.wait(lambda: executor.spin_once(timeout_sec=0) or condition())
+
+    until(lambda: all(node.get_subscription_count() for node in nodes))
+    speak()
+    until(player.all_here)
+    player.begin()
+    until(lambda: played[0])
+    speak(replay=played[0][0].replay, index=played[0][0].index)
+    until(player.have_taken_all)
+    assert said == [] and not player.lost
+    for node in nodes:
+        graph.node.destroy_publisher(node)
+    executor.shutdown()
+    seat.destroy_node()
 
 
 # Before there is an instrument.

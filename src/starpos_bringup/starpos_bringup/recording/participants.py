@@ -7,14 +7,17 @@ from collections.abc import Callable
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from starpos_common.replayed import DEPTH, LATCHED, PLAYED, TAKEN
+from starpos_common.replayed import DEPTH, PLAYED, TAKEN
 from starpos_interfaces.msg import Played, Taken
 
 # A node that says nothing for so long has ended, or hangs; they speak once a second.
 SILENCE_S = 30.0
 # A node that waits for so long for a message that was published has lost it.
 LOST_S = 30.0
+# All nodes speak on one topic: with a depth of one, the word of one that is not read yet would replace another's.
+WORDS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class _Participant:
@@ -49,7 +52,7 @@ class Participants:
         # whether one was lost on the way
         self.lost = False
         self._publisher = node.create_publisher(Played, PLAYED, DEPTH)
-        node.create_subscription(Taken, TAKEN, self._on_taken, LATCHED)
+        node.create_subscription(Taken, TAKEN, self._on_taken, WORDS)
 
     def _on_taken(self, words: Taken) -> None:
         if words.node in self._heard:
