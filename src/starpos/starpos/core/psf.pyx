@@ -134,6 +134,14 @@ cdef void evaluate(
             by_y[first + p] = (psf.axes[1] * by_u[p] + psf.axes[3] * by_v[p]) * gauss[p]
 
 
+cdef inline int _offsets(double left, double top, int size, int first, double *dx, double *dy) noexcept nogil:
+    """Set the offsets (px) of a stamp's pixels from the first on, at most a block; how many."""
+    cdef int n = min(BLOCK, size * size - first), p
+    for p in range(n):
+        dx[p], dy[p] = left + (first + p) % size, top + (first + p) // size
+    return n
+
+
 def evaluated(
     const double[:, :, ::1] axes, const double[:, :, ::1] series, const double[::1] left, const double[::1] top, int size
 ):
@@ -143,26 +151,25 @@ def evaluated(
     series     (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
     left, top  (N,) px: of the first column and the first row from each star's centre
     """
-    cdef int n = left.shape[0], area = size * size, k, block, first, p, place
+    cdef int stars = left.shape[0], area = size * size, n, k, block, first, p, place
     cdef double[BLOCK] dx
     cdef double[BLOCK] dy
     cdef double[3][BLOCK] found
     cdef Local psf
-    sound(axes, series, n)
-    if top.shape[0] != n or size < 1:
-        raise ValueError(f"{n} stars, {top.shape[0]} rows, stamps of {size} px: as many rows as stars, and at least a pixel")
-    out = np.empty((3, n, size, size), np.float32)
-    cdef float[:, :, ::1] image = out.reshape(3, n, area)
+    sound(axes, series, stars)
+    if top.shape[0] != stars or size < 1:
+        raise ValueError(f"{stars} stars, {top.shape[0]} rows, stamps of {size} px: as many rows as stars, and at least a pixel")
+    out = np.empty((3, stars, size, size), np.float32)
+    cdef float[:, :, ::1] image = out.reshape(3, stars, area)
     with nogil:
-        for k in range(n):
+        for k in range(stars):
             local_of(axes, series, k, &psf)
             for block in range(blocks(area)):
                 first = block * BLOCK
-                for p in range(min(BLOCK, area - first)):
-                    dx[p], dy[p] = left[k] + (first + p) % size, top[k] + (first + p) // size
-                evaluate(&psf, dx, dy, min(BLOCK, area - first), found[0], found[1], found[2])
+                n = _offsets(left[k], top[k], size, first, dx, dy)
+                evaluate(&psf, dx, dy, n, found[0], found[1], found[2])
                 for place in range(3):
-                    for p in range(min(BLOCK, area - first)):
+                    for p in range(n):
                         image[place, k, first + p] = <float>found[place][p]
     return out[0], out[1], out[2]
 
@@ -172,7 +179,7 @@ def terms(const double[:, :, ::1] axes, const double[::1] left, const double[::1
 
     orders (T, 2): i, j of each; the others as in `evaluated`.
     """
-    cdef int n = left.shape[0], area = size * size, count = orders.shape[0], k, block, first, p, highest = 1
+    cdef int stars = left.shape[0], area = size * size, count = orders.shape[0], n, k, block, first, highest = 1
     cdef double[BLOCK] dx
     cdef double[BLOCK] dy
     cdef double[BLOCK] u
@@ -180,23 +187,22 @@ def terms(const double[:, :, ::1] axes, const double[::1] left, const double[::1
     cdef double[BLOCK] gauss
     cdef double[:, :, ::1] constant = np.ones((1, 1, 1))
     cdef Local psf
-    sound(axes, constant, n)
-    if top.shape[0] != n or orders.shape[1] != 2 or size < 1:
+    sound(axes, constant, stars)
+    if top.shape[0] != stars or orders.shape[1] != 2 or size < 1:
         raise ValueError("as many rows as stars, two orders of each term, and stamps of at least a pixel are needed")
     for k in range(count):
         highest = max(highest, max(orders[k, 0], orders[k, 1]))
         if not (0 <= orders[k, 0] <= ORDERS and 0 <= orders[k, 1] <= ORDERS):
             raise ValueError(f"a term of orders {orders[k, 0]} and {orders[k, 1]}: they must be 0 to {ORDERS}")
-    out = np.empty((n, count, area), np.float32)
+    out = np.empty((stars, count, area), np.float32)
     cdef float[:, :, ::1] term = out
     with nogil:
-        for k in range(n):
+        for k in range(stars):
             local_of(axes, constant, k, &psf)
             for block in range(blocks(area)):
                 first = block * BLOCK
-                for p in range(min(BLOCK, area - first)):
-                    dx[p], dy[p] = left[k] + (first + p) % size, top[k] + (first + p) // size
-                _scaled(&psf, dx, dy, min(BLOCK, area - first), u, v, gauss)
+                n = _offsets(left[k], top[k], size, first, dx, dy)
+                _scaled(&psf, dx, dy, n, u, v, gauss)
                 if count:
-                    terms_at(&orders[0, 0], count, highest, u, v, gauss, min(BLOCK, area - first), area, &term[k, 0, first])
+                    terms_at(&orders[0, 0], count, highest, u, v, gauss, n, area, &term[k, 0, first])
     return out
