@@ -14,6 +14,9 @@ from starpos.normal import SIGMA_PER_MAD
 RAISED, UNEVEN = 0.6, 1.6
 # The 24 pixels around a hot pixel hold together less than this share of its light and than so many sigma of their noise.
 ALONE, NOTHING = 0.25, 3.0
+# Hot pixels may be neighbours: of nine pixels all but the brightest, or all but the two brightest, then hold less than
+# these shares of the brightest's light. In a star of 1 px FWHM they hold 0.7 even where two share the light.
+HALF, QUARTER = 0.5, 0.25
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,10 +79,13 @@ def cut(
 
 
 def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether the pixels x, y (N,) int are hot: their neighbours together have less than half the brightest's light."""
-    core = cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9)
-    peak = core.max(1)
-    return core.sum(1) - peak < 0.5 * peak
+    """Whether the pixels x, y (N,) int are hot, one or two together: the others of nine have hardly any light.
+
+    Less than half the brightest's without it, or less than a quarter of it without the second too.
+    """
+    core = np.sort(cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9), axis=1)
+    peak, second, rest = core[:, 8], core[:, 7], core[:, :7].sum(1)
+    return (rest + second < HALF * peak) | (rest < QUARTER * peak)
 
 
 def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -212,6 +212,20 @@ def test_hot_pixels_cost_no_fit_each_and_hardly_a_star(rng):
     assert len(peaks_of(pixels).x) < len(stars) + 0.4 * hot.sum()
 
 
+@pytest.mark.parametrize("seed", [1, 6])
+def test_pairs_of_hot_pixels_do_not_teach_how_a_star_looks(seed):
+    rng, size = np.random.default_rng(seed), (1600, 1600)
+    stars = grid(size, 270, ELECTRONS, rng)
+    stars[:, 2] = np.minimum(500 * (1 + rng.pareto(1, len(stars))), 1e5)
+    light = noisy(field(size, stars, trail=(2.6, -2.2)), rng).astype(float)
+    hot = rng.random(size) < 0.003
+    light[hot] += 100 + rng.exponential(2000, hot.sum())
+    found = detect(Frame(light.clip(0, 65535).astype(np.uint16)))
+    index = match(found.stars, stars)
+    assert np.all(index >= 0) and len(found.stars) == len(stars)
+    assert 2.9 < found.fwhm_px < 3.05
+
+
 def test_a_disc_that_saturates_is_few_peaks_and_hides_no_star_a_cell_of_the_background_away(rng):
     stars = grid(SIZE, 50, ELECTRONS, rng)
     y, x = np.indices(SIZE)
