@@ -228,3 +228,9 @@ def test_without_stars_and_of_bad_readings_there_is_no_fix_but_a_sentence(graph,
     assert ears.fixes and not ears.headings and not ears.odometry
     assert all(m.status.status == NavSatStatus.STATUS_NO_FIX and np.isnan(m.latitude) for m in ears.fixes)
     assert graph.call(Trigger, "navigator/reset", Trigger.Request()).success
+
+
+def test_the_transform_is_published_as_long_as_it_is_asked_for(graph, ears):
+    for wanted in (False, True):
+        assert graph.set("navigator", publish_tf=wanted) == (True, "")
+        graph.wait(lambda n=int(wanted): graph.node.count_publishers("/tf") == n, f"{wanted} on /tf")

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of the README, of the tutorials and of how A3 is found, typed one after another, do what their pages say.
+"""The commands of the README, of the tutorials and of the how-tos, typed one after another, do what their pages say.
 
-Some seconds of CPU: two nights of ten frames, which are the first that a newcomer sees.
+Some seconds of CPU: two nights of ten frames, which are the first that a newcomer sees, and smaller ones.
 """
 
 import json
 import re
 
 import pytest
+import yaml
 from test_documented_commands import shown, words
 from test_documents import ROOT
 
@@ -15,8 +16,8 @@ from starpos_testing.command_line import run
 
 # frames are written as lists of their stars, which is quick and gives the same answers to some metres
 LISTS = ("--stars-only", "--focal-mm", "600", "--pixel-um", "6.4")
-# a photo that is identified with no option, and a painted report, have tests of their own
-ELSEWHERE = ("starpos identify photo.jpg", "starpos report", "starpos doctor")
+# a photo that is identified with no option, a painted report and a cluster have tests of their own
+ELSEWHERE = re.compile("starpos (?:identify photo.jpg|report|doctor|.* --scheduler )")
 
 
 def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:
@@ -24,7 +25,7 @@ def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:
     monkeypatch.chdir(folder)
     said = {}
     for line in shown(ROOT / page):
-        if not line.startswith("starpos ") or line.startswith(ELSEWHERE):
+        if not line.startswith("starpos ") or ELSEWHERE.match(line):
             continue
         _, command, *rest = expanded(words(line), folder)
         lists = {"simulate": LISTS[:1], "solve": LISTS[1:]}.get(command, ())
@@ -72,6 +73,45 @@ def test_a3_is_found_by_the_commands_that_say_how(tmp_path, monkeypatch, capsys)
     [where] = [line for line in night.splitlines() if "2 frames together" in line]
     assert numbers(where)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
     assert {f.name for f in tmp_path.glob("*.yaml")} == {"mine.yaml", "pillar.yaml"}
+
+
+def test_the_camera_is_calibrated_by_the_command_that_says_how(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    assert run(capsys, "simulate", tmp_path / "night", "-n", "6", "--turn", "60", *LISTS[:1])[0] == 0
+    typed("docs/how-to/calibrate_camera.md", tmp_path, monkeypatch, capsys)
+    camera = yaml.safe_load((tmp_path / "camera.yaml").read_text())
+    assert camera["camera_matrix"]["data"][0] == pytest.approx(600 / 0.0064, rel=1e-4)
+    assert (tmp_path / "camera.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_solvers_pointings_make_a_place_by_the_command_that_says_how(tmp_path, monkeypatch, capsys):
+    assert run(capsys, "simulate", tmp_path / "night", "-n", "3", *LISTS[:1])[0] == 0
+    frames = json.loads((tmp_path / "night" / "truth.json").read_text())["frames"]
+    _, out, _ = run(capsys, "identify", "--json", *sorted((tmp_path / "night").glob("stars_*")), *LISTS[1:])
+    pointings = [json.loads(line) for line in out.splitlines()]
+    page = (ROOT / "docs" / "how-to" / "pointings.md").read_text()
+    [head] = re.findall(r"^    (utc_unix_s,ra_deg,.*)$", page, re.MULTILINE)
+    rows = [
+        f"{frame['mid_unix_s']},{p['ra']},{p['dec']},{p['roll']},1.5,20"
+        for frame, p in zip(frames, pointings, strict=True)
+    ]
+    (tmp_path / "table.csv").write_text("\n".join([head, *rows]) + "\n")
+    known = "camera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [0, 0, 0]"
+    known = f"starpos_instrument: 1\n{known}\ncalibration_stddev_arcsec: [5, 5, 20]\n"
+    (tmp_path / "mine.yaml").write_text(known)
+    [solved] = typed("docs/how-to/pointings.md", tmp_path, monkeypatch, capsys).values()
+    [night] = [line for line in solved.splitlines() if "3 frames together" in line]
+    assert numbers(night)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
+
+
+def test_an_archives_nights_have_a_place_each_by_the_command_that_says_how(tmp_path, monkeypatch, capsys):
+    (tmp_path / "archive").mkdir()
+    for night, latitude in (("first", 35.0), ("second", -20.0)):
+        where = ("--latitude", latitude, "--misalignment", "0", "0", "0")
+        assert run(capsys, "simulate", tmp_path / "archive" / night, "-n", "2", *where, *LISTS[:1])[0] == 0
+    [solved] = typed("docs/how-to/many_nights.md", tmp_path, monkeypatch, capsys).values()
+    places = [numbers(told)[0] for told in re.findall("2 frames together: (.*)", solved)]
+    assert places == pytest.approx([35.0, -20.0], abs=0.1)
 
 
 def lines(said: dict[str, str]) -> list[str]:
