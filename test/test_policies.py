@@ -118,7 +118,7 @@ def hold(graph, *enclaves: str):
 @pytest.mark.usefixtures("tf2")
 def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
-    secured("starpos_solver", "solver", sim)
+    secured("starpos_solver", "solver", sim, "gyro:=true")
     secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
     secured("starpos_camera", "detector", sim)
