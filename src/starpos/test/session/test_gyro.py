@@ -2,10 +2,10 @@
 """The gyro's prediction: right where readings support it, none where they do not, and never a wrong answer."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from imu_readings import reading
 from scipy.spatial.transform import Rotation
 
 from starpos.fix.solver import Status
@@ -37,17 +37,6 @@ class Said(list):
 
     def refuse(self, name, sentence):
         self.append(sentence)
-
-
-def reading(unix_s, rate, measured=True):
-    ns = round(unix_s * 1e9)
-    stamp = SimpleNamespace(sec=ns // 10**9, nanosec=ns % 10**9)
-    x, y, z = map(float, rate)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp),
-        angular_velocity=SimpleNamespace(x=x, y=y, z=z),
-        angular_velocity_covariance=[0.0 if measured else -1.0] + [0.0] * 8,
-    )
 
 
 def tell(gyro, begin_s, end_s, rate=RATE, rate_hz=100, now=LIVE):
