@@ -118,10 +118,10 @@ def hold(graph, *enclaves: str):
 @pytest.mark.usefixtures("tf2")
 def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
-    secured("starpos_solver", "solver", sim)
+    secured("starpos_solver", "solver", sim, "gyro:=true")
     secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
-    secured("starpos_camera", "detector", sim)
+    secured("starpos_camera", "detector", sim, "gyro:=true")
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
     secured("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), "--images"))
     dashboard = secured("starpos_dashboard", "dashboard", sim, "port:=0")
@@ -134,7 +134,7 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
 
 def test_the_policy_holds_for_camera_and_detector_in_one_process(graph, secured):
     graph.hear(Image, "detector/image_annotated")
-    secured("starpos_camera", "camera_detector", "use_sim_time:=true", *SKY)
+    secured("starpos_camera", "camera_detector", "use_sim_time:=true", "gyro:=true", *SKY)
     hold(graph, "/starpos/camera_detector")
 
 

@@ -5,7 +5,7 @@ import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,14 +13,16 @@ import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image, Imu
 from std_msgs.msg import Header
 
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
 from starpos.recording.messages import message_to_frame, message_to_shutter
+from starpos.session.trails import Trails
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
 from starpos_common.clock_report import time_is_simulated
@@ -28,7 +30,7 @@ from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
 from starpos_common.replayed import Replayed
-from starpos_common.topics import Take, publisher, subscription
+from starpos_common.topics import Take, publisher, subscription, subscription_from_any
 from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
@@ -36,6 +38,8 @@ from starpos_interfaces.msg import Capture, StarArray
 # Only the newest frame is kept; each more would take another 42 MB.
 IMAGE_DEPTH = 1
 CAPTURES_KEPT = 16
+# seconds of an IMU at 400 Hz
+IMU_QUEUE = 4000
 # An image waits so long for its Capture, which comes on another topic: where a busy machine lost it, the middleware
 # repeats it when the next one is sent, or after 3 s.
 CAPTURE_PATIENCE_S = 3.5
@@ -98,6 +102,12 @@ class DetectorNode(Node):
         # Where frames come from, for messages.
         self._where = ""
         self._annotator = Annotator(self)
+        self._trails: Trails | None = None
+        if self._values["gyro"]:
+            self._trails = Trails(self._values["calibration_url"])
+            best_effort = ReliabilityPolicy.BEST_EFFORT
+            subscription(self, Imu, "imu/data", self._on_imu, IMU_QUEUE, best_effort)
+            subscription_from_any(self, CameraInfo, "camera/camera_info", self._on_camera, 1)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
         self._diagnostics = Diagnostics(self, {"Stars": self._report})
@@ -143,8 +153,26 @@ class DetectorNode(Node):
         if size != self._size:
             self._size = size
             self.get_logger().info(f"frames of {size}.")
+        if self._trails is not None:
+            frame = self._trails.told(frame)
         if self._worker.offer(Job(frame, header)):
             self._dropped += 1
+
+    def _on_imu(self, message: Imu) -> None:
+        # in a replay the stars would depend on which readings came before a frame
+        if not time_is_simulated(self):
+            self._tell_trails("imu/data", lambda trails: trails.take_imu(message))
+
+    def _on_camera(self, message: CameraInfo, info: Mapping[str, Any]) -> None:
+        self._tell_trails("camera_info", lambda trails: trails.take_camera(message))
+
+    def _tell_trails(self, name: str, tell: Callable[[Trails], None]) -> None:
+        assert self._trails is not None
+        try:
+            tell(self._trails)
+            self._troubles.right(name)
+        except StarposError as error:
+            self._troubles.wrong(name, str(error))
 
     def _arrived(self) -> None:
         now = time.monotonic()

@@ -56,4 +56,19 @@ PARAMETERS = (
         minimum=0.0,
         maximum=3600.0,
     ),
+    Parameter(
+        "gyro",
+        False,
+        "Take imu/data, by whose turn rates stars trail: frames with fewer than five stars to learn from are measured "
+        "better. A trail that does not fit is left out. Of no effect with use_sim_time: a replay gives the same stars at "
+        "any rate.",
+        read_only=True,
+    ),
+    Parameter(
+        "calibration_url",
+        "",
+        "Instrument file (YAML), as the solver's, whose link_to_camera says how the camera sits on the IMU; '' for its "
+        "axis along z and the top of the frame forward. Used with gyro; wrong, it helps nothing.",
+        read_only=True,
+    ),
 )

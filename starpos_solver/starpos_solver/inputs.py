@@ -10,6 +10,8 @@ from starpos_common.diagnostics import Diagnosis, Level
 from starpos_common.troubles import Troubles
 
 STALE_S = 5.0
+# seconds of an IMU at 400 Hz that may wait while a node does something else
+IMU_QUEUE = 4000
 
 
 class Inputs:

@@ -19,12 +19,9 @@ from starpos_common.job import JobRunner
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
 from starpos_interfaces.msg import Attitude
-from starpos_solver.inputs import Inputs
+from starpos_solver.inputs import IMU_QUEUE, Inputs
 from starpos_solver.navigator_outputs import NavigatorPublishers
 from starpos_solver.node_log import NodeLog
-
-# seconds of an IMU at 400 Hz that may wait while the node does something else
-IMU_QUEUE = 4000
 
 
 class NavigatorNode(Node):

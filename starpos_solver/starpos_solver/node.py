@@ -9,12 +9,14 @@ from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo
+from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Imu
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
 from starpos.session import reports
 from starpos.session.frames import Answered, Output
+from starpos.session.gyro import IMU_TOPIC
 from starpos.session.now import Now, Sent
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos_common.clock_report import time_is_simulated
@@ -26,7 +28,7 @@ from starpos_common.topics import Take, subscription, subscription_from_any
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.inputs import Inputs
+from starpos_solver.inputs import IMU_QUEUE, Inputs
 from starpos_solver.node_log import NodeLog
 from starpos_solver.publishing import SolutionPublishers
 from starpos_solver.settings import SolverSettings
@@ -48,7 +50,8 @@ class SolverNode(Node):
         self._settings = SolverSettings(self, self._camera, self._apply)
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._inputs = Inputs(self, ("camera_info", "stars", "tilt"))
+        gyro = (IMU_TOPIC,) * self._values["gyro"]
+        self._inputs = Inputs(self, ("camera_info", "stars", "tilt", *gyro))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(
@@ -86,6 +89,9 @@ class SolverNode(Node):
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
         self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
         subscription(self, msg.StarArray, "stars", self._taker("stars", takes), 10)
+        if self._values["gyro"]:
+            best_effort = ReliabilityPolicy.BEST_EFFORT
+            subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -132,6 +138,9 @@ class SolverNode(Node):
                 takes[name](message, info)
 
         return on_message
+
+    def _on_imu(self, message: Imu) -> None:
+        self._session.gyro.take(message, self._now())
 
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):

@@ -70,6 +70,13 @@ def to_small_vector(r: np.ndarray) -> np.ndarray:
     return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
 
 
+def to_vector(r: np.ndarray) -> np.ndarray:
+    """The rotation vector (3,) of any rotation, of at most pi rad."""
+    x, y, z, w = to_quaternion(r).tolist()
+    sine = math.hypot(x, y, z)
+    return np.array([x, y, z]) * (2 * math.atan2(sine, w) / sine if sine else 2.0)
+
+
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Vector products (..., 3) of a and b, both (..., 3): as `np.cross`, which takes several times as long for a few."""
     (ax, ay, az), (bx, by, bz) = (np.moveaxis(v, -1, 0) if v.ndim > 1 else v for v in (a, b))

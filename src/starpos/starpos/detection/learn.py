@@ -51,11 +51,15 @@ SMOOTHING, SMOOTHING_WIDTH = np.array([0.25, 0.5, 0.25], np.float32), 0.5
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """A frame's PSF and response, and the distance from a star (px) out to which its light is used."""
+    """A frame's PSF and response, and the distance from a star (px) out to which its light is used.
+
+    teachers: how many stars have taught them.
+    """
 
     psf: Psf
     response: Response
     reach: int
+    teachers: int
 
 
 def learn(
@@ -72,6 +76,7 @@ def learn(
     """
     response = Response(np.ones(len(background.level)), 0.3, 0.0, 0.0)
     psf, stamps, x, y = _teachers(plane, background, x, y, height, saturation)
+    teachers = len(x)
     fine = background.is_mosaic and psf.fwhm_px < FINE_FWHM and len(x) >= FINE_STARS
     rounds = ROUNDS + FINE_ROUNDS * fine
     for round_ in range(rounds + RING_ROUNDS):
@@ -86,7 +91,7 @@ def learn(
         strange, error = _strangeness(stamps, fit)
         sound &= strange < 3 * max(0, np.quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
-        response = _respond(stamps, psf, x, y, fit, sound, response)
+        response = respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= rounds
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
             # the response has now been learnt with the final PSF
@@ -98,7 +103,7 @@ def learn(
             else even_terms(psf, RING_ORDER if ring else ORDER)
         )
         psf = _refined(stamps, psf, fit, sound, response, terms)
-    return Lesson(psf, response, reach_of(psf))
+    return Lesson(psf, response, reach_of(psf), teachers)
 
 
 def _teachers(
@@ -242,7 +247,7 @@ def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     return left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
 
 
-def _respond(
+def respond(
     stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, fit: Fit, sound: np.ndarray, before: Response
 ) -> Response:
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""

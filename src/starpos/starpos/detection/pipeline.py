@@ -16,6 +16,7 @@ from starpos.detection.finding import find_peaks
 from starpos.detection.learn import learn
 from starpos.detection.plane import halved, plane_of
 from starpos.detection.streak import find_streaks
+from starpos.detection.trail import with_trail
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
@@ -103,21 +104,32 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
     about = {"width": frame.width, "height": frame.height} | frame.about
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
-    return _detect(*plane_of(frame), settings, about, MOST_HALVINGS)
+    trail = None if frame.trail_px is None else np.array(frame.trail_px)
+    return _detect(*plane_of(frame), settings, about, MOST_HALVINGS, trail)
 
 
 def _detect(
-    plane: np.ndarray, mosaic: bool | None, settings: DetectionSettings, about: dict[str, Any], halvings: int
+    plane: np.ndarray,
+    mosaic: bool | None,
+    settings: DetectionSettings,
+    about: dict[str, Any],
+    halvings: int,
+    trail: np.ndarray | None = None,
 ) -> Detection:
     """The Detection of a plane (h, w), or of one reduced by two, at most so many times, if that shows more stars."""
-    found = _detect_at_full_size(plane, mosaic, settings, about, halvings)
+    found = _detect_at_full_size(plane, mosaic, settings, about, halvings, trail)
     if found.fwhm_px < WIDE_FWHM or not halvings or min(plane.shape) < 2 * SHORTEST_PX:
         return found
     smaller, gain = halved(plane)
     saturation_dn = None if settings.saturation_dn is None else settings.saturation_dn * 4 / gain
     size = {"width": smaller.shape[1], "height": smaller.shape[0]}
     reduced = _detect(
-        smaller, False, replace(settings, saturation_dn=saturation_dn), about | size, halvings - 1
+        smaller,
+        False,
+        replace(settings, saturation_dn=saturation_dn),
+        about | size,
+        halvings - 1,
+        None if trail is None else trail / 2,
     )
     if _clear(reduced.stars) <= _clear(found.stars):
         return found
@@ -143,7 +155,12 @@ def _clear(stars: Stars) -> int:
 
 
 def _detect_at_full_size(
-    plane: np.ndarray, mosaic: bool | None, settings: DetectionSettings, about: dict[str, Any], halvings: int
+    plane: np.ndarray,
+    mosaic: bool | None,
+    settings: DetectionSettings,
+    about: dict[str, Any],
+    halvings: int,
+    trail: np.ndarray | None = None,
 ) -> Detection:
     """The Detection of a plane (h, w) that may be reduced so many times more."""
     if min(plane.shape) < 2:
@@ -159,6 +176,8 @@ def _detect_at_full_size(
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
+    if trail is not None:
+        lesson = with_trail(lesson, plane, background, x, y, saturation, trail)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - halvings) // pixels)

@@ -7,9 +7,11 @@ series (Refregier 2003, MNRAS 338, 35) along the principal axes of the mean star
 units of the star's widths. The series has no term of first order, so its centre is the centroid of all light.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike
 
 from starpos.core.psf import evaluated, terms
@@ -18,6 +20,8 @@ from starpos.core.psf import evaluated, terms
 MONOMIALS = 6
 # Limits of the squared widths at a place of the field over the mean ones.
 NARROW, BROAD = 0.25, 6.0
+# of the series that a trail has along it
+TRAIL_ORDER = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +120,22 @@ def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) ->
     axes = (vectors / np.sqrt(values)).T[::-1]
     box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]])
     return Psf(axes, np.eye(2)[None], np.ones((1, 1, 1)), box)
+
+
+def trailed(sigma: float, trail: np.ndarray) -> Psf:
+    """The Psf of a round Gaussian of sigma px that moves evenly along a trail (2,) px.
+
+    The coefficient of h_i is its mean over the light: that of He_i / sqrt(i!) over +-sqrt(3), where an even spread has a
+    variance of 1, times the power i / 2 of the trail's share of the variance along it.
+    """
+    psf = gaussian(np.eye(2) * sigma**2 + np.outer(trail, trail) / 12)
+    share = 1 - sigma**2 * (psf.axes[0] @ psf.axes[0])
+    even = np.arange(0, TRAIL_ORDER + 1, 2)
+    root = np.array([math.sqrt(3 * math.factorial(i)) for i in even])
+    highest = hermite_e.hermeval(np.sqrt(3), np.eye(TRAIL_ORDER + 2)[:, even + 1])
+    series = np.zeros((1, TRAIL_ORDER + 1, 1))
+    series[0, even, 0] = share ** (even / 2) * highest / ((even + 1) * root)
+    return replace(psf, series=series)
 
 
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:

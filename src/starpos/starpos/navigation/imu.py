@@ -54,13 +54,13 @@ class ImuLog:
             said.append(
                 f"{place}: {int(gaps.sum())} gaps, {lost:.2f} s in all: what happened there is not known"
             )
-        clipped = _clipped(np.hstack([gyro, force]))
-        if clipped.any():
+        full = clipped(np.hstack([gyro, force]))
+        if full.any():
             said.append(
-                f"{place}: {int(clipped.sum())} readings are their channel's greatest value, as if saturated: left "
+                f"{place}: {int(full.sum())} readings are their channel's greatest value, as if saturated: left "
                 "out"
             )
-        use = ~clipped
+        use = ~full
         return cls(
             utc_unix_s=utc_unix_s[use],
             length_s=np.where(gaps, usual, apart)[use],
@@ -76,7 +76,7 @@ class ImuLog:
         return float(np.sqrt(np.mean(steps**2) / 6) * np.median(self.length_s))
 
 
-def _clipped(values: np.ndarray) -> np.ndarray:
+def clipped(values: np.ndarray) -> np.ndarray:
     """Mask (N,) of rows in a run of CLIPPED or more at the greatest magnitude that their channel (N, C) ever has."""
     mask = np.zeros(len(values), bool)
     size = np.abs(values)

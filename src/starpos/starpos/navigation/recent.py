@@ -49,7 +49,9 @@ class RecentReadings:
         self.last_s = row[0]
 
     def close(self) -> None:
-        """Make a block of the readings since the last call."""
+        """Make a block of the readings since the last call, if there are any."""
+        if not self._open:
+            return
         before = self._blocks[-1][0][-1, 0] if self._blocks else None
         block = np.array(self._open)
         self._open = []

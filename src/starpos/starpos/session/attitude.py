@@ -7,19 +7,25 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification import wide
+from starpos.identification.search import Priors
 from starpos.navigation.sightings import sighted
 
 # what the stars are not asked before
 UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
 
 
+def asked(solver: Solver, stars: Stars, answer: Solution, predicted: Priors = ()) -> Solution:
+    """The answer that a solver has given to a frame, or where it did not ask the stars what they say."""
+    if answer.found is None and answer.status in UNASKED:
+        return solver.identify(stars, predicted)
+    return answer
+
+
 def attitude_of(solver: Solver, stars: Stars, answer: Solution, frame_id: str) -> CameraAttitude | None:
-    """The attitude of a frame that a solver has answered, None where its stars tell none.
+    """The attitude of a frame whose stars a solver has been asked for, None where they tell none.
 
     That is where they are not identified beyond suspicion, or seen through a fisheye or a mirror.
     """
-    if answer.found is None and answer.status in UNASKED:
-        answer = solver.identify(stars)
     found = answer.found
     if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
         return None

@@ -183,6 +183,14 @@ PARAMETERS = (
     ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
     Parameter(
+        "gyro",
+        False,
+        "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "
+        "Its axes are frame_id's, as calibration_url's link_to_camera has them; wrong ones help nothing, harm nothing. "
+        "Of no effect with use_sim_time: a replay gives the same answers at any rate.",
+        read_only=True,
+    ),
+    Parameter(
         "tilt_window",
         0.5,
         "Span of tilts averaged where the exposure is unknown.",

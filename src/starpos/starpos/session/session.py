@@ -20,14 +20,16 @@ from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
+from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.session import reports
-from starpos.session.attitude import attitude_of
+from starpos.session.attitude import asked, attitude_of
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
+from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
@@ -70,6 +72,7 @@ class SolverSession:
         self.counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
         self.tilts = TiltBuffer()
         self.doubt = ClockDoubt()
+        self.gyro = Gyro(heard)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
@@ -99,6 +102,7 @@ class SolverSession:
 
     def _other_camera(self) -> None:
         self._hint = None
+        self.gyro.forget()
         self.calibrating.camera_changed()
 
     @property
@@ -263,22 +267,31 @@ class SolverSession:
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
-        answer = self._answer_to(frame, self._hint)
+        predicted = self.gyro.predicted(frame.stars, self.instrument.solver)
+        answer = self._answer_to(frame, self._hint, predicted)
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
         header = frame.message.header
         answered = self._answered(header.stamp, answer, now)
-        attitude = self._attitude(frame.stars, answer, header.frame_id)
+        attitude = self._attitude(frame.stars, answer, header.frame_id, predicted)
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
 
-    def _attitude(self, stars: Stars, answer: Solution, frame_id: str) -> CameraAttitude | None:
+    def _attitude(
+        self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors
+    ) -> CameraAttitude | None:
         solver = self.instrument.solver
+        if solver is None:
+            return None
         try:
-            return None if solver is None else attitude_of(solver, stars, answer, frame_id)
+            answer = asked(solver, stars, answer, predicted)
+            attitude = attitude_of(solver, stars, answer, frame_id)
+            if attitude is not None and answer.found is not None:
+                self.gyro.saw(stars, answer.found, solver)
+            return attitude
         except Exception:
             # A defect costs this attitude only.
             self._log.error(traceback.format_exc())
@@ -297,7 +310,7 @@ class SolverSession:
             return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
         return frame, self._answer_to(frame, answer.hint)
 
-    def _answer_to(self, frame: Waiting, hint: Hint | None) -> Solution:
+    def _answer_to(self, frame: Waiting, hint: Hint | None, predicted: Priors = ()) -> Solution:
         stars = frame.stars
         try:
             solver = self.instrument.solver_now
@@ -305,7 +318,9 @@ class SolverSession:
                 raise TimeError(
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
-            return solver.solve(stars, lambda mid, *_: self.tilts.average(mid, self._span(stars)), hint)
+            return solver.solve(
+                stars, lambda mid, *_: self.tilts.average(mid, self._span(stars)), hint, predicted
+            )
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
@@ -381,5 +396,6 @@ class SolverSession:
         self._waiting.clear()
         self._early.clear()
         self.latest = self.answer = self._hint = None
+        self.gyro.forget()
         self.doubt.clear()
         self.calibrating.forget()

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a gyro says that the stars of a frame have moved during its exposure."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from starpos.frames.frame import Frame
+from starpos.instrument.instrument import TOP_OF_FRAME
+from starpos.recording.messages import message_to_camera
+from starpos.session.gyro_readings import GyroReadings
+from starpos.session.parameters import known_instrument
+
+# this share of an exposure may be without readings
+MOST_MISSING = 0.1
+
+
+class Trails:
+    """Takes a gyro's readings and the camera's intrinsics, and gives frames their trails.
+
+    calibration_url: instrument file whose link_to_camera takes the IMU's axes into C, '' for the usual ones;
+    InstrumentError if it is broken.
+    """
+
+    def __init__(self, calibration_url: str) -> None:
+        known = known_instrument(calibration_url)
+        self._link = np.asarray(known.link_to_camera if known else TOP_OF_FRAME, float)
+        self._readings = GyroReadings()
+        self._focal_px: float | None = None
+
+    def take_imu(self, message: Any) -> None:
+        """Take a sensor_msgs/Imu; VoyageError in a sentence if it cannot be used."""
+        self._readings.take(message)
+
+    def take_camera(self, message: Any) -> None:
+        """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
+        self._focal_px = message_to_camera(message).fx
+
+    def told(self, frame: Frame) -> Frame:
+        """The frame with its trail; as it is where time, exposure, focal length or readings lack."""
+        if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
+            return frame
+        begin_s, end_s = (frame.mid_unix_s + share * frame.exposure_s for share in (-0.5, 0.5))
+        turn = self._readings.turn(begin_s, end_s, MOST_MISSING * frame.exposure_s, np.zeros(3))
+        if turn is None:
+            return frame
+        # where a star that was on the axis is at the end
+        x, y, z = self._link @ turn.T @ self._link.T[:, 2]
+        return replace(frame, trail_px=(float(self._focal_px * x / z), float(self._focal_px * y / z)))

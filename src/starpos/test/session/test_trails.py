@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame's trail by a gyro: as the stars move in the simulated sky; none where anything lacks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from imu_readings import reading
+
+from starpos.errors import InstrumentError, VoyageError
+from starpos.frames.frame import Frame
+from starpos.session import trails
+from starpos.session.trails import Trails
+
+MID_S, EXPOSURE_S, FOCAL_PX = 1793642400.0, 0.02, 4636.0
+FRAME = Frame(np.zeros((10, 10), np.uint8), mid_unix_s=MID_S, exposure_s=EXPOSURE_S)
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """Trails of a camera; CameraInfo is its test's own."""
+    camera = type("Camera", (), {"fx": FOCAL_PX})
+    monkeypatch.setattr(trails, "message_to_camera", lambda message: camera)
+    told = Trails("")
+    told.take_camera(None)
+    return told
+
+
+def turn(told, rate, begin_s=MID_S - 0.1, end_s=MID_S + 0.1):
+    for t in np.arange(begin_s, end_s, 0.005):
+        told.take_imu(reading(t, rate))
+
+
+@pytest.mark.parametrize(
+    ("rate", "way"),
+    [
+        # x is the top of the frame, y its right: about x the axis goes to the left, and stars to the right
+        ((0.1, 0.0, 0.0), (1, 0)),
+        # about y it goes to the top, and stars down
+        ((0.0, 0.1, 0.0), (0, 1)),
+        ((-0.1, 0.1, 0.0), (-1, 1)),
+        ((0.0, 0.0, 0.1), (0, 0)),
+    ],
+)
+def test_stars_move_as_the_camera_turns(told, rate, way):
+    turn(told, rate)
+    trail = told.told(FRAME).trail_px
+    assert trail == pytest.approx(np.multiply(way, 0.1 * EXPOSURE_S * FOCAL_PX), abs=0.02)
+
+
+def test_where_anything_lacks_there_is_none(told):
+    assert told.told(FRAME).trail_px is None
+    turn(told, (0.1, 0.0, 0.0), end_s=MID_S)
+    assert told.told(FRAME).trail_px is None
+    turn(told, (0.1, 0.0, 0.0), begin_s=MID_S)
+    assert told.told(FRAME).trail_px is not None
+    assert told.told(replace(FRAME, exposure_s=None)).trail_px is None
+    assert told.told(replace(FRAME, mid_unix_s=None)).trail_px is None
+    with pytest.raises(VoyageError, match="NaN"):
+        told.take_imu(reading(MID_S + 1.0, (np.nan, 0.0, 0.0)))
+    unknown = Trails("")
+    turn(unknown, (0.1, 0.0, 0.0))
+    assert unknown.told(FRAME).trail_px is None
+
+
+def test_a_broken_instrument_file_is_told(tmp_path):
+    with pytest.raises(InstrumentError):
+        Trails(f"{tmp_path / 'none.yaml'}")
