@@ -9,7 +9,6 @@ import numpy as np
 from starpos.frames.frame import Frame
 from starpos.instrument.instrument import TOP_OF_FRAME
 from starpos.recording.messages import message_to_camera
-from starpos.session.gyro_readings import GyroReadings
 from starpos.session.parameters import known_instrument
 
 # this share of an exposure may be without readings
@@ -24,6 +23,9 @@ class Trails:
     """
 
     def __init__(self, calibration_url: str) -> None:
+        # it needs scipy's rotations, which a detector without a gyro does not load
+        from starpos.session.gyro_readings import GyroReadings
+
         known = known_instrument(calibration_url)
         self._link = np.asarray(known.link_to_camera if known else TOP_OF_FRAME, float)
         self._readings = GyroReadings()
