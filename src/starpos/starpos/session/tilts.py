@@ -127,6 +127,9 @@ class TiltBuffer:
 
     def _note_step(self, before: Tilt, sample: Tilt) -> None:
         apart = sample.utc_unix_s - before.utc_unix_s
+        # a sample that comes again tells nothing new, and would make chance look like noise
+        if sample.utc_unix_s <= self._latest_unix_s:
+            return
         if 0 < apart < NEIGHBOURS_S and sample.axes == before.axes:
             variance = float(np.diag(sample.covariance).mean())
             self._steps.append((sample.utc_unix_s, sample.theta - before.theta, variance))

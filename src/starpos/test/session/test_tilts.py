@@ -76,6 +76,13 @@ def test_the_noise_is_measured_from_all_samples_so_far():
     assert buffer_of(noisy + later).average(T0, 0.5).covariance[0, 0] * 5 == pytest.approx(found**2)
 
 
+def test_samples_that_come_again_and_again_tell_the_noise_once():
+    apart = 2.5 * np.degrees(NOISE)
+    five = [sample(k / 10, 1.0 + apart * (k % 2)) for k in range(-2, 3)]
+    once = buffer_of(five).average(T0, 0.5).covariance
+    assert buffer_of(10 * five).average(T0, 0.5).covariance == pytest.approx(once, rel=1e-12)
+
+
 def test_samples_from_before_the_clock_was_set_back_are_none_of_the_same_times_now():
     before = [sample(k / 10, 20.0) for k in range(-20, 300)]
     buffer = buffer_of([*before, *(sample(k / 10 + 0.03) for k in range(-3, 4))])
