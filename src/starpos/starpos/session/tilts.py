@@ -53,6 +53,7 @@ class TiltBuffer:
         self._good.clear()
         self._flagged.clear()
         self._steps.clear()
+        self._latest_unix_s = -np.inf
         self._publishers = TiltPublishers()
 
     def heard(self, message: Any, number: int | None, now_s: float) -> None:

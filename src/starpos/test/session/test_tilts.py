@@ -83,6 +83,16 @@ def test_samples_that_come_again_and_again_tell_the_noise_once():
     assert buffer_of(10 * five).average(T0, 0.5).covariance == pytest.approx(once, rel=1e-12)
 
 
+def test_a_cleared_buffer_measures_the_noise_as_a_new_one():
+    rng = np.random.default_rng(5)
+    noisy = [sample(-6 + k / 10, *([1, -2] + 4 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(63)]
+    buffer = buffer_of([*noisy, sample(60.0)])
+    buffer.clear()
+    for message in noisy:
+        buffer.add(message, NOISE)
+    assert np.array_equal(buffer.average(T0, 0.5).covariance, buffer_of(noisy).average(T0, 0.5).covariance)
+
+
 def test_samples_from_before_the_clock_was_set_back_are_none_of_the_same_times_now():
     before = [sample(k / 10, 20.0) for k in range(-20, 300)]
     buffer = buffer_of([*before, *(sample(k / 10 + 0.03) for k in range(-3, 4))])
