@@ -39,7 +39,7 @@ def truth():
     return json.loads(NIGHT.with_suffix(".json").read_text())
 
 
-def test_nodes_that_speak_at_once_are_all_heard(graph):
+def test_nodes_that_speak_at_once_are_all_heard_and_only_a_replays_answers_count(graph):
     said = []
     seat = Node("player", context=graph.node.context)
     executor = SingleThreadedExecutor(context=seat.context)
@@ -57,13 +57,17 @@ def test_nodes_that_speak_at_once_are_all_heard(graph):
         graph.wait(lambda: executor.spin_once(timeout_sec=0) or condition())
 
     until(lambda: all(node.get_subscription_count() for node in nodes))
-    speak()
+    speak(takes=["/stars"])
     until(player.all_here)
     player.begin()
     until(lambda: played[0])
-    speak(replay=played[0][0].replay, index=played[0][0].index)
+    # an answer to a frame that came before, told with the replay's begin, is none of the replay's
+    theirs = {"takes": ["/stars"], "replay": played[0][0].replay, "index": played[0][0].index}
+    speak(made=1, fixes=1, **theirs)
     until(player.have_taken_all)
-    assert said == [] and not player.lost
+    assert said == [] and not player.lost and player.answers("/stars") == (0, 0)
+    speak(made=3, fixes=2, **theirs)
+    until(lambda: player.answers("/stars") == (4, 2))
     for node in nodes:
         graph.node.destroy_publisher(node)
     executor.shutdown()

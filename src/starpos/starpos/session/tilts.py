@@ -85,6 +85,8 @@ class TiltBuffer:
         if self._latest_unix_s > unix_s:
             self._latest_unix_s = unix_s
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
+            # A night that is played again comes from here on: its steps count once, as when it was played first.
+            self._steps = deque((s for s in self._steps if s[0] <= unix_s - ORDER_S), maxlen=NOISE_CAPACITY)
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether all samples that an exposure needs have arrived: none that may still come lies in it or bounds it."""
@@ -129,7 +131,7 @@ class TiltBuffer:
     def _note_step(self, before: Tilt, sample: Tilt) -> None:
         apart = sample.utc_unix_s - before.utc_unix_s
         # a sample that comes again tells nothing new, and would make chance look like noise
-        if sample.utc_unix_s <= self._latest_unix_s:
+        if self._steps and sample.utc_unix_s <= self._steps[-1][0]:
             return
         if 0 < apart < NEIGHBOURS_S and sample.axes == before.axes:
             variance = float(np.diag(sample.covariance).mean())

@@ -93,6 +93,26 @@ def test_a_cleared_buffer_measures_the_noise_as_a_new_one():
     assert np.array_equal(buffer.average(T0, 0.5).covariance, buffer_of(noisy).average(T0, 0.5).covariance)
 
 
+def test_a_night_that_is_played_again_measures_the_same_noise():
+    """Three exposures of few samples tell nothing; with both times counted they told of noise that is not there."""
+    rng = np.random.default_rng(5)
+    buffer, shots = TiltBuffer(), [0.0, 3.0, 6.0]
+    night = [
+        [sample(t + k / 10, *([1, -2] + 2.5 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(-2, 3)]
+        for t in shots
+    ]
+
+    def played():
+        for t, messages in zip(shots, night, strict=True):
+            for message in messages:
+                buffer.add(message, NOISE)
+            yield buffer.average(T0 + t, 0.5).covariance
+
+    first = list(played())
+    assert np.array_equal(list(played()), first)
+    assert np.array_equal(list(played()), first)
+
+
 def test_samples_from_before_the_clock_was_set_back_are_none_of_the_same_times_now():
     before = [sample(k / 10, 20.0) for k in range(-20, 300)]
     buffer = buffer_of([*before, *(sample(k / 10 + 0.03) for k in range(-3, 4))])

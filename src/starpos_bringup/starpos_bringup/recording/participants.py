@@ -21,10 +21,10 @@ WORDS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class _Participant:
-    """A node: its newest Taken and when that came, since when it has taken nothing new, and its first Taken."""
+    """A node: its newest Taken and when that came, since when it has taken nothing new, and its first Taken of a replay."""
 
     def __init__(self, words: Taken) -> None:
-        self.before = words
+        self.begun: Taken | None = None
         self.gone = False
         self.hear(words)
         self.stands_since_s = time.monotonic()
@@ -59,6 +59,10 @@ class Participants:
             self._heard[words.node].hear(words)
         else:
             self._heard[words.node] = _Participant(words)
+        participant = self._heard[words.node]
+        # what it said before may be a second old, and leave out an answer to somebody else's frame
+        if participant.begun is None and self._members is not None and words.replay == self._replay:
+            participant.begun = words
 
     @property
     def _present(self) -> list[_Participant]:
@@ -82,10 +86,10 @@ class Participants:
         return [(p.words.makes[0], p.words.made) for p in self.taking(topic)]
 
     def answers(self, topic: str) -> tuple[int, int]:
-        """How many answers and fixes have come of the messages of a topic since the player began."""
-        theirs = [p for p in self._heard.values() if topic in p.words.takes]
-        made = sum(p.words.made - p.before.made for p in theirs)
-        return made, sum(p.words.fixes - p.before.fixes for p in theirs)
+        """How many answers and fixes have come of the messages of a topic since the first replay began."""
+        spans = [(p.begun, p.words) for p in self._heard.values() if p.begun and topic in p.words.takes]
+        made = sum(now.made - begun.made for begun, now in spans)
+        return made, sum(now.fixes - begun.fixes for begun, now in spans)
 
     def begin(self) -> None:
         """Begin a replay with those that are here now."""
