@@ -99,38 +99,65 @@ class Detection:
         return float(np.median(self.chi2)) if len(self.chi2) else float("nan")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Picture:
+    """What stars are looked for in.
+
+    plane     (h, w) of a frame, or of one reduced by two, which may be reduced so many times (halvings) more
+    mosaic    whether its pixels are of several colours
+    about     what a frame's Stars know of it
+    trail_px  (2,) how far a star moves during the exposure; None if nobody said
+    """
+
+    plane: np.ndarray
+    mosaic: bool | None
+    settings: DetectionSettings
+    about: dict[str, Any]
+    halvings: int
+    trail_px: np.ndarray | None
+
+    def halved(self) -> tuple["_Picture", int]:
+        """The picture of half the size, and the flux of 1 DN in it."""
+        plane, gain = halved(self.plane)
+        settings = self.settings
+        if settings.saturation_dn is not None:
+            settings = replace(settings, saturation_dn=settings.saturation_dn * 4 / gain)
+        smaller = replace(
+            self,
+            plane=plane,
+            mosaic=False,
+            settings=settings,
+            about=self.about | {"width": plane.shape[1], "height": plane.shape[0]},
+            halvings=self.halvings - 1,
+            trail_px=None if self.trail_px is None else self.trail_px / 2,
+        )
+        return smaller, gain
+
+
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
     about = {"width": frame.width, "height": frame.height} | frame.about
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
-    trail = None if frame.trail_px is None else np.array(frame.trail_px)
-    return _detect(*plane_of(frame), settings, about, MOST_HALVINGS, trail)
-
-
-def _detect(
-    plane: np.ndarray,
-    mosaic: bool | None,
-    settings: DetectionSettings,
-    about: dict[str, Any],
-    halvings: int,
-    trail: np.ndarray | None = None,
-) -> Detection:
-    """The Detection of a plane (h, w), or of one reduced by two, at most so many times, if that shows more stars."""
-    found = _detect_at_full_size(plane, mosaic, settings, about, halvings, trail)
-    if found.fwhm_px < WIDE_FWHM or not halvings or min(plane.shape) < 2 * SHORTEST_PX:
-        return found
-    smaller, gain = halved(plane)
-    saturation_dn = None if settings.saturation_dn is None else settings.saturation_dn * 4 / gain
-    size = {"width": smaller.shape[1], "height": smaller.shape[0]}
-    reduced = _detect(
-        smaller,
-        False,
-        replace(settings, saturation_dn=saturation_dn),
-        about | size,
-        halvings - 1,
-        None if trail is None else trail / 2,
+    plane, mosaic = plane_of(frame)
+    picture = _Picture(
+        plane=plane,
+        mosaic=mosaic,
+        settings=settings,
+        about=about,
+        halvings=MOST_HALVINGS,
+        trail_px=None if frame.trail_px is None else np.array(frame.trail_px),
     )
+    return _detect(picture)
+
+
+def _detect(picture: _Picture) -> Detection:
+    """The Detection of a picture, or of a smaller one if that shows more stars."""
+    found = _detect_at_full_size(picture)
+    if found.fwhm_px < WIDE_FWHM or not picture.halvings or min(picture.plane.shape) < 2 * SHORTEST_PX:
+        return found
+    smaller, gain = picture.halved()
+    reduced = _detect(smaller)
     if _clear(reduced.stars) <= _clear(found.stars):
         return found
     s = reduced.stars
@@ -141,8 +168,8 @@ def _detect(
         flux=gain * s.flux,
         covariance=4 * s.covariance,
         fwhm_px=2 * reduced.fwhm_px,
-        width=about["width"],
-        height=about["height"],
+        width=picture.about["width"],
+        height=picture.about["height"],
     )
     return replace(
         found, stars=stars, fwhm_px=2 * reduced.fwhm_px, chi2=reduced.chi2, left_out=reduced.left_out
@@ -154,18 +181,11 @@ def _clear(stars: Stars) -> int:
     return int(np.count_nonzero((stars.flags & (EDGE | ELONGATED | BLENDED)) == 0))
 
 
-def _detect_at_full_size(
-    plane: np.ndarray,
-    mosaic: bool | None,
-    settings: DetectionSettings,
-    about: dict[str, Any],
-    halvings: int,
-    trail: np.ndarray | None = None,
-) -> Detection:
-    """The Detection of a plane (h, w) that may be reduced so many times more."""
+def _detect_at_full_size(picture: _Picture) -> Detection:
+    plane, settings, about = picture.plane, picture.settings, picture.about
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
-    background = measure_background(plane, settings.mesh_px, mosaic)
+    background = measure_background(plane, settings.mesh_px, picture.mosaic)
     level, noise = float(np.median(background.level)), float(np.median(background.noise))
     limit = max(PEAKS, 2 * settings.max_stars)
     peaks = find_peaks(plane, background, settings.threshold, limit, settings.threads)
@@ -176,11 +196,11 @@ def _detect_at_full_size(
     background = replace(background, streaks=find_streaks(plane, background, x, y))
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
-    if trail is not None:
-        lesson = with_trail(lesson, plane, background, x, y, saturation, trail)
+    if picture.trail_px is not None:
+        lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail_px)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
-    most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - halvings) // pixels)
+    most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - picture.halvings) // pixels)
     chunks = [slice(i, min(i + chunk, most)) for i in range(0, most, chunk)]
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

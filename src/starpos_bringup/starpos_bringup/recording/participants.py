@@ -21,7 +21,7 @@ WORDS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class _Participant:
-    """A node: its newest Taken and when that came, since when it has taken nothing new, and its first Taken of a replay."""
+    """A node: its newest Taken, when that came, since when it has taken nothing new, and its first Taken of a replay."""
 
     def __init__(self, words: Taken) -> None:
         self.begun: Taken | None = None
