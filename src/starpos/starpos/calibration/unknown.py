@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to say of fixes that were made with an A3 that nobody knows."""
+"""What to say of fixes that were made with an A3 of which nobody knows all, or nothing."""
 
 import numpy as np
 
+from starpos.averaging.average import Average
+from starpos.fix.budget import CALIBRATION
+from starpos.fix.fix import Fix
 from starpos.instrument.instrument import Calibration
 
 # what to do, in the options of `starpos solve` and in the parameters of the node
@@ -14,17 +17,46 @@ BY_PARAMETERS = (
     "turn the instrument on the spot and set self_calibration:=true, find it at a known place with solver/calibrate or "
     "starpos calibrate --site and set calibration_url, or set misalignment and misalignment_stddev"
 )
+# of one lean nothing is known of the turn about the plumb line: then an angle has a sigma of some 100 deg
+UNKNOWN_DEG = 60.0
+# a turn that is known better than so is said to be known; a place that is wider is worth a word
+KNOWN_DEG, WIDE_M = 5.0, 10_000.0
+TELL_IT = (
+    "calibrate with leans of some degrees between the frames, or say with --misalignment and --turn-stddev how the mount "
+    "has it"
+)
 
 
-def unknown_a3(calibration: Calibration, covariance: np.ndarray, ways: str = BY_OPTIONS) -> str:
-    """Say in a sentence that A3 is not known, and what to do; '' if it is known.
+def unknown_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> str:
+    """Say in a sentence that A3, or its turn about the plumb line, makes a place wide, and what to do; '' if not.
 
-    covariance: of a place, (2, 2) or larger, of east m and north m first.  ways: what to do.
+    ways: what to do where nothing is known of A3.
     """
-    if not calibration.unknown:
+    metres = float(np.sqrt(np.diag(place.covariance)[:2].max()))
+    if calibration.unknown:
+        return (
+            f"the misalignment of camera and inclinometer is not known, which makes the place {metres / 1000:.0f} km wide "
+            f"(1 sigma): {ways}"
+        )
+    own = sum(np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == CALIBRATION)
+    if metres < WIDE_M or own < 0.5 * np.trace(place.covariance[:2, :2]) or not may_turn(calibration):
         return ""
-    km = float(np.sqrt(np.diag(covariance)[:2].max())) / 1000
     return (
-        f"the misalignment of camera and inclinometer is not known, which makes the place {km:.0f} km wide (1 sigma): "
-        + ways
+        f"the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, {_known(calibration)}, "
+        f"makes the place {metres / 1000:.0f} km wide (1 sigma): lean it as then, or {TELL_IT}"
     )
+
+
+def may_turn(calibration: Calibration) -> bool:
+    """Whether A3's turn about the plumb line is hardly known."""
+    return calibration.turn_stddev_deg > KNOWN_DEG
+
+
+def at_another_lean(calibration: Calibration) -> str:
+    """Say how well A3's turn about the plumb line is known, which counts at another lean."""
+    return f"at another lean A3's turn about the plumb line counts, {_known(calibration)}"
+
+
+def _known(calibration: Calibration) -> str:
+    turn_deg = calibration.turn_stddev_deg
+    return "which is not known" if turn_deg > UNKNOWN_DEG else f"known to {turn_deg:.2g} deg"

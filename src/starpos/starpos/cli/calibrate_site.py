@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import Calibrated, calibrate_at
+from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
 from starpos.cli import common
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.earth.vertical import astronomic
@@ -25,9 +26,6 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
-
-# an angle with a larger sigma counts as unknown
-UNKNOWN_DEG = 60.0
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -160,16 +158,14 @@ def _about(found: Calibrated, site: Site) -> str:
             f"the vertical of a fixed camera of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} "
             f"(by gravity), known to {found.plumb_stddev_arcsec:.2f} arcsec, and {sag:g} arcsec of sag in an hour\n"
         )
-    turns = np.sqrt(np.linalg.eigvalsh(np.asarray(c.covariance_arcsec2))) / 3600
     lines = [
         f"A3 of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} (by gravity): "
         "{:.5f} {:.5f} {:.5f} deg".format(*c.misalignment_deg),
         f"the plumb line in the camera is known to {found.plumb_stddev_arcsec:.2f} arcsec; "
-        f"at another lean, A3's turn about it counts, "
-        + ("which is not known" if turns[-1] > UNKNOWN_DEG else f"known to {turns[-1]:.2g} deg"),
+        + at_another_lean(c),
     ]
-    if turns[-1] > 1:
-        lines.append("to tell that turn as well, lean the instrument by some degrees between the frames")
+    if may_turn(c):
+        lines.append(f"to tell that turn as well, {TELL_IT}")
     return "\n".join(lines) + "\n"
 
 

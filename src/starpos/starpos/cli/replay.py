@@ -165,7 +165,7 @@ def tell(
         )
     common.tell_extrapolation("replay", solved)
     if solved:
-        if night.average and (unknown := unknown_a3(calibration, night.average.covariance, BY_PARAMETERS)):
+        if night.average and (unknown := unknown_a3(calibration, night.average, BY_PARAMETERS)):
             common.complain("replay", f"{bag}: {unknown}")
         warnings = {warning for s in night.solutions for warning in s.warnings}
         whole = NightFolder((), None, bag if len(args.bags) > 1 else None)

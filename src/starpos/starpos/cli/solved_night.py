@@ -7,7 +7,7 @@ from pathlib import Path
 
 from starpos.averaging.average import Average, average
 from starpos.calibration.turning import turn
-from starpos.calibration.unknown import unknown_a3
+from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn, unknown_a3
 from starpos.cli import common
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown
@@ -69,7 +69,7 @@ def tell(
         last, near = solved[-1].fix, near_of(args)
         whole = last if together is None else together
         tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        if instrument is not None and (unknown := unknown_a3(instrument.calibration, whole.covariance)):
+        if instrument is not None and (unknown := unknown_a3(instrument.calibration, whole)):
             _say(night, unknown)
         _tell_doubts(night, instrument, solved, whole, near)
         about = {} if near is None else {"km_from_near": near.km_from(whole.latitude, whole.longitude)}
@@ -114,7 +114,10 @@ def solved_by_turning(
     if args.save is not None:
         instrument_file.write(Path(args.save), turned.instrument, f"A3 by turning on the spot: {error}")
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
-    _say(night, f"calibrated: {error}; {kept}")
+    found = turned.instrument.calibration
+    _say(night, f"calibrated: {error}; {kept}; {at_another_lean(found)}")
+    if may_turn(found):
+        _say(night, f"to use A3 at another lean, {TELL_IT}")
     return turned.solutions
 
 

@@ -16,6 +16,8 @@ from starpos.units import HOUR_S
 ALWAYS = ("always",)
 # the key of a pose, which only the average of several fixes knows, takes its place
 EACH_POSE = ("pose",)
+# the name of A3's own term
+CALIBRATION = "calibration"
 # 1 sigma of the difference of two temperatures that nobody measured: a warm room and a clear night
 UNKNOWN_TEMPERATURE_C = 14.0
 
@@ -210,7 +212,7 @@ def tilt_terms(level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: fl
         [level_of(up) @ symmetric_root(mounting.calibration_covariance), _turn_error(up, mounting)]
     )
     return (
-        ErrorTerm("calibration", level @ calibration, shared=ALWAYS, posed=True),
+        ErrorTerm(CALIBRATION, level @ calibration, shared=ALWAYS, posed=True),
         ErrorTerm("remounting", level @ level_of(up) * mounting.remounted_rad, shared=ALWAYS, posed=True),
         *_inclinometer_terms(level @ levelling_of(up, tilt.slope), tilt, mounting, utc_unix_s),
         ErrorTerm(

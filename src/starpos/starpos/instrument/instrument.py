@@ -172,6 +172,12 @@ class Calibration:
         variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
         return bool(variances[1] >= (UNKNOWN_ARCSEC[0] / 2) ** 2)
 
+    @property
+    def turn_stddev_deg(self) -> float:
+        """Standard deviation (deg) about the axis about which A3 is known least: mostly the plumb line."""
+        variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
+        return float(np.sqrt(max(variances[-1], 0.0))) / 3600
+
     def check_age(self, utc_unix_s: float) -> None:
         """Raise InstrumentError if it is too old, or too new, for a frame of that time."""
         age_days = abs(utc_unix_s - self.utc_unix_s) / DAY_S

@@ -9,6 +9,7 @@ import numpy as np
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
+from starpos.fix.budget import CALIBRATION
 from starpos.fix.fix import Fix
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.units import ARCSEC
@@ -117,7 +118,7 @@ class Averaging:
 
 def _is_wide(fix: Fix) -> bool:
     """Whether A3 may be so wrong that a linear filter cannot separate its error from the place."""
-    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name in ("calibration", "remounting"))
+    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name in (CALIBRATION, "remounting"))
     return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from starpos.calibration.misalignment import Calibrated, calibrate_at
+from starpos.calibration.unknown import at_another_lean
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
@@ -345,13 +346,12 @@ class Calibrating:
 
 def _about(found: Calibrated) -> str:
     c = found.instrument.calibration
-    turn_deg = math.sqrt(np.linalg.eigvalsh(np.asarray(c.covariance_arcsec2))[-1]) / 3600
     without = sum(s.fix is None for s in found.solutions)
     left_out = f", {without} more had no fix" if without else ""
     rx, ry, rz = c.misalignment_deg
     return (
         f"A3 of {c.frames} frames is {rx:.5f} {ry:.5f} {rz:.5f} deg{left_out}; the plumb line in the camera is known to "
-        f"{found.plumb_stddev_arcsec:.2f} arcsec, the turn about it, which counts at another lean, to {turn_deg:.2g} deg"
+        f"{found.plumb_stddev_arcsec:.2f} arcsec; {at_another_lean(c)}"
     )
 
 

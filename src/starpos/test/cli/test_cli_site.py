@@ -155,14 +155,14 @@ def test_valid_days_and_the_turn_that_is_known(known, run, tmp_path):
     c = instrument_file.read(out).calibration
     assert c.valid_days == 2
     assert np.sqrt(np.linalg.eigvalsh(c.covariance_arcsec2)[-1]) == pytest.approx(1800, rel=0.01)
-    assert "known to 0.5 deg" in said and "lean the instrument" not in said
+    assert "known to 0.5 deg" in said and "leans of some degrees" not in said
     assert "has the plumb line 0." in said.splitlines()[-1]
     # 5 deg further north
     moved = ("--site", LAT + 5, LON)
     said = run(*args, *moved, "--misalignment", 1.5, -2, 129.5)[1]
     assert "given has the plumb line 5.1 deg from there: if that cannot be, check the site" in said
     status, said, _ = run(*args)
-    assert "to tell that turn as well, lean the instrument by some degrees" in said.splitlines()[-1]
+    assert "to tell that turn as well, calibrate with leans of some degrees" in said.splitlines()[-1]
     assert np.sqrt(np.linalg.eigvalsh(instrument_file.read(out).calibration.covariance_arcsec2)[-1]) > 1e5
 
 

@@ -40,8 +40,9 @@ def test_the_place_is_found_and_a3_saved_for_another_night(turned, tmp_path, cap
     assert status == 0 and len(each) == 8
     assert max(arcsec_off(combined)) < 4 * max(combined["sigma_north_m"], combined["sigma_east_m"]) / 20
     assert combined["sigma_north_m"] < 400
-    (said,) = errors
+    said, caveat = errors
     assert "the plumb line in the camera is known to" in said and f"{saved} is written" in said
+    assert "plumb line counts, which is not known" in said and "--turn-stddev" in caveat
     assert read(saved).calibration.frames == 8
 
     later = simulated(tmp_path / "later", "-n", "4", "--seed", "9", "--azimuth", "100")
@@ -51,6 +52,18 @@ def test_the_place_is_found_and_a3_saved_for_another_night(turned, tmp_path, cap
     sigma = max(combined["sigma_north_m"], combined["sigma_east_m"])
     assert max(arcsec_off(combined)) < 4 * sigma / 20
     assert 10 < sigma < 800
+
+
+def test_a_night_at_another_lean_than_the_turn_says_what_makes_it_wide(turned, tmp_path, capsys):
+    lean = simulated(tmp_path / "lean", "-n", "1", "--seed", "9", "--altitude", "77")
+    turn = ("--misalignment", "0", "0", "20", "--turn-stddev")
+    for name, known in (("loose", ()), ("held", (*turn, "2"))):
+        saved = tmp_path / f"{name}.yaml"
+        assert solve(capsys, turned, *WIDE, *known, "--self-calibrate", "--save", saved)[0] == 0
+        status, out, errors = solve(capsys, lean, "--instrument", saved, "--json")
+        wide = objects(out)[-1]["sigma_east_m"] > 1e5
+        assert status == 0 and wide == (name == "loose")
+        assert any("leans otherwise than when A3 was found" in line for line in errors) == wide
 
 
 def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys):
@@ -64,7 +77,7 @@ def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys)
 
 def test_a_frames_own_place_waits_for_the_turn_and_no_loose_angles_are_printed(turned, capsys):
     status, out, errors = solve(capsys, turned, *WIDE, "--self-calibrate")
-    (said,) = errors
+    said, _ = errors
     assert status == 0 and out.count("its place waits for the whole turn") == 8
     assert "--misalignment" not in said and "the plumb line" in said and "--save OUT keeps A3" in said
 
