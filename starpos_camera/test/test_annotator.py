@@ -183,7 +183,9 @@ def test_the_solution_of_the_frame_names_its_stars(viewer):
     viewer.start_solver()
     plain, stars = viewer.see({"ids": [], "indices": [], "magnitudes": []})
     row = next(k for k, s in enumerate(stars) if not s.flags and 100 < s.x < 500 and 50 < s.y < 430)
-    named, _ = viewer.see({"indices": [row]}, lambda picture, stars: has(picture[:480], stars[row], IDENTIFIED))
+    named, _ = viewer.see(
+        {"indices": [row]}, lambda picture, stars: has(picture[:480], stars[row], IDENTIFIED)
+    )
     assert has(plain[:480], stars[row], DETECTED)
     rows, columns = np.nonzero((named[:480] != plain[:480]).any(2))
     away = np.hypot(columns - stars[row].x, rows - stars[row].y)

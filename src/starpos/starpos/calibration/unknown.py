@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What to say of fixes that were made with an A3 of which nobody knows all, or nothing."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
-from starpos.averaging.average import Average
-from starpos.fix.budget import CALIBRATION
-from starpos.fix.fix import Fix
+from starpos.fix.budget import CALIBRATION, ErrorTerm
 from starpos.instrument.instrument import Calibration
 
 # what to do, in the options of `starpos solve` and in the parameters of the node
@@ -27,23 +27,26 @@ TELL_IT = (
 )
 
 
-def unknown_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> str:
+def unknown_a3(
+    calibration: Calibration, covariance: np.ndarray, terms: Iterable[ErrorTerm], ways: str = BY_OPTIONS
+) -> str:
     """Say in a sentence that A3, or its turn about the plumb line, makes a place wide, and what to do; '' if not.
 
+    covariance: of the place, (2, 2) or larger, of east m and north m first.  terms: the budget of it, or of a fix there.
     ways: what to do where nothing is known of A3.
     """
-    metres = float(np.sqrt(np.diag(place.covariance)[:2].max()))
+    metres = float(np.sqrt(np.diag(covariance)[:2].max()))
     if calibration.unknown:
         return (
-            f"the misalignment of camera and inclinometer is not known, which makes the place {metres / 1000:.0f} km wide "
-            f"(1 sigma): {ways}"
+            f"the misalignment of camera and inclinometer is not known, which makes the place {metres / 1000:.0f} km "
+            f"wide (1 sigma): {ways}"
         )
-    own = sum(np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == CALIBRATION)
-    if metres < WIDE_M or own < 0.5 * np.trace(place.covariance[:2, :2]) or not may_turn(calibration):
+    own = sum(np.trace(t.covariance[:2, :2]) for t in terms if t.name == CALIBRATION)
+    if metres < WIDE_M or own < 0.5 * np.trace(covariance[:2, :2]) or not may_turn(calibration):
         return ""
     return (
-        f"the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, {_known(calibration)}, "
-        f"makes the place {metres / 1000:.0f} km wide (1 sigma): lean it as then, or {TELL_IT}"
+        "the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, "
+        f"{_known(calibration)}, makes the place {metres / 1000:.0f} km wide (1 sigma): lean it as then, or {TELL_IT}"
     )
 
 

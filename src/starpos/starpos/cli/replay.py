@@ -165,11 +165,12 @@ def tell(
         )
     common.tell_extrapolation("replay", solved)
     if solved:
-        if night.average and (unknown := unknown_a3(calibration, night.average, BY_PARAMETERS)):
+        whole = night.average
+        if whole and (unknown := unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS)):
             common.complain("replay", f"{bag}: {unknown}")
         warnings = {warning for s in night.solutions for warning in s.warnings}
-        whole = NightFolder((), None, bag if len(args.bags) > 1 else None)
-        put_combined(output, whole, night.average, solved, warnings, vertical)
+        folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
+        put_combined(output, folder, night.average, solved, warnings, vertical)
     # a trouble names its bag
     common.complain("replay", night.trouble or f"{bag}: {night.summary}")
     return common.UNREADABLE if night.trouble else 0 if solved else NO_FIX

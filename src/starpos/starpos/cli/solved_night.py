@@ -69,7 +69,9 @@ def tell(
         last, near = solved[-1].fix, near_of(args)
         whole = last if together is None else together
         tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        if instrument is not None and (unknown := unknown_a3(instrument.calibration, whole)):
+        if instrument is not None and (
+            unknown := unknown_a3(instrument.calibration, whole.covariance, whole.terms)
+        ):
             _say(night, unknown)
         _tell_doubts(night, instrument, solved, whole, near)
         about = {} if near is None else {"km_from_near": near.km_from(whole.latitude, whole.longitude)}

@@ -74,7 +74,7 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
     combined, why_not, said = _combined(fixes, shots)
     remarks += said
     if instrument and shop.turn_stddev_deg is None:
-        unknown = unknown_a3(instrument.calibration, combined or fixes[-1])
+        unknown = unknown_a3(instrument.calibration, (combined or fixes[-1]).covariance, fixes[-1].terms)
         remarks += [unknown] if unknown else []
     if extrapolated_days > 0:
         remarks.append(
