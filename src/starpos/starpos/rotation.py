@@ -14,9 +14,14 @@ def full_turn(angle: float) -> float:
     return 0.0 if turned >= 2 * np.pi else turned
 
 
+def half_turns(angles: np.ndarray) -> np.ndarray:
+    """The angles in rad, brought to [-pi, pi)."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
 def half_turn(angle: float) -> float:
     """The angle in rad, brought to [-pi, pi)."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+    return float(half_turns(np.asarray(angle)))
 
 
 def unit_vector(longitude: ArrayLike, latitude: ArrayLike) -> np.ndarray:

@@ -24,6 +24,7 @@ from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_log import TiltLog
+from starpos.rotation import half_turn
 from starpos.units import HOUR_S
 
 NEAR_KM = 50.0
@@ -134,7 +135,7 @@ def far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Seque
 
 def _hours_ahead(near: Near, fix: Fix | Average) -> float:
     """By how many hours wrong times explain a place, ahead of UTC; 0 if none do."""
-    east = (fix.longitude - near.longitude + np.pi) % (2 * np.pi) - np.pi
+    east = half_turn(fix.longitude - near.longitude)
     hours = round(-east / ROTATION_RAD_S / HOUR_S / ZONE_H) * ZONE_H
     turned = fix.longitude + hours * HOUR_S * ROTATION_RAD_S
     return hours if near.km_from(fix.latitude, turned) <= near.km else 0.0

@@ -55,7 +55,7 @@ def define(experiments: "argparse._SubParsersAction[argparse.ArgumentParser]") -
             "--tiltmeter",
             type=common.number(1e-3, 1e3),
             metavar="ARCSEC",
-            help="an inclinometer of this noise a reading instead of the SCA100T's 12.6, and as steady",
+            help="an inclinometer of this noise a reading instead of a compensated SCA100T's 12.6, and as steady",
         )
         parser.add_argument("--json", action="store_true", help="one JSON object a night, and one for all")
         parser.set_defaults(run=work)
@@ -126,7 +126,9 @@ def _nees(solved: list[NightOutcome]) -> np.ndarray:
 
 def _errors(args: argparse.Namespace) -> montecarlo_nights.InclinometerErrors:
     return (
-        montecarlo_nights.SCA100T if args.tiltmeter is None else montecarlo_nights.tiltmeter(args.tiltmeter)
+        montecarlo_nights.COMPENSATED
+        if args.tiltmeter is None
+        else montecarlo_nights.tiltmeter(args.tiltmeter)
     )
 
 

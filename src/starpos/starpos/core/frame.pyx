@@ -110,7 +110,7 @@ def explained(const Py_ssize_t[::1] star, const Py_ssize_t[::1] index, const Py_
     return found, seen, due
 
 
-def place_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
+def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
     """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
 
     centre    vector in C, three numbers of any length, of the frame's centre

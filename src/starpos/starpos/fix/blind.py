@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.errors import StarposError
-from starpos.fix.solver import Solution, Status, attitude_of, judged, status_of
+from starpos.fix.solver import Solution, Status, attitude_of, status_of, suspicions
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Sky, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
@@ -58,7 +58,7 @@ class BlindSolver:
                 Solution.failed(stars, Status.NOT_IDENTIFIED, message), identify_s=time.perf_counter() - begin
             )
         camera, found = answer
-        warnings, explained = judged(
+        warnings, explained = suspicions(
             seen, frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera), sky, found
         )
         return replace(

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.frame import mean_sigma, place_of
+from starpos.core.frame import mean_sigma, pointing_of
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
@@ -166,7 +166,7 @@ class Solver:
             return _failure(stars, e)
         if found is None:
             return replace(_unidentified(stars, camera, sky), identify_s=time.perf_counter() - begin)
-        warnings, explained = judged(stars, field, sky, found)
+        warnings, explained = suspicions(stars, field, sky, found)
         return Solution(
             Status.OK,
             "identified",
@@ -217,7 +217,7 @@ class Solver:
             return replace(
                 _unidentified(stars, camera, sky), tilt=tilt, identify_s=time.perf_counter() - begin
             )
-        warnings, explained = judged(stars, field, sky, found)
+        warnings, explained = suspicions(stars, field, sky, found)
         identified = time.perf_counter()
         names, magnitudes = catalogue.names(found.catalogue), catalogue.vmag(found.catalogue)
         solution = replace(
@@ -412,7 +412,7 @@ def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
     return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
 
 
-def judged(
+def suspicions(
     stars: Stars, field: FrameStars | wide.WideField, sky: Sky, found: Identification
 ) -> tuple[tuple[str, ...], Explained]:
     """Names, sorted, of what is suspicious about the stars' identification, and what it explains.
@@ -437,7 +437,7 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     else:
         across, down = (x - camera.cx) / fx, (y - camera.cy) / fy
         centre, above = (across, down, 1.0), (across, down - 1 / fy, 1.0)
-    ra, dec, roll = place_of(centre, above, found.attitude, sky.velocity, found.mirrored)
+    ra, dec, roll = pointing_of(centre, above, found.attitude, sky.velocity, found.mirrored)
     return Attitude(
         ra=full_turn(ra),
         dec=dec,

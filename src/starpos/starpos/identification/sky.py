@@ -10,7 +10,6 @@ from starpos.core.screen import BrightTable
 from starpos.core.sky import StarTable
 from starpos.earth.orientation import earth_motion
 from starpos.identification.triangles import TriangleCatalogue
-from starpos.rotation import normalised
 from starpos.sky.catalogue import EPOCH, Catalogue
 
 
@@ -58,10 +57,6 @@ class Sky:
     def bright(self, row: np.ndarray) -> np.ndarray:
         """Unit vectors (n, 3) of the triangle catalogue's rows `row` (n,)."""
         return self.directions(self.triangles.star[row])
-
-    def unaberrated(self, v: np.ndarray) -> np.ndarray:
-        """ICRS directions (n, 3) of stars seen in the directions v (n, 3)."""
-        return normalised(v - np.asarray(self.velocity))
 
 
 @lru_cache(maxsize=2)

@@ -222,7 +222,7 @@ def elevations(angles: np.ndarray) -> np.ndarray:
     """
     angles = np.asarray(angles, float)
     with np.errstate(invalid="ignore"):
-        unwrapped = np.where(np.abs(angles) > np.pi, (angles + np.pi) % (2 * np.pi) - np.pi, angles)
+        unwrapped = np.where(np.abs(angles) > np.pi, rotation.half_turns(angles), angles)
     if angles.shape[-1] == 2:
         return unwrapped
     return np.where(np.abs(unwrapped) > np.pi / 2, np.sign(unwrapped) * np.pi - unwrapped, unwrapped)
@@ -266,20 +266,10 @@ def levelling_of(up: np.ndarray, slope: np.ndarray) -> np.ndarray:
     return np.stack([moved[1], -moved[0], np.zeros(slope.shape[1])])
 
 
-def sca100t_angle(
-    volts: ArrayLike,
-    offset_v: float = SCA100T_OFFSET_V,
-    sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
-) -> np.ndarray:
-    """Angle in rad from the SCA100T's output: asin((V - offset) / sensitivity); NaN beyond +-1 g (paper, section 3.1)."""
-    g = (np.asarray(volts, float) - offset_v) / sensitivity_v_per_g
-    return np.arcsin(np.where(np.abs(g) <= 1, g, np.nan))
-
-
 def sca100t_volts(
     angle: ArrayLike,
     offset_v: float = SCA100T_OFFSET_V,
     sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
 ) -> np.ndarray:
-    """The inverse of `sca100t_angle`: output voltage at an angle in rad."""
+    """The SCA100T's output voltage at an angle in rad: offset + sensitivity sin(angle) (paper, section 3.1)."""
     return offset_v + sensitivity_v_per_g * np.sin(angle)

@@ -162,8 +162,8 @@ class Calibration:
             [self.turned_to(rotation.from_vector(s * axis) @ self.a3).misalignment_deg for s in (-step, step)]
             for axis in np.eye(3)
         ]
-        differences = np.array([np.subtract(after, before) for before, after in around])
-        slope = ((differences + 180) % 360 - 180).T / np.degrees(2 * step)
+        differences = np.radians([np.subtract(after, before) for before, after in around])
+        slope = rotation.half_turns(differences).T / (2 * step)
         return slope @ np.asarray(self.covariance_arcsec2) @ slope.T / 3600**2
 
     @property

@@ -127,7 +127,7 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     found = identify_frame(field, sky)
     if found is None:
         raise FrameError(why_unidentified(stars, camera, catalogue))
-    suspicious, _ = solver.judged(stars, field, sky, found)
+    suspicious, _ = solver.suspicions(stars, field, sky, found)
     if suspicious:
         raise FrameError(
             f"{stars.place}: its stars are not those of one sky ({', '.join(suspicious)}): left out"

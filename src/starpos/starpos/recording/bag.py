@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 PACKAGE = "starpos_interfaces"
+# the latest time that ROS can hold
+LAST_NS = (2**31 - 1) * 10**9
 
 
 class BagReader:
@@ -77,6 +79,10 @@ class BagReader:
                 return
             except Exception as error:
                 raise self._broken(error) from None
+            if not 0 <= log_ns <= LAST_NS:
+                raise BagError(
+                    f"{self.path}: a message of {connection.topic} was logged at {log_ns} ns, no time until 2038"
+                )
             yield connection, log_ns, bytes(data)
 
     def decoded(self, connections: "Sequence[Connection]") -> "Iterator[tuple[Connection, int, Any]]":

@@ -8,6 +8,7 @@ import numpy as np
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith, zenith_of
 from starpos.normal import SIGMA_PER_MAD
 from starpos.report.night import Night, ReportedPlace, Truth
+from starpos.rotation import half_turns
 from starpos.units import ARCSEC
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
@@ -56,7 +57,7 @@ def stability(night: Night) -> Stability:
     ):
         true = _true_headings(night)
         heading_from = "truth" if true is not None else ""
-        away[:, 2] = np.nan if true is None else wrapped(seen[:, 2] - true)
+        away[:, 2] = np.nan if true is None else half_turns(seen[:, 2] - true)
     sigma = np.array([_own_sigma(p) for p in places])
     return Stability(
         np.array([k for k, _ in night.fixed]),
@@ -108,7 +109,7 @@ def share_inside(night: Night, squared_distance: float) -> int:
 
 def error_arcsec(place: ReportedPlace, truth: Truth) -> np.ndarray:
     """Latitude, longitude (2,) of a place minus the truth, in arcsec."""
-    return wrapped(np.array([place.latitude - truth.latitude, place.longitude - truth.longitude])) / ARCSEC
+    return half_turns(np.array([place.latitude - truth.latitude, place.longitude - truth.longitude])) / ARCSEC
 
 
 def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
@@ -116,13 +117,8 @@ def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
     return _angles(place.covariance, place.latitude)[:2] / ARCSEC
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angles in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
 def _from_mean(seen: np.ndarray) -> np.ndarray:
-    away = wrapped(seen - seen[0])
+    away = half_turns(seen - seen[0])
     return away - away.mean(0)
 
 

@@ -11,11 +11,11 @@ from starpos.fix.budget import ErrorTerm
 from starpos.instrument.inclinometer import Tilt
 from starpos.report.bag import Recorded, star_lists
 from starpos.report.folder import StarList, StarLists
-from starpos.report.measures import offset_m, wrapped
+from starpos.report.measures import offset_m
 from starpos.report.night import Night, ReportedPlace
 from starpos.report.solutions import star_list_of
 from starpos.report.working import Workshop, why_none, worked
-from starpos.rotation import full_turn
+from starpos.rotation import full_turn, half_turns
 
 
 def night(recorded: Recorded, shop: Workshop) -> Night:
@@ -81,7 +81,7 @@ def _as_recorded(r: Recorded, shop: Workshop) -> Night:
 def _bound(places: list[ReportedPlace]) -> ReportedPlace:
     """The plain mean of places, with the mean of their covariances: an upper bound, whatever their correlation is."""
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
-    away = wrapped(seen - seen[0])
+    away = half_turns(seen - seen[0])
     mean = seen[0] + away.mean(0)
     still = np.ptp(away[:, 2]) < 10 * np.median([p.sigma[2] for p in places]) or len(places) == 1
     names = [t.name for t in places[0].terms]
@@ -93,7 +93,7 @@ def _bound(places: list[ReportedPlace]) -> ReportedPlace:
     return ReportedPlace(
         utc_unix_s=float(np.mean([p.utc_unix_s for p in places])),
         latitude=float(mean[0]),
-        longitude=float(wrapped(mean[1])),
+        longitude=float(half_turns(mean[1])),
         heading=full_turn(mean[2]) if still else float("nan"),
         covariance=np.mean([p.covariance for p in places], axis=0),
         terms=tuple(terms),

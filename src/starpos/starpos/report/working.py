@@ -23,8 +23,8 @@ from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.report.folder import StarList, StarLists
-from starpos.report.measures import wrapped
 from starpos.report.night import NO_TILT, Night, ReportedPlace, Shot
+from starpos.rotation import half_turns
 from starpos.sky.catalogue import Catalogue
 from starpos.utc import utc_text
 
@@ -225,7 +225,7 @@ def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
     attitudes = [s.camera_to_itrs for _, s in night.fixed if s.camera_to_itrs is not None]
     moved = np.abs(tilts - np.median(tilts, axis=0)).max() * EARTH_RADIUS_M
     noise = np.sqrt(np.median(np.trace(own[:, :2, :2], axis1=1, axis2=2) / 2))
-    turned = np.abs(wrapped(headings - headings[0])).max()
+    turned = np.abs(half_turns(headings - headings[0])).max()
     if len(tilts) < 3 or moved > STILL_SIGMA * noise + 1.0 or turned > np.radians(1.0):
         return None
     g = level_of(up_of(tilts.mean(0))) @ instrument.mounting.a3

@@ -21,7 +21,9 @@ def asked(solver: Solver, stars: Stars, answer: Solution, predicted: Priors = ()
     return answer
 
 
-def attitude_of(solver: Solver, stars: Stars, answer: Solution, frame_id: str) -> CameraAttitude | None:
+def camera_attitude_of(
+    solver: Solver, stars: Stars, answer: Solution, frame_id: str
+) -> CameraAttitude | None:
     """The attitude of a frame whose stars a solver has been asked for, None where they tell none.
 
     That is where they are not identified beyond suspicion, or seen through a fisheye or a mirror.

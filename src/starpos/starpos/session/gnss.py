@@ -9,6 +9,7 @@ import numpy as np
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.vertical import Geodetic
 from starpos.recording.messages import stamp_to_unix
+from starpos.rotation import half_turn
 
 # of a fix that states no error, m an axis
 UNSTATED_M = 30.0
@@ -52,7 +53,7 @@ def contradiction(gnss: GnssPlace, ground: Geodetic, utc_unix_s: float, speed: f
     speed: of the vehicle, m/s, which goes on between the two times.
     """
     prime, meridian = curvature_radii_m(ground.latitude)
-    east = (gnss.longitude - ground.longitude + np.pi) % (2 * np.pi) - np.pi
+    east = half_turn(gnss.longitude - ground.longitude)
     off = np.array([east * prime * np.cos(ground.latitude), (gnss.latitude - ground.latitude) * meridian])
     on_the_way = speed * (utc_unix_s - gnss.utc_unix_s)
     claim = ground.covariance[:2, :2] + gnss.covariance + np.eye(2) * on_the_way**2

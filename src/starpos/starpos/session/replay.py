@@ -3,9 +3,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from starpos.errors import BagError
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
 from starpos.session.frames import Output
@@ -14,9 +12,6 @@ from starpos.session.log import Heard, Log
 from starpos.session.now import Now, Sent
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
-
-# The latest time that ROS can hold.
-LAST_NS = (2**31 - 1) * 10**9
 
 
 class Replay:
@@ -40,7 +35,6 @@ class Replay:
         with BagReader(path, typed=True) as bag:
             _, connections = instrument_in(bag, path, namespace, INPUTS, (STARS,))
             for connection, log_ns, message in bag.decoded(connections):
-                check_log_time(path, connection.topic, log_ns)
                 # Time never goes back, even if the times of a bag's messages do.
                 now_ns = max(now_ns, log_ns)
                 now = Now.in_data(now_ns * 1e-9)
@@ -63,9 +57,3 @@ class Replay:
             for jobs in self._jobs:
                 jobs.work()
             yield from self.session.at(now)
-
-
-def check_log_time(path: Any, topic: str, log_ns: int) -> None:
-    """Raise BagError if a message was recorded at no time that ROS can hold."""
-    if not 0 <= log_ns <= LAST_NS:
-        raise BagError(f"{path}: a message of {topic} was logged at {log_ns} ns, no time until 2038")

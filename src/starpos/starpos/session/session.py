@@ -24,7 +24,7 @@ from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
 from starpos.session import reports
-from starpos.session.attitude import asked, attitude_of
+from starpos.session.attitude import asked, camera_attitude_of
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
@@ -288,7 +288,7 @@ class SolverSession:
             return None
         try:
             answer = asked(solver, stars, answer, predicted)
-            attitude = attitude_of(solver, stars, answer, frame_id)
+            attitude = camera_attitude_of(solver, stars, answer, frame_id)
             if attitude is not None and answer.found is not None:
                 self.gyro.saw(stars, answer.found, solver)
             return attitude

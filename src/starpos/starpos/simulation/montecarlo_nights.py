@@ -39,7 +39,8 @@ EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
 FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0
 # 1 sigma of the lean that a turn by hand causes
 LEAN_DEG = 0.05
-SCA100T = InclinometerErrors()
+# an SCA100T-D01 that is compensated and calibrated; as sold it is `sensors.SCA100T`
+COMPENSATED = InclinometerErrors()
 
 
 def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
@@ -239,7 +240,7 @@ def photograph(
 def turned_night(
     rng: np.random.Generator,
     catalogue: Catalogue,
-    errors: InclinometerErrors = SCA100T,
+    errors: InclinometerErrors = COMPENSATED,
     headings: int = 4,
     frames: int = 25,
     clock_stddev_s: float = 0.01,
@@ -260,7 +261,7 @@ def turned_night(
 def calibrated_night(
     rng: np.random.Generator,
     catalogue: Catalogue,
-    errors: InclinometerErrors = SCA100T,
+    errors: InclinometerErrors = COMPENSATED,
     frames: int = 6,
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,

@@ -17,6 +17,7 @@ from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site, camera_to_enu
 
@@ -83,7 +84,7 @@ class Scene:
     def heading(self) -> float:
         """Azimuth in rad of the base link's x axis."""
         forward = self.attitude @ np.asarray(self.instrument.link_to_camera)[:, 0]
-        return float(np.arctan2(forward[0], forward[1]) % (2 * np.pi))
+        return full_turn(np.arctan2(forward[0], forward[1]))
 
     @property
     def tilt(self) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, correlation, total_covariance
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import UTC, SkyField, random_field, turn
+from starpos_testing.skies.fields import UTC, SkyField, random_field
 
 STATE = earth_state(UTC)
 
@@ -51,7 +51,11 @@ def read_at(f, *times):
 def moved_m(a, field):
     """East, north in m: found minus true."""
     prime, meridian = curvature_radii_m(np.radians(field.latitude))
-    east = turn(a.longitude - np.radians(field.longitude)) * prime * np.cos(np.radians(field.latitude))
+    east = (
+        rotation.half_turn(a.longitude - np.radians(field.longitude))
+        * prime
+        * np.cos(np.radians(field.latitude))
+    )
     return np.array([east, (a.latitude - np.radians(field.latitude)) * meridian])
 
 
@@ -105,7 +109,7 @@ def test_an_average_errs_as_its_covariance_says(calibration, rng):
         a = average(fixes(field, rng, [field.azimuth] * 4, calibration=calibration))
         m = moved_m(a, field)
         position.append(m @ np.linalg.solve(a.covariance[:2, :2], m))
-        heading.append(turn(a.heading - field.heading) ** 2 / a.covariance[2, 2])
+        heading.append(rotation.half_turn(a.heading - field.heading) ** 2 / a.covariance[2, 2])
     assert np.mean(position) / 2 == pytest.approx(1, abs=4 / np.sqrt(60))
     assert np.mean(heading) == pytest.approx(1, abs=4 * np.sqrt(2 / 60))
 
@@ -114,7 +118,7 @@ def test_an_instrument_that_turned_has_the_heading_of_its_last_pose(rng):
     made = fixes(SkyField(), rng, [10.0, 10.0, 12.0, 12.0])
     a, last = average(made), average(made[2:])
     assert a.poses == 2
-    assert turn(a.heading - last.heading) == pytest.approx(0, abs=3 * sigmas(last)[2])
+    assert rotation.half_turn(a.heading - last.heading) == pytest.approx(0, abs=3 * sigmas(last)[2])
     # What is known of the place helps it.
     assert 0.5 * sigmas(last)[2] < sigmas(a)[2] < sigmas(last)[2]
 
@@ -124,7 +128,7 @@ def test_over_the_date_line_and_over_north(rng):
     a = average(fixes(field, rng, [0.0] * 8))
     assert np.all(np.abs(moved_m(a, field)) < 4 * sigmas(a)[:2])
     assert -np.pi <= a.longitude < np.pi
-    assert abs(turn(a.heading)) < 5 * sigmas(a)[2]
+    assert abs(rotation.half_turn(a.heading)) < 5 * sigmas(a)[2]
     assert 0 <= a.heading < 2 * np.pi
 
 
@@ -232,7 +236,7 @@ def test_the_recursion_is_generalised_least_squares_over_all(shared, rng):
     plane = Plane.at(made[0])
     latitude, longitude, heading = recursion.place
     expected = moved[2] + plane.heading - plane.convergence(latitude, longitude)
-    assert turn(heading - expected) == pytest.approx(0, abs=1e-11)
+    assert rotation.half_turn(heading - expected) == pytest.approx(0, abs=1e-11)
 
 
 def test_as_they_come_or_all_at_once(rng):
@@ -334,7 +338,9 @@ def test_a_knocked_tripod_does_not_move_the_place(rng):
     during = [spoiled(fixes(field, rng, [40.2])[0], 5e4, 2e4)]
     a = check_not_moved(before + during + after, before + after, field)
     assert (a.moved, a.left_out) == (0, 1)
-    assert turn(a.heading - average(in_order(after)).heading) == pytest.approx(0, abs=3 * sigmas(a)[2])
+    assert rotation.half_turn(a.heading - average(in_order(after)).heading) == pytest.approx(
+        0, abs=3 * sigmas(a)[2]
+    )
 
 
 @pytest.mark.parametrize(("moved_to_m", "needs"), [(1e6, 3), (2e4, 3), (700.0, 25)])
@@ -404,4 +410,4 @@ def test_the_heading_of_a_pose_that_nobody_believed_is_none(rng):
     assert np.isnan(a.heading) and np.isnan(a.covariance[2]).all()
     assert np.all(np.abs(moved_m(a, field)) < 4 * np.sqrt(np.diag(a.covariance)[:2]))
     right = average(in_order(before + wrong + fixes(field, rng, [160.0])))
-    assert right.poses == 2 and turn(right.heading - field.heading) != 0
+    assert right.poses == 2 and rotation.half_turn(right.heading - field.heading) != 0

@@ -15,7 +15,7 @@ from starpos.fix.fix import Mounting
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import PAPER, UTC, SkyField, random_field, turn
+from starpos_testing.skies.fields import PAPER, UTC, SkyField, random_field
 
 STATE = earth_state(UTC)
 PLACES = {
@@ -33,8 +33,8 @@ PLACES = {
 def error_arcsec(fix, field):
     """North, east, heading: found minus true."""
     phi = np.radians(field.latitude)
-    east = turn(fix.longitude - np.radians(field.longitude)) * np.cos(phi)
-    return np.array([fix.latitude - phi, east, turn(fix.heading - field.heading)]) / ARCSEC
+    east = rotation.half_turn(fix.longitude - np.radians(field.longitude)) * np.cos(phi)
+    return np.array([fix.latitude - phi, east, rotation.half_turn(fix.heading - field.heading)]) / ARCSEC
 
 
 @pytest.mark.parametrize("where", PLACES)
@@ -81,7 +81,9 @@ def test_the_attitude_is_that_of_the_link(rng):
     )
     np.testing.assert_allclose(turned.link_to_enu, field.attitude @ link, atol=1e-10)
     forward = turned.link_to_enu[:, 0]
-    assert turn(turned.heading - np.arctan2(forward[0], forward[1])) == pytest.approx(0, abs=1e-12)
+    assert rotation.half_turn(turned.heading - np.arctan2(forward[0], forward[1])) == pytest.approx(
+        0, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 1e-9, -1e-9, 90.0, 180.0, 270.0])
@@ -91,7 +93,7 @@ def test_heading_is_clockwise_from_north_in_0_to_360(azimuth, rng):
     xy, places = field.places(STATE, rng)
     heading = np.degrees(field.solve(xy, places, STATE).heading)
     assert 0 <= heading < 360
-    assert turn(np.radians(heading - azimuth)) / ARCSEC == pytest.approx(0, abs=1e-4)
+    assert rotation.half_turn(np.radians(heading - azimuth)) / ARCSEC == pytest.approx(0, abs=1e-4)
 
 
 def test_a_focal_length_a_percent_off_is_found(rng):

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
-# The latest time that a Clock message can hold.
-LAST_NS = (2**31 - 1) * 10**9
 
 
 @dataclass(frozen=True)
@@ -84,10 +82,6 @@ class Bag:
         """Read (topic, log time in ns, bytes) in the bag's order; raises BagError if the file breaks off."""
         connections = [c for c in self._reader.connections if c.id in topics]
         for connection, log_ns, data in self._reader.messages(connections):
-            if not 0 <= log_ns <= LAST_NS:
-                raise BagError(
-                    f"{self.path}: a message of {connection.topic} was logged at {log_ns} ns, no time until 2038"
-                )
             topic = topics[connection.id]
             yield (
                 topic,

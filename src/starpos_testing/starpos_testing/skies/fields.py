@@ -58,7 +58,7 @@ class SkyField:
     def heading(self) -> float:
         """Azimuth in rad of the top of the frame, C's -y."""
         up = -self.attitude[:, 1]
-        return float(np.arctan2(up[0], up[1]) % (2 * np.pi))
+        return rotation.full_turn(np.arctan2(up[0], up[1]))
 
     def tilt(self, covariance=NO_ERROR) -> Tilt:
         up = self.a3 @ self.attitude[2]
@@ -112,8 +112,3 @@ def random_field(rng, **fixed) -> SkyField:
         "misalignment": tuple(rng.uniform(-3, 3, 3).tolist()),
     }
     return replace(SkyField(), **drawn | fixed)
-
-
-def turn(angle):
-    """An angle, or an array of them, in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
