@@ -285,6 +285,15 @@ class NavigatorSession:
             covariance=axes @ estimate.covariance[PLACE, PLACE] @ axes.T,
         )
 
+    def _why_old(self, since_s: float) -> str:
+        """Say why the newest frame that is adjusted is so old."""
+        if self._recent.readings.last_s - self._recent.newest_frame_s > self._values["stars_timeout"]:
+            return f"no frame with stars for {since_s:.0f} s: no fix"
+        return (
+            f"the newest adjustment ends {since_s:.0f} s ago, for it takes longer than the frames take to come: no fix; "
+            "shorten window, or play a recording at its own rate"
+        )
+
     def report(self) -> Diagnosis:
         """Make the diagnostic `Navigation`: what is known, what is missing, how good it is."""
         estimate, known, recent = self._estimate, self._known, self._recent
@@ -306,7 +315,7 @@ class NavigatorSession:
             "time since the newest frame that is adjusted (s)": since_s,
         }
         if self._stars_missing:
-            return Diagnosis(Level.WARN, f"no frame with stars for {since_s:.0f} s: no fix", values)
+            return Diagnosis(Level.WARN, self._why_old(since_s), values)
         faults = list(self._faults)
         if self._gnss is not None and abs(estimate.utc_unix_s - self._gnss.utc_unix_s) < OLDEST_S:
             fix = estimate.fix

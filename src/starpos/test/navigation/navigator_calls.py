@@ -78,7 +78,7 @@ class Told:
 
 
 class Navigator:
-    """A session whose jobs are done at once, and what it has made."""
+    """A session whose jobs are done at once, while it works, and what it has made."""
 
     def __init__(self, **values):
         values = {p.name: p.default for p in PARAMETERS} | {
@@ -91,7 +91,7 @@ class Navigator:
         settings = NavigatorSettings(values)
         assert settings.check(values, frozenset(values)) is None
         settings.adopt()
-        self.told, self.outputs = Told(), []
+        self.told, self.outputs, self.works = Told(), [], True
         self._jobs = JobsInTurn(self.told.error)
         self.session = NavigatorSession(settings, lambda: self._jobs, self.told, self.told)
 
@@ -101,7 +101,8 @@ class Navigator:
             now = Now(unix_s, unix_s)
             take_it = getattr(self.session, f"take_{take}")
             self.outputs += take_it(arguments[0], now, *arguments[1:])
-            self._jobs.work()
+            if self.works:
+                self._jobs.work()
         return self
 
     def at(self, unix_s):

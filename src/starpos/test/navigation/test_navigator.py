@@ -101,6 +101,17 @@ def test_the_imu_carries_on_without_stars_with_a_wider_claim_and_not_for_ever(re
     assert "no frame with stars for" in navigator.session.report().message
 
 
+def test_an_adjustment_that_does_not_keep_up_is_not_said_to_be_a_want_of_stars(record, model):
+    begin = record.frames_s[0]
+    events = events_of(record)
+    navigator = Navigator(imu_model=model, stars_timeout=20.0).play([e for e in events if e[0] < begin + 25])
+    navigator.works = False
+    navigator.play([e for e in events if e[0] >= begin + 25])
+    assert navigator.at(record.frames_s[-1]).fix is None
+    said = navigator.session.report().message
+    assert "the newest adjustment ends" in said and "shorten window" in said
+
+
 def test_odometry_counts_from_a_place_that_is_known(told, record):
     known = [o for o in told.outputs if o.position is not None]
     assert known and claimed_m(known[0]) < 1000 < claimed_m(next(o for o in told.outputs if o.fix))
