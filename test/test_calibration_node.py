@@ -62,7 +62,7 @@ def save(graph, path=""):
 
 
 def check_fix(graph, azimuth, within_m, **changes):
-    """That the next fix is near the true place, and as near as it claims; its shot."""
+    """Check that the next fix is near the true place, and as near as it claims; its shot."""
     shot = shoot(azimuth, instrument=WRONG, **changes)
     solution = graph.answer(shot)[0]
     assert solution.status == Solution.OK, solution.status_text

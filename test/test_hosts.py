@@ -113,7 +113,7 @@ def seconds_of(stamp: tuple[int, int]) -> float:
 
 
 def test_a_link_that_loses_a_fifth_of_the_packets_costs_time_but_no_fix_is_wrong(tmp_path):
-    """And takes a tenth of a second, either way. Without the profile hardly one list of stars comes through whole."""
+    """Each takes a tenth of a second, either way. Without the profile hardly one list of stars comes through whole."""
     cadence_s = 0.5
     with two_hosts(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOSSY)) as instrument:
         ear = instrument.ear

@@ -140,7 +140,7 @@ def send_stars_and_wheels(ears, record):
 
 
 def send_readings(ears, record, begin_s, end_s):
-    """Those of some seconds since the record began."""
+    """Send those of some seconds since the record began."""
     imu = record.imu
     since = imu.utc_unix_s - record.frames_s[0] + 0.5
     for k in np.flatnonzero((since > begin_s + 1e-6) & (since < end_s + 1e-6)):

@@ -20,7 +20,7 @@ RULES = {("topics", "publish"), ("topics", "subscribe"), ("services", "reply")}
 
 
 def full_name(name: str, namespace: str, node: str) -> str:
-    """As sros2's template writes it."""
+    """The name as sros2's template writes it."""
     if name.startswith("/"):
         return name
     base = namespace if namespace.endswith("/") else f"{namespace}/"
@@ -100,7 +100,7 @@ def secured(graph, run):
 
 
 def hold(graph, *enclaves: str):
-    """Until each has done all that it may, at any time; it has done nothing that it may not."""
+    """Wait until each has done all that it may, at any time; it has done nothing that it may not."""
     policy, seen = allowed(), {e: set() for e in enclaves}
 
     def complete():

@@ -48,7 +48,7 @@ def answer_of_all(graph, shot):
 
 
 def check_same_answer(graph, shot, tilts, expected):
-    """That these tilts instead, after a reset, give the same answer to the last bit once they all are there."""
+    """Check that these tilts instead, after a reset, give the same answer to the last bit once they all are there."""
     forget(graph, shot)
     graph.send(replace(shot, tilts=tilts))
     graph.result(shot.stamp)

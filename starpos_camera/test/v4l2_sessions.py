@@ -19,7 +19,7 @@ SETTINGS = CaptureSettings(None, None, 5.0)
 
 
 def wait(seconds):
-    """Until the camera's buffers are full of old frames."""
+    """Wait until the camera's buffers are full of old frames."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         pass

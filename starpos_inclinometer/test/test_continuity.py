@@ -97,7 +97,7 @@ def test_a_tilt_that_leaps_is_believed_with_the_next_sample(cable):
 
 
 def test_a_tilt_that_moves_on_and_on_is_followed(cable):
-    """And so it is from the beginning, when no sample is known to be sound."""
+    """It is followed from the beginning, when no sample is known to be sound."""
     moving = [line(k, x=CODE + 200_000 * k) for k in range(20)]
     assert numbers(cable.send(*moving)) == list(range(20))
     assert cable.counts.implausible == 0

@@ -65,7 +65,7 @@ def tell(record_property):
 
 
 class Ears(Listener):
-    """With the tilts, and when each came."""
+    """A listener with the tilts, and when each came."""
 
     def __init__(self):
         super().__init__()

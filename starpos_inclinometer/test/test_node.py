@@ -24,7 +24,7 @@ def domain():
 
 
 class Ears(Listener):
-    """With the tilts and the states of the link, oldest first."""
+    """A listener with the tilts and the states of the link, oldest first."""
 
     def __init__(self):
         super().__init__()

@@ -159,7 +159,7 @@ def test_what_is_flagged_tells_no_noise(odd):
 
 
 def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
-    """Also where the compensation is as large on both sides of the reference."""
+    """The compensation may be as large on both sides of the reference."""
     x_alone = (
         (WARM, 0.020),
         (offset_x(0.0, 1e-5), 0.016),

@@ -29,7 +29,7 @@ class SolutionPublishers:
 
     @property
     def publishers(self) -> tuple[Publisher, ...]:
-        """Those of all topics, the solution's first."""
+        """The publishers of all topics, the solution's first."""
         return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude
 
     def publish(self, output: Output) -> None:

@@ -60,7 +60,7 @@ class Measured:
 
     @property
     def cost(self) -> Cost:
-        """As a cell of the table."""
+        """What stands in a cell of the table."""
         return Cost(self.ms, f"{self.found} found, {self.off_px:.3f} px off")
 
 

@@ -218,7 +218,7 @@ def tallied(what: str, fields, number: int, conditions, answers) -> dict[str, Ta
 
 
 def cost(tally: Tally) -> Cost:
-    """As a cell of the table."""
+    """What stands in a cell of the table."""
     text = (
         f"{100 * tally.correct / tally.fields:.1f} %"
         if tally.correct

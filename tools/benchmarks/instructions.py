@@ -109,7 +109,7 @@ def total(path: Path) -> int:
 
 
 def counted(folder: Path) -> None:
-    """Within valgrind: do each work twice, count the second, print a line of JSON for each."""
+    """Do each work twice, within valgrind, count the second, and print a line of JSON for each."""
     for name, work in works(folder):
         work()
         before = set(folder.glob("count.*"))

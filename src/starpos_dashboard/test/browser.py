@@ -116,7 +116,7 @@ class Page:
         return result[0]
 
     def shows(self, **texts):
-        """Until elements show these texts."""
+        """Wait until elements show these texts."""
         seen = {}
 
         def come():

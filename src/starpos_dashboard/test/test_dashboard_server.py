@@ -77,7 +77,7 @@ def until(condition):
 
 
 def wait(server, condition):
-    """Until it comes true; each question gives the server's thread a turn."""
+    """Wait until it comes true; each question gives the server's thread a turn."""
     until(lambda: condition() or not ask(server, "/icon.svg"))
 
 

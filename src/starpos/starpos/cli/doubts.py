@@ -134,7 +134,7 @@ def far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Seque
 
 
 def _hours_ahead(near: Near, fix: Fix | Average) -> float:
-    """By how many hours wrong times explain a place, ahead of UTC; 0 if none do."""
+    """Hours ahead of UTC by which wrong times explain a place; 0 if none do."""
     east = half_turn(fix.longitude - near.longitude)
     hours = round(-east / ROTATION_RAD_S / HOUR_S / ZONE_H) * ZONE_H
     turned = fix.longitude + hours * HOUR_S * ROTATION_RAD_S

@@ -105,7 +105,7 @@ cdef double _excess(
     const double[:, ::1] residual, const double[:, :, ::1] covariance, double extra, double share, double median_of_chi2,
     double *d2,
 ) noexcept nogil:
-    """By how much the mean squared distance along an axis exceeds `share`; by their median if median_of_chi2 > 0."""
+    """How far the mean squared distance along an axis is above `share`; from the median if median_of_chi2 > 0."""
     cdef int n = residual.shape[0], k
     cdef double xx, xy, yy, x, y, total = 0.0
     for k in range(n):

@@ -84,7 +84,7 @@ cdef void _fit_alone(
     const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
-    """As `_fit`, from the rotation that is best with the given focal length: the result depends on no starting pose."""
+    """Fit as `_fit` does, from the rotation that is best with the given focal length: the result depends on no starting pose."""
     cdef double[9] b
     cdef double[3] v
     cdef int k, i, j
@@ -265,7 +265,7 @@ cdef double weighed(
     const double *width, const Py_ssize_t *star, const Py_ssize_t *rank, const double *w, const Py_ssize_t *row, int many,
     Chances chances,
 ) except? -1:
-    """As `log_ratio`, of the n brightest detections; w[row[k]] is the direction of the star matched with star[k]."""
+    """What `log_ratio` returns, of the n brightest detections; w[row[k]] is the direction of the star matched with star[k]."""
     cdef int e, i, j, k, passed, hits = 0
     cdef double best = -1e300, total, most, odds, least = 1e300, variance, volume
     cdef double[16] information

@@ -72,7 +72,7 @@ cdef class Judge:
         return min(<int>self.frame.sigma.shape[0], self.frame.tested)
 
     cdef judged(self, const double *attitude, double focal, bint mirrored, const double *radius):
-        """As `identified`."""
+        """What `identified` returns."""
         cdef Work work
         cdef int n = self._deciding(), most = min(<int>self.frame.sigma.shape[0], self.rules.most_stars)
         cdef double log_odds

@@ -43,7 +43,7 @@ def halved(plane: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _measured(pixels: np.ndarray) -> np.ndarray | None:
-    """At which (row, column) modulo 2 each colour was measured, (3, 2, 2) bool; None if no mosaic is seen.
+    """Whether each colour was measured at (row, column) modulo 2, (3, 2, 2) bool; None if no mosaic is seen.
 
     An average is less noisy than the values it is made of, so each colour is noisiest where it was measured.
     """

@@ -177,7 +177,7 @@ class InclinometerErrors:
         return max(abs(off) - EXPLAINED_SIGMA * sigma, 0.0) / 2
 
     def _off_square(self, tilt: Tilt) -> tuple[float, float]:
-        """By how much the squares of the sines of three axes do not add up to 1, and the stated sigma of that."""
+        """How far the squares of the sines of three axes are from adding up to 1, and the stated sigma of that."""
         sines = np.sin(tilt.theta)
         squares = sines**2
         # each axis shows a share of the other two

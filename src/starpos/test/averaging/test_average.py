@@ -286,7 +286,7 @@ def spoiled(f, east_m=0.0, north_m=0.0):
 
 
 def check_not_moved(spoiled_fixes, sound, field):
-    """That the average of these is that of the sound ones, within a fraction of its error."""
+    """Check that the average of these is that of the sound ones, within a fraction of its error."""
     a, b = average(in_order(spoiled_fixes)), average(in_order(sound))
     off = moved_m(a, field) - moved_m(b, field)
     assert np.all(np.abs(off) < 0.5 * sigmas(b)[:2])

@@ -140,7 +140,7 @@ def test_leans_by_hand_tell_the_turn_of_a3_too():
 
 @pytest.mark.parametrize("noise", [SCA100T, QUIET])
 def test_without_a_lean_the_turn_stays_what_it_was(noise):
-    """And its error is that of any angle."""
+    """Its error is that of any angle."""
     for seed in range(10):
         made, truth = readings(np.random.default_rng(seed), FOUR, noise)
         found = level(made, truth.given)
@@ -248,7 +248,7 @@ HUNG = {
 @pytest.mark.parametrize("noise", [SCA100T, QUIET])
 @pytest.mark.parametrize("kind", HUNG)
 def test_hang_errs_as_it_says(kind, noise, site):
-    """Under a zenith that is known, or off by as much as is said of it."""
+    """The zenith is known, or off by as much as is said of it."""
     plumb, whole = [], []
     for seed in range(24):
         rng = np.random.default_rng(seed)

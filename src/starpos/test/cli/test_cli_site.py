@@ -69,7 +69,7 @@ def elsewhere(tmp_path_factory, catalogue):
 
 
 def check_elsewhere(run, elsewhere, instrument):
-    """That `solve` finds the other place with this instrument file."""
+    """Check that `solve` finds the other place with this instrument file."""
     status, said, errors = run(
         "solve", *elsewhere.frames, *elsewhere.tilt, *AIR, "--instrument", instrument, "--json"
     )

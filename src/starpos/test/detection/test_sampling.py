@@ -46,7 +46,7 @@ def test_between_cells_the_sky_is_linear_and_beyond_them_as_on_the_edge(rng):
 
 @pytest.mark.parametrize("phases", [1, 4])
 def test_stamps_are_the_pixels_around_stars(phases, rng):
-    """Also where they lie partly, or wholly, beyond the frame."""
+    """Some lie partly, or wholly, beyond the frame."""
     plane = rng.integers(0, 1000, (30, 20)).astype(np.uint16)
     x, y = rng.integers(-9, 29, (2, 40))
     level, noise = rng.uniform(0, 9, (2, 40, phases)).astype(np.float32)

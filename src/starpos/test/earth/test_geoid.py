@@ -183,7 +183,7 @@ def test_the_error_grows_with_the_roughness_and_with_the_spacing(tmp_path):
 
 
 def test_outside_nothing_is_known(tmp_path):
-    """Also within one node of the edge, at a place that is no number, and where the file has no data."""
+    """Nothing is known within one node of the edge, at a place that is no number, and where the file has no data."""
     heights = np.fromfunction(lambda r, c: 30 + 0.2 * r - 0.1 * c, (60, 80))
     heights[20:22, 30] = -88.8888
     heights[40, 30] = np.nan

@@ -32,7 +32,7 @@ def night(shared, tmp_path_factory):
 
 
 def test_a_night_made_by_others(night, catalogue):
-    """Within 0.3 arcsec in latitude and longitude and 3 arcsec in heading of what they put in."""
+    """The fix is within 0.3 arcsec in latitude and longitude and 3 arcsec in heading of what they put in."""
     truth = json.loads((night / "truth.json").read_text())
     mine = scene_of(pointing_deg=(310.0, 85.0, 200.0))
     assert np.degrees(mine.heading) == pytest.approx(truth["frames"][0]["heading_deg"], abs=1e-9)

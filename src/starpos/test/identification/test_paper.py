@@ -34,7 +34,7 @@ def test_the_papers_stars_differ_little_from_the_plain_cut(catalogue):
 
 
 def test_the_printed_angles(catalogue):
-    """As docs/the_paper.md#star-vectors says; 27 mas in the place of HIP 98753's component A are 1.4e-5 rad."""
+    """See docs/the_paper.md#star-vectors; 27 mas in the place of HIP 98753's component A are 1.4e-5 rad."""
     here, sigma = paper.angles_of_printed(catalogue)
     assert here == pytest.approx(paper.ANGLES, abs=1.5e-5)
     assert np.all(np.abs(here - paper.ANGLES) < 1.5 * sigma + 5e-6)

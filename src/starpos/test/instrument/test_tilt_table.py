@@ -35,7 +35,7 @@ def test_two_inclinometers_whose_readings_alternate_are_refused(tmp_path, rng, n
 
 @pytest.mark.parametrize(("often", "held"), [(10, 1), (10, 10), (3, 1), (2, 1), (1, 1), (0.2, 1)])
 def test_two_inclinometers_of_which_one_is_read_more_often_are_refused(tmp_path, rng, often, held):
-    """Also where its driver gives each reading several times."""
+    """Its driver may give each reading several times."""
     one, other = 1000 + 0.1 * np.arange(60), 1000.031 + 0.1 / often * np.arange(60 * often)
     logs = []
     for t, x, times in ((one, 1.0, 1), (other, 1.1, held)):
@@ -47,7 +47,7 @@ def test_two_inclinometers_of_which_one_is_read_more_often_are_refused(tmp_path,
 
 
 def test_wild_readings_and_turns_are_of_one_inclinometer(tmp_path, rng):
-    """Also many that are wild, a few that are wild alike, and a mount that goes there and back."""
+    """Many readings are wild, or a few are wild alike, or the mount goes there and back."""
     t = 1000 + 0.1 * np.arange(1000)
     x, y = rng.normal(0, 0.0035, (2, 1000))
     wild, alike = rng.random(1000) < 0.1, np.arange(1000) % 50 == 7

@@ -67,7 +67,7 @@ def apart(a, b):
 
 @pytest.mark.parametrize(("zenith_distance_deg", "limit_arcsec"), [(0, 0.1), (15, 0.1), (30, 0.3), (45, 1.0)])
 def test_it_is_the_attitude_by_the_stars_within_its_claim(zenith_distance_deg, limit_arcsec):
-    """In the mean, of where the camera looks: that moves the place."""
+    """The mean counts, of where the camera looks: that moves the place."""
     turns = []
     for seed in range(6):
         frame, zenith = frame_at(zenith_distance_deg, seed)

@@ -61,7 +61,7 @@ def mcap(path, payloads, compression, stated=None, indexed=False):
 
 
 def read(path) -> list[bytes]:
-    """As replay does."""
+    """Read as replay does."""
     with Reader(path) as opened:
         bounds.check_chunks(opened)
         return [bytes(data) for _, _, data in opened.messages()]

@@ -41,7 +41,7 @@ def lists(night):
 
 @pytest.fixture(scope="module")
 def tilts(night):
-    """As they are after they went through messages, whose stamps are whole microseconds."""
+    """The night's tilts after they went through messages, whose stamps are whole microseconds."""
     return read_tilt_csv(night / "tilt.csv")
 
 
@@ -246,7 +246,7 @@ def test_a_bag_without_a_camera_takes_the_options(solved_place, lists, tilts, tm
 
 
 def without_definitions(bag):
-    """As a recorder before Iron leaves a db3."""
+    """Leave the db3 as a recorder before Iron does."""
     (file,) = bag.glob("*.db3")
     with sqlite3.connect(file) as db:
         db.execute("DELETE FROM message_definitions")

@@ -47,7 +47,7 @@ def test_claims_are_true(kind, outcomes):
 
 @pytest.mark.montecarlo
 def test_the_ground_is_less_well_known_than_the_plumb_line(outcomes):
-    """By the 6 arcsec, 185 m, of a deflection nobody knows."""
+    """The difference is the 6 arcsec, 185 m, of a deflection nobody knows."""
     for o in outcomes["turned"]:
         more = np.sqrt(np.diag(o.covariance_ground - o.covariance)[:2])
         assert more == pytest.approx([185.5, 185.5], abs=2)
@@ -129,7 +129,7 @@ def run(capsys):
 
 
 def test_the_papers_nights(run, monkeypatch):
-    """But for 4 frames a heading where the paper has 25."""
+    """They have 4 frames a heading, where the paper has 25."""
     monkeypatch.setattr(montecarlo_nights, "turned_night", partial(montecarlo_nights.turned_night, frames=4))
     status, said, errors = run("nights", "--nights", 2, "--seed", 5, "--tiltmeter", 1, "--json", "--jobs", 1)
     assert (status, errors) == (0, [])

@@ -78,7 +78,7 @@ class Participants:
         )
 
     def taking(self, topic: str) -> list[_Participant]:
-        """Those that take a topic."""
+        """The participants that take a topic."""
         return [p for p in self._present if topic in p.words.takes]
 
     def made_of(self, topic: str) -> list[tuple[str, int]]:
