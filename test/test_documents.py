@@ -27,19 +27,24 @@ OF_NODES = {
 }
 ROOMS = (ROOT / "docs", ROOT / "test", ROOT / "tools", *PACKAGES)
 FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglob("*"))) if f.is_file())
+CYTHON = (".pyx", ".pxd")
 # but what Cython has written
-SOURCES = [f for f in FILES if f.suffix in (".py", ".c", ".h") and not f.with_suffix(".pyx").exists()]
+SOURCES = [
+    f
+    for f in FILES
+    if f.suffix in (".py", ".h", *CYTHON) or (f.suffix == ".c" and not f.with_suffix(".pyx").exists())
+]
 MODULES = {p.name: p / p.name for p in PACKAGES}
 FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
 # Names of the C library, of ERFA, of avr-libc.
 FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}
 SHOUTED = r"\b(?:ARCHITECTURE|CONTRIBUTING|DESIGN|ERRATA|PROTOCOL|README|TUTORIAL)\b(?:\.md)?"
-NAMED = re.compile(rf"{SHOUTED}|(?<![\w./-])[\w./-]*\w\.(?:md|rst|py|c|h|svg)\b(?:#[\w-]+)?")
+NAMED = re.compile(rf"{SHOUTED}|(?<![\w./-])[\w./-]*\w\.(?:md|rst|py|pyx|pxd|c|h|svg)\b(?:#[\w-]+)?")
 DOTTED = re.compile(r"(?<![\w./-])(starpos(?:_[a-z]+)?)((?:\.[A-Za-z]\w*)+)")
 
 
 def headings(document: Path) -> set[str]:
-    """As GitHub makes anchors of them."""
+    """The headings, as GitHub makes anchors of them."""
     found = re.findall(r"^#+ (.*)$", document.read_text(), re.MULTILINE)
     plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", h).replace("`", "").strip().lower() for h in found)
     return {re.sub(r"[^\w\- ]", "", h).replace(" ", "-") for h in plain}
@@ -164,9 +169,20 @@ def test_what_is_not_there_is_found(said):
     assert not_there(said, ROOT / "src" / "starpos" / "starpos" / "rotation.py")
 
 
+def test_what_the_compiled_core_names_is_read(tmp_path):
+    source = tmp_path / "new.pyx"
+    source.write_text('x = 1  # see nowhere.py\ndef f():\n    """As starpos.nowhere\n    # says."""\n')
+    assert [not_there(text, source) for text in said_beside_the_code(source)] == [
+        ["nowhere.py"],
+        ["starpos.nowhere"],
+    ]
+
+
 def said_beside_the_code(source: Path) -> list[str]:
     """Comments and docstrings."""
     text = source.read_text()
+    if source.suffix in CYTHON:
+        return re.findall(r'""".*?"""|#[^\n]*', text, re.DOTALL)
     if source.suffix != ".py":
         return re.findall(r"//.*|/\*.*?\*/", text, re.DOTALL if "/*" in text else 0)
     comments = [

@@ -22,12 +22,25 @@ def walls():
 FIELDS = "".join(f"    {name}: float\n" for name in "abcdef")
 BREACHES = [
     ("layers", {"starpos.frames.new": "from starpos.sky.catalogue import Catalogue"}, "floor 1"),
-    ("layers", {"starpos.frames.new": "import starpos.fix.fix"}, "floor 1"),
+    ("layers", {"starpos.frames.new": "from starpos.fix import fix"}, "floor 1"),
+    (
+        "layers",
+        {"starpos.frames.new": "from starpos import Solver"},
+        "frames (floor 1) imports fix (floor 5)",
+    ),
+    ("layers", {"starpos.frames.new": "import starpos"}, "opens every floor"),
+    ("layers", {"starpos.frames.new": "import starpos.fix.fix"}, "opens every floor"),
+    ("layers", {"starpos.frames.new": "from ..fix.solver import Solver"}, "write the full name"),
+    ("layers", {"starpos_solver.new": "from . import node"}, "write the full name"),
     ("layers", {"starpos.earth.new": "from starpos.instrument.camera import Camera"}, "floor 2"),
     ("layers", {"starpos.units": "from starpos.frames.frame import Frame"}, "floor 0"),
     ("layers", {"starpos.cellar.new": ""}, "no floor"),
     ("layers", {"starpos.fix.new": "def f():\n    from rclpy.node import Node"}, "which is ROS"),
     ("layers", {"starpos.fix.new": "from sensor_msgs.msg import Image"}, "which is ROS"),
+    ("layers", {"starpos.fix.new": "from starpos_interfaces.msg import Tilt"}, "which is ROS"),
+    ("layers", {"starpos.fix.new": "import tf2_ros"}, "which is ROS"),
+    ("layers", {"starpos.fix.new": "from rosbag2_py import SequentialReader"}, "which is ROS"),
+    ("layers", {"starpos.fix.new": "from starpos_common import exits"}, "does not allow"),
     ("layers", {"starpos_solver.new": "import starpos_camera.camera"}, "does not allow"),
     ("layers", {"starpos_common.new": "import starpos_testing.nodes"}, "does not allow"),
     (
@@ -43,22 +56,59 @@ BREACHES = [
     ("keywords", {"starpos.fix.new": f"@dataclass(frozen=True)\nclass Six:\n{FIELDS}"}, "6 fields"),
     ("words", {"starpos.fix.new": '"""Of nothing."""'}, "a verb or a noun"),
     ("words", {"starpos.fix.new": "x = 1\n" * 500}, "500 lines"),
+    ("words", {"starpos.fix.new": 'def f():\n    """By how much."""'}, "a verb or a noun"),
+    ("words", {"starpos.core.new": 'cdef f():\n    """And more.\n    """'}, "new.py:2"),
+    ("words", {"starpos.core.new": "x = 1\n" * 500}, "500 lines"),
     ("comments", {"starpos.fix.new": "# Above.\nx = 1  # noqa: E741\ny = 2  # in m\n"}, "new.py:3"),
+    ("comments", {"starpos.core.new": "# Above.\nx = '#'\ny = 2  # in m\n"}, "new.py:3"),
+    (
+        "core",
+        {"starpos.core.new": '"""Text.\n"""\nimport numpy as np, rclpy'},
+        "new.py:3: the core imports rclpy",
+    ),
+    ("core", {"starpos.core.new": "def f():\n    from starpos.fix import fix"}, "imports starpos.fix"),
+    ("core", {"starpos.core.new": "cimport starpos.fix"}, "imports starpos.fix"),
+    ("core", {"starpos.core.new": "from . cimport algebra"}, "imports ."),
+    (
+        "circles",
+        {"starpos.fix.solver": "from starpos.fix import a", "starpos.fix.a": "from starpos import Solver"},
+        "in a circle",
+    ),
 ]
+
+
+def house_of(walls, sources):
+    return [
+        (walls.Compiled if name.startswith("starpos.core.") else walls.Module)(name, ROOT / "new.py", text)
+        for name, text in sources.items()
+    ]
 
 
 @pytest.mark.parametrize(("rule", "sources", "sentence"), BREACHES)
 def test_a_breach_is_seen(walls, rule, sources, sentence):
-    house = [walls.Module(name, ROOT / "new.py", text) for name, text in sources.items()]
-    found = list(getattr(walls, rule)(house))
+    found = list(getattr(walls, rule)(house_of(walls, sources)))
     assert len(found) == 1 and sentence in found[0]
 
 
 def test_what_is_allowed_is_no_breach(walls):
     sources = {
-        "starpos.fix.new": "import numpy as np\nfrom starpos.identification import Sky\nimport starpos.rotation",
+        "starpos.fix.new": "import numpy as np\nfrom starpos.identification import Sky\nimport yaml\nimport json",
         "starpos_solver.new": "from starpos.fix.solver import Solver\nfrom starpos_interfaces.msg import Tilt",
         "starpos.rotation": "from starpos.units import ARCSEC",
+        "starpos.parallel.same": "import starpos",
+        "starpos.cli.new": "from starpos import Solver, __version__",
+        "starpos_bringup.new": "import starpos\nimport tf2_ros",
     }
-    house = [walls.Module(name, ROOT / "new.py", text) for name, text in sources.items()]
+    house = house_of(walls, sources)
     assert [*walls.layers(house), *walls.aliases(house)] == []
+
+
+def test_what_the_core_may_is_no_breach(walls):
+    text = (
+        '# Above, "as it stands.\n"""Text: from rclpy import Node."""\n'
+        "from libc.math cimport sqrt\nfrom starpos.core.algebra cimport Point\ncimport starpos.core.wide\n"
+        'cdef extern from *:\n    """\n    By C.\n    """\n    void f()\n'
+        'def f():\n    """As many as `many`."""\n    return "# no comment"\n'
+    )
+    house = house_of(walls, {"starpos.core.new": text})
+    assert [*walls.core(house), *walls.words(house), *walls.comments(house)] == []
