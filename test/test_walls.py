@@ -53,6 +53,16 @@ BREACHES = [
     ),
     ("aliases", {"starpos.fix.new": "from starpos.fix.solver import Solution as Answer"}, "as Answer"),
     ("twins", {"starpos.fix.a": "class Two: ...", "starpos_solver.b": "class Two: ..."}, "2 things"),
+    (
+        "same_functions",
+        {
+            "starpos.core.new": "def two(x):\n    return x",
+            "starpos.earth.b": "def two(): ...",
+            "starpos.fix.c": "from starpos.core.new import two",
+            "starpos.fix.d": "from starpos.earth.b import two",
+        },
+        "starpos.fix: two stands for 2 things, of starpos.core.new and starpos.earth.b",
+    ),
     ("keywords", {"starpos.fix.new": f"@dataclass(frozen=True)\nclass Six:\n{FIELDS}"}, "6 fields"),
     ("words", {"starpos.fix.new": '"""Of nothing."""'}, "a verb or a noun"),
     ("words", {"starpos.fix.new": "x = 1\n" * 500}, "500 lines"),

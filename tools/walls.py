@@ -92,6 +92,10 @@ class Module:
             if isinstance(node, DOCUMENTED) and (said := ast.get_docstring(node)):
                 yield getattr(node, "lineno", 1), said
 
+    def functions(self) -> Iterator[str]:
+        """The names of its functions."""
+        yield from (node.name for node in self.tree.body if isinstance(node, ast.FunctionDef))
+
     def comments(self) -> Iterator[tuple[int, str, str]]:
         """Each comment: its line, the code beside it, and itself."""
         for token in tokenize.generate_tokens(io.StringIO(self.text).readline):
@@ -116,6 +120,10 @@ class Compiled(Module):
         for line, before, said in self.parts("long"):
             if not before and not (line > 1 and lines[line - 2].lstrip().startswith("cdef extern")):
                 yield line, said.strip('"').strip()
+
+    def functions(self) -> Iterator[str]:
+        """The names of those of its functions that Python sees."""
+        yield from re.findall(r"(?m)^def (\w+)\(", self.code())
 
     def comments(self) -> Iterator[tuple[int, str, str]]:
         """Each comment: its line, the code beside it, and itself."""
@@ -288,6 +296,22 @@ def twins(house: list[Module]) -> Iterator[str]:
             yield f"{name} stands for {len(places)} things: {', '.join(p.rsplit(': ', 1)[0] for p in places)}"
 
 
+def same_functions(house: list[Module]) -> Iterator[str]:
+    """Names of functions that one folder imports from two modules."""
+    functions = {f"{module.name}.{name}" for module in house for name in module.functions()}
+    homes_of: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for module in house:
+        if isinstance(module, Compiled):
+            continue
+        for node, target in imports(module):
+            if isinstance(node, ast.ImportFrom) and target in functions:
+                home, _, name = target.rpartition(".")
+                homes_of[module.name.rpartition(".")[0], name].add(home)
+    for (folder, name), found in sorted(homes_of.items()):
+        if len(found) > 1:
+            yield f"{folder}: {name} stands for {len(found)} things, of {' and '.join(sorted(found))}"
+
+
 def dataclass_call(node: ast.ClassDef) -> ast.expr | None:
     """The decorator that makes it a dataclass."""
     for decorator in node.decorator_list:
@@ -337,6 +361,7 @@ def breaches() -> list[str]:
     return [line for rule in (layers, circles, aliases, twins, keywords) for line in rule(house)] + [
         *words(everything),
         *comments(everything),
+        *same_functions([*house, *core_files]),
         *core(core_files),
     ]
 

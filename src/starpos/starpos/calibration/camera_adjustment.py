@@ -277,7 +277,7 @@ class CameraAdjustment:
         return state, inverse
 
 
-def settled(problem: CameraAdjustment) -> SettledCamera:
+def settled_camera(problem: CameraAdjustment) -> SettledCamera:
     """The fit without outliers, with the stars' errors widened to their scatter; raises CalibrationError."""
     state = CameraEstimate(np.zeros(len(problem.sigma)), problem.start)
     keep, jitter2, stable = np.ones(len(problem.xy), bool), 0.0, False

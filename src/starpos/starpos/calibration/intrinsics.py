@@ -17,7 +17,7 @@ from starpos.calibration.camera_adjustment import (
     Sighting,
     camera_values,
     parameters,
-    settled,
+    settled_camera,
     with_values,
 )
 from starpos.earth.refraction import Atmosphere
@@ -126,7 +126,7 @@ def fit_camera(
             f"{count} identified stars are too few for a camera: give frames with {fewest} at least"
         )
     problem = CameraAdjustment.of(sightings, given, atmosphere, free)
-    fitted = settled(problem)
+    fitted = settled_camera(problem)
     camera = problem.camera(fitted.state.q)
     to_named = problem.named_per_unit()
     keep = fitted.keep
