@@ -10,6 +10,7 @@ from starpos.earth.vertical import Deflection as Deflection
 from starpos.earth.vertical import geodetic as geodetic
 from starpos.errors import StarposError as StarposError
 from starpos.fix.fix import Fix as Fix
+from starpos.fix.readable import InDegrees as InDegrees
 from starpos.fix.solver import Solution as Solution
 from starpos.fix.solver import Solver as Solver
 from starpos.fix.solver import Status as Status
@@ -22,6 +23,10 @@ from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
+from starpos.report.night import Night as Night
+from starpos.report.night import ReportedPlace as ReportedPlace
+from starpos.report.night import Shot as Shot
+from starpos.report.opening import NightOnDisk as NightOnDisk
 from starpos.report.opening import open_night as open_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue

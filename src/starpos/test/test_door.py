@@ -81,6 +81,14 @@ def test_the_doors_own_example_is_what_comes_of_it(night, monkeypatch):
     assert told.examples and runner.failures == 0, "".join(lines)
 
 
+def test_what_a_night_is_made_of_has_public_names(night):
+    """Only these are in the reference of the library."""
+    opened = starpos.open_night(night, calibration=starpos.Calibration.of((0, 0, 0), (5, 5, 5)))
+    answer = opened.solve()
+    for value in (opened, answer, answer.wgs84, answer.combined, answer.shots[0]):
+        assert type(value).__name__ in starpos.__all__
+
+
 def test_a_night_in_a_notebook_is_a_short_table_in_degrees(tmp_path):
     simulated(tmp_path, "-n", "2", "--stars-only")
     answer = starpos.open_night(tmp_path, instrument=starpos.Instrument(4635.9375)).solve()

@@ -125,7 +125,9 @@ class Night:
     """All frames of one place; printed, and in a notebook shown, in a few lines.
 
     origin: a sentence that says where the fixes come from.
-    combined: the average; None if there is none, and why_not says why.
+    shots: one for each frame.
+    combined: the average, astronomic and in rad; None if there is none, and why_not says why.
+    wgs84: the same for a map, in deg.
     steady (N, 3): latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved.
     """
 
