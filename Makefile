@@ -16,7 +16,7 @@ PACKAGES := $(patsubst %/package.xml,%,$(wildcard */package.xml src/*/package.xm
 INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/package.xml $(p)/setup.* $(p)/CMakeLists.txt \
   $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* \
   $(p)/layouts $(p)/layouts/* $(p)/sros2 $(p)/sros2/* $(p)/urdf $(p)/urdf/* $(p)/resource/* \
-  $(p)/$(notdir $(p))/core $(p)/$(notdir $(p))/core/*.pyx $(p)/$(notdir $(p))/core/*.pxd))
+  $(p)/$(notdir $(p))/core/*.pyx $(p)/$(notdir $(p))/core/*.pxd))
 
 .PHONY: build demo bench docs emulated test lint clean distclean FORCE
 build: install/.built

@@ -25,6 +25,8 @@ from starpos.parallel.processes import Processes, processors
 OPTICS = ("--focal-mm", "600", "--pixel-um", "6.4")
 # Frames simulated; a longer night repeats them.
 AT_ONCE = 8
+# The tests' bag, and how many star lists it holds.
+NIGHT, LISTS = Path(__file__).resolve().parents[2] / "test" / "data" / "night", 10
 
 
 def timed(command: list[str]) -> tuple[np.ndarray, bytes]:
@@ -94,6 +96,8 @@ def rows(options) -> Iterator[Row]:
     note = "the same answers" if same else "OTHER ANSWERS"
     ours, alone = Cost(1000 * best[jobs][1], note), Cost(1000 * best[1][1])
     yield Row(f"{number} star lists solved on {jobs} processes, all their CPU", ours, "on one process", alone)
+    (_, cpu_s), _ = timed(["replay", *[str(NIGHT)] * (number // LISTS)])
+    yield Row(f"{number} star lists replayed from bags, all their CPU", Cost(1000 * cpu_s), "solved", alone)
 
 
 def main() -> None:
