@@ -17,8 +17,12 @@ def like_radians(log: TiltLog) -> str:
     """
     order = np.argsort(log.utc_unix_s, kind="stable")
     apart = np.diff(log.utc_unix_s[order])
-    steps = np.diff(log.theta[order, :2], axis=0)[(apart > 0) & (apart < BRACKET_S)]
-    steps = steps[np.isfinite(steps).all(1)]
+    every = np.diff(log.theta[order, :2], axis=0)
+    sound = (apart > 0) & np.isfinite(every).all(1)
+    steps = every[sound & (apart < BRACKET_S)]
+    if len(steps) < ENOUGH_STEPS:
+        # one reading a frame: an instrument that stands differs from frame to frame by its noise alone
+        steps = every[sound]
     if len(steps) < ENOUGH_STEPS or np.nanmax(np.abs(np.degrees(log.theta[:, :2]))) > np.pi / 2:
         return ""
     noise = float(np.degrees(white_noise(steps).mean()))

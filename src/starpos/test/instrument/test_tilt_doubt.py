@@ -10,11 +10,11 @@ from starpos.instrument.tilt_log import TiltLog
 NOISE = np.radians(0.0035)
 
 
-def table(theta_x, theta_y, noise, stated=NOISE, number=40):
-    """Readings at 10 Hz of two angles, in rad, that a reader took for degrees."""
+def table(theta_x, theta_y, noise, stated=NOISE, number=40, period_s=0.1):
+    """Readings of two angles, in rad, that a reader took for degrees."""
     rng = np.random.default_rng(3)
     theta = np.array([theta_x, theta_y])[:, None] + rng.normal(0, noise, (2, number))
-    t = 1.8e9 + np.arange(number) / 10
+    t = 1.8e9 + np.arange(number) * period_s
     return TiltLog.of(t, *np.radians(theta), np.full(number, np.nan), np.full(number, stated))
 
 
@@ -23,12 +23,17 @@ def test_radians_are_seen_at_any_lean(angle):
     assert "look like radians" in like_radians(table(angle, -0.1, NOISE))
 
 
+def test_radians_are_seen_of_one_reading_a_frame():
+    assert "look like radians" in like_radians(table(0.05, -0.1, NOISE, number=12, period_s=20.0))
+
+
 @pytest.mark.parametrize(
     "sound",
     [
         # a level instrument in degrees
         table(0.02, -0.01, np.degrees(NOISE)),
         table(12.0, -3.0, np.degrees(NOISE)),
+        table(0.02, -0.01, np.degrees(NOISE), number=12, period_s=20.0),
         # readings of no noise, or too few of them
         table(0.1, 0.1, 0.0),
         table(0.1, 0.1, NOISE, number=6),
@@ -37,7 +42,7 @@ def test_radians_are_seen_at_any_lean(angle):
         # beyond a right angle no reading is of radians
         table(2.0, 0.1, NOISE),
     ],
-    ids=["level", "leaning", "without noise", "few", "quiet", "large"],
+    ids=["level", "leaning", "one a frame", "without noise", "few", "quiet", "large"],
 )
 def test_degrees_are_left_in_peace(sound):
     assert like_radians(sound) == ""
