@@ -2,9 +2,9 @@
 // A camera of V4L2 for programs that this library is preloaded into: OpenCV's own backend talks to it as to the kernel's.
 // It is /dev/starpos-emulated while the file `plugged` is in the folder STARPOS_V4L2; other files there change what it
 // does: `short` (frames lack 16 bytes), `unstamped`, `realtime` (stamps of the other clock), `frozen`, `automatic` (no
-// control of the exposure), `dark` (exposed for longer than the period that it tells). A frame is exposed up to its
-// stamp, and there 10 ms later. Its pixels are row * 5 + column * 3, but for the first 8: the start of the exposure,
-// steady time in us.
+// control of the exposure), `dark` (exposed for longer than the period that it tells), `pull` (`plugged` goes as soon as
+// a frame is waited for). A frame is exposed up to its stamp, and there 10 ms later. Its pixels are row * 5 + column * 3,
+// but for the first 8: the start of the exposure, steady time in us.
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -32,11 +32,13 @@ static struct v4l2_pix_format format = {.width = 64, .height = 48, .pixelformat 
 static int64_t next_us;  // the start of the next exposure
 static int exposure = 50, automatic = 3, gain = 10;  // 100 us, V4L2_EXPOSURE_APERTURE_PRIORITY
 
-static int is(const char *name) {
-  char path[4096];
+static const char *file(const char *name) {
+  static char path[4096];
   snprintf(path, sizeof path, "%s/%s", getenv("STARPOS_V4L2"), name);
-  return !access(path, F_OK);
+  return path;
 }
+
+static int is(const char *name) { return !access(file(name), F_OK); }
 
 static int64_t clock_us(clockid_t id) {
   struct timespec t;
@@ -74,6 +76,14 @@ static void advance(void) {
   }
 }
 
+// Called by the program that plays: returns once no buffer is left for a new frame, all have old ones.
+void starpos_emulated_fill(void) {
+  for (advance(); streaming && queued && !is("frozen"); advance()) {
+    struct timespec at = {.tv_sec = there_us() / 1000000, .tv_nsec = there_us() % 1000000 * 1000};
+    clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, NULL);
+  }
+}
+
 static int fail(int error) {
   errno = error;
   return -1;
@@ -82,6 +92,7 @@ static int fail(int error) {
 static int wait_for_the_next(void) {
   struct itimerspec at = {.it_value = {.tv_sec = there_us() / 1000000, .tv_nsec = there_us() % 1000000 * 1000}};
   if (is("frozen")) at.it_value.tv_sec += 1000;
+  if (is("pull")) unlink(file("plugged"));
   timerfd_settime(device, TFD_TIMER_ABSTIME, &at, NULL);
   return fail(EAGAIN);
 }

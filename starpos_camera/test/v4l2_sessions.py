@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs under the emulated V4L2 camera: `v4l2_sessions.py SESSION [PARAMETERS]`, JSON in and on its last line out."""
 
+import ctypes
 import json
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -16,13 +16,8 @@ from starpos_camera.sources.video import Video
 
 FOLDER = Path(os.environ["STARPOS_V4L2"])
 SETTINGS = CaptureSettings(None, None, 5.0)
-
-
-def wait(seconds):
-    """Wait until the camera's buffers are full of old frames."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        pass
+# Waits until the camera's buffers are full of old frames.
+fill = ctypes.CDLL(None).starpos_emulated_fill
 
 
 def told(source, settings=SETTINGS):
@@ -58,23 +53,21 @@ def frames(source, settings=((None, None),)):
     out = []
     for exposure_s, gain in settings:
         out.append(told(source, CaptureSettings(exposure_s, gain, 5.0)))
-        wait(0.2)
+        fill()
     return out
 
 
 def unplugged(source):
     """Between two frames, in the middle of one, and back."""
-    plug = FOLDER / "plugged"
+    plug, pull = FOLDER / "plugged", FOLDER / "pull"
     out = [told(source)]
     plug.unlink()
     out += [told(source), told(source)]
     plug.touch()
     out.append(told(source))
-    pull = threading.Timer(0.1, plug.unlink)
-    pull.start()
-    # It settles for four frames first.
+    pull.touch()
     out.append(told(source, CaptureSettings(0.08, None, 5.0)))
-    pull.join()
+    pull.unlink()
     plug.touch()
     return [*out, told(source)]
 
