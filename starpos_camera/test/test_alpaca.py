@@ -10,17 +10,19 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 from alpaca_servers import HEIGHT, WIDTH, Liar, Simulator, free_port, image_bytes
+from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.alpaca import Alpaca
-from starpos_camera.sources.source import CaptureError, CaptureSettings
+from starpos_camera.sources.source import CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import require
-from starpos_testing.patience import WAIT_S
+from starpos_testing.patience import WAIT_S, until
 
-SHORT = CaptureSettings(0.1, None, 5.0)
-LONG = CaptureSettings(2.0, None, 5.0)
+LONG = CaptureSettings(6.0, None, 7.0)
+# One of ASCOM's camera states.
+EXPOSING = 2
 
 
 def values(address, **changes):
@@ -34,12 +36,11 @@ def make(server, **changes):
     return Alpaca(given, time.time)
 
 
-def attempt(source, settings=SHORT):
-    """What a call gave: an exposure or the sentence of its error."""
-    try:
-        return source.capture(settings)
-    except CaptureError as error:
-        return str(error)
+def exposing(source, camera):
+    """Begin a long capture in a thread; returns its result to come once the camera exposes."""
+    capture = in_thread(attempt, source, LONG)
+    until(lambda: camera.CameraState == EXPOSING)
+    return capture
 
 
 @pytest.fixture(scope="module")
@@ -102,24 +103,18 @@ def test_another_program_disconnects_bins_or_aborts(simulator, record_property):
     other.NumX, other.NumY = WIDTH // 2, HEIGHT // 2
     assert "no other program may bin it" in attempt(source)
     assert source.capture(SHORT).frame.width == WIDTH
-    abort = threading.Timer(0.5, other.AbortExposure)
-    abort.start()
-    begin = time.monotonic()
-    assert "ended by another program" in attempt(source, LONG)
-    noticed_s = time.monotonic() - begin - 0.5
-    abort.join()
+    capture = exposing(source, other)
+    aborted_s = time.monotonic()
+    other.AbortExposure()
+    said, noticed_s = capture.result(WAIT_S)
+    assert "ended by another program" in said
     simulator_settles(other)
     source.capture(SHORT)
     record_property("fault", "Alpaca: another client disconnects, bins, aborts")
     record_property(
-        "result", f"connected again, refused, noticed after {noticed_s:.1f} s; frames go on, none wrong"
+        "result",
+        f"connected again, refused, noticed after {noticed_s - aborted_s:.1f} s; frames go on, none wrong",
     )
-
-
-def until(condition):
-    end = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end
 
 
 def simulator_settles(camera):
@@ -133,12 +128,11 @@ def test_a_server_killed_in_mid_exposure_and_back(tmp_path, record_property):
     try:
         source = make(simulator)
         source.capture(SHORT)
-        kill = threading.Timer(0.5, simulator.kill)
-        kill.start()
-        begin = time.monotonic()
-        assert "no Alpaca server, or it has gone" in attempt(source, LONG)
-        noticed_s = time.monotonic() - begin - 0.5
-        kill.join()
+        capture = exposing(source, simulator.client())
+        killed_s = time.monotonic()
+        simulator.kill()
+        said, noticed_s = capture.result(WAIT_S)
+        assert "no Alpaca server, or it has gone" in said
         assert "no Alpaca server" in attempt(source)
         simulator.start()
         begin = time.monotonic()
@@ -147,7 +141,9 @@ def test_a_server_killed_in_mid_exposure_and_back(tmp_path, record_property):
     finally:
         simulator.kill()
     record_property("fault", "Alpaca: server killed in mid-exposure, and back")
-    record_property("result", f"noticed after {noticed_s:.1f} s; a frame {back_s:.1f} s after it was back")
+    record_property(
+        "result", f"noticed after {noticed_s - killed_s:.1f} s; a frame {back_s:.1f} s after it was back"
+    )
 
 
 def test_nobody_there_and_addresses_that_are_none():
@@ -159,14 +155,14 @@ def test_nobody_there_and_addresses_that_are_none():
 
 def test_close_ends_an_exposure(simulator):
     source = make(simulator, alpaca__device=1)
+    camera = simulator.client(1)
     source.capture(SHORT)
-    stop = threading.Timer(0.3, source.close)
-    stop.start()
-    begin = time.monotonic()
-    assert "the node ends" in attempt(source, CaptureSettings(6.0, None, 7.0))
-    assert time.monotonic() - begin < 5.0
-    stop.join()
-    simulator_settles(simulator.client(1))
+    capture = exposing(source, camera)
+    closed_s = time.monotonic()
+    source.close()
+    said, ended_s = capture.result(WAIT_S)
+    assert "the node ends" in said and ended_s - closed_s < 5.0
+    simulator_settles(camera)
 
 
 def test_a_gain_is_set_once_and_kept(liar):
@@ -182,7 +178,7 @@ def test_the_node_ends_within_a_long_exposure(simulator, start):
         "camera", "source:=alpaca", f"alpaca.address:={simulator.address}", "exposure:=60.0", "cadence:=0.5"
     )
     camera = simulator.client()
-    until(lambda: camera.CameraState == 2)
+    until(lambda: camera.CameraState == EXPOSING)
     begin = time.monotonic()
     status, out = process.end(signal.SIGINT)
     assert status == 0 and time.monotonic() - begin < 30, out

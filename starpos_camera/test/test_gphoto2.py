@@ -2,13 +2,13 @@
 """The source `gphoto2`, on libgphoto2 with its virtual USB camera, a Nikon D750 that returns the pictures of a folder."""
 
 import re
-import threading
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
 from starpos_camera.camera_parameters import PARAMETERS
@@ -21,7 +21,6 @@ from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
 from starpos_testing.skies import raws
 
-TENTH = CaptureSettings(0.1, None, 5.0)
 AS_IT_IS = CaptureSettings(None, None, 5.0)
 MOSAIC = raws.mosaic()
 GREY = (MOSAIC >> 8).astype(np.uint8)
@@ -78,21 +77,13 @@ def make(folder):
 
     def make(**changes):
         given = values(**changes)
-        assert Gphoto2.refusal(given, TENTH) is None
+        assert Gphoto2.refusal(given, SHORT) is None
         sources.append(Gphoto2(given, time.time))
         return sources[-1]
 
     yield make
     for source in sources:
         source.close()
-
-
-def attempt(source, settings=TENTH):
-    """What a call gave: an exposure or the sentence of its error."""
-    try:
-        return source.capture(settings)
-    except CaptureError as error:
-        return str(error)
 
 
 def on_the_card():
@@ -113,7 +104,7 @@ def on_the_card():
 def test_a_jpeg_has_its_rows_on_top_the_shutters_exposure_and_the_commands_time(make):
     source = make(command_lag=0.5, command_lag_stddev=0.02)
     begin = time.time()
-    taken = source.capture(TENTH)
+    taken = source.capture(SHORT)
     frame = taken.frame
     assert abs(frame.pixels.astype(int) - GREY).max() < 5 and frame.pattern == ""
     assert begin + 0.55 < frame.mid_unix_s < time.time() + 0.55
@@ -125,14 +116,14 @@ def test_a_jpeg_has_its_rows_on_top_the_shutters_exposure_and_the_commands_time(
 
 def test_a_raw_file_is_the_mosaic_and_tells_its_exposure(make, folder):
     folder.put(raws.dng(MOSAIC, "gbrg", exposure=(1, 10)))
-    taken = make().capture(TENTH)
+    taken = make().capture(SHORT)
     assert np.array_equal(taken.frame.pixels, MOSAIC) and taken.frame.pattern == "gbrg"
     assert (taken.frame.exposure_s, taken.remark) == (0.1, "")
 
 
 def test_the_exposure_is_the_one_the_file_says_it_had(make, folder):
     folder.put(raws.with_exif(JPEG, exposure=(1, 4)))
-    taken = make().capture(TENTH)
+    taken = make().capture(SHORT)
     assert taken.frame.exposure_s == 0.25
     assert "0.25 s" in taken.remark and "0.1 s" in taken.remark
 
@@ -140,14 +131,14 @@ def test_the_exposure_is_the_one_the_file_says_it_had(make, folder):
 def test_only_what_was_taken_is_deleted(make):
     source = make()
     for _ in range(3):
-        source.capture(TENTH)
+        source.capture(SHORT)
     assert on_the_card() == ["a.jpg"]
 
 
 def test_frames_stay_in_the_camera_where_they_should(make):
     source = make(gphoto2__keep=True, gphoto2__target="card")
     for _ in range(3):
-        source.capture(TENTH)
+        source.capture(SHORT)
     assert len(on_the_card()) == 4
 
 
@@ -158,13 +149,13 @@ def test_exposures_are_the_cameras_own_to_five_percent(make):
     assert source.capture(AS_IT_IS).frame.exposure_s == pytest.approx(0.05)
     said = attempt(source, CaptureSettings(0.3, None, 5.0))
     assert "no shutterspeed of 0.3 s" in said and "0.1000s and 1.0000s" in said
-    assert source.capture(TENTH).frame.exposure_s == pytest.approx(0.1)
+    assert source.capture(SHORT).frame.exposure_s == pytest.approx(0.1)
 
 
 def test_a_longer_exposure_is_held_open_which_this_camera_cannot(make):
     source = make()
     assert "switch it off and on" in attempt(source, CaptureSettings(3.0, None, 5.0))
-    assert source.capture(TENTH).frame.exposure_s == pytest.approx(0.1)
+    assert source.capture(SHORT).frame.exposure_s == pytest.approx(0.1)
 
 
 def test_the_gain_is_a_setting_the_camera_has(make):
@@ -194,7 +185,7 @@ def test_short_files_are_never_frames(make, folder, raw, keep, record_property):
 
 def test_a_camera_unplugged_and_back(make, folder, record_property):
     source = make()
-    source.capture(TENTH)
+    source.capture(SHORT)
     folder.unplug()
     said = [attempt(source) for _ in range(3)]
     assert all(isinstance(s, str) for s in said)
@@ -230,13 +221,11 @@ def test_a_camera_that_is_not_there_is_said_with_those_that_are(make):
 
 def test_closing_ends_a_capture_soon(make):
     source = make()
-    source.capture(TENTH)
-    said = []
-    capture = threading.Thread(target=lambda: said.append(attempt(source)))
-    capture.start()
+    source.capture(SHORT)
+    capture = in_thread(attempt, source)
     source.close()
-    capture.join(WAIT_S)
-    assert not isinstance(said[0], str) or "the node ends" in said[0]
+    said, _ = capture.result(WAIT_S)
+    assert not isinstance(said, str) or "the node ends" in said
 
 
 def test_the_node_takes_frames_and_says_when_the_camera_is_gone(folder, start, listener, record_property):

@@ -4,12 +4,12 @@
 import math
 import os
 import signal
-import threading
 import time
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from attempts import SHORT, in_thread
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
 from starpos_camera.camera_parameters import PARAMETERS
@@ -20,7 +20,6 @@ from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture
 from starpos_testing.patience import WAIT_S
 
-SHORT = CaptureSettings(0.1, None, 5.0)
 LONG = CaptureSettings(60.0, None, 60.0)
 # The simulator's own.
 SIZE = (1024, 1280)
@@ -44,23 +43,6 @@ def sentence(source, settings=SHORT) -> str:
     text = str(raised.value)
     assert text.startswith(source.hardware_id) and text.endswith(".") and "\n" not in text
     return text
-
-
-class Attempt(threading.Thread):
-    """A capture in a thread; `end` gives the sentence of its error and when it came (monotonic)."""
-
-    def __init__(self, source, settings):
-        super().__init__()
-        self._work = lambda: sentence(source, settings)
-        self._result = None
-        self.start()
-
-    def run(self):
-        self._result = self._work(), time.monotonic()
-
-    def end(self):
-        self.join()
-        return self._result
 
 
 @pytest.fixture
@@ -153,11 +135,11 @@ def test_what_another_client_has_set_does_not_stay(source, other):
 def test_the_server_is_killed_in_an_exposure_and_comes_back(server, source, other, record_property):
     source.capture(SHORT)
     other.catch_up()
-    attempt = Attempt(source, LONG)
+    capture = in_thread(sentence, source, LONG)
     other.hear("CCD_EXPOSURE", "Busy")
     server.kill()
     killed = time.monotonic()
-    text, noticed = attempt.end()
+    text, noticed = capture.result(WAIT_S)
     assert "the INDI server went away during the exposure" in text
     assert noticed - killed < 3
     assert "no INDI server answers" in sentence(source)
@@ -174,11 +156,11 @@ def test_the_server_is_killed_in_an_exposure_and_comes_back(server, source, othe
 def test_the_driver_is_killed_in_an_exposure_and_comes_back(server, source, other, record_property):
     source.capture(SHORT)
     other.catch_up()
-    attempt = Attempt(source, LONG)
+    capture = in_thread(sentence, source, LONG)
     other.hear("CCD_EXPOSURE", "Busy")
     server.kill_driver()
     killed = time.monotonic()
-    text, noticed = attempt.end()
+    text, noticed = capture.result(WAIT_S)
     assert "the camera or its driver went away during the exposure" in text
     assert noticed - killed < 2
     source.capture(SHORT)
@@ -199,11 +181,11 @@ def test_the_driver_is_killed_in_an_exposure_and_comes_back(server, source, othe
 def test_another_client_disconnects_or_aborts(source, other, vector, members, said, record_property):
     source.capture(SHORT)
     other.catch_up()
-    attempt = Attempt(source, LONG)
+    capture = in_thread(sentence, source, LONG)
     other.hear("CCD_EXPOSURE", "Busy")
     other.tell("Switch", vector, **members)
     begin = time.monotonic()
-    text, noticed = attempt.end()
+    text, noticed = capture.result(WAIT_S)
     assert said in text
     source.capture(SHORT)
     record_property("fault", f"another INDI client sets {vector} in an exposure")
@@ -224,11 +206,11 @@ def test_an_exposure_somebody_else_left_running_is_aborted(source, other):
 def test_closing_aborts_the_exposure_at_once(source, other):
     source.capture(SHORT)
     other.catch_up()
-    attempt = Attempt(source, LONG)
+    capture = in_thread(sentence, source, LONG)
     other.hear("CCD_EXPOSURE", "Busy")
     begin = time.monotonic()
     source.close()
-    text, ended = attempt.end()
+    text, ended = capture.result(WAIT_S)
     assert "closed" in text and ended - begin < LONG.exposure_s / 2
     other.hear("CCD_ABORT_EXPOSURE", "Ok")
     assert "the node ends" in sentence(source)
@@ -238,12 +220,12 @@ def test_a_frame_that_does_not_come_in_time_is_given_up(server, source, other):
     source.capture(SHORT)
     impatient = make(server, indi__readout=2.0)
     other.catch_up()
-    attempt = Attempt(impatient, CaptureSettings(1.0, None, 5.0))
+    capture = in_thread(sentence, impatient, CaptureSettings(1.0, None, 5.0))
     other.hear("CCD_EXPOSURE", "Busy")
     (driver,) = server.drivers()
     os.kill(driver, signal.SIGSTOP)
     # As of one that hangs.
-    text, _ = attempt.end()
+    text, _ = capture.result(WAIT_S)
     os.kill(driver, signal.SIGCONT)
     assert "gave no frame in time" in text
     impatient.capture(SHORT)

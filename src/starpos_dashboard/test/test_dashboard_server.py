@@ -5,14 +5,13 @@ import http.client
 import json
 import resource
 import socket
-import time
 from contextlib import ExitStack, closing
 
 import pytest
 
 from starpos_dashboard import access
 from starpos_testing.lacking import require
-from starpos_testing.patience import WAIT_S
+from starpos_testing.patience import WAIT_S, until
 
 SECRETS = ("/../setup.py", "/..%2fserver.py", "/vendor/../../server.py", "//etc/passwd", "/assets/index.html",
            "/vendor/d3-geo.LICENSE", "/%00", "/index.html/..", "/frame.jpg")  # fmt: skip
@@ -68,12 +67,6 @@ class Viewer:
     def close(self):
         self.lines.close()
         self.socket.close()
-
-
-def until(condition):
-    end = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end
 
 
 def wait(server, condition):

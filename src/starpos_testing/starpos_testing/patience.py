@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long tests wait."""
 
+import time
+from collections.abc import Callable
+
 # For any event: ten times what the slowest takes on a machine that is not busy, and more.
 WAIT_S = 120.0
+
+
+def until(condition: Callable[[], object]) -> None:
+    """Ask again and again until a condition is true; AssertionError after WAIT_S."""
+    end = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end, f"waited {WAIT_S:g} s in vain"
