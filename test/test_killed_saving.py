@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """kill -9 in the middle of saving: the file is whole, the old one or the new one; what is left over does no harm."""
 
+import random
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from starpos.instrument.instrument import Instrument
 from starpos_common.messages import camera_to_message
 from starpos_interfaces.srv import SaveCalibration
 from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
+from starpos_testing.patience import WAIT_S
 
 KILLS, KILLED_NODES = 40, 2
 # That a service keeps.
@@ -27,6 +29,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 
 folder, kills = Path(sys.argv[1]), int(sys.argv[2])
+random.seed(int(sys.argv[3]))
 cameras = [Camera.from_focal(100, 80, focal) for focal in (1000.0, 2000.0)]
 files = {
     "instrument.yaml": (lambda p, c: instrument_file.write(p, Instrument(c.fx, camera=c)),
@@ -54,12 +57,13 @@ for name, (write, read) in files.items():
 
 
 def test_a_file_is_the_old_or_the_new_one_whenever_its_writer_is_killed(tmp_path, record_property):
-    made = subprocess.run([sys.executable, "-c", KILLER, str(tmp_path), str(KILLS)],
-                          check=False, capture_output=True, text=True, timeout=100)  # fmt: skip
-    assert made.returncode == 0, made.stderr
+    seed = random.randrange(2**32)
+    made = subprocess.run([sys.executable, "-c", KILLER, str(tmp_path), str(KILLS), str(seed)],
+                          check=False, capture_output=True, text=True, timeout=WAIT_S)  # fmt: skip
+    assert made.returncode == 0, f"seed {seed}: {made.stderr}"
     for line in made.stdout.splitlines():
         _, old, new = line.split()
-        assert int(old) + int(new) == KILLS and int(old) and int(new), line
+        assert int(old) + int(new) == KILLS and int(old) and int(new), f"seed {seed}: {line}"
     record_property("fault", f"kill -9 at any moment of saving, {KILLS} times for each kind of file")
     record_property("result", f"always a whole file: {'; '.join(made.stdout.splitlines())}")
 
