@@ -29,7 +29,7 @@ def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, sol
 
     shown, looked_at = {}, set()
 
-    def identified():
+    def identified(_):
         """Pictures, stars and solutions of the frames that have all three, with circles of the solver's."""
         for image in images:
             stamp = (image.header.stamp.sec, image.header.stamp.nanosec)
@@ -45,12 +45,7 @@ def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, sol
         return bool(shown)
 
     # The first ones go before detector and solver have met once more.
-    for _ in range(20):
-        shot, image, capture = photograph()
-        graph.send(shot, image, capture)
-        if graph.comes(identified, 2.5):
-            break
-    assert shown, "no image with an identified star"
+    graph.photograph_until(identified, photograph)
 
     solution, catalogue = shown["solution"], load_catalogue()
     assert solution.status == Solution.OK

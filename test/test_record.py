@@ -6,12 +6,16 @@ import signal
 
 import numpy as np
 import pytest
+from rclpy.duration import Duration
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
 
 from starpos_interfaces.msg import Solution
 from starpos_testing.graph.shots import SOLVER, photograph, shoot
+
+# Those that this file's messages go to.
+TOPICS = ("stars", "tilt", "camera/capture", "camera/image_raw", "solver/solution", "fix")
 
 
 @pytest.fixture
@@ -42,9 +46,21 @@ def fields(message) -> dict:
     return {name: getattr(message, name) for name in message.get_fields_and_field_types()}
 
 
-def counts_of(graph) -> dict[str, str]:
+def counts_of(graph, report=-1) -> dict[str, int]:
     """Messages by topic that the recorder says it has."""
-    return {v.key: v.value for v in graph.diagnostics["record: Bag"][-1][1].values}
+    said = {v.key: v.value for v in graph.diagnostics["record: Bag"][report][1].values}
+    return {topic: int(said[topic]) for topic in TOPICS}
+
+
+def settled_counts_of(graph) -> dict[str, int]:
+    """Messages by topic that the recorder has, when nothing that was published is still under way to it."""
+    for publisher in (graph.stars, graph.tilt, graph.capture, graph.image):
+        graph.wait(lambda p=publisher: p.wait_for_all_acked(Duration()))
+    # Its queues are empty where it took nothing between two reports. The first may have been sent before.
+    graph.diagnostics["record: Bag"].clear()
+    reports = graph.diagnostics["record: Bag"]
+    graph.wait(lambda: len(reports) > 2 and counts_of(graph, -2) == counts_of(graph))
+    return counts_of(graph)
 
 
 def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
@@ -55,22 +71,20 @@ def test_what_was_published_is_in_the_bag_bit_for_bit_and_gives_the_same_fixes(
     process = recorded("--images")
     graph.state("record: Bag", "recording")
     _, image, capture = photograph()
-    first = shoot()
-    names = ("stars", "tilt", "camera/capture", "camera/image_raw", "solver/solution")
-    # A publisher may know the recorder before the recorder knows it.
-    for _ in range(20):
-        graph.send(first)
+
+    def recorder_knows_all():
+        """A publisher may know the recorder before the recorder knows it: until then messages are lost."""
+        graph.answer(shoot())
         graph.capture.publish(capture)
         graph.image.publish(image)
-        if graph.comes(lambda: all(int(counts_of(graph)[name]) for name in names), 2.0):
-            break
-    # What is under way arrives.
-    graph.comes(lambda: False, 2.5)
-    begun = counts_of(graph)
+        return graph.comes(lambda: all(counts_of(graph).values()), 2.0)
+
+    graph.wait(recorder_knows_all)
+    begun = settled_counts_of(graph)
     shots = [shoot() for _ in range(3)]
     answers = [graph.answer(shot)[0] for shot in shots]
     more = {"stars": 3, "tilt": 3 * len(shots[0].tilts), "solver/solution": 3, "fix": 3}
-    graph.wait(lambda: all(int(counts_of(graph)[name]) >= int(begun[name]) + n for name, n in more.items()))
+    graph.wait(lambda: all(counts_of(graph)[name] >= begun[name] + n for name, n in more.items()))
 
     process.signal(signal.SIGINT)
     assert process.wait() == 0, process.output

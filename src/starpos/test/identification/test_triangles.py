@@ -211,10 +211,10 @@ def test_who_waited_for_another_process_that_built_does_not_build_again(own_cach
         target=triangle_cache.cached, args=(catalogue, BROAD, lambda what, done: built.append(done))
     )
     waiting.start()
-    assert absent.wait(30)
+    assert absent.wait(WAIT_S)
     away.rename(folder)
     os.close(other)
-    waiting.join(60)
+    waiting.join(WAIT_S)
     assert not waiting.is_alive()
     assert built == []
 

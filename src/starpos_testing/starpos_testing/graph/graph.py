@@ -18,6 +18,9 @@ from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix
 from starpos_interfaces.msg import Capture, Solution, StarArray, Tilt
 from starpos_testing.patience import WAIT_S
 
+# Until another photograph is sent: nodes that have not met lose it.
+AGAIN_S = 2.0
+
 
 def executable(package: str, name: str) -> str:
     return str(Path(get_package_prefix(package)) / "lib" / package / name)
@@ -146,12 +149,24 @@ class Graph:
     def wait_for_detector(self, photograph):
         """Wait until an image comes back as a solution, which is the only proof that detector and solver have met."""
         self.wait(lambda: self.image.get_subscription_count() and self.capture.get_subscription_count())
-        for _ in range(20):
+        self.photograph_until(lambda stamps: any(s in self.solutions for s in stamps), photograph)
+
+    def photograph_until(self, condition, photograph):
+        """Send photographs until a condition of all their stamps is true, and wait until no more answers to them come."""
+        stamps: list[tuple[int, int]] = []
+
+        def come():
             shot, image, capture = photograph()
+            stamps.append(shot.stamp)
             self.send(shot, image, capture)
-            if self.comes(lambda s=shot: s.stamp in self.solutions, 2.0):
-                return
-        raise AssertionError("detector and solver do not find each other")
+            return self.comes(lambda: condition(stamps), AGAIN_S)
+
+        self.wait(come, "for what becomes of photographs")
+        # frames are answered in their order and the newest is never dropped: after it no other answer comes
+        self.result(stamps[-1])
+        for stamp in stamps:
+            if stamp in self.solutions:
+                self.result(stamp)
 
     def send(self, shot, image=None, capture=None):
         """Publish a shot's intrinsics, its tilts, then its stars or the image that they are in."""
