@@ -9,13 +9,9 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from starpos_interfaces.msg import Solution
 from starpos_testing.graph.shots import azimuth_for_heading, shoot
+from starpos_testing.headings import yaw_deg
 
 CARDINAL = [(0.01, 90), (359.99, 90), (90.01, 0), (89.99, 0), (180.01, -90), (179.99, -90), (270.0, 180)]
-
-
-def yaw_deg(imu) -> float:
-    q = imu.orientation
-    return math.degrees(math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
 
 
 @pytest.mark.parametrize(("heading", "yaw"), CARDINAL)

@@ -16,6 +16,7 @@ from starpos.fix.solver import Solution, Status
 from starpos.session.frames import ground_of
 from starpos_interfaces import msg
 from starpos_solver import outputs
+from starpos_testing.headings import yaw_deg
 
 EXACT = Deflection(0.0, 0.0, 0.0)
 
@@ -60,11 +61,6 @@ def answer_facing(azimuth_deg: float) -> Solution:
         magnitudes=np.array([5.25, 7.5, 10.0]),
         fix=fix_facing(azimuth_deg),
     )
-
-
-def yaw_deg(imu) -> float:
-    q = imu.orientation
-    return math.degrees(math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
 
 
 @pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
