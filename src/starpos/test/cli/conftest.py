@@ -41,6 +41,18 @@ def lists(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """Two nights: of lists that turn, and of frames; the first has a broken frame among its good ones."""
+    folder = tmp_path_factory.mktemp("archive")
+    size = ("--size", "1000", "700", *WIDE)
+    turned = ["simulate", str(folder / "turned"), "-n", "8", "--turn", "45", "--stars-only", *size]
+    assert main(turned) == 0
+    assert main(["simulate", str(folder / "still"), "-n", "2", "--seed", "2", *size]) == 0
+    (folder / "turned" / "stars_0002b.csv").write_text("no list of stars\n")
+    return folder
+
+
 @pytest.fixture
 def run(capsys):
     """Run a command: exit status, standard output, lines of standard error."""

@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from test_cli_jobs import archive, frames, run, solve  # noqa: F401  # a fixture
+from archives import frames, run, solve
 
 import starpos
 from starpos.errors import FrameError
@@ -63,7 +63,7 @@ def opencv_threads(of):
 
 
 @pytest.mark.parametrize("more", [(), ("--self-calibrate",)], ids=["each", "turned"])
-def test_a_cluster_gives_the_same_answers(more, cluster, archive, capfd, monkeypatch):  # noqa: F811
+def test_a_cluster_gives_the_same_answers(more, cluster, archive, capfd, monkeypatch):
     # The workers have another folder.
     monkeypatch.chdir(archive / "turned")
     command = [Path(a).name if a.endswith(".csv") else a for a in solve(archive / "turned", "--json", *more)]
@@ -76,7 +76,7 @@ def test_a_cluster_gives_the_same_answers(more, cluster, archive, capfd, monkeyp
 
 
 @pytest.mark.parametrize("command", ["detect", "identify"])
-def test_detect_and_identify_go_to_a_cluster_too(command, cluster, archive, capfd):  # noqa: F811
+def test_detect_and_identify_go_to_a_cluster_too(command, cluster, archive, capfd):
     given = [command, *frames(archive / "still", "*.fits"), "none.fits", "--json"]
     assert run(capfd, [*given, "--scheduler", cluster]) == run(capfd, given)
 
@@ -155,7 +155,7 @@ def test_workers_leave_one_another_their_processors(cluster, tmp_path):
         assert list(workers.map([(opencv_threads, str(tmp_path / "a"))] * 6))[-1] == 1
 
 
-def test_no_scheduler_is_told(archive, capfd, monkeypatch):  # noqa: F811
+def test_no_scheduler_is_told(archive, capfd, monkeypatch):
     monkeypatch.setattr(cluster_module, "ANSWER_WITHIN_S", 0.5)
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))

@@ -5,7 +5,6 @@ import gzip
 import json
 import os
 import pty
-import re
 import select
 import shutil
 import signal
@@ -16,45 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from archives import frames, run, solve
+from cli_calls import KNOWN, WIDE
 
-from starpos.cli import main
 from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
-
-WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
-# the same, with an A3 that is known
-KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
-SIZE = ("--size", "1000", "700", *WIDE)
-
-
-@pytest.fixture(scope="module")
-def archive(tmp_path_factory):
-    """Two nights: of lists that turn, and of frames; the first has a broken frame among its good ones."""
-    folder = tmp_path_factory.mktemp("archive")
-    turned = ["simulate", str(folder / "turned"), "-n", "8", "--turn", "45", "--stars-only", *SIZE]
-    assert main(turned) == 0
-    assert main(["simulate", str(folder / "still"), "-n", "2", "--seed", "2", *SIZE]) == 0
-    (folder / "turned" / "stars_0002b.csv").write_text("no list of stars\n")
-    return folder
-
-
-def frames(night, pattern="*.csv"):
-    return [str(p) for p in sorted(night.glob(pattern)) if p.name != "tilt.csv"]
-
-
-def solve(night, *more):
-    return ["solve", *frames(night), "--tilt", str(night / "tilt.csv"), *KNOWN, *map(str, more)]
-
-
-def run(capfd, command):
-    """Exit status, standard output, standard error without timings."""
-    capfd.readouterr()
-    try:
-        status = main(command)
-    except SystemExit as e:
-        status = e.code
-    out, err = capfd.readouterr()
-    return status, re.sub(r'"cpu_ms": [^,}]*|\d+ ms$', "", out, flags=re.M), err
 
 
 # the table, which has fewer digits, once

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from test_identification import random_attitude, seen, sky_for
+from test_identification import seen, sky_for
 
 from starpos import rotation
 from starpos.core.poses import log_ratio
@@ -12,6 +12,7 @@ from starpos.identification.evidence import CHANCES, DOUBLE_PX, LOG_SHARES, WIDT
 from starpos.identification.pose import FrameStars, Pose, directions
 from starpos.instrument.camera import Camera
 from starpos.simulation.montecarlo_fields import Conditions, draw
+from starpos_testing.skies.scenes import random_attitude
 
 # so few pixels that chance has a chance
 SMALL = Camera.from_focal(300, 225, 375 / 2 / np.tan(np.radians(5.5)))

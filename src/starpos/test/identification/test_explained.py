@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_identification_crowd import CAMERA, SIGMA_PX, random_attitude, sky, stars_on, under  # noqa: F401
+from crowds import CAMERA, SIGMA_PX, stars_on, under
 
 from starpos.fix.solver import TWO_SKIES, UNEXPLAINED, Solver, Status
 from starpos.frames.stars import Stars
@@ -13,33 +13,33 @@ from starpos.identification import identify
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.pose import FrameStars
 from starpos.instrument.instrument import Instrument
-from starpos_testing.skies.scenes import solver_of, stars_of, tilt_of, wide_scene
+from starpos_testing.skies.scenes import random_attitude, solver_of, stars_of, tilt_of, wide_scene
 
 
 @pytest.fixture
-def field(sky, rng):  # noqa: F811
+def field(sky, rng):
     """Pixels (N, 2) of a field of 15 stars or more."""
     while len(xy := stars_on(sky, random_attitude(rng), rng)) < 15:
         pass
     return xy
 
 
-def explained(xy, sky):  # noqa: F811
+def explained(xy, sky):
     sigma = np.full(len(xy), SIGMA_PX)
     return explained_by(identify(xy, sigma, CAMERA, sky), FrameStars.of(xy, sigma, CAMERA))
 
 
-def test_a_clear_frame_is_explained_and_all_its_stars_are_there(field, sky):  # noqa: F811
+def test_a_clear_frame_is_explained_and_all_its_stars_are_there(field, sky):
     e = explained(field, sky)
     assert e.explained == e.bright and e.seen >= e.due - 1 and e.enough
 
 
-def test_a_crowd_of_false_stars_does_not_hide_that_all_bright_stars_are_there(field, sky, rng):  # noqa: F811
+def test_a_crowd_of_false_stars_does_not_hide_that_all_bright_stars_are_there(field, sky, rng):
     e = explained(under(20, field, rng), sky)
     assert e.explained < e.bright - 10 and e.seen >= e.due - 1 and e.enough
 
 
-def test_behind_a_cloud_stars_are_missing_but_all_detections_are_explained(field, sky):  # noqa: F811
+def test_behind_a_cloud_stars_are_missing_but_all_detections_are_explained(field, sky):
     e = explained(field[field[:, 0] < 0.6 * CAMERA.width], sky)
     assert e.explained == e.bright and e.seen < 0.9 * e.due and e.enough
 

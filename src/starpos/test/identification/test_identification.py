@@ -6,7 +6,7 @@ import pytest
 
 from starpos.identification import Sky, identify, identify_directions, search, triangle_cache
 from starpos.instrument.camera import Camera
-from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_stars
+from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_attitude, random_stars
 
 FIELDS = {
     "15 deg": (Camera.from_focal(*SIZE, FOCAL_PX), 7.0),
@@ -17,11 +17,6 @@ FIELDS = {
 
 def sky_for(catalogue, camera, **more):
     return Sky(catalogue, triangle_cache.cached(catalogue, camera.half_diagonal_rad), **more)
-
-
-def random_attitude(rng):
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.linalg.det(q)
 
 
 def seen(sky, camera, attitude, limit_mag, rng, sigma=0.05, missing=0.0):

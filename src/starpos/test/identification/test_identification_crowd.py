@@ -5,36 +5,11 @@ import time
 
 import numpy as np
 import pytest
+from crowds import CAMERA, SIGMA_PX, stars_on, under
 
-from starpos.identification import PointingPrior, Sky, identify, triangle_cache
-from starpos.instrument.camera import Camera
+from starpos.identification import PointingPrior, identify
 from starpos.rotation import about_axis
-
-# the paper's field, pixels binned by four
-CAMERA, LIMIT = Camera.from_focal(1404, 936, 23437.5), 8.8
-SIGMA_PX = 0.05
-
-
-@pytest.fixture(scope="module")
-def sky(catalogue):
-    return Sky(catalogue, triangle_cache.cached(catalogue, CAMERA.half_diagonal_rad))
-
-
-def random_attitude(rng):
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.linalg.det(q)
-
-
-def stars_on(sky, attitude, rng):
-    """Pixels (N, 2) of the catalogue's stars on the frame, brightest first."""
-    index = sky.catalogue.cone(attitude[2], CAMERA.half_diagonal_rad * 1.05, LIMIT)
-    xy = CAMERA.project(sky.directions(index) @ attitude.T)
-    on = (xy >= 0).all(1) & (xy <= [CAMERA.width - 1, CAMERA.height - 1]).all(1)
-    return xy[on] + rng.normal(0, SIGMA_PX, (on.sum(), 2))
-
-
-def under(crowd, xy, rng):
-    return np.concatenate([rng.uniform(0, [CAMERA.width - 1, CAMERA.height - 1], (crowd, 2)), xy])
+from starpos_testing.skies.scenes import random_attitude
 
 
 def found_in(xy, sky, priors=()):

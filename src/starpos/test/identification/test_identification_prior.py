@@ -3,12 +3,12 @@
 
 import numpy as np
 import pytest
-from test_identification import FIELDS, check, random_attitude, seen, sky_for
+from test_identification import FIELDS, check, seen, sky_for
 
 from starpos import rotation
 from starpos.identification import PlumbPrior, PointingPrior, identify, search
 from starpos.units import ARCSEC
-from starpos_testing.skies.scenes import START, solver_of, stars_of, tilt_of, wide_scene
+from starpos_testing.skies.scenes import START, random_attitude, solver_of, stars_of, tilt_of, wide_scene
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from test_identification import random_attitude, sky_for
+from test_identification import sky_for
 
 from starpos import rotation
 from starpos.detection import detect
@@ -17,7 +17,15 @@ from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_testing.skies.rendered import field, noisy
-from starpos_testing.skies.scenes import FOCAL_PX, SIZE, solver_of, stars_of, tilt_of, wide_scene
+from starpos_testing.skies.scenes import (
+    FOCAL_PX,
+    SIZE,
+    random_attitude,
+    solver_of,
+    stars_of,
+    tilt_of,
+    wide_scene,
+)
 
 CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)
 CORNER_PX = np.hypot(*SIZE) / 2

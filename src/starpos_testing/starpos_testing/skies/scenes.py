@@ -52,6 +52,12 @@ def with_false_stars(stars, xy, flux_factor=10.0) -> Stars:
     )  # fmt: skip
 
 
+def random_attitude(rng):
+    """A rotation (3, 3), any with the same probability."""
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.linalg.det(q)
+
+
 def random_stars(n, rng, width=SIZE[0], height=SIZE[1], mid_unix_s=START) -> Stars:
     """Random points, which are no part of the sky."""
     x, y = rng.uniform(0, width - 1, n), rng.uniform(0, height - 1, n)
