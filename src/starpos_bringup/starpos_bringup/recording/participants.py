@@ -21,20 +21,30 @@ WORDS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class _Participant:
-    """A node: its newest Taken, when that came, since when it has taken nothing new, and its first Taken of a replay."""
+    """A node: its newest Taken, when that came, since when it has taken nothing new, and what it made in replays.
+
+    gone: it is not waited for any more.  left: it took part in this replay and names it no more.
+    """
 
     def __init__(self, words: Taken) -> None:
-        self.begun: Taken | None = None
-        self.gone = False
-        self.hear(words)
-        self.stands_since_s = time.monotonic()
-
-    def hear(self, words: Taken) -> None:
-        self.heard_s = time.monotonic()
-        known: Taken | None = getattr(self, "words", None)
-        if known is None or words.busy or (words.replay, words.index) != (known.replay, known.index):
-            self.stands_since_s = self.heard_s
         self.words = words
+        self.heard_s = self.stands_since_s = time.monotonic()
+        self.gone = self.left = False
+        self.made = self.fixes = 0
+
+    def hear(self, words: Taken, replay: int) -> None:
+        """Take what it says; replay: the one under way."""
+        self.heard_s = time.monotonic()
+        before, self.words = self.words, words
+        if words.busy or (words.replay, words.index) != (before.replay, before.index):
+            self.stands_since_s = self.heard_s
+        if replay and before.replay == replay:
+            if words.replay != replay:
+                self.left = True
+                return
+            # what it said before may be a second old, and leave out an answer to somebody else's frame
+            self.made += words.made - before.made
+            self.fixes += words.fixes - before.fixes
 
 
 class Participants:
@@ -49,6 +59,8 @@ class Participants:
         # those of this replay; None before it begins. Who comes later takes part in the next.
         self._members: list[_Participant] | None = None
         self._replay = self._index = 0
+        # when it was asked what is taken
+        self._asked_s = 0.0
         # whether one was lost on the way
         self.lost = False
         self._publisher = node.create_publisher(Played, PLAYED, DEPTH)
@@ -56,13 +68,9 @@ class Participants:
 
     def _on_taken(self, words: Taken) -> None:
         if words.node in self._heard:
-            self._heard[words.node].hear(words)
+            self._heard[words.node].hear(words, self._replay)
         else:
             self._heard[words.node] = _Participant(words)
-        participant = self._heard[words.node]
-        # what it said before may be a second old, and leave out an answer to somebody else's frame
-        if participant.begun is None and self._members is not None and words.replay == self._replay:
-            participant.begun = words
 
     @property
     def _present(self) -> list[_Participant]:
@@ -87,26 +95,34 @@ class Participants:
 
     def answers(self, topic: str) -> tuple[int, int]:
         """How many answers and fixes have come of the messages of a topic since the first replay began."""
-        spans = [(p.begun, p.words) for p in self._heard.values() if p.begun and topic in p.words.takes]
-        made = sum(now.made - begun.made for begun, now in spans)
-        return made, sum(now.fixes - begun.fixes for begun, now in spans)
+        takers = [p for p in self._heard.values() if topic in p.words.takes]
+        return sum(p.made for p in takers), sum(p.fixes for p in takers)
 
     def begin(self) -> None:
-        """Begin a replay with those that are here now."""
-        self._members = list(self._heard.values())
+        """Begin a replay with those that are here now, also with those that were given up in the last but are heard."""
+        now_s = time.monotonic()
+        self._members = [p for p in self._heard.values() if now_s - p.heard_s <= SILENCE_S]
+        for p in self._members:
+            p.gone = p.left = False
         self._replay, self._index = random.getrandbits(63), -1
         self.tell(Played.BEGIN, 0, answer=True)
 
     def begin_again(self) -> None:
         """Say once more that the replay begins: a node that had not found the player yet has not heard it."""
-        self._index -= 1
-        self.tell(Played.BEGIN, 0, answer=True)
+        self._publish(Played.BEGIN, 0, answer=True)
 
     def tell(
         self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool = False
     ) -> None:
-        """Say what is played."""
+        """Say what is played; answer: and ask whether it is taken."""
         self._index += 1
+        if answer:
+            self._asked_s = time.monotonic()
+        self._publish(kind, now_ns, topic, stamp, answer=answer)
+
+    def _publish(
+        self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool
+    ) -> None:
         sec, nanosec = divmod(now_ns, 10**9)
         self._publisher.publish(
             Played(
@@ -125,13 +141,21 @@ class Participants:
         for p in self._present:
             if (p.words.replay, p.words.index) == (self._replay, self._index):
                 continue
-            now_s, name = time.monotonic(), p.words.node
-            if now_s - p.heard_s > SILENCE_S:
-                p.gone = self.lost = True
-                self._say(f"{name} has not been heard for {SILENCE_S:.0f} s: it goes on without it")
-            elif now_s - p.stands_since_s > LOST_S:
-                p.gone = self.lost = True
-                self._say(f"a message was lost on its way to {name}: it goes on without it")
-            else:
+            why = self._why_given_up(p)
+            if not why:
                 return False
+            p.gone = self.lost = True
+            self._say(f"{why}: it goes on without it")
         return True
+
+    def _why_given_up(self, p: _Participant) -> str:
+        """Why a node is not waited for any more; '' while it is."""
+        now_s, name = time.monotonic(), p.words.node
+        # it may be long since a node was asked anything
+        if now_s - max(p.heard_s, self._asked_s) > SILENCE_S:
+            return f"{name} has not been heard for {SILENCE_S:.0f} s"
+        if p.left:
+            return f"{name} was started again" if not p.words.replay else f"{name} follows another player"
+        if now_s - max(p.stands_since_s, self._asked_s) > LOST_S:
+            return f"a message was lost on its way to {name}"
+        return ""
