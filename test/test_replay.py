@@ -219,6 +219,14 @@ def test_latched_topics_reach_latecomers_and_a_signal_ends_it(graph, run, tmp_pa
     assert replay.wait() == 0 and "Traceback" not in replay.output, replay.output
 
 
+def test_a_player_says_that_it_goes_on_while_the_bag_is_silent(graph, run, tmp_path):
+    bag = write_bag(tmp_path / "bag", [(k * S, "/words", STRING, text("")) for k in (1, 1000)])
+    played = graph.hear(Played, replayed.PLAYED)
+    run("starpos_bringup", "replay", arguments=(str(bag), "--wait", "0"))
+    graph.wait(lambda: len(played) > 3)
+    assert {(m.kind, m.index, m.topic) for m in played[-2:]} == {(Played.MESSAGE, 0, "")}
+
+
 def test_a_single_file_and_chosen_topics(graph, run, tmp_path):
     messages = [(S + k, f"/words{k % 2}", STRING, text(str(k))) for k in range(8)]
     bag = write_bag(tmp_path / "bag", messages)

@@ -2,6 +2,7 @@
 """A bag gives the same answers each time: by our player, by another's, and by the command line without ROS."""
 
 import math
+import signal
 import subprocess
 import sys
 import time
@@ -68,13 +69,17 @@ def told(message: NavSatFix):
 
 
 @pytest.fixture(scope="module")
-def averages(graph, tmp_path_factory):
-    """A solver whose time is simulated; the averages that it publishes."""
-    heard = graph.hear(NavSatFix, "fix_averaged")
+def solver(graph, tmp_path_factory):
+    """A solver whose time is simulated."""
     log = tmp_path_factory.mktemp("solver") / "log"
-    graph.start(log, "starpos_solver", "solver", "use_sim_time:=true", *KNOWN)
+    process = graph.start(log, "starpos_solver", "solver", "use_sim_time:=true", *KNOWN)
     graph.wait_for_solver()
-    return heard
+    return process
+
+
+@pytest.fixture(scope="module")
+def averages(graph, solver):
+    return graph.hear(NavSatFix, "fix_averaged")
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +112,18 @@ def test_the_player_and_the_command_line_agree_to_the_last_bit(
     assert replay.wait() == 0, replay.output
     assert "2 frames, 2 answers, 2 fixes" in replay.output
     check(graph, averages, attitudes, expected)
+
+
+@pytest.mark.usefixtures("nothing_known")
+def test_a_bag_gives_all_its_fixes_after_a_player_that_was_killed(graph, run, solver, bag):
+    killed = run("starpos_bringup", "replay", arguments=(str(bag), "--inputs", "stars"))
+    graph.wait(lambda: graph.fixes, "for a fix")
+    killed.signal(signal.SIGKILL)
+    killed.wait()
+    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--rate", "0", "--inputs", "stars"))
+    assert replay.wait() == 0, replay.output
+    assert "2 frames, 2 answers, 2 fixes" in replay.output
+    assert "inclinometers publish" not in solver.output, solver.output
 
 
 def play_as_others_do(graph, bag, rate):

@@ -84,6 +84,7 @@ class SolverNode(Node):
                 takes,
                 self._outputs.publishers,
                 busy=lambda: session.busy,
+                begin=session.begin,
                 end=lambda: self._publish(session.end(self._now())),
             )
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)

@@ -115,7 +115,9 @@ def test_a_node_that_falls_silent_is_given_up(seat):
 
 
 @pytest.mark.parametrize(
-    ("replay", "why"), [(0, "was started again"), (5, "follows another player")], ids=["again", "another"]
+    ("replay", "why"),
+    [(0, "was started again, or did not hear the player for long"), (5, "follows another player")],
+    ids=["again", "another"],
 )
 def test_a_node_that_takes_part_no_more_is_given_up_at_once(seat, replay, why):
     seat.begins(SOLVER)
@@ -137,6 +139,19 @@ def test_a_node_that_was_started_again_takes_part_in_the_next_replay_and_counts_
     seat.made[SOLVER] = 3
     seat.hears(SOLVER)
     assert seat.player.have_taken_all() and seat.player.answers("/stars") == (8, 8)
+
+
+def test_a_player_that_goes_on_tells_nothing_new(seat):
+    told = []
+    seat.player._publisher = SimpleNamespace(publish=told.append)
+    seat.player.go_on()
+    assert told == []
+    seat.begins(SOLVER)
+    assert not seat.asks()
+    seat.player.go_on()
+    assert [(m.index, m.topic, m.answer) for m in told[1:]] == [(1, "/stars", True), (1, "", False)]
+    seat.hears(SOLVER)
+    assert seat.player.have_taken_all()
 
 
 def test_a_node_that_is_gone_before_a_replay_begins_is_not_waited_for(seat):

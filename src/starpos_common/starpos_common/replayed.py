@@ -26,8 +26,12 @@ DEPTH = 5000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # How often it is looked at whether there is something new to say.
 HEARTBEAT_S, LOOK_S = 1.0, 0.1
-# A player that the graph has not shown for so long has ended; a busy machine may lose sight of one that has not.
-ENDED_S = 5.0
+# A player says something at least so often, while it plays.
+WORD_S = 1.0
+# One that says nothing for so long has ended if the graph does not show it: a busy machine may lose sight of one that
+# has not.  The graph shows a killed one for many seconds: so long without a word is enough.
+ENDED_S, SILENT_S = 5.0, 15.0
+BROKEN_OFF = "the player ended in the middle, and {} messages are left out: play it again"
 
 
 class Replayed:
@@ -36,7 +40,7 @@ class Replayed:
     takes: what takes the messages of a topic, by its relative name.
     makes: the node's publishers, first that of what it makes of a frame; the node counts this in `made` and `fixes`.
     busy: whether the node still works on what it has taken; it calls `go_on` when that is done.
-    end: called when no more messages come.
+    begin, end: called before the first message of a replay, and when no more come.
     """
 
     def __init__(
@@ -45,18 +49,21 @@ class Replayed:
         takes: Mapping[str, Take],
         makes: Sequence[Publisher],
         busy: Callable[[], bool],
+        begin: Callable[[], object] = lambda: None,
         end: Callable[[], object] = lambda: None,
     ) -> None:
         self.made = self.fixes = 0
         self.unix_s: float | None = None
-        self._node, self._busy, self._end = node, busy, end
+        self._node, self._busy, self._begin, self._end = node, busy, begin, end
         self._names = {name: node.resolve_topic_name(name) for name in takes}
         self._takes = {self._names[name]: take for name, take in takes.items()}
         self._makes = makes
         self._replay = self._index = 0
         self._playing = False
-        # when a player was last heard, or shown by the graph
-        self._player_s = 0.0
+        # newest index that was heard
+        self._heard = 0
+        # for how long the player has said nothing while this node listened, and when this was last counted
+        self._silent_s, self._beat_s = 0.0, time.monotonic()
         self._turns: deque[Played] = deque()
         self._taking: Played | None = None
         self._held: dict[str, deque[tuple[Any, Mapping[str, Any]]]] = {}
@@ -90,17 +97,21 @@ class Replayed:
                 return
 
     def _on_played(self, turn: Played) -> None:
-        self._player_s = time.monotonic()
         if turn.kind == Played.BEGIN:
             if turn.replay == self._replay and self._playing:
                 # the player has not heard that it was taken
+                self._silent_s = 0.0
                 self._say()
                 return
-            self._leave()
-            self._replay, self._playing = turn.replay, True
+            self._leave(BROKEN_OFF)
+            self._replay, self._playing, self._heard = turn.replay, True, -1
         if turn.replay == self._replay and self._playing:
-            self._turns.append(turn)
-            self.go_on()
+            self._silent_s = 0.0
+            # a number that was heard before only says that the player goes on
+            if turn.index > self._heard:
+                self._heard = turn.index
+                self._turns.append(turn)
+                self.go_on()
 
     def _take(self, turn: Played) -> bool:
         """Take a turn; False if its message has not come yet, or if it goes on after a job."""
@@ -115,6 +126,8 @@ class Replayed:
             self._taking = turn
             take(*held)
             return True
+        if turn.kind == Played.BEGIN:
+            self._begin()
         if turn.kind == Played.END:
             self._end()
             if self._busy():
@@ -136,25 +149,36 @@ class Replayed:
     def _done(self, turn: Played) -> None:
         self._taking, self._index = None, turn.index
         if turn.kind == Played.END:
-            self._leave()
+            self._leave("another node publishes what is played, too: {} messages of it are left out")
         if turn.answer:
             self._say()
 
-    def _leave(self) -> None:
+    def _leave(self, why: str) -> None:
+        """Take part no more; why: says of how many messages that wait for their turn."""
+        if number := sum(map(len, self._held.values())):
+            self._node.get_logger().warning(why.format(number))
         self._playing, self._taking, self.unix_s = False, None, None
         self._turns.clear()
         self._held.clear()
 
     def _beat(self) -> None:
         # a player that was killed will not end it
-        if self._node.count_publishers(PLAYED):
-            self._player_s = time.monotonic()
-        elif self._playing and time.monotonic() - self._player_s > ENDED_S:
-            self._leave()
+        if self._playing and self._player_is_gone():
+            self._leave(BROKEN_OFF)
+            # the player, should it be alive, need not wait for this node
+            self._replay = self._index = 0
         listeners = sum(p.get_subscription_count() for p in self._makes)
         if listeners != self._listeners or time.monotonic() - self._said_s > HEARTBEAT_S:
             self._listeners = listeners
             self._say()
+
+    def _player_is_gone(self) -> bool:
+        now_s = time.monotonic()
+        # what was said while this node stood still it reads only now
+        self._silent_s += min(now_s - self._beat_s, 2 * LOOK_S)
+        self._beat_s = now_s
+        shown = self._node.count_publishers(PLAYED) > 0
+        return self._silent_s > (SILENT_S if shown else ENDED_S)
 
     def _say(self) -> None:
         self._said_s = time.monotonic()

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node's part in a replay: nothing is taken before its turn, whatever comes first."""
 
+import time
+from types import SimpleNamespace
+
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
+from starpos_common import replayed
 from starpos_common.dropped import Dropped
-from starpos_common.replayed import Replayed
+from starpos_common.replayed import ENDED_S, SILENT_S, Replayed
 from starpos_interfaces.msg import Played, Tilt
 from starpos_testing.nodes import take_domain
 
@@ -27,13 +31,17 @@ class Taking:
     """A node that takes tilts and works on them while a test wants it to."""
 
     def __init__(self, node):
-        self.took, self.busy, self.ended = [], False, 0
+        self.took, self.busy, self.begun, self.ended = [], False, 0, 0
+        made = node.create_publisher(Tilt, "made", 1)
         self.replayed = Replayed(
-            node, {"tilt": self._take}, [node.create_publisher(Tilt, "made", 1)], lambda: self.busy, self._end
+            node, {"tilt": self._take}, [made], lambda: self.busy, self._begin, self._end
         )
 
     def _take(self, message, info):
         self.took.append((message.header.stamp.sec, self.replayed.unix_s))
+
+    def _begin(self):
+        self.begun += 1
 
     def _end(self):
         self.ended += 1
@@ -69,6 +77,7 @@ def test_messages_are_taken_in_the_order_and_at_the_time_they_were_played(taking
     taking.turn(4, 3)
     assert taking.took == [(1, 101.0), (2, 102.0)]
     assert taking.tilt(3) and taking.took[-1] == (3, 103.0)
+    assert taking.begun == 1 and taking.ended == 0
     taking.turn(5, 3, kind=Played.END)
     assert taking.ended == 1 and not taking.replayed.playing
 
@@ -79,7 +88,7 @@ def test_a_beginning_that_is_said_again_takes_nothing_back(taking):
     taking.tilt(2)
     taking.turn(0, kind=Played.BEGIN)
     taking.turn(2, 2)
-    assert taking.took == [(1, 101.0), (2, 102.0)]
+    assert taking.took == [(1, 101.0), (2, 102.0)] and taking.begun == 1
 
 
 def test_the_next_waits_while_the_node_works(taking):
@@ -101,7 +110,73 @@ def test_another_replay_leaves_nothing_of_the_last(taking):
     taking.turn(1, 1)
     assert taking.took == []
     taking.tilt(1)
-    assert len(taking.took) == 1
+    assert len(taking.took) == 1 and taking.begun == 2
+
+
+def test_a_number_that_is_said_again_is_no_message(taking):
+    taking.turn(0, kind=Played.BEGIN)
+    taking.tilt(1), taking.turn(1, 1)
+    taking.tilt(1), taking.turn(1, 1)
+    assert taking.took == [(1, 101.0)]
+
+
+@pytest.fixture
+def warned(node, monkeypatch):
+    """What the node warns of."""
+    said = []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=said.append))
+    return said
+
+
+@pytest.fixture
+def passes(taking, monkeypatch):
+    """Time goes on, and the node beats: passes(seconds); or it stands still: passes(seconds, still=True)."""
+    now_s = [time.monotonic()]
+    monkeypatch.setattr(replayed, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    def passes(seconds, still=False):
+        step_s = seconds if still else 0.1
+        for _ in range(round(seconds / step_s)):
+            now_s[0] += step_s
+            taking.replayed._beat()
+
+    return passes
+
+
+@pytest.mark.parametrize(("shown", "after_s"), [(False, ENDED_S), (True, SILENT_S)])
+def test_a_player_that_was_killed_holds_the_node_up_for_seconds_and_it_says_what_is_left_out(
+    node, taking, warned, passes, shown, after_s
+):
+    # as the graph shows a killed one
+    dead = [node.create_publisher(Played, replayed.PLAYED, 1) for _ in range(shown)]
+    taking.turn(0, kind=Played.BEGIN)
+    taking.turn(1, 9), taking.tilt(1), taking.tilt(2)
+    passes(after_s - 1)
+    assert taking.replayed.playing
+    # its last number, once more
+    taking.turn(1, 0, topic="")
+    passes(after_s - 1)
+    assert taking.replayed.playing and warned == []
+    passes(2)
+    assert not taking.tilt(3) and taking.took == []
+    assert warned == ["the player ended in the middle, and 2 messages are left out: play it again"]
+    passes(SILENT_S)
+    assert len(warned) == 1
+    for publisher in dead:
+        node.destroy_publisher(publisher)
+
+
+def test_a_node_that_stood_still_waits_for_what_was_said_meanwhile(taking, passes):
+    taking.turn(0, kind=Played.BEGIN)
+    passes(2 * SILENT_S, still=True)
+    assert taking.replayed.playing
+
+
+def test_messages_of_others_than_the_player_are_named_at_the_end(taking, warned):
+    taking.turn(0, kind=Played.BEGIN)
+    taking.tilt(1), taking.tilt(5), taking.turn(1, 1)
+    taking.turn(2, kind=Played.END)
+    assert warned == ["another node publishes what is played, too: 1 messages of it are left out"]
 
 
 def test_messages_that_never_came_are_counted_by_the_numbers_of_one_publisher(node):

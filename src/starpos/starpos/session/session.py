@@ -211,6 +211,10 @@ class SolverSession:
         self._ended = False
         return self._on(now)
 
+    def begin(self) -> None:
+        """Note that recorded messages begin: who published on `tilt` before was another player, no second inclinometer."""
+        self.tilts.forget_publishers()
+
     def end(self, now: Now) -> list[Output]:
         """Answer the frames that wait, because nothing comes any more; again after a job."""
         self._ended = True

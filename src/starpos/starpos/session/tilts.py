@@ -54,6 +54,10 @@ class TiltBuffer:
         self._flagged.clear()
         self._steps.clear()
         self._latest_unix_s = -np.inf
+        self.forget_publishers()
+
+    def forget_publishers(self) -> None:
+        """Forget who has published, but no samples: whoever publishes next is alone at first."""
         self._publishers = TiltPublishers()
 
     def heard(self, message: Any, number: int | None, now_s: float) -> None:

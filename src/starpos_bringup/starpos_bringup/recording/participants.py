@@ -2,6 +2,7 @@
 """The nodes that take part in a replay, as the player sees them (starpos_common/replayed.py is their side)."""
 
 import random
+import threading
 import time
 from collections.abc import Callable
 
@@ -58,12 +59,14 @@ class Participants:
         self._heard: dict[str, _Participant] = {}
         # those of this replay; None before it begins. Who comes later takes part in the next.
         self._members: list[_Participant] | None = None
-        self._replay = self._index = 0
+        self._replay, self._index = 0, -1
         # when it was asked what is taken
         self._asked_s = 0.0
         # whether one was lost on the way
         self.lost = False
         self._publisher = node.create_publisher(Played, PLAYED, DEPTH)
+        # `go_on` is called by another thread
+        self._speaking = threading.Lock()
         node.create_subscription(Taken, TAKEN, self._on_taken, WORDS)
 
     def _on_taken(self, words: Taken) -> None:
@@ -104,24 +107,33 @@ class Participants:
         self._members = [p for p in self._heard.values() if now_s - p.heard_s <= SILENCE_S]
         for p in self._members:
             p.gone = p.left = False
-        self._replay, self._index = random.getrandbits(63), -1
+        with self._speaking:
+            self._replay, self._index = random.getrandbits(63), -1
         self.tell(Played.BEGIN, 0, answer=True)
 
     def begin_again(self) -> None:
         """Say once more that the replay begins: a node that had not found the player yet has not heard it."""
-        self._publish(Played.BEGIN, 0, answer=True)
+        with self._speaking:
+            self._publish(Played.BEGIN, 0, answer=True)
+
+    def go_on(self) -> None:
+        """Say that the player goes on: its newest number once more.  Any thread may call it."""
+        with self._speaking:
+            if self._index >= 0:
+                self._publish(Played.MESSAGE, 0)
 
     def tell(
         self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool = False
     ) -> None:
         """Say what is played; answer: and ask whether it is taken."""
-        self._index += 1
         if answer:
             self._asked_s = time.monotonic()
-        self._publish(kind, now_ns, topic, stamp, answer=answer)
+        with self._speaking:
+            self._index += 1
+            self._publish(kind, now_ns, topic, stamp, answer=answer)
 
     def _publish(
-        self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool
+        self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool = False
     ) -> None:
         sec, nanosec = divmod(now_ns, 10**9)
         self._publisher.publish(
@@ -155,7 +167,12 @@ class Participants:
         if now_s - max(p.heard_s, self._asked_s) > SILENCE_S:
             return f"{name} has not been heard for {SILENCE_S:.0f} s"
         if p.left:
-            return f"{name} was started again" if not p.words.replay else f"{name} follows another player"
+            other = (
+                "follows another player"
+                if p.words.replay
+                else "was started again, or did not hear the player for long"
+            )
+            return f"{name} {other}"
         if now_s - max(p.stands_since_s, self._asked_s) > LOST_S:
             return f"a message was lost on its way to {name}"
         return ""

@@ -3,6 +3,7 @@
 
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -18,6 +19,7 @@ from rosgraph_msgs.msg import Clock
 
 from starpos_bringup.recording.bag import Topic
 from starpos_bringup.recording.participants import Participants
+from starpos_common.replayed import WORD_S
 from starpos_interfaces.msg import Played
 
 STARS, IMAGE = "starpos_interfaces/msg/StarArray", "sensor_msgs/msg/Image"
@@ -68,6 +70,14 @@ class Player:
         self._now_ns: int | None = None
         self._show = sys.stderr.isatty()
         self._shown_s = 0.0
+        # a thread of its own: the bag's next message may be long in coming from a slow disk
+        self._over = threading.Event()
+        self._voice = threading.Thread(target=self._go_on, name="voice", daemon=True)
+        self._voice.start()
+
+    def _go_on(self) -> None:
+        while not self._over.wait(WORD_S):
+            self._participants.go_on()
 
     def _publisher(self, topic: Topic) -> Publisher:
         # An image may have 42 MB.
@@ -257,6 +267,8 @@ class Player:
 
     def close(self) -> None:
         """End the nodes."""
+        self._over.set()
+        self._voice.join()
         self._executor.shutdown()
         self._node.destroy_node()
         self._frame_node.destroy_node()
