@@ -126,6 +126,7 @@ def play(graph, run, truth):
     count = len(truth["frames"])
     assert replay.wait() == 0, replay.output
     assert f"{count} frames, {count} answers, {count} fixes" in replay.output, replay.output
+    assert "/stars is in the bag, and is made again" in replay.output, replay.output
     graph.wait(lambda: len(graph.solutions) == len(graph.imus) == count, f"for all; {replay.output}")
     return {s: (graph.solutions[s][0], graph.imus[s][0]) for s in sorted(graph.solutions)}
 
@@ -346,8 +347,9 @@ def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_ma
 
 def test_bad_calls(run):
     for words, said in (
-        ((str(NIGHT), "--rate", "-1"), "--rate"),
-        ((str(NIGHT), "--rate", "nan"), "--rate"),
+        ((str(NIGHT), "--rate", "-1"), "-1 is not a number of at least 0"),
+        ((str(NIGHT), "--rate", "nan"), "nan is not a number of at least 0"),
+        ((str(NIGHT), "--rate", "abc"), "abc is not a number of at least 0"),
         ((str(NIGHT), "--topics", "/nothing"), "no topic /nothing"),
         ((), "BAG"),
         ((str(NIGHT), "--inputs", "moon"), "--inputs"),

@@ -212,7 +212,7 @@ class SolverSession:
         return self._on(now)
 
     def begin(self) -> None:
-        """Note that recorded messages begin: who published on `tilt` before was another player, no second inclinometer."""
+        """Note that recorded messages begin: who published on `tilt` before was another player, no rival."""
         self.tilts.forget_publishers()
 
     def end(self, now: Now) -> list[Output]:

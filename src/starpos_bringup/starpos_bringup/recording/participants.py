@@ -96,6 +96,10 @@ class Participants:
         """The topics made from this one (stars from images), each with how many messages have been published so far."""
         return [(p.words.makes[0], p.words.made) for p in self.taking(topic)]
 
+    def making(self, topic: str) -> list[list[str]]:
+        """What each of those that publish a topic takes."""
+        return [list(p.words.takes) for p in self._present if topic in p.words.makes]
+
     def answers(self, topic: str) -> tuple[int, int]:
         """How many answers and fixes have come of the messages of a topic since the first replay began."""
         takers = [p for p in self._heard.values() if topic in p.words.takes]

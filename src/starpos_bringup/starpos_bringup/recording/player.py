@@ -10,6 +10,7 @@ from typing import Any
 
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -39,7 +40,8 @@ SETTLED_S = 1.0
 class Player:
     """Publishes the topics of a bag, and has the nodes that take part take them one after another.
 
-    frames: how many frames a solver could answer: those that were played, and star lists made from played images.
+    frames: how many frames a solver could answer: star lists that were played, or made of played images; images of which
+    none was made, unless nobody takes images while somebody takes star lists.
     """
 
     def __init__(
@@ -84,7 +86,10 @@ class Player:
         large = topic.type_name.endswith("Image")
         durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
         profile = QoSProfile(depth=2 if large else 1000, durability=durability)
-        return (self._frame_node if large else self._node).create_publisher(topic.kind, topic.name, profile)
+        node = self._frame_node if large else self._node
+        # a subscription of another QoS is no reason for rclpy's warning: a node hears latched topics by two
+        silent = PublisherEventCallbacks(use_default_callbacks=False)
+        return node.create_publisher(topic.kind, topic.name, profile, event_callbacks=silent)
 
     @property
     def answers(self) -> tuple[int, int]:
@@ -116,11 +121,26 @@ class Player:
                 f"those who subscribe to {', '.join(heard)} do not say what they take: start detector and solver with "
                 "use_sim_time"
             )
-        doubled = [n for n in self._publishers if self._node.count_publishers(n) > 1 and not self._is_made(n)]
-        if doubled:
+        self._say_doubled()
+
+    def _say_doubled(self) -> None:
+        """Say which topics come twice: from another node too, or made again of what is played."""
+        makers = {n: self._participants.making(n) for n in self._publishers}
+        others = [n for n, known in makers.items() if self._node.count_publishers(n) > 1 + len(known)]
+        if others:
             self._say(
-                f"{', '.join(doubled)} is published by another node too: both are heard; --topics leaves it out"
+                f"{', '.join(others)} is published by another node too: both are heard; --topics leaves it out"
             )
+        frames = {*self._frame_topics, *self._made_of_frames()}
+        again = [n for n, known in makers.items() if any(frames & set(takes) for takes in known)]
+        if again:
+            self._say(
+                f"{', '.join(again)} is in the bag, and is made again of what is played: what is in both comes twice; "
+                "--inputs stars, or images, plays it once"
+            )
+
+    def _made_of_frames(self) -> set[str]:
+        return {makes for n in self._frame_topics for makes, _ in self._participants.made_of(n)}
 
     def _all_listen(self) -> bool:
         every = [*self._publishers.values(), self._clock]
@@ -128,7 +148,7 @@ class Player:
 
     def _chain(self) -> bool:
         """Whether somebody takes the frames, and somebody the star lists that are made of them."""
-        makers = {makes for n in self._frame_topics for makes, _ in self._participants.made_of(n)}
+        makers = self._made_of_frames()
         solvers = [*self._star_topics, *makers]
         return bool(makers) and any(map(self._participants.taking, solvers))
 
@@ -150,9 +170,6 @@ class Player:
         known = self._node.get_subscriptions_info_by_topic(name)
         verdicts = [qos_check_compatible(publisher.qos_profile, s.qos_profile)[0] for s in known]
         return sum(verdict != QoSCompatibility.ERROR for verdict in verdicts)
-
-    def _is_made(self, name: str) -> bool:
-        return any(name == makes for n in self._frame_topics for makes, _ in self._participants.made_of(n))
 
     def start_round(self) -> None:
         """Begin a replay with those who take part."""
@@ -191,13 +208,17 @@ class Player:
         before = self._participants.made_of(topic.name) if topic.type_name == IMAGE else []
         self._publishers[topic.name].publish(data)
         self.count += 1
-        made = False
-        if self._participants.taking(topic.name):
+        made, taken = False, bool(self._participants.taking(topic.name))
+        if taken:
             made = self._agree(topic, message.header.stamp, before)
         elif self._rate == 0 and self.count % BURST == 0:
             self._spin(BURST_REST_S)
-        self.frames += topic.type_name in (STARS, IMAGE) and not made
+        if topic.type_name == STARS or (topic.type_name == IMAGE and (taken or not self._frames_are_taken())):
+            self.frames += not made
         self._progress()
+
+    def _frames_are_taken(self) -> bool:
+        return any(map(self._participants.taking, self._frame_topics))
 
     def _agree(self, topic: Topic, stamp: Any, before: list[tuple[str, int]]) -> bool:
         """Wait until the nodes have taken a message, and then what they made of it; return whether they made anything."""
