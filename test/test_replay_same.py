@@ -160,21 +160,25 @@ def test_a_player_who_asks_nobody_gives_the_same_where_nothing_is_dropped(
     check(graph, averages, attitudes, expected)
 
 
+@pytest.mark.usefixtures("solver")
 def test_what_such_a_player_loses_is_named(graph, run):
     graph.node.destroy_publisher(graph.tilt)
+    graph.tilt = graph._publisher(Tilt, "tilt", 1000)
+    for _ in range(7):
+        graph.tilt.publish(Tilt())
     solver = run(
         "starpos_solver", "solver", "use_sim_time:=true", "qos_overrides./tilt.subscription.depth:=1"
     )
-    graph.tilt = graph._publisher(Tilt, "tilt", 1000)
     graph.wait(lambda: graph.tilt.get_subscription_count() == 2)
 
     def lost():
         for _ in range(200):
             graph.tilt.publish(Tilt())
-        return graph.comes(lambda: "/tilt: " in solver.output, 0.2)
+        return graph.comes(lambda: "dropped on the way" in solver.output, 0.2)
 
     graph.wait(lost, "for the warning")
     assert "messages were dropped on the way: play it slower" in solver.output
+    assert "messages came before this node listened: start it first" in solver.output
 
 
 @pytest.mark.timeout(5 * WAIT_S)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from starpos_common import replayed
@@ -179,9 +180,57 @@ def test_messages_of_others_than_the_player_are_named_at_the_end(taking, warned)
     assert warned == ["another node publishes what is played, too: 1 messages of it are left out"]
 
 
-def test_messages_that_never_came_are_counted_by_the_numbers_of_one_publisher(node):
+@pytest.fixture
+def published(node):
+    """published(**qos): the node publishes tilts, as another does in the graph."""
+    made = []
+
+    def published(**qos):
+        made.append(node.create_publisher(Tilt, "tilt", QoSProfile(depth=1, **qos)))
+
+    yield published
+    for publisher in made:
+        node.destroy_publisher(publisher)
+
+
+def numbers_of(node, *numbers):
     dropped = Dropped(node, "play it slower")
-    for number in (5, 6, 9, 2, 3):
+    for number in numbers:
         dropped.came("tilt", {"publication_sequence_number": number})
+    return dropped
+
+
+def test_messages_that_never_came_are_counted_by_the_numbers_of_one_publisher(node, warned, published):
+    published()
+    dropped = numbers_of(node, 1, 2, 5, 5, 7)
     dropped.came("stars", {"publication_sequence_number": None})
-    assert dropped.counts == {"tilt": 2}
+    assert dropped.counts == {"tilt": 3}
+    assert warned == ["/tilt: 2 messages were dropped on the way: play it slower"]
+
+
+def test_messages_from_before_the_node_listened_are_counted_and_named(node, warned, published):
+    published()
+    assert numbers_of(node, 8, 9, 12).counts == {"tilt": 9}
+    # the second is another publisher
+    assert numbers_of(node, 1, 2, 4, 2, 3).counts == {"tilt": 2}
+    early = "/tilt: {} messages came before this node listened: start it first"
+    assert [w for w in warned if "listened" in w] == [early.format(7), early.format(1)]
+    assert sum("dropped on the way" in w for w in warned) == 2
+
+
+def test_what_was_latched_before_the_node_listened_is_no_loss(node, warned, published):
+    published(durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    assert numbers_of(node, 8, 9).counts == {} and warned == []
+
+
+def test_messages_from_before_are_told_once_the_graph_shows_their_publisher(node, warned, published):
+    dropped = numbers_of(node, 8)
+    assert warned == []
+    published()
+    dropped.came("tilt", {"publication_sequence_number": 9})
+    assert dropped.counts == {"tilt": 7} and len(warned) == 1
+
+
+def test_of_several_publishers_nothing_is_told(node, warned, published):
+    published(), published()
+    assert numbers_of(node, 8, 1, 9, 2).counts == {} and warned == []
