@@ -130,10 +130,6 @@ class SolverNode(Node):
 
     def _taker(self, name: str, takes: Mapping[str, Take]) -> Take:
         def on_message(message: Any, info: Mapping[str, Any]) -> None:
-            if name == "tilt":
-                self._transforms.inclinometer = message.header.frame_id
-            elif name == CAMERA_TOPIC:
-                self._transforms.camera = message.header.frame_id
             if self._replayed is None or not self._replayed.holds(name, message, info):
                 self._note_dropped(name, info)
                 takes[name](message, info)
@@ -170,7 +166,10 @@ class SolverNode(Node):
     def _update_transforms(self) -> None:
         solver = self._session.instrument.solver
         self._transforms.update(
-            self._values["publish_tf"], self._values["frame_id"], solver.instrument if solver else None
+            self._values["publish_tf"],
+            self._values["frame_id"],
+            self._session.names,
+            solver.instrument if solver else None,
         )
 
     def _publish(self, outputs: list[Output]) -> None:

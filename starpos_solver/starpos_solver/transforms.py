@@ -14,7 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from starpos.instrument.instrument import Instrument
-from starpos.session.transforms import Transform, transforms_of
+from starpos.session.transforms import FrameNames, Transform, transforms_of
 
 STATIC, MOVING = "/tf_static", "/tf"
 # as tf2_ros has them
@@ -23,27 +23,23 @@ MOVING_QOS = QoSProfile(depth=100)
 
 
 class StaticTransforms:
-    """Publishes the transforms of an instrument; its frames have the names that messages give them.
-
-    camera, inclinometer: these names, '' before a message has come.
-    """
+    """Publishes the transforms of an instrument."""
 
     def __init__(self, node: Node) -> None:
-        self.camera = self.inclinometer = ""
         self._node = node
         self._publisher: Publisher | None = None
         self._published: tuple[Transform, ...] = ()
 
-    def update(self, wanted: bool, link: str, instrument: Instrument | None) -> None:
+    def update(self, wanted: bool, link: str, names: FrameNames, instrument: Instrument | None) -> None:
         """Publish what is known, if it differs from before; take it back if it is not wanted.
 
-        link: name of the base link.  instrument: that in use, None before there is one.
+        link: name of the base link.  names: of the others.  instrument: that in use, None before there is one.
         """
         if not wanted:
             self._close()
         elif _can_be_told(self._node, STATIC):
             self._publish(
-                transforms_of(instrument, link, self.camera, self.inclinometer) if instrument else ()
+                transforms_of(instrument, link, names.camera, names.inclinometer) if instrument else ()
             )
 
     def _publish(self, transforms: tuple[Transform, ...]) -> None:

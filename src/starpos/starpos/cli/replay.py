@@ -64,8 +64,9 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 @dataclass
 class PlayedNight:
-    """What came of a bag: its solutions, the average of its place, what was said; trouble: why it broke off."""
+    """What came of a bag: frames read, solutions, the average of its place, what was said; trouble: why it broke off."""
 
+    frames: int = 0
     solutions: list[Solution] = field(default_factory=list)
     average: Average | None = None
     said: list[str] = field(default_factory=list)
@@ -75,7 +76,7 @@ class PlayedNight:
     def summary(self) -> str:
         """How many frames there were, and what came of them."""
         fixes = sum(s.fix is not None for s in self.solutions)
-        return f"{len(self.solutions)} frames, {len(self.solutions)} answers, {fixes} fixes"
+        return f"{self.frames} frames, {len(self.solutions)} answers, {fixes} fixes"
 
 
 class _Said:
@@ -121,6 +122,7 @@ class Playing:
                     night.average = output.place
         except StarposError as error:
             night.trouble = str(error)
+        night.frames = replay.frames
         return night
 
 

@@ -15,9 +15,10 @@ from starpos.session.settings import Settings
 
 
 class Replay:
-    """A session whose messages come from a bag, each at the time it was recorded at."""
+    """A session whose messages come from a bag, each at the time it was recorded at; frames: star lists read so far."""
 
     def __init__(self, settings: Settings, heard: Heard, log: Log) -> None:
+        self.frames = 0
         self._jobs: list[JobsInTurn] = []
         self._log = log
         self.session = SolverSession(settings, self._new_jobs, heard, log)
@@ -42,6 +43,7 @@ class Replay:
                     tilts += 1
                     yield from session.take_tilt(message, Sent(tilts), now)
                 elif connection.msgtype == STARS:
+                    self.frames += 1
                     yield from session.take_stars(message, now)
                 else:
                     yield from session.take_camera(message, now)

@@ -36,6 +36,7 @@ from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
 from starpos.session.settings import Settings
 from starpos.session.tilts import TiltBuffer
+from starpos.session.transforms import FrameNames, name_in
 from starpos.sky import catalogue
 
 # Most frames that wait for their tilts or for the triangles; older ones are dropped. Of recorded ones none should be.
@@ -71,6 +72,8 @@ class SolverSession:
         self.answer: Solution | None = None
         self.counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
         self.tilts = TiltBuffer()
+        # of the frames that the messages taken are in
+        self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
         self._settings, self._values = settings, settings.values
@@ -141,6 +144,7 @@ class SolverSession:
             self._heard.refuse("camera_info", str(e))
             return made
         self._heard.came("camera_info")
+        self.names.camera = name_in(message)
         self.instrument.take(camera, stamp_to_unix(message.header.stamp), at_once=not now.played)
         return made + self._work(now)
 
@@ -173,6 +177,7 @@ class SolverSession:
                 raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
             self.tilts.add(message, self._settings.tilt_stddev_rad)
             self._heard.came("tilt")
+            self.names.inclinometer = name_in(message)
         except StarposError as e:
             self._heard.refuse("tilt", str(e))
 

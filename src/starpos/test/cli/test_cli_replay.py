@@ -12,6 +12,7 @@ pytest.importorskip("rosbags")
 
 from starpos.cli import main
 from starpos.errors import InstrumentError
+from starpos.session import session
 from starpos.session.parameter_file import settings_of
 
 NIGHT = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
@@ -69,6 +70,12 @@ OF_TWO = """
   solver:
     ros__parameters: {min_stars: 7}
 """
+
+
+def test_frames_that_got_no_answer_are_counted(capsys, told, monkeypatch):
+    monkeypatch.setattr(session, "WAITING_PLAYED", 0)
+    status, _, errors = run(capsys, NIGHT, *told)
+    assert status == 1 and "10 frames, 0 answers, 0 fixes" in errors
 
 
 def test_a_file_of_two_instruments_is_read_as_their_nodes_read_it(tmp_path):

@@ -109,6 +109,20 @@ def tilts_of(messages, end_s):
     return [(message, at_s) for kind, message, at_s in messages if kind == TILT and at_s < end_s]
 
 
+def test_frames_have_the_names_of_messages_that_are_taken(told, messages, begin_s):
+    tilt, came_s = first(messages, TILT)
+    names = "starpos_camera_optical_frame", "starpos_inclinometer_frame"
+    told.tell(TILT, tilt, came_s)
+    assert (told.session.names.camera, told.session.names.inclinometer) == names
+    broken = deepcopy(tilt)
+    broken.x, broken.header.frame_id = float("nan"), "elsewhere"
+    told.tell(TILT, broken, came_s)
+    no_camera = deepcopy(first(messages, CAMERA_INFO)[0])
+    no_camera.k[0], no_camera.header.frame_id = float("nan"), "elsewhere"
+    told.tell(CAMERA_INFO, no_camera, came_s)
+    assert (told.session.names.camera, told.session.names.inclinometer) == names
+
+
 def test_a_frame_without_tilts_waits_by_the_clock_of_the_data(told, messages):
     stars, came_s = first(messages, STARS)
     assert told.tell(STARS, stars, came_s) == []
