@@ -49,7 +49,7 @@ COMMANDS = {
         "where frames look, lost in space",
         (
             "starpos identify photo.jpg",
-            "starpos identify *.fits --focal-mm 600 --pixel-um 6.4 --jobs auto --csv > pointings.csv",
+            "starpos identify *.fits --focal-mm 600 --pixel-um 6.4 --jobs auto --csv > where.csv",
         ),
         "starpos solve makes a place of frames with their tilts and times",
     ),

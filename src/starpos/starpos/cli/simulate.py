@@ -21,29 +21,34 @@ def define(parser: argparse.ArgumentParser) -> None:
         "night, which is replaced",
     )
     parser.add_argument("-n", "--frames", type=common.number(1, 1e6, int), default=5, help="how many (5)")
-    parser.add_argument("--latitude", type=common.number(-90, 90), default=35.7046, help="deg, astronomic")
     parser.add_argument(
-        "--longitude", type=common.number(-360, 360), default=51.4106, help="deg, east positive"
+        "--latitude", type=common.number(-90, 90), default=35.7046, help="deg, astronomic (35.7046)"
     )
     parser.add_argument(
-        "--start", default="2026-11-02T18:00:00", metavar="UTC", help="start of the first exposure"
+        "--longitude", type=common.number(-360, 360), default=51.4106, help="deg, east positive (51.4106)"
+    )
+    parser.add_argument(
+        "--start",
+        default="2026-11-02T18:00:00",
+        metavar="UTC",
+        help="start of the first exposure (2026-11-02T18:00:00)",
     )
     parser.add_argument("--cadence", type=common.number(0, 1e6), default=5.0, help="s between frames (5)")
     parser.add_argument("--exposure", type=common.number(1e-6, 3600), default=0.5, help="s (0.5)")
     parser.add_argument(
-        "--azimuth", type=common.number(-360, 360), default=40.0, help="deg, of the optical axis"
+        "--azimuth", type=common.number(-360, 360), default=40.0, help="deg, of the optical axis (40)"
     )
     parser.add_argument(
-        "--altitude", type=common.number(5, 90), default=78.0, help="deg, of the optical axis"
+        "--altitude", type=common.number(5, 90), default=78.0, help="deg, of the optical axis (78)"
     )
     parser.add_argument(
-        "--roll", type=common.number(-360, 360), default=15.0, help="deg, about the optical axis"
+        "--roll", type=common.number(-360, 360), default=15.0, help="deg, about the optical axis (15)"
     )
     parser.add_argument(
-        "--turn", type=common.number(-360, 360), default=0.0, help="deg of azimuth between frames"
+        "--turn", type=common.number(-360, 360), default=0.0, help="deg of azimuth between frames (0)"
     )
-    parser.add_argument("--focal-mm", type=float, default=600.0)
-    parser.add_argument("--pixel-um", type=float, default=6.4)
+    parser.add_argument("--focal-mm", type=float, default=600.0, metavar="MM", help="focal length (600)")
+    parser.add_argument("--pixel-um", type=float, default=6.4, metavar="UM", help="pixel size (6.4)")
     common.add_lens(parser)
     parser.add_argument(
         "--size",
@@ -51,10 +56,15 @@ def define(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         default=(5616, 3744),
         metavar=("WIDTH", "HEIGHT"),
-        help="px",
+        help="px (5616 3744)",
     )
     parser.add_argument(
-        "--misalignment", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("RX", "RY", "RZ")
+        "--misalignment",
+        type=float,
+        nargs=3,
+        default=(0.0, 0.0, 0.0),
+        metavar=("RX", "RY", "RZ"),
+        help="A3 in deg: camera to inclinometer (0 0 0)",
     )
     parser.add_argument(
         "--tilt-noise",
@@ -68,7 +78,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         default=(0.0, 0.0),
         metavar=("X", "Y"),
-        help="deg",
+        help="deg, of the inclinometer's zero (0 0)",
     )
     parser.add_argument(
         "--readout",
@@ -78,9 +88,13 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="rolling shutter: s from the first row to the last, negative: the bottom row is first (0: global)",
     )
     parser.add_argument(
-        "--stars-only", action="store_true", help="lists of detected stars (CSV) instead of frames"
+        "--stars-only",
+        action="store_true",
+        help="lists of detected stars (stars_0000.csv ...) instead of frames",
     )
-    parser.add_argument("--seed", type=common.number(0, 2**63, int), default=1)
+    parser.add_argument(
+        "--seed", type=common.number(0, 2**63, int), default=1, metavar="S", help="of the random numbers (1)"
+    )
     common.add_air(parser)
     parser.set_defaults(run=run)
 

@@ -131,3 +131,9 @@ def focal_px(header: Mapping) -> float | None:
     except (KeyError, TypeError, ValueError, ArithmeticError):
         return None
     return focal if np.isfinite(focal) and focal > 0 else None
+
+
+def focal_mm(focal_px: float, pixel_um: float) -> float:
+    """FOCALLEN, mm, of a focal length in px and pixels of so many um."""
+    # so many digits make 29.67 of 29.669999999999998
+    return float(f"{focal_px * pixel_um / 1000:.12g}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of
-from starpos.frames.header import focal_px, shutter, times
+from starpos.frames.header import focal_mm, focal_px, shutter, times
 from starpos.frames.stars import Stars
 
 MAX_CSV_BYTES = 20_000_000
@@ -80,14 +80,19 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
     )
 
 
-def write_star_list(path: Path | str, stars: Stars, start_utc: str) -> None:
-    """Write a list of stars as CSV, in the form that `read_frame` reads."""
+def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: float = 1.0) -> None:
+    """Write a list of stars as CSV, in the form that `read_frame` reads.
+
+    pixel_um: with the focal length in px it makes FOCALLEN, mm; a list of stars without a focal length states neither.
+    """
     about = {
         "DATE-OBS": start_utc,
         "EXPTIME": stars.exposure_s,
         "NAXIS1": stars.width,
         "NAXIS2": stars.height,
     }
+    if stars.focal_px is not None:
+        about |= {"FOCALLEN": focal_mm(stars.focal_px, pixel_um), "XPIXSZ": pixel_um}
     if stars.shutter is not None:
         about["ROLLSHUT"] = stars.shutter.readout_s
     sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)

@@ -128,8 +128,12 @@ class Calibration:
         stddev_arcsec: Sequence[float] = UNKNOWN_ARCSEC,
     ) -> "Calibration":
         """Make a Calibration from three angles and the standard deviations (3,) about S's axes."""
-        if len(stddev_arcsec) != 3:
-            raise InstrumentError("calibration_stddev_arcsec is three numbers")
+        for name, numbers in (
+            ("misalignment_deg", misalignment_deg),
+            ("calibration_stddev_arcsec", stddev_arcsec),
+        ):
+            if np.shape(numbers) != (3,):
+                raise InstrumentError(f"{name} is three numbers, one for each axis: give three")
         if not (
             np.isfinite(stddev_arcsec).all() and 0 <= min(stddev_arcsec) <= max(stddev_arcsec) <= MOST_ARCSEC
         ):

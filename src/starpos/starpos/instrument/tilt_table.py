@@ -73,6 +73,10 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
                 f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise"
             )
     column = dict(zip(names, rows.T, strict=True))
+    if not np.isfinite([column[name] for name in NEEDED]).all(0).any():
+        raise TiltError(
+            f"{path}: none of its {len(rows)} readings is a number: check the inclinometer and what wrote the table"
+        )
     _check_one_sensor(path, column, rows)
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]

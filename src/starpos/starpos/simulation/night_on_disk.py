@@ -11,6 +11,7 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.files import read_regular
 from starpos.frames.frame import Frame
+from starpos.frames.header import focal_mm
 from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS
 from starpos.frames.star_list import write_star_list
@@ -56,7 +57,7 @@ def write_night(
             names.append(f"stars_{k:04d}.csv" if stars_only else f"frame_{k:04d}.fits")
             if stars_only:
                 listed = detected(now, stars, start + exposure_s / 2, exposure_s, rng)
-                write_star_list(folder / names[-1], listed, _text(start))
+                write_star_list(folder / names[-1], listed, _text(start), pixel_um)
             else:
                 frame = render(now, stars, start, exposure_s, rng)
                 write_fits(folder / names[-1], frame, _text(start), pixel_um)
@@ -125,8 +126,7 @@ def write_fits(path: Path | str, frame: Frame, start_utc: str, pixel_um: float =
     header["EXPTIME"] = (frame.exposure_s, "s")
     header["ORIGIN"] = ("starpos simulate", "no camera took this frame")
     if frame.focal_px is not None:
-        # so many digits make 29.67 of 29.669999999999998
-        header["FOCALLEN"] = (float(f"{frame.focal_px * pixel_um / 1000:.12g}"), "mm")
+        header["FOCALLEN"] = (focal_mm(frame.focal_px, pixel_um), "mm")
         header["XPIXSZ"] = (pixel_um, "um")
     if frame.shutter is not None:
         header["ROLLSHUT"] = (frame.shutter.readout_s, "s from the row read first to the last")

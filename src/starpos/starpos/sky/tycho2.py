@@ -26,6 +26,7 @@ UNMEASURED_MAS_YEAR = 100.0
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123
 # Four times the largest of the original files.
 MOST_BYTES = 120_000_000
+CURE = "give tycho2_2.orig.tar.xz, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat"
 
 # Each column's first byte (from 0) and length, by name.
 _MAIN = {
@@ -58,7 +59,7 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
         seen += 1
         progress(name, seen / 21)
     if seen < 21:
-        raise CatalogueError(f"{source}: {seen} of the 21 files tyc2.dat.00 .. 19 and suppl_1.dat are there")
+        raise CatalogueError(f"{source}: it holds {seen} of the 21 original files of Tycho-2: {CURE}")
     stars = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     stars = _merge_photocentres(stars)
     return pack(**{k: v[stars["vmag"] < limit_mag] for k, v in stars.items() if k != "photocentre"})
@@ -85,9 +86,10 @@ def originals(source: Path) -> Iterator[tuple[str, bytes]]:
                 if file is not None and Path(member.name).name in wanted:
                     yield Path(member.name).name, file.read()
     except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as e:
-        reason = str(e).partition("\n")[0]
+        # what tarfile says of a file that is no archive is a table of all it tried
+        reason = f" ({e.strerror})" if isinstance(e, OSError) and e.strerror else ""
         raise CatalogueError(
-            f"{source}: not a folder or archive of Tycho-2's original files ({reason})"
+            f"{source}: not a folder or archive of Tycho-2's original files{reason}: {CURE}"
         ) from None
 
 

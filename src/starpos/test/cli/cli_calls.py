@@ -47,3 +47,13 @@ def promised():
 def solve(capsys, folder, *more, frames="frame_*.fits"):
     paths = sorted(folder.glob(frames))
     return run(capsys, "solve", *paths, "--tilt", folder / "tilt.csv", *AIR, *more)
+
+
+def without_focal_length(path, folder):
+    """A copy, in a folder, of a list of stars whose first line states no focal length."""
+    head, rows = path.read_text().split("\n", 1)
+    about = json.loads(head.lstrip("# "))
+    del about["FOCALLEN"], about["XPIXSZ"]
+    bare = folder / path.name
+    bare.write_text(f"# {json.dumps(about)}\n{rows}")
+    return bare

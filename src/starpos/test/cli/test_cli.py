@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 import pytest
-from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, solve
+from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, solve, without_focal_length
 
 from starpos.cli import main
 from starpos_testing.command_line import run
@@ -194,7 +194,7 @@ BAD_CALLS = {
     "no frame": ("solve",),
     "no tilt": ("identify",),
     "half a focal length": ("identify", "STARS", "--focal-mm", "600"),
-    "no focal length": ("solve", "STARS", "--tilt", "TILT"),
+    "no focal length": ("solve", "BARE", "--tilt", "TILT"),
     "a negative focal length": ("identify", "STARS", "--focal-mm=-600", "--pixel-um", "6"),
     "a focal length of nan": ("identify", "STARS", "--focal-mm", "nan", "--pixel-um", "6"),
     "a word for a number": ("identify", "STARS", "--focal-mm", "long", "--pixel-um", "6"),
@@ -225,7 +225,13 @@ BAD_CALLS = {
 
 @pytest.mark.parametrize("kind", BAD_CALLS)
 def test_a_bad_call_is_exit_2_and_one_line(kind, lists, tmp_path, capsys):
-    names = {"STARS": lists / "stars_0000.csv", "TILT": lists / "tilt.csv", "OUT": tmp_path / "out"}
+    bare = without_focal_length(lists / "stars_0000.csv", tmp_path)
+    names = {
+        "STARS": lists / "stars_0000.csv",
+        "BARE": bare,
+        "TILT": lists / "tilt.csv",
+        "OUT": tmp_path / "out",
+    }
     status, out, errors = run(capsys, *(names.get(a, a) for a in BAD_CALLS[kind]))
     assert status == 2
     assert len(errors) == 1
@@ -253,9 +259,10 @@ def test_identify(night, lists, capsys):
     assert out.count("RA ") == 2
 
 
-def test_identify_needs_no_option_at_all(lists, capsys):
+def test_identify_needs_no_option_at_all(lists, tmp_path, capsys):
     """The scale is found with the stars; random points have none."""
-    status, out, errors = run(capsys, "identify", lists / "stars_0000.csv", "--json")
+    bare = without_focal_length(lists / "stars_0000.csv", tmp_path)
+    status, out, errors = run(capsys, "identify", bare, "--json")
     (answer,) = objects(out)
     assert (status, errors) == (0, []) and answer["focal_px"] == pytest.approx(4636, rel=3e-3)
     _, out, _ = run(capsys, "identify", lists / "stars_0000.csv", *WIDE, "--json")

@@ -8,10 +8,11 @@ import shutil
 import numpy as np
 import pytest
 from astropy.io import fits
-from cli_calls import KNOWN, PLACE, WIDE, objects, solve
+from cli_calls import AIR, KNOWN, PLACE, WIDE, objects, solve
 
 from starpos import open_night
 from starpos.fix.readable import length_text
+from starpos.frames.reading import read_frame
 from starpos_testing.command_line import run
 
 NEAR = ("--near", PLACE["latitude"] - 0.2, PLACE["longitude"] + 0.2)
@@ -115,6 +116,11 @@ def test_a_simulated_night_never_replaces_files_that_were_not_simulated(tmp_path
 def test_simulated_frames_state_the_focal_length_and_the_pixels_that_were_asked_for(night):
     header = fits.getheader(night / "frame_0000.fits")
     assert (header["FOCALLEN"], header["XPIXSZ"], header["ORIGIN"]) == (29.67, 6.4, "starpos simulate")
+
+
+def test_simulated_lists_are_solved_without_a_focal_length(lists, capsys):
+    assert read_frame(lists / "stars_0000.csv").focal_px == pytest.approx(29670 / 6.4, rel=1e-12)
+    assert run(capsys, "solve", lists, *AIR)[0] == 0
 
 
 def test_a_report_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys):

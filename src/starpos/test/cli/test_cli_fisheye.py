@@ -4,7 +4,7 @@
 import json
 
 import pytest
-from cli_calls import AIR, PLACE, objects
+from cli_calls import AIR, PLACE, objects, without_focal_length
 
 from starpos.cli import main
 from starpos.instrument import camera_file
@@ -80,7 +80,7 @@ def test_a_pinhole_is_told_to_be_none(skies, run):
 
 
 def test_a_lens_goes_with_a_focal_length_and_not_with_an_instrument_file(skies, run, tmp_path):
-    frame = sorted(skies.glob("stars_*.csv"))[0]
+    frame = without_focal_length(sorted(skies.glob("stars_*.csv"))[0], tmp_path)
     (tmp_path / "mine.yaml").write_text(
         "starpos_instrument: 1\ncamera: {focal_px: 500, model: equidistant}\n"
     )

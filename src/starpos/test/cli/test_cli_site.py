@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_calls import without_focal_length
 
 from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file, instrument_file
@@ -203,11 +204,13 @@ def test_a_bad_call_is_refused_in_a_line(kind, known, run, tmp_path):
         "TILT": known.tilt,
     }
     options = [x for o in options for x in names.get(o, [o])]
-    status, said, errors = run("calibrate", *known.frames, *options)
+    (tmp_path / "lists").mkdir()
+    frames = [without_focal_length(Path(frame), tmp_path / "lists") for frame in known.frames]
+    status, said, errors = run("calibrate", *frames, *options)
     assert (status, said) == (2, "")
     assert words in errors[-1]
     assert errors[-1].startswith("starpos calibrate: ")
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["lists"]
 
 
 def test_what_the_frames_do_not_tell_is_status_1_and_no_file(known, run, tmp_path):

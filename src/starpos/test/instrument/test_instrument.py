@@ -137,3 +137,9 @@ def test_focal_length_in_pixels():
     ):
         with pytest.raises(InstrumentError, match="both must be positive"):
             focal_px_of(focal, pixel)
+
+
+@pytest.mark.parametrize("wrong", [((0, 0, 0), 5), ((0, 0, 0), (1, 2)), (5,), ("abc",), ((1, 2),)])
+def test_a_calibration_of_other_than_three_numbers_is_refused(wrong):
+    with pytest.raises(InstrumentError, match="is three numbers, one for each axis: give three"):
+        Calibration.of(*wrong)

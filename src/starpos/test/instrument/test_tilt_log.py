@@ -190,6 +190,17 @@ def test_no_reading_near_the_exposure(mid):
         log(np.zeros(10)).average(mid, 0.5)
 
 
+@pytest.mark.parametrize("row", ["{},nan,nan,15", "{},1.5,nan,15", "nan,1.5,2.5,{}"])
+def test_a_table_without_a_number_is_refused_when_it_is_read(row, tmp_path):
+    path = tmp_path / "tilt.csv"
+    rows = "\n".join(row.format(10 + k) for k in range(7))
+    path.write_text(f"utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n{rows}\n")
+    with pytest.raises(
+        TiltError, match=r"tilt\.csv: none of its 7 readings is a number: check the inclinometer"
+    ):
+        read_tilt_csv(path)
+
+
 def test_nothing_but_nan_and_nothing_at_all():
     for empty in (log([np.nan] * 5), log([])):
         with pytest.raises(TiltError, match="no tilt reading"):

@@ -127,3 +127,10 @@ def test_the_command_line_builds_it_and_says_that_it_is_there(originals, capsys)
     )
     status, _, errors = run(capsys, "catalogue", "deepen", originals / "none")
     assert (status, len(errors)) == (2, 1) and "not a folder or archive" in errors[0]
+    (originals / "tilt.csv").write_text("utc_unix_s,theta_x_deg\n")
+    (originals / "none").mkdir()
+    for name in ("tilt.csv", "none"):
+        status, _, errors = run(capsys, "catalogue", "deepen", originals / name)
+        assert (status, len(errors)) == (2, 1) and ": give tycho2_2.orig.tar.xz, or a folder with" in errors[
+            0
+        ]
