@@ -14,6 +14,8 @@ from starpos.errors import InstrumentError
 
 # Linux opens no longer path.
 LONGEST_PATH = 4096
+# every page and picture that starpos makes has this mark in its first HEAD bytes
+MARK, HEAD = b"starpos", 400
 
 
 def open_regular(path: Path | str) -> BinaryIO:
@@ -82,6 +84,12 @@ def write_whole(path: Path | str, content: bytes) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def has_mark(path: Path | str) -> bool:
+    """Whether a file is a page or a picture that starpos has made.  Raises OSError as `open_regular` does."""
+    with open_regular(path) as file:
+        return MARK in file.read(HEAD)
 
 
 def path_of(url: str) -> Path:

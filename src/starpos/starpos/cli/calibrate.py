@@ -2,7 +2,7 @@
 """`starpos calibrate`: the camera and A3 from stars, written to files that the other commands read."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,11 +12,12 @@ import numpy as np
 from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.intrinsics import Intrinsics, rms
-from starpos.cli import calibrate_site, common
+from starpos.cli import calibrate_site, common, overwriting
 from starpos.cli.archive import frames_among
 from starpos.cli.doubts import checked_tilts
-from starpos.cli.frame_work import NO_CAMERA, reader_of
+from starpos.cli.frame_work import NO_CAMERA, Look, Reader, reader_of
 from starpos.cli.output import add_formats
+from starpos.cli.overwriting import CAMERA_NAME, Written
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.frames.pointings import read_pointings
@@ -31,8 +32,6 @@ from starpos.sky import catalogue
 
 # Exit status.
 NOTHING = 1
-# the name that the camera node uses
-CAMERA_NAME = "camera"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -67,11 +66,16 @@ def run(args: argparse.Namespace) -> int:
     if args.pointings is not None and args.camera is not None:
         raise InstrumentError("--pointings say nothing of the camera: give frames for --camera")
     calibrate_site.check(args)
+    overwriting.check(args, *_written(args))
     if args.map is not None and find_spec("matplotlib") is None:
         raise InstrumentError("--map draws with matplotlib, which is not here: pip install matplotlib")
     if args.pointings is not None:
         return _from_pointings(args)
-    frames, unreadable = _stars_of_all(args)
+    read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
+    # an instrument that cannot be used is refused before all frames are worked on
+    if (first := Look(read)(tuple(args.frames))) is not None:
+        calibrate_site.check_output(args, common.instrument_of(args, first))
+    frames, unreadable = _stars_of_all(args.frames, read)
     if not frames:
         return common.UNREADABLE
     instrument = common.instrument_of(args, frames[0])
@@ -106,6 +110,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
     if len(whole) < len(pointings):
         common.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = common.instrument_of(args, NO_CAMERA)
+    calibrate_site.check_output(args, instrument)
     tilts = _tilts(args, instrument)
     try:
         calibrate_site.run(args, whole, instrument, tilts)
@@ -115,19 +120,27 @@ def _from_pointings(args: argparse.Namespace) -> int:
     return 0
 
 
-def _stars_of_all(args: argparse.Namespace) -> tuple[list[Stars], bool]:
+def _written(args: argparse.Namespace) -> Iterator[Written]:
+    """The files that the options name to be written."""
+    if args.camera is not None:
+        yield Written("--camera", args.camera, overwriting.camera)
+    if args.map is not None:
+        yield Written("--map", args.map, overwriting.picture)
+    if args.output is not None:
+        yield Written("--output", args.output, overwriting.instrument)
+
+
+def _stars_of_all(paths: Sequence[str], read: Reader) -> tuple[list[Stars], bool]:
     """The stars of the frames that can be read, and whether some cannot."""
     progress, unreadable = common.ProgressBar(), False
     frames: list[Stars] = []
-    read = reader_of(args)
-    args.frames = frames_among(args.frames, args.tilt)
-    for k, path in enumerate(args.frames):
+    for k, path in enumerate(paths):
         try:
             frames.append(common.stars_of(read(path)))
         except FrameError as e:
             common.complain("calibrate", e)
             unreadable = True
-        progress("frames", (k + 1) / len(args.frames))
+        progress("frames", (k + 1) / len(paths))
     return frames, unreadable
 
 

@@ -13,12 +13,13 @@ from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
 from starpos.cli import common
 from starpos.cli.deflection import add_vertical, vertical_of
+from starpos.cli.overwriting import save_instrument
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_update
 from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, SAG_ARCSEC_PER_SQRT_HOUR
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
@@ -57,7 +58,12 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     add_vertical(parser)
     common.add_turn(parser)
-    parser.add_argument("-o", "--output", metavar="OUT", help="write the instrument file (YAML) with A3")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        help="write A3 into an instrument file (YAML); one that is there keeps its other keys",
+    )
     parser.add_argument(
         "--valid-days",
         type=common.number(0.01, 1e5),
@@ -104,6 +110,14 @@ def check(args: argparse.Namespace) -> None:
         raise InstrumentError(f"--site {latitude:g} {longitude:g}: give latitude and longitude in deg")
 
 
+def check_output(args: argparse.Namespace, instrument: Instrument) -> None:
+    """Raise InstrumentError if the file of -o is there and is of another instrument."""
+    if args.site is not None:
+        instrument_update.check_fits(
+            Path(args.output), instrument, fixed=args.fixed, camera_found=args.camera is not None
+        )
+
+
 def run(
     args: argparse.Namespace,
     frames: Sequence[Stars | Pointing],
@@ -134,7 +148,7 @@ def run(
     about = _about(found, site)
     if args.misalignment is not None:
         about += _against(instrument.calibration, calibration)
-    instrument_file.write(Path(args.output), found.instrument, about)
+    save_instrument("calibrate", args.output, found.instrument, about, camera_found=args.camera is not None)
     if args.json:
         common.print_json(_json_of(found, args.output))
     else:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import common
+from starpos.cli import common, overwriting
+from starpos.cli.overwriting import Written
 from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue, deeper
@@ -86,6 +87,7 @@ def build_file(args: argparse.Namespace) -> int:
     """Build a catalogue from the original files; raises CatalogueError."""
     from starpos.sky import tycho2
 
+    overwriting.check(args, Written("--out", args.out, overwriting.stars))
     made = tycho2.build(args.originals, args.limit_mag, common.ProgressBar())
     try:
         catalogue.save(made, args.out)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import common, montecarlo_nights
+from starpos.cli import common, montecarlo_nights, overwriting
+from starpos.cli.overwriting import Written
 from starpos.errors import FrameError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
@@ -36,7 +37,13 @@ Exit status: 0; 1 where an answer was wrong or invented."""
 def define(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     whole = common.number(0, 10_000_000, int)
-    parser.add_argument("--fields", type=whole, default=1000, metavar="N", help="of each kind (1000)")
+    parser.add_argument(
+        "--fields",
+        type=common.number(1, 10_000_000, int),
+        default=1000,
+        metavar="N",
+        help="of each kind (1000)",
+    )
     parser.add_argument("--seed", type=whole, default=1, metavar="S", help="of the random numbers (1)")
     parser.add_argument(
         "--false",
@@ -84,6 +91,8 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.keep is not None:
+        overwriting.check(args, Written("--keep", args.keep, overwriting.failed_fields))
     camera = common.camera_of(args)
     stars = deeper.for_field(catalogue.load_catalogue(), camera, common.ProgressBar())
     conditions = _conditions(args, stars, camera)

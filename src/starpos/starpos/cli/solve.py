@@ -2,11 +2,11 @@
 """`starpos solve`: position and heading from frames with their tilts, for each frame and for all together."""
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from starpos.cli import common, jobs, solve_pointings
+from starpos.cli import common, jobs, overwriting, solve_pointings
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.doubts import add_near, checked_tilts, near_of
@@ -18,10 +18,11 @@ from starpos.cli.fix_output import (
 )
 from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of
 from starpos.cli.output import Output, add_formats
-from starpos.cli.solved_night import solved_by_turning, tell
+from starpos.cli.overwriting import Written
+from starpos.cli.solved_night import check_save, solved_by_turning, tell
 from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import InstrumentError, StarposError, TiltError
-from starpos.fix.solver import Solution, Solver
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
@@ -43,7 +44,10 @@ def define(parser: argparse.ArgumentParser) -> None:
     add_near(parser)
     common.add_self_calibration(parser)
     parser.add_argument(
-        "--save", metavar="OUT", help="write the instrument file (YAML) with the A3 of --self-calibrate"
+        "--save",
+        metavar="OUT",
+        help="write the A3 of --self-calibrate into an instrument file (YAML); one that is there keeps its other keys; "
+        "exit status 1 if the headings hardly tell A3, and nothing is written",
     )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -64,6 +68,8 @@ def run(args: argparse.Namespace) -> int:
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
     common.check_frames(args)
+    if args.save is not None:
+        overwriting.check(args, Written("--save", args.save, overwriting.instrument))
     if args.pointings is not None:
         return solve_pointings.run(args)
     vertical, read, output = vertical_of(args), reader_of(args), Output(args, COLUMNS, HEAD)
@@ -91,7 +97,8 @@ def run(args: argparse.Namespace) -> int:
             # takes the answers of this night, and leaves the others
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
             if args.self_calibrate:
-                rows = _turned(args, plan, list(rows))
+                rows, saving = _turned(args, plan, list(rows))
+                statuses.append(saving)
             instrument = None if plan.solver is None else plan.solver.instrument
             fits = None if instrument is None else partial(say_what_would_fit, "solve", read, instrument)
             known = None if args.self_calibrate else instrument
@@ -112,6 +119,7 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     if about is None:
         return Plan(night, Listing(read))
     instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
+    check_save(args, instrument)
     noise = instrument.inclinometer.noise_rad
     table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)
     jobs.prepare("solve", instrument, about)
@@ -124,11 +132,14 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     )
 
 
-def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> Iterator:
-    """(path, Solution or FrameError) of frames (path, Stars or FrameError), solved with the A3 that all of them tell."""
+def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> tuple[list, int]:
+    """(path, Solution or FrameError) of frames (path, Stars or FrameError), solved with the A3 that all of them tell.
+
+    Returns the exit status of saving that A3 too.
+    """
     frames = [stars for _, stars in rows if isinstance(stars, Stars)]
-    answers: Iterator[Solution] = iter(())
-    if frames and plan.solver is not None and plan.tilts is not None:
-        answers = iter(solved_by_turning(args, plan.night, plan.solver, plan.tilts, frames))
-    for path, item in rows:
-        yield path, next(answers) if isinstance(item, Stars) else item
+    if not frames or plan.solver is None or plan.tilts is None:
+        return rows, 0
+    solved, saving = solved_by_turning(args, plan.night, plan.solver, plan.tilts, frames)
+    answers = iter(solved)
+    return [(path, next(answers) if isinstance(item, Stars) else item) for path, item in rows], saving

@@ -14,7 +14,7 @@ from starpos.cli.doubts import Near, checked_tilts, far, near_of
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
 from starpos.cli.frame_work import NO_CAMERA
 from starpos.cli.output import Output
-from starpos.cli.solved_night import NO_FIX, solved_by_turning, tell
+from starpos.cli.solved_night import NO_FIX, check_save, solved_by_turning, tell
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.pointing import IDEAL
@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
     if args.jobs is not None or args.scheduler is not None:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
-    solver = _solver_of(args)
+    solver, saving = _solver_of(args), 0
+    check_save(args, solver.instrument)
     noise = solver.instrument.inclinometer.noise_rad
     log = None if own_level else checked_tilts("solve", args.tilt, noise)
     whole = [p for p in pointings if p.has_roll]
@@ -51,12 +52,13 @@ def run(args: argparse.Namespace) -> int:
         return _from_elevations(args, output, solver, log, pointings, vertical, near)
     night = NightFolder(tuple(p.source for p in pointings), args.tilt)
     if args.self_calibrate and log is not None:
-        solved = iter(solved_by_turning(args, night, solver, log, whole))
+        turned, saving = solved_by_turning(args, night, solver, log, whole)
+        solved = iter(turned)
         answers = [next(solved) if p.has_roll else solver.solve(p) for p in pointings]
     else:
         answers = [solver.solve(p, None if log is None else log.average) for p in pointings]
     given = None if args.self_calibrate else solver.instrument
-    return tell(args, output, night, zip(night.frames, answers, strict=True), vertical, given)
+    return max(saving, tell(args, output, night, zip(night.frames, answers, strict=True), vertical, given))
 
 
 def _solver_of(args: argparse.Namespace) -> Solver:

@@ -14,13 +14,14 @@ from starpos.cli.deflection import tell_unknown
 from starpos.cli.doubts import Levelled, Near, far, mistaken, near_of
 from starpos.cli.fix_output import Solved, json_about, json_of, line_of, put_combined
 from starpos.cli.output import Output
+from starpos.cli.overwriting import save_instrument
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solution, Solver, Status
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_update
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.utc import utc_text
@@ -96,31 +97,40 @@ def _tell_doubts(
         _say(night, away)
 
 
+def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
+    """Raise InstrumentError if the file of --save is there and is of another instrument."""
+    if args.save is not None:
+        instrument_update.check_fits(Path(args.save), instrument)
+
+
 def solved_by_turning(
     args: argparse.Namespace,
     night: NightFolder,
     solver: Solver,
     tilts: TiltLog,
     frames: Sequence[Stars | Pointing],
-) -> Sequence[Solution]:
-    """Find A3 and the solutions of a night's frames, and write A3 as --save asks."""
+) -> tuple[Sequence[Solution], int]:
+    """Find A3 and the solutions of a night's frames, and write A3 as --save asks.
+
+    Returns the solutions, and the exit status of saving: NO_FIX where nothing is worth saving.
+    """
     try:
         turned = turn(solver, frames, tilts.average, common.turn_of(args), solver.progress)
     except FixError as e:
-        return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames]
+        return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames], NO_FIX
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
         kept = "" if args.save is None else f" {args.save} is not written:"
         _say(night, f"not calibrated:{kept} the headings hardly tell A3, {error}: turn it further")
-        return turned.solutions
+        return turned.solutions, 0 if args.save is None else NO_FIX
     if args.save is not None:
-        instrument_file.write(Path(args.save), turned.instrument, f"A3 by turning on the spot: {error}")
+        save_instrument("solve", args.save, turned.instrument, f"A3 by turning on the spot: {error}")
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
     found = turned.instrument.calibration
     _say(night, f"calibrated: {error}; {kept}; {at_another_lean(found)}")
     if may_turn(found):
         _say(night, f"to use A3 at another lean, {TELL_IT}")
-    return turned.solutions
+    return turned.solutions, 0
 
 
 def _say(night: NightFolder, text: StarposError | str) -> None:

@@ -62,8 +62,22 @@ def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
 
     InstrumentError if the file cannot be written.
     """
+    yaml_file.save(path, _content(camera, name), comment)
+
+
+def as_written(path: Path, name: str) -> bool:
+    """Whether a file is what `write` has written with a comment and this name, and nobody has changed it."""
+    try:
+        text = yaml_file.text_at(path, "calibration file")
+        comment = yaml_file.own_comment(text)
+        return bool(comment) and text == yaml_file.text_of(_content(read(path), name), comment)
+    except InstrumentError:
+        return False
+
+
+def _content(camera: Camera, name: str) -> dict:
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-    content = {
+    return {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_name": name,
@@ -73,7 +87,6 @@ def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
         "rectification_matrix": _matrix(3, 3, (1, 0, 0, 0, 1, 0, 0, 0, 1)),
         "projection_matrix": _matrix(3, 4, (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)),
     }
-    yaml_file.save(path, content, comment)
 
 
 def _matrix(rows: int, columns: int, values: Sequence[float]) -> dict:

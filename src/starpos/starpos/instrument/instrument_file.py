@@ -105,6 +105,11 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
 
     comment is text for people, written at the end of the file.
     """
+    yaml_file.save(Path(path), content_of(instrument), comment)
+
+
+def content_of(instrument: Instrument) -> dict[str, Any]:
+    """The keys and values of an instrument's file."""
     c, camera = instrument.calibration, instrument.camera
     content: dict[str, Any] = {
         "starpos_instrument": FORMAT,
@@ -145,7 +150,7 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
     content["clock_stddev_s"] = float(instrument.clock_stddev_s)
     if instrument.shutter is not None:
         content["shutter"] = {key: float(getattr(instrument.shutter, key)) for key in SHUTTER}
-    yaml_file.save(Path(path), content, comment)
+    return content
 
 
 def _from_mapping(content: dict, folder: Path) -> Instrument:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML files that hold a calibration: whoever reads them checks the content; they are written whole or not at all."""
 
+import hashlib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +11,28 @@ from starpos.errors import InstrumentError, one_line
 
 # Ten times what a calibration needs. A parser of YAML reads about 100 kB in a second.
 MOST_BYTES = 64_000
+# The line above the comment that `save` writes, with the digest of that comment, and the lines of that.
+BY_STARPOS = re.compile(r"^# by starpos, ([0-9a-f]{8}):\n((?:#.*\n)+)", re.MULTILINE)
 
 
 def load(path: Path, what: str) -> Any:
     """Read the content of a file, which may be of any kind; InstrumentError if it cannot be read as `what`."""
+    return parse(_bytes_at(path, what), f"{path}: not a readable {what}")
+
+
+def text_at(path: Path, what: str) -> str:
+    """Read the text of a file; InstrumentError as `load` raises it, and if it is no UTF-8."""
     try:
-        text = files.read_regular(path, MOST_BYTES)
+        return _bytes_at(path, what).decode()
+    except UnicodeDecodeError:
+        raise InstrumentError(f"{path}: not a readable {what} (it is no UTF-8)") from None
+
+
+def _bytes_at(path: Path, what: str) -> bytes:
+    try:
+        return files.read_regular(path, MOST_BYTES)
     except OSError as e:
         raise InstrumentError(f"{path}: not a readable {what} ({e.strerror})") from None
-    return parse(text, f"{path}: not a readable {what}")
 
 
 def parse(text: bytes | str, complaint: str) -> Any:
@@ -62,13 +77,50 @@ def save(path: Path, content: dict, comment: str = "") -> None:
 
     comment is text for people, written at its end.
     """
-    import yaml
-
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
-    text += "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     try:
-        files.write_whole(path, text.encode())
+        files.write_whole(path, text_of(content, comment).encode())
     # ValueError: the name contains a NUL
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InstrumentError(f"{path}: the file cannot be written there ({reason})") from None
+
+
+def text_of(content: dict, comment: str = "") -> str:
+    """The text that `save` writes."""
+    import yaml
+
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
+    lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
+    return text + (f"# by starpos, {_digest(lines)}:\n{lines}" if lines else "")
+
+
+def own_comment(text: str) -> str:
+    """The comment of a file's text that `save` wrote and nobody has changed; '' without one."""
+    found = BY_STARPOS.search(text)
+    if found is None or _digest(found[2]) != found[1]:
+        return ""
+    return "".join(line[1:].removeprefix(" ") for line in found[2].splitlines(keepends=True))
+
+
+def line_of_comment(text: str) -> int:
+    """The first line, from 1, of a file's YAML that has a comment of a person; 0 without one."""
+    import yaml
+
+    if own_comment(text):
+        # as many lines as it had
+        text = BY_STARPOS.sub(lambda found: "\n" * found[0].count("\n"), text, count=1)
+    end = 0
+    for token in yaml.scan(text, yaml.SafeLoader):
+        begin = token.start_mark.index
+        if isinstance(token, yaml.ScalarToken) and token.style not in ("|", ">"):
+            if "#" in text[end:begin]:
+                break
+            end = token.end_mark.index
+    else:
+        begin = len(text)
+    at = text.find("#", end, begin)
+    return 0 if at < 0 else text.count("\n", 0, at) + 1
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

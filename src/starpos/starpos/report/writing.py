@@ -7,12 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from starpos.errors import StarposError
-from starpos.files import open_regular, write_whole
+from starpos.files import has_mark, write_whole
 
-# every file of a report has this mark in its first HEAD bytes
-MARK = b"starpos"
 PAGE = "index.html"
-HEAD = 400
 
 
 class WriteError(StarposError):
@@ -55,10 +52,6 @@ def _refused(folder: Path, error: Exception) -> WriteError:
 
 
 def _check_ours(path: Path) -> None:
-    if not path.exists():
+    if not path.exists() or (path.is_file() and has_mark(path)):
         return
-    if path.is_file():
-        with open_regular(path) as file:
-            if MARK in file.read(HEAD):
-                return
     raise WriteError(f"{path}: it is there already and no report of starpos: move it, or give another --out")

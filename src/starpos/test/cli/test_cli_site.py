@@ -186,7 +186,7 @@ REFUSED = {
     "a deflection that is none": ((*PLACE, "--geodetic", "--xi", "nan", "TILT", "-o", "OUT", *OPTICS), "finite"),
     "a turn of nothing": ((*PLACE, "--turn-stddev", "0", "TILT", "-o", "OUT", *OPTICS), "must lie between"),
     "no days": ((*PLACE, "--valid-days", "0", "TILT", "-o", "OUT", *OPTICS), "must lie between"),
-    "a folder for a file": ((*PLACE, "TILT", "-o", "FOLDER", *OPTICS), "the file cannot be written there"),
+    "a folder for a file": ((*PLACE, "TILT", "-o", "FOLDER", *OPTICS), "it is there already, and no instrument file"),
     "a file for a folder": ((*PLACE, "TILT", "-o", "/dev/null/mine.yaml", *OPTICS), "the file cannot be written there"),
     "no such tilts": ((*PLACE, "--tilt", "none.csv", "-o", "OUT", *OPTICS), "none.csv"),
     "two instruments": ((*PLACE, "TILT", "-o", "OUT", *OPTICS, "--instrument", "x.yaml"), "give either"),

@@ -144,14 +144,11 @@ def test_the_command_json(capsys):
     assert all(r["cpu_ms_median"] <= r["cpu_ms_worst"] for r in rows)
 
 
-def test_no_fields_at_all(capsys):
-    assert main(["montecarlo", *WIDE, "--fields", "0", "--json"]) == 0
-
-
 @pytest.mark.parametrize(
     "bad",
     [
         ("--fields", "-1"),
+        ("--fields", "0"),
         ("--focal-mm", "0"),
         ("--focal-error", "50"),
         ("--size", "1", "1"),

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that options name to be written: refused, before the work, where they would replace what is not theirs."""
+
+import argparse
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from starpos import files
+from starpos.cli import common
+from starpos.errors import CatalogueError, InstrumentError
+from starpos.instrument import camera_file, instrument_file, instrument_update, yaml_file
+from starpos.instrument.instrument import Instrument
+from starpos.sky import catalogue
+
+# options of which a command reads a file, or several
+INPUTS = ("frames", "tilt", "pointings", "imu", "geoid", "originals")
+# the name in the camera's file, which the camera node uses
+CAMERA_NAME = "camera"
+# 'a.fits[2]' is an image in the file a.fits
+HDU = re.compile(r"\[[^]]*\]$")
+MOST_LIST_BYTES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file that an option names to be written.
+
+    check: raises InstrumentError, without what to do, unless the file of that name, which is there, may be replaced.
+    """
+
+    option: str
+    name: str
+    check: Callable[[Path], None]
+
+
+def check(args: argparse.Namespace, *written: Written) -> None:
+    """Raise InstrumentError unless each of these files may be written.
+
+    One that is there may be if it is of the kind that the command writes. An input may not, whatever it is, nor may two
+    be one file. The file of --instrument may: it keeps all that was not found anew.
+    """
+    read, names = set(_inputs(args)), set()
+    for output in written:
+        path, real = Path(output.name), os.path.realpath(output.name)
+        instead = f"give another {output.option}"
+        if real in read:
+            raise InstrumentError(f"{path}: {output.option} would replace what is read: {instead}")
+        if real in names:
+            raise InstrumentError(f"{path}: two options would write it: {instead}")
+        names.add(real)
+        try:
+            if path.exists():
+                output.check(path)
+        except InstrumentError as e:
+            raise InstrumentError(f"{e}: move it away, or {instead}") from None
+        # ValueError: the name contains a NUL
+        except (OSError, ValueError) as e:
+            reason = getattr(e, "strerror", None) or e
+            raise InstrumentError(f"{path}: the file cannot be written there ({reason}): {instead}") from None
+
+
+def _inputs(args: argparse.Namespace) -> Iterator[str]:
+    """Real paths of what a command reads."""
+    for name in INPUTS:
+        given = getattr(args, name, None) or ()
+        for path in [given] if isinstance(given, str) else given:
+            yield os.path.realpath(path)
+            yield os.path.realpath(HDU.sub("", path))
+
+
+def instrument(path: Path) -> None:
+    """The check of an instrument file."""
+    try:
+        instrument_file.read(path)
+    except InstrumentError:
+        raise _there(path, "no instrument file that can be read") from None
+    if line := yaml_file.line_of_comment(yaml_file.text_at(path, "instrument file")):
+        raise _there(path, f"its line {line} has a comment, which would be lost")
+
+
+def camera(path: Path) -> None:
+    """The check of a camera's calibration file."""
+    if not camera_file.as_written(path, CAMERA_NAME):
+        raise _there(path, "starpos calibrate has not made it as it is")
+
+
+def picture(path: Path) -> None:
+    """The check of a picture: a PNG can say who has made it."""
+    if not (path.is_file() and path.suffix.lower() == ".png" and files.has_mark(path)):
+        raise _there(path, "no picture of starpos")
+
+
+def stars(path: Path) -> None:
+    """The check of a catalogue."""
+    try:
+        catalogue.load_catalogue(str(path))
+    except CatalogueError:
+        raise _there(path, "no catalogue of starpos") from None
+
+
+def failed_fields(folder: Path) -> None:
+    """The check of a folder for the fields that `starpos montecarlo` failed on: its lists have a verdict."""
+    if not folder.is_dir():
+        raise _there(folder, "no folder")
+    for path in sorted(folder.glob("*.csv")):
+        head = files.read_regular(path, MOST_LIST_BYTES).partition(b"\n")[0]
+        try:
+            is_ours = "VERDICT" in json.loads(head.removeprefix(b"#"))
+        except (ValueError, TypeError, RecursionError):
+            is_ours = False
+        if not is_ours:
+            raise _there(path, "starpos montecarlo has not made it")
+
+
+def save_instrument(
+    command: str, name: str, found: Instrument, about: str, *, camera_found: bool = False
+) -> None:
+    """Write A3 into an instrument file, new or there already; raises InstrumentError."""
+    instrument_update.write(Path(name), found, about, camera_found=camera_found)
+    if arcsec := instrument_file.read(name).calibration.remounted_arcsec:
+        common.complain(
+            command,
+            f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again",
+        )
+
+
+def _there(path: Path, why: str) -> InstrumentError:
+    return InstrumentError(f"{path}: it is there already, and {why}")

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Instrument files that are there already: a calibration puts A3 into them and leaves what people have written."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from starpos.errors import InstrumentError
+from starpos.instrument import instrument_file, yaml_file
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.instrument import Instrument
+
+# what a calibration finds of A3, or of the vertical of a fixed camera; of these a file may have one or another
+FOUND = (
+    "misalignment_deg",
+    "calibration_stddev_arcsec",
+    "calibration_covariance_arcsec2",
+    "calibrated",
+    "vertical",
+)
+
+
+def check_fits(
+    path: Path, instrument: Instrument, *, fixed: bool = False, camera_found: bool = False
+) -> None:
+    """Raise InstrumentError if a file is there that is of another instrument than the one to be calibrated.
+
+    fixed: of a camera fixed to the ground.  camera_found: the file's camera will be replaced too.
+    """
+    if not path.exists():
+        return
+    kept = instrument_file.read(path)
+    if (kept.vertical is not None) != fixed:
+        other = "an instrument with an inclinometer" if fixed else "a camera that is fixed to the ground"
+        raise InstrumentError(
+            f"{path}: it is there already, and of {other}: move it away, or write another file"
+        )
+    if not camera_found and _lens(kept) != _lens(instrument):
+        what = "camera"
+    elif not fixed and _says_sensor(instrument) and _sensor(kept) != _sensor(instrument):
+        what = "inclinometer"
+    else:
+        return
+    raise InstrumentError(
+        f"{path}: it is there already, with another {what} than this calibration's: give --instrument {path}, or write "
+        "another file"
+    )
+
+
+def _lens(instrument: Instrument) -> tuple:
+    return instrument.focal_px, instrument.camera, instrument.model if instrument.camera is None else None
+
+
+def _sensor(instrument: Instrument) -> InclinometerErrors:
+    # a calibration finds how new the error is at each pose
+    return replace(instrument.inclinometer, pose_rad=0.0)
+
+
+def _says_sensor(instrument: Instrument) -> bool:
+    """Whether an instrument has other errors of its inclinometer than those that hold where nobody says any."""
+    return bool(instrument.inclinometer_model) or _sensor(instrument) != _sensor(Instrument(1.0))
+
+
+def write(path: Path, instrument: Instrument, comment: str, *, camera_found: bool = False) -> None:
+    """Write an instrument file; one that is there keeps all keys but those of A3, and of the camera if it was found.
+
+    InstrumentError if it cannot be written.
+    """
+    new = instrument_file.content_of(instrument)
+    if path.exists():
+        pose = instrument_file.read(path).inclinometer.pose_rad < instrument.inclinometer.pose_rad
+        found = {*FOUND, *["camera"] * camera_found, *["tilt_pose_arcsec"] * pose}
+        kept = yaml_file.load(path, "instrument file")
+        changed = {k: v for k, v in kept.items() if k not in found} | {k: new[k] for k in found if k in new}
+        order = ["starpos_instrument", *instrument_file.KEYS]
+        new = {k: changed[k] for k in sorted(changed, key=order.index)}
+    yaml_file.save(path, new, comment)
