@@ -44,7 +44,7 @@ def node(context):
 
 @pytest.fixture
 def player_of(context):
-    """player_of(topics, *nodes): a player of these topics, beside nodes that take part and at once take everything."""
+    """Makes a player of topics, beside nodes that take part and at once take everything; and the list of what it says."""
     players = []
 
     def player_of(topics, *nodes):

@@ -131,7 +131,7 @@ def warned(node, monkeypatch):
 
 @pytest.fixture
 def passes(taking, monkeypatch):
-    """Time goes on, and the node beats: passes(seconds); or it stands still: passes(seconds, still=True)."""
+    """Has some seconds pass while the node beats; or, with still, while it stands still."""
     now_s = [time.monotonic()]
     monkeypatch.setattr(replayed, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
 
@@ -182,7 +182,7 @@ def test_messages_of_others_than_the_player_are_named_at_the_end(taking, warned)
 
 @pytest.fixture
 def published(node):
-    """published(**qos): the node publishes tilts, as another does in the graph."""
+    """Has the node publish tilts with a QoS, as another does in the graph."""
     made = []
 
     def published(**qos):
