@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("launch_ros", reason="ros2/launch_ros is not installed here")
 
-from launch import LaunchContext
-
-launching = importlib.import_module("starpos_bringup.launching")
+@pytest.fixture
+def launching(launch):
+    """The module, which imports launch."""
+    return importlib.import_module("starpos_bringup.launching")
 
 
 @pytest.fixture
-def environment(tmp_path, monkeypatch):
+def environment(launching, tmp_path, monkeypatch):
     """What a process of ours gets beside the environment, given variables of the user's."""
     parameters = tmp_path / "mine.yaml"
     parameters.write_text("")
@@ -24,6 +24,8 @@ def environment(tmp_path, monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
     def environment(**of_user):
+        from launch import LaunchContext
+
         for name, value in of_user.items():
             monkeypatch.setenv(name, value)
         context, process = LaunchContext(), launching.process("starpos_solver", "solver", common)
@@ -35,7 +37,7 @@ def environment(tmp_path, monkeypatch):
     return environment
 
 
-def test_nodes_find_each_other_at_once_and_the_rest_of_the_robot_is_as_it_was(environment):
+def test_nodes_find_each_other_at_once_and_the_rest_of_the_robot_is_as_it_was(environment, launching):
     profiles = environment()
     assert set(profiles) == set(launching.PROFILES)
     assert all(Path(path).name == "quick_start.xml" and Path(path).is_file() for path in profiles.values())
