@@ -20,7 +20,8 @@ from starpos_testing.patience import WAIT_S
 KILLS, KILLED_NODES = 40, 2
 # That a service keeps.
 CALLS = 8
-# Forks a child that saves two contents in turn, kills it at a random moment, looks at the file; says how often which.
+# Forks a child that saves two contents in turn, kills it at a random moment after so many, looks at the file; says how
+# often which.
 KILLER = """
 import os, random, signal, sys, time
 from pathlib import Path
@@ -43,14 +44,20 @@ for name, (write, read) in files.items():
     write(path, cameras[0])
     once_s = time.perf_counter() - begin
     for _ in range(kills):
+        saved, tell = os.pipe()
         child = os.fork()
         if child == 0:
             while True:
                 for camera in cameras:
                     write(path, camera)
-        time.sleep(random.uniform(0, 4 * once_s))
+                    os.write(tell, b".")
+        os.close(tell)
+        for _ in range(random.randrange(6)):
+            os.read(saved, 1)
+        time.sleep(random.uniform(0, 2 * once_s))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+        os.close(saved)
         found.append(read(path))
     print(name, found.count(1000.0), found.count(2000.0))
 """
