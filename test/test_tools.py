@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 
 TOOLS = Path(__file__).parent.parent / "tools"
 

@@ -11,7 +11,7 @@ from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
-from starpos.fix.solver import Solution, Status
+from starpos.fix.solution import Solution, Status
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 

@@ -12,7 +12,7 @@ from std_msgs.msg import Header
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ErrorTerm, heading_of
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Status
+from starpos.fix.solution import Solution, Status
 from starpos.session.frames import ground_of
 from starpos_interfaces import msg
 from starpos_solver import outputs

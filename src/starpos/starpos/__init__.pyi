@@ -11,9 +11,9 @@ from starpos.earth.vertical import geodetic as geodetic
 from starpos.errors import StarposError as StarposError
 from starpos.fix.fix import Fix as Fix
 from starpos.fix.readable import InDegrees as InDegrees
-from starpos.fix.solver import Solution as Solution
+from starpos.fix.solution import Solution as Solution
+from starpos.fix.solution import Status as Status
 from starpos.fix.solver import Solver as Solver
-from starpos.fix.solver import Status as Status
 from starpos.frames.frame import Frame as Frame
 from starpos.frames.reading import read_frame as read_frame
 from starpos.frames.stars import Stars as Stars

@@ -14,7 +14,8 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Solver, Status, Tilts
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver, Tilts
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint

@@ -13,7 +13,7 @@ from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.fix.fix import Fix
 from starpos.fix.readable import InDegrees, length_text
-from starpos.fix.solver import Solution, Status
+from starpos.fix.solution import Solution, Status
 from starpos.instrument.inclinometer import Tilt
 from starpos.utc import utc_text
 

@@ -19,7 +19,8 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.pointing import IDEAL
-from starpos.fix.solver import Solution, Solver
+from starpos.fix.solution import Solution
+from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame

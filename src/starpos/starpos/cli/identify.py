@@ -12,7 +12,7 @@ from starpos.cli.output import Output, add_formats
 from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import FrameError
 from starpos.fix.blind import BlindSolver
-from starpos.fix.solver import Solution, Status
+from starpos.fix.solution import Solution, Status
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.sky.catalogue import load_catalogue
 

@@ -25,7 +25,7 @@ from starpos.cli.output import Output, add_formats
 from starpos.cli.solved_night import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
-from starpos.fix.solver import Solution
+from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Calibration
 from starpos.session.frames import Answered, Averaged
 from starpos.session.parameter_file import settings_of

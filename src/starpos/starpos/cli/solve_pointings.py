@@ -18,7 +18,8 @@ from starpos.cli.solved_night import NO_FIX, check_save, solved_by_turning, tell
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, InstrumentError, StarposError
 from starpos.fix.pointing import IDEAL
-from starpos.fix.solver import Solver, status_of
+from starpos.fix.solution import status_of
+from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing, read_pointings
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue

@@ -18,7 +18,8 @@ from starpos.cli.overwriting import save_instrument
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, StarposError
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Solver, Status
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_update

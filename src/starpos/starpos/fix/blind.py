@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.errors import StarposError
-from starpos.fix.solver import Solution, Status, attitude_of, status_of, suspicions
+from starpos.fix.solution import Solution, Status, status_of
+from starpos.fix.solver import attitude_of, suspicions
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Sky, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind

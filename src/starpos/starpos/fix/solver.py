@@ -4,8 +4,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, field, replace
-from enum import Enum
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,11 +12,12 @@ import numpy as np
 from starpos.core.frame import mean_sigma, pointing_of
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TiltRangeError, TimeError
+from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.fix.horizon import check_above_horizon
 from starpos.fix.pointing import IDEAL, pointing_fix
 from starpos.fix.seen import directions_of, high_enough, inside
+from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Attitude, Solution, Status, status_of
 from starpos.fix.unidentified import why_unidentified
 from starpos.fix.unmoved import check_unmoved
 from starpos.frames.pointings import Pointing
@@ -31,7 +31,7 @@ from starpos.identification.pose import FrameStars
 from starpos.identification.search import Priors, field_of, identify_frame
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
-from starpos.instrument.camera import PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.camera_vertical import own_level
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
@@ -43,91 +43,8 @@ from starpos.units import ARCSEC
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
-# Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
-# not identified, nor are the bright stars there that should be.
-TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
-
 # the tilt at (mid_unix_s, exposure_s, spread_s)
 Tilts = Callable[[float, float, float], Tilt]
-
-
-class Status(str, Enum):
-    """Result of the work on one frame."""
-
-    OK = "ok"
-    TOO_FEW_STARS = "too few stars"
-    NOT_IDENTIFIED = "not identified"
-    NO_TILT = "no tilt"
-    TILT_OUT_OF_RANGE = "tilt out of range"
-    TIME_OUTSIDE_TABLES = "time outside tables"
-    BAD_INPUT = "bad input"
-    POOR_FIT = "poor fit"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Attitude:
-    """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
-
-    model: of its lens.
-    """
-
-    ra: float
-    dec: float
-    roll: float
-    focal_px: float
-    residual_arcsec: float
-    log_odds: float
-    mirrored: bool
-    model: str = PLUMB_BOB
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Solution of one frame: a status, a sentence, and as much of the answer as there is.
-
-    star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
-    identify_s, fix_s: seconds that the two steps took.
-    extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
-    warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
-    explained: how much of the frame the identification explains.
-    found: the identification itself, whose rows are those of the input's stars.
-    hint: helps to identify the next frame.
-    """
-
-    status: Status
-    message: str
-    _: KW_ONLY
-    source: str
-    utc_unix_s: float | None
-    stars_detected: int
-    names: tuple[str, ...] = ()
-    star: np.ndarray | None = None
-    magnitudes: np.ndarray | None = None
-    attitude: Attitude | None = None
-    fix: Fix | None = None
-    tilt: Tilt | None = None
-    identify_s: float = 0.0
-    fix_s: float = 0.0
-    extrapolated_days: float = 0.0
-    hint: Hint | None = None
-    warnings: tuple[str, ...] = ()
-    explained: Explained | None = None
-    found: Identification | None = None
-
-    @classmethod
-    def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
-        """A solution that has nothing but its status and message."""
-        number = len(stars) if isinstance(stars, Stars) else 0
-        return cls(status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=number)
-
-    def __repr__(self) -> str:
-        found = self.fix.in_degrees if self.fix else self.message
-        return f"<Solution {self.status.value}: {found}; {len(self.names)} of {self.stars_detected} stars>"
-
-    @property
-    def ok(self) -> bool:
-        """Whether all that was asked for is there."""
-        return self.status is Status.OK
 
 
 @dataclass(frozen=True)
@@ -399,17 +316,6 @@ def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
 
 def _failure(stars: Stars | Pointing, error: StarposError) -> Solution:
     return Solution.failed(stars, status_of(stars, error), str(error))
-
-
-def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
-    """The status of a frame whose work ended with an error."""
-    kinds = (
-        (TiltRangeError, Status.TILT_OUT_OF_RANGE),
-        (TiltError, Status.NO_TILT),
-        (TimeError, Status.BAD_INPUT if stars.mid_unix_s is None else Status.TIME_OUTSIDE_TABLES),
-        (FixError, Status.POOR_FIT),
-    )
-    return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
 
 
 def suspicions(

@@ -13,7 +13,7 @@ from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix
 from starpos.fix.readable import InDegrees
-from starpos.fix.solver import Attitude, Status
+from starpos.fix.solution import Attitude, Status
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))

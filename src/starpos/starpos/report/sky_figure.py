@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
-from starpos.fix.solver import Attitude
+from starpos.fix.solution import Attitude
 from starpos.instrument.camera import Camera
 from starpos.report.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE

@@ -9,7 +9,7 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import FrameError, StarposError
 from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solver import Attitude, Status
+from starpos.fix.solution import Attitude, Status
 from starpos.instrument.camera import Camera
 from starpos.recording.messages import message_to_stars, stamp_to_unix
 from starpos.report.folder import StarList

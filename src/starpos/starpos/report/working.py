@@ -16,7 +16,8 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, StarposError
 from starpos.fix.budget import heading_of, place_of
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Solver, Status
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import level_of, up_of

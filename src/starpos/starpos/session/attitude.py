@@ -4,7 +4,8 @@
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.fix.solver import Solution, Solver, Status
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification import wide
 from starpos.identification.search import Priors

@@ -8,7 +8,7 @@ from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution
+from starpos.fix.solution import Solution
 from starpos.frames.stars import Stars
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from starpos.earth.orientation import EQUATOR_M_PER_S, table_age_days
-from starpos.fix.solver import Solution
+from starpos.fix.solution import Solution
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration

@@ -17,7 +17,8 @@ from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
-from starpos.fix.solver import Solution, Solver, Status
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors

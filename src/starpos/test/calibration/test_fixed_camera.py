@@ -9,7 +9,8 @@ import pytest
 from starpos import rotation
 from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.errors import FixError, InstrumentError
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.rotation import half_turn

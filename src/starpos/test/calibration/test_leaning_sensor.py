@@ -17,7 +17,8 @@ from starpos.calibration.misalignment import calibrate_at
 from starpos.calibration.turning import turn
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import FixError
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument

@@ -10,7 +10,7 @@ from starpos.averaging.average import average
 from starpos.calibration.misalignment import VALID_DAYS, calibrate_at
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import FixError
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import EXACT
 from starpos.instrument.instrument import Calibration

@@ -10,7 +10,8 @@ from starpos import rotation
 from starpos.averaging.average import average
 from starpos.calibration.turning import turn
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, up_of
 from starpos.instrument.instrument import Calibration, Instrument

@@ -15,7 +15,7 @@ from cli_calls import KNOWN, PLACE, objects, solve
 
 from starpos.earth import orientation
 from starpos.errors import TimeError
-from starpos.fix.solver import Solution, Status
+from starpos.fix.solution import Solution, Status
 from starpos.frames.stars import no_stars
 from starpos.session import reports
 from starpos.utc import unix_of

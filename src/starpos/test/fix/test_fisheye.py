@@ -9,7 +9,7 @@ from solved_night import off_by_sigma
 
 from starpos.errors import InstrumentError
 from starpos.fix.other_focal import focal_that_fits
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 from starpos.identification import wide
 from starpos.identification.triangle_cache import cached
 from starpos.instrument.camera import EQUIDISTANT, Camera

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from solved_night import refused
 
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 

@@ -9,7 +9,8 @@ import pytest
 from starpos.averaging.average import average
 from starpos.calibration.misalignment import calibrate_at
 from starpos.calibration.turning import turn
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.instrument.camera import Camera
 from starpos.rotation import half_turn

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from starpos.fix.other_focal import focal_that_fits
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument

@@ -12,7 +12,8 @@ from solved_night import off_by_sigma, refused
 
 from starpos.earth.orientation import earth_state, station_velocity
 from starpos.errors import TiltError
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import EXACT, Tilt

@@ -10,7 +10,7 @@ from solved_night import refused
 from starpos.averaging.average import average
 from starpos.cli.common import tell_extrapolation
 from starpos.earth.orientation import earth_state
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
 from starpos_testing.skies.scenes import EXPOSURE, START, solver_of, stars_of, tilt_of, wide_scene

@@ -3,7 +3,8 @@
 
 import numpy as np
 
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.fix.unidentified import why_unidentified
 from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera

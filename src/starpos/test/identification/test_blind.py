@@ -11,7 +11,8 @@ import pytest
 from starpos import rotation
 from starpos.detection import detect
 from starpos.fix.blind import BlindSolver
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
 from starpos.identification import blind, quad_cache, quads

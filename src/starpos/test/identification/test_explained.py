@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from crowds import CAMERA, SIGMA_PX, stars_on, under
 
-from starpos.fix.solver import TWO_SKIES, UNEXPLAINED, Solver, Status
+from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Status
+from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification import identify
 from starpos.identification.explained import Explained, explained_by

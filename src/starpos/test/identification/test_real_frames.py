@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.fix.solver import Solver, Status
+from starpos.fix.solution import Status
+from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
 from starpos.instrument.instrument import Instrument
 

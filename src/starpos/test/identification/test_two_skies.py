@@ -9,7 +9,8 @@ from test_identification import sky_for
 
 from starpos import rotation
 from starpos.detection import detect
-from starpos.fix.solver import TWO_SKIES, Solver, Status
+from starpos.fix.solution import TWO_SKIES, Status
+from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.identification.search import frame_stars, identify_frame

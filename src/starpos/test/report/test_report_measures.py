@@ -11,7 +11,7 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solver import Attitude, Status
+from starpos.fix.solution import Attitude, Status
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument

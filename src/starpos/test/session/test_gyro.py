@@ -8,7 +8,7 @@ import pytest
 from imu_readings import reading
 from scipy.spatial.transform import Rotation
 
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 from starpos.session.gyro import Gyro
 from starpos.session.gyro_readings import GyroReadings
 from starpos.session.now import Now

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from starpos.earth.orientation import measured_until
-from starpos.fix.solver import Solution, Status
+from starpos.fix.solution import Solution, Status
 from starpos.frames.shutter import GLOBAL, UNKNOWN, Shutter
 from starpos.frames.stars import no_stars
 from starpos.instrument.instrument import Calibration

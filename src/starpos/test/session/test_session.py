@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from starpos.fix.solver import Status
+from starpos.fix.solution import Status
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
 from starpos.recording.messages import stamp_to_unix

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solution of a frame: its status, and as much of the answer as there is."""
+
+from dataclasses import KW_ONLY, dataclass
+from enum import Enum
+
+import numpy as np
+
+from starpos.errors import FixError, StarposError, TiltError, TiltRangeError, TimeError
+from starpos.fix.fix import Fix
+from starpos.frames.pointings import Pointing
+from starpos.frames.stars import Stars
+from starpos.identification import Identification
+from starpos.identification.explained import Explained
+from starpos.identification.hint import Hint
+from starpos.instrument.camera import PLUMB_BOB
+from starpos.instrument.inclinometer import Tilt
+
+# Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
+# not identified, nor are the bright stars there that should be.
+TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
+
+
+class Status(str, Enum):
+    """Result of the work on one frame."""
+
+    OK = "ok"
+    TOO_FEW_STARS = "too few stars"
+    NOT_IDENTIFIED = "not identified"
+    NO_TILT = "no tilt"
+    TILT_OUT_OF_RANGE = "tilt out of range"
+    TIME_OUTSIDE_TABLES = "time outside tables"
+    BAD_INPUT = "bad input"
+    POOR_FIT = "poor fit"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attitude:
+    """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
+
+    model: of its lens.
+    """
+
+    ra: float
+    dec: float
+    roll: float
+    focal_px: float
+    residual_arcsec: float
+    log_odds: float
+    mirrored: bool
+    model: str = PLUMB_BOB
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Solution of one frame: a status, a sentence, and as much of the answer as there is.
+
+    star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
+    identify_s, fix_s: seconds that the two steps took.
+    extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
+    warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
+    explained: how much of the frame the identification explains.
+    found: the identification itself, whose rows are those of the input's stars.
+    hint: helps to identify the next frame.
+    """
+
+    status: Status
+    message: str
+    _: KW_ONLY
+    source: str
+    utc_unix_s: float | None
+    stars_detected: int
+    names: tuple[str, ...] = ()
+    star: np.ndarray | None = None
+    magnitudes: np.ndarray | None = None
+    attitude: Attitude | None = None
+    fix: Fix | None = None
+    tilt: Tilt | None = None
+    identify_s: float = 0.0
+    fix_s: float = 0.0
+    extrapolated_days: float = 0.0
+    hint: Hint | None = None
+    warnings: tuple[str, ...] = ()
+    explained: Explained | None = None
+    found: Identification | None = None
+
+    @classmethod
+    def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
+        """A solution that has nothing but its status and message."""
+        number = len(stars) if isinstance(stars, Stars) else 0
+        return cls(status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=number)
+
+    def __repr__(self) -> str:
+        found = self.fix.in_degrees if self.fix else self.message
+        return f"<Solution {self.status.value}: {found}; {len(self.names)} of {self.stars_detected} stars>"
+
+    @property
+    def ok(self) -> bool:
+        """Whether all that was asked for is there."""
+        return self.status is Status.OK
+
+
+def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
+    """The status of a frame whose work ended with an error."""
+    kinds = (
+        (TiltRangeError, Status.TILT_OUT_OF_RANGE),
+        (TiltError, Status.NO_TILT),
+        (TimeError, Status.BAD_INPUT if stars.mid_unix_s is None else Status.TIME_OUTSIDE_TABLES),
+        (FixError, Status.POOR_FIT),
+    )
+    return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)
