@@ -23,7 +23,7 @@ from peers import Absent
 from table import Cost, Row
 
 from starpos import table_cache
-from starpos.cli.common import ProgressBar
+from starpos.cli.console import ProgressBar
 from starpos.cli.montecarlo import looking
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera

@@ -27,10 +27,10 @@ def triangle_cache(tmp_path_factory):
 @pytest.fixture(scope="session", autouse=True)
 def no_lines_of_progress():
     """Progress of slow work has no lines here: tests count the lines of what is wrong."""
-    from starpos.cli import common
+    from starpos.cli import console
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(common, "LINE_EVERY_S", float("inf"))
+        patch.setattr(console, "LINE_EVERY_S", float("inf"))
         yield
 
 

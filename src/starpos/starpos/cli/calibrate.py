@@ -12,10 +12,10 @@ import numpy as np
 from starpos.calibration.camera import FromSky, calibrate_camera
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.intrinsics import Intrinsics, rms
-from starpos.cli import calibrate_site, common, overwriting
+from starpos.cli import calibrate_site, console, options, overwriting
 from starpos.cli.archive import frames_among
 from starpos.cli.doubts import checked_tilts
-from starpos.cli.frame_work import NO_CAMERA, Look, Reader, reader_of
+from starpos.cli.frame_work import NO_CAMERA, Look, Reader, reader_of, stars_of
 from starpos.cli.output import add_formats
 from starpos.cli.overwriting import CAMERA_NAME, Written
 from starpos.earth.refraction import Atmosphere
@@ -35,7 +35,7 @@ NOTHING = 1
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser, pointings=True)
+    options.add_frames(parser, pointings=True)
     add_formats(parser, "one JSON object for --camera and one for --site instead of text", None)
     parser.add_argument(
         "--camera",
@@ -45,14 +45,14 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", metavar="PNG", help="draw where the stars lie off the given and the fitted camera (--camera)"
     )
-    common.add_stamps(parser)
-    common.add_instrument(parser)
+    options.add_stamps(parser)
+    options.add_instrument(parser)
     parser.add_argument(
         "--tilt",
         metavar="CSV",
         help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]: refraction is undone",
     )
-    common.add_air(parser)
+    options.add_air(parser)
     calibrate_site.define(parser)
     parser.set_defaults(run=run)
 
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
     if args.map is not None and args.camera is None:
         raise InstrumentError("--map is of the camera: give --camera OUT.yaml too")
-    common.check_frames(args)
+    options.check_frames(args)
     if args.pointings is not None and args.camera is not None:
         raise InstrumentError("--pointings say nothing of the camera: give frames for --camera")
     calibrate_site.check(args)
@@ -74,26 +74,26 @@ def run(args: argparse.Namespace) -> int:
     read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
     # an instrument that cannot be used is refused before all frames are worked on
     if (first := Look(read)(tuple(args.frames))) is not None:
-        calibrate_site.check_output(args, common.instrument_of(args, first))
+        calibrate_site.check_output(args, options.instrument_of(args, first))
     frames, unreadable = _stars_of_all(args.frames, read)
     if not frames:
-        return common.UNREADABLE
-    instrument = common.instrument_of(args, frames[0])
+        return console.UNREADABLE
+    instrument = options.instrument_of(args, frames[0])
     tilts = _tilts(args, instrument)
     try:
         if args.camera is not None:
             camera = _camera(args, frames, instrument, tilts)
             if args.site is None:
-                common.complain(
+                console.complain(
                     "calibrate", "an A3 belongs to the camera it was found with: find it again with this one"
                 )
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.site is not None:
             calibrate_site.run(args, frames, instrument, tilts)
     except (CalibrationError, FixError) as e:
-        common.complain("calibrate", e)
-        return common.UNREADABLE if unreadable else NOTHING
-    return common.UNREADABLE if unreadable else 0
+        console.complain("calibrate", e)
+        return console.UNREADABLE if unreadable else NOTHING
+    return console.UNREADABLE if unreadable else 0
 
 
 def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
@@ -108,14 +108,14 @@ def _from_pointings(args: argparse.Namespace) -> int:
     pointings = read_pointings(args.pointings)
     whole = [p for p in pointings if p.has_roll]
     if len(whole) < len(pointings):
-        common.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
-    instrument = common.instrument_of(args, NO_CAMERA)
+        console.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
+    instrument = options.instrument_of(args, NO_CAMERA)
     calibrate_site.check_output(args, instrument)
     tilts = _tilts(args, instrument)
     try:
         calibrate_site.run(args, whole, instrument, tilts)
     except FixError as e:
-        common.complain("calibrate", e)
+        console.complain("calibrate", e)
         return NOTHING
     return 0
 
@@ -132,13 +132,13 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
 
 def _stars_of_all(paths: Sequence[str], read: Reader) -> tuple[list[Stars], bool]:
     """The stars of the frames that can be read, and whether some cannot."""
-    progress, unreadable = common.ProgressBar(), False
+    progress, unreadable = console.ProgressBar(), False
     frames: list[Stars] = []
     for k, path in enumerate(paths):
         try:
-            frames.append(common.stars_of(read(path)))
+            frames.append(stars_of(read(path)))
         except FrameError as e:
-            common.complain("calibrate", e)
+            console.complain("calibrate", e)
             unreadable = True
         progress("frames", (k + 1) / len(paths))
     return frames, unreadable
@@ -148,14 +148,14 @@ def _camera(
     args: argparse.Namespace, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None
 ) -> Camera:
     """Fit the camera of --camera, write, draw and print it."""
-    air = common.atmosphere_of(args)
+    air = options.atmosphere_of(args)
     given = instrument.camera_for(frames[0].width, frames[0].height)
     levels: Sequence[np.ndarray | None] = [None] * len(frames)
     if tilts is not None:
         frames, levels = _levelled(frames, instrument, tilts)
-    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, common.ProgressBar())
+    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, console.ProgressBar())
     for k in sorted(set(range(len(frames))) - set(found.used)):
-        common.complain("calibrate", f"{frames[k].source}: none of the sky fits it, it is left out")
+        console.complain("calibrate", f"{frames[k].source}: none of the sky fits it, it is left out")
     if tilts is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
@@ -163,7 +163,7 @@ def _camera(
     if args.map is not None:
         _draw(args.map, found)
     if args.json:
-        common.print_json(_json_of(found, args.camera))
+        console.print_json(_json_of(found, args.camera))
     else:
         print(about, end="")
     return found.fit.camera
@@ -183,7 +183,7 @@ def _levelled(
             levels.append(level_of(tilt.up) @ instrument.mounting.a3)
             kept.append(stars)
         except StarposError as e:
-            common.complain("calibrate", f"{stars.source} is left out: {e}")
+            console.complain("calibrate", f"{stars.source} is left out: {e}")
     if not kept:
         raise CalibrationError(
             "no frame has a tilt: check that --tilt is of the same night, or leave it away"
@@ -198,7 +198,7 @@ def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[St
         " and, without times, aberration scales it" if timeless else ""
     )
     cost = np.hypot(cost, UNTIMED * timeless)
-    common.complain(
+    console.complain(
         "calibrate",
         f"without --tilt {what} is not known: {1e6 * cost:.0f} ppm, {cost * fit.camera.fx:.2g} px, of fx and fy, "
         "which their sigmas hold",

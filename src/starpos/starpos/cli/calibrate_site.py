@@ -11,7 +11,7 @@ import numpy as np
 from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.overwriting import save_instrument
 from starpos.earth.vertical import astronomic
@@ -46,7 +46,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sag",
-        type=common.number(0, MOST_SAG_ARCSEC),
+        type=options.number(0, MOST_SAG_ARCSEC),
         metavar="ARCSEC",
         help="how far a --fixed camera sags in an hour, 1 sigma about each axis; it grows with the root of the time "
         f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times that)",
@@ -57,7 +57,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="--site is on WGS 84, as a map or a receiver has it: the deflection of the vertical is put on",
     )
     add_vertical(parser)
-    common.add_turn(parser)
+    options.add_turn(parser)
     parser.add_argument(
         "-o",
         "--output",
@@ -66,7 +66,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--valid-days",
-        type=common.number(0.01, 1e5),
+        type=options.number(0.01, 1e5),
         metavar="DAYS",
         help="after which the calibration is refused (365)",
     )
@@ -125,22 +125,22 @@ def run(
     tilts: TiltLog | None,
 ) -> None:
     """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not tell it."""
-    solver = Solver(instrument, catalogue.load_catalogue(), common.atmosphere_of(args))
+    solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     site, stddev_arcsec = _site(args)
     if tilts is None:
         sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
-        found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, common.ProgressBar())
+        found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, console.ProgressBar())
     elif instrument.vertical is not None:
         raise InstrumentError(
             f"{args.instrument} is of a camera that is fixed to the ground: give --fixed, or another instrument file"
         )
     else:
         found = calibrate_at(
-            solver, frames, tilts.average, site, stddev_arcsec, common.turn_of(args), common.ProgressBar()
+            solver, frames, tilts.average, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
         )
     for solution in found.solutions:
         if solution.fix is None:
-            common.complain("calibrate", f"left out: {solution.message}")
+            console.complain("calibrate", f"left out: {solution.message}")
     calibration = found.instrument.calibration
     if args.valid_days is not None:
         calibration = replace(calibration, valid_days=args.valid_days)
@@ -150,7 +150,7 @@ def run(
         about += _against(instrument.calibration, calibration)
     save_instrument("calibrate", args.output, found.instrument, about, camera_found=args.camera is not None)
     if args.json:
-        common.print_json(_json_of(found, args.output))
+        console.print_json(_json_of(found, args.output))
     else:
         print(about, end="")
 

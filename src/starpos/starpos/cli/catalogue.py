@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import common, overwriting
+from starpos.cli import console, options, overwriting
 from starpos.cli.overwriting import Written
 from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
@@ -28,7 +28,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     info = kinds.add_parser("info", help="stars, magnitudes and errors of the catalogue in use")
     info.add_argument("path", nargs="?", metavar="FILE", help="another file than the one in use")
     info.add_argument(
-        "--year", type=common.number(1900, 2200), default=2026.0, help="for the errors of places (2026)"
+        "--year", type=options.number(1900, 2200), default=2026.0, help="for the errors of places (2026)"
     )
     info.set_defaults(run=show)
     build = kinds.add_parser(
@@ -37,7 +37,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     build.formatter_class = argparse.RawDescriptionHelpFormatter
     build.add_argument("originals", metavar="ORIGINALS", help="folder or archive of the original files")
     build.add_argument(
-        "--limit-mag", type=common.number(0, 20), default=11.0, metavar="V", help="faintest V kept (11.0)"
+        "--limit-mag", type=options.number(0, 20), default=11.0, metavar="V", help="faintest V kept (11.0)"
     )
     build.add_argument(
         "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
@@ -53,8 +53,8 @@ def define(parser: argparse.ArgumentParser) -> None:
     deepen.set_defaults(run=keep_deeper)
     triangle = kinds.add_parser("triangles", help="the catalogue of triangles of a field; the paper's")
     triangle.add_argument("--paper", action="store_true", help="count the paper's triangles again instead")
-    common.add_optics(triangle)
-    common.add_size(triangle)
+    options.add_optics(triangle)
+    options.add_size(triangle)
     triangle.set_defaults(run=show_triangles)
 
 
@@ -88,7 +88,7 @@ def build_file(args: argparse.Namespace) -> int:
     from starpos.sky import tycho2
 
     overwriting.check(args, Written("--out", args.out, overwriting.stars))
-    made = tycho2.build(args.originals, args.limit_mag, common.ProgressBar())
+    made = tycho2.build(args.originals, args.limit_mag, console.ProgressBar())
     try:
         catalogue.save(made, args.out)
     except OSError as e:
@@ -100,7 +100,7 @@ def build_file(args: argparse.Namespace) -> int:
 
 def keep_deeper(args: argparse.Namespace) -> int:
     """Build the deeper catalogue from the original files into the cache; raises CatalogueError."""
-    made = deeper.build(args.originals, common.ProgressBar(), anew=True)
+    made = deeper.build(args.originals, console.ProgressBar(), anew=True)
     print(
         f"{len(made)} stars are kept in {cache_folder()}: small fields take them from now on", file=sys.stderr
     )
@@ -109,7 +109,7 @@ def keep_deeper(args: argparse.Namespace) -> int:
 
 def show_triangles(args: argparse.Namespace) -> int:
     """Print the catalogue of triangles of a field, or the paper's."""
-    return show_paper() if args.paper else show_field(common.camera_of(args))
+    return show_paper() if args.paper else show_field(options.camera_of(args))
 
 
 def show_paper() -> int:
@@ -143,7 +143,7 @@ def show_field(camera: Camera) -> int:
     from starpos.identification import triangle_cache
     from starpos.instrument.instrument import Instrument
 
-    progress = common.ProgressBar()
+    progress = console.ProgressBar()
     Solver(Instrument(camera.fx), catalogue.load_catalogue(), progress=progress).prepare(
         camera.width, camera.height
     )

@@ -3,7 +3,7 @@
 
 import argparse
 
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.earth import geoid
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
@@ -26,7 +26,7 @@ def add_vertical(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--altitude-m",
-        type=common.number(-1000, 100_000),
+        type=options.number(-1000, 100_000),
         metavar="M",
         help="height above the ellipsoid: plumb lines curve by 0.17 arcsec (5 m) a km at 45 deg; not with --xi and "
         "--eta, which are those at the instrument",
@@ -65,7 +65,7 @@ def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection)
     """Complain if the geoid that was given has no data at the place."""
     if args.geoid is not None and not deflection.known:
         stddev = deflection.stddev_arcsec
-        common.complain(
+        console.complain(
             command,
             f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec",
         )

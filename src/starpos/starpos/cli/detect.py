@@ -4,7 +4,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from starpos.cli import common, jobs
+from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
 from starpos.cli.frame_work import Detecting, Reader
 from starpos.cli.output import Output, add_formats
@@ -20,7 +20,7 @@ JSON_HELP = "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sig
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser)
+    options.add_frames(parser)
     add_formats(parser, JSON_HELP, "a row of a CSV a star")
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -34,14 +34,14 @@ def run(args: argparse.Namespace) -> int:
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
-                status = common.UNREADABLE
+                status = console.UNREADABLE
             _tell(path, answer, output)
     return status
 
 
 def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", output: Output) -> None:
     if isinstance(answer, FrameError):
-        common.complain("detect", answer)
+        console.complain("detect", answer)
         output.put({"file": path, "stars": [], "cpu_ms": 0.0, "status": "bad input"}, "", ())
         return
     found, cpu_ms = answer

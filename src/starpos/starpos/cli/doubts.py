@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.averaging.average import Average
-from starpos.cli import common
+from starpos.cli import console
 from starpos.cli.frame_work import tilts
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
@@ -70,7 +70,7 @@ def checked_tilts(command: str, path: str, noise_rad: float) -> TiltLog:
     """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
     log = tilts(path, noise_rad)
     if doubt := like_radians(log):
-        common.complain(command, f"{path}: {doubt}")
+        console.complain(command, f"{path}: {doubt}")
     return log
 
 

@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli.common import clock_of, stars_of
+from starpos.cli.options import clock_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
 from starpos.fix.blind import BlindSolver
@@ -95,6 +95,15 @@ class Look:
                 self.read.keep(path, item)
                 return About(item.width, item.height, item.focal_px)
         return None
+
+
+def stars_of(item: Frame | Stars) -> Stars:
+    """The stars of a list, or those detected on a frame."""
+    if isinstance(item, Stars):
+        return item
+    from starpos.detection import detect
+
+    return detect(item).stars
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import argparse
 
 import numpy as np
 
-from starpos.cli import common, jobs
+from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
 from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, reader_of
 from starpos.cli.output import Output, add_formats
@@ -30,16 +30,16 @@ HEAD = (
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser)
+    options.add_frames(parser)
     add_formats(parser, JSON_HELP, "a row of a CSV a frame")
-    common.add_stamps(parser)
+    options.add_stamps(parser)
     parser.add_argument(
         "--instrument",
         metavar="FILE",
         help="instrument file (YAML), whose camera is taken, instead of the next three",
     )
-    common.add_optics(parser)
-    common.add_lens(parser)
+    options.add_optics(parser)
+    options.add_lens(parser)
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
@@ -56,9 +56,9 @@ def run(args: argparse.Namespace) -> int:
         untold = (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
         if about is not None and untold and about.focal_px is None:
             work = IdentifyingBlind(read)
-            BlindSolver(load_catalogue(), common.ProgressBar()).prepare()
+            BlindSolver(load_catalogue(), console.ProgressBar()).prepare()
         elif about is not None:
-            instrument = common.instrument_of(args, about)
+            instrument = options.instrument_of(args, about)
             work = Identifying(read, instrument)
             jobs.prepare("identify", instrument, about)
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
@@ -73,11 +73,11 @@ def run(args: argparse.Namespace) -> int:
             any_found |= found.ok
             lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             if not found.ok:
-                common.complain("identify", found.message)
+                console.complain("identify", found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     if lost is not None and not any_found and isinstance(work, Identifying):
         say_what_would_fit("identify", read, work.instrument, lost)
-    return common.UNREADABLE if unreadable else 0 if any_found else 1
+    return console.UNREADABLE if unreadable else 0 if any_found else 1
 
 
 def as_json(path: str, s: Solution) -> dict:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.cli.frame_work import About
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solver import Solver
@@ -38,7 +38,7 @@ def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
 
 def _jobs(text: str) -> int:
     try:
-        return 0 if text == AUTO else common.number(0, MOST_JOBS, int)(text)
+        return 0 if text == AUTO else options.number(0, MOST_JOBS, int)(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor {AUTO}") from None
 
@@ -58,7 +58,7 @@ def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = 
 
     silent: whether, where no terminal is, the answers are lines that show how far the work is.
     """
-    bar = common.ProgressBar(terminal_only=silent)
+    bar = console.ProgressBar(terminal_only=silent)
     for k, answer in enumerate(answers, 1):
         if not (silent and sys.stdout.isatty()):
             bar(f"{what} {k} of {number}", k / number)
@@ -67,8 +67,8 @@ def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = 
 
 def prepare(command: str, instrument: Instrument, about: About) -> None:
     """Put the tables of a field into the cache, where all processes of a machine find them; says what it lacks."""
-    solver = Solver(instrument, catalogue.load_catalogue(), progress=common.ProgressBar())
+    solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error
     with suppress(StarposError):
         if thin := solver.prepare(about.width, about.height):
-            common.complain(command, thin)
+            console.complain(command, thin)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import common, montecarlo_nights, overwriting
+from starpos.cli import console, montecarlo_nights, options, overwriting
 from starpos.cli.overwriting import Written
 from starpos.errors import FrameError
 from starpos.fix.solver import Solver
@@ -36,10 +36,10 @@ Exit status: 0; 1 where an answer was wrong or invented."""
 
 def define(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
-    whole = common.number(0, 10_000_000, int)
+    whole = options.number(0, 10_000_000, int)
     parser.add_argument(
         "--fields",
-        type=common.number(1, 10_000_000, int),
+        type=options.number(1, 10_000_000, int),
         default=1000,
         metavar="N",
         help="of each kind (1000)",
@@ -47,14 +47,14 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole, default=1, metavar="S", help="of the random numbers (1)")
     parser.add_argument(
         "--false",
-        type=common.number(0, 100, int),
+        type=options.number(0, 100, int),
         nargs="*",
         default=[0, 1, 2],
         metavar="K",
         help="false stars (0 1 2)",
     )
     parser.add_argument(
-        "--stars", type=common.number(1, 100, int), nargs="*", default=[5, 6, 7], metavar="K",
+        "--stars", type=options.number(1, 100, int), nargs="*", default=[5, 6, 7], metavar="K",
         help="fields of only so many stars (5 6 7)",
     )  # fmt: skip
     parser.add_argument(
@@ -63,21 +63,21 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="fields of random points, nothing to find (a fifth of --fields)",
     )
-    common.add_optics(parser)
-    common.add_size(parser)
+    options.add_optics(parser)
+    options.add_size(parser)
     parser.add_argument(
         "--limit-mag",
-        type=common.number(0, 20),
+        type=options.number(0, 20),
         metavar="V",
         help="faintest star (9; what gives as many in other fields)",
     )
     parser.add_argument(
-        "--noise-px", type=common.number(0.001, 10), default=0.05, metavar="PX", help="centroids' (0.05)"
+        "--noise-px", type=options.number(0.001, 10), default=0.05, metavar="PX", help="centroids' (0.05)"
     )
     parser.add_argument("--ideal", action="store_true", help="the paper's conditions, see below")
     parser.add_argument(
         "--focal-error",
-        type=common.number(0, 3),
+        type=options.number(0, 3),
         default=0.0,
         metavar="PERCENT",
         help="of the focal length, at most (0)",
@@ -93,16 +93,16 @@ def define(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.keep is not None:
         overwriting.check(args, Written("--keep", args.keep, overwriting.failed_fields))
-    camera = common.camera_of(args)
-    stars = deeper.for_field(catalogue.load_catalogue(), camera, common.ProgressBar())
+    camera = options.camera_of(args)
+    stars = deeper.for_field(catalogue.load_catalogue(), camera, console.ProgressBar())
     conditions = _conditions(args, stars, camera)
-    solver = Solver(Instrument(camera.fx), stars, progress=common.ProgressBar())
+    solver = Solver(Instrument(camera.fx), stars, progress=console.ProgressBar())
     solver.prepare(camera.width, camera.height)
     if not args.json:
         _print_head(conditions, stars)
     wrong = 0
     for label, paper, number, fields in _rows(args, stars, conditions):
-        tally, bar = montecarlo_fields.Tally(), common.ProgressBar()
+        tally, bar = montecarlo_fields.Tally(), console.ProgressBar()
         for done, given in enumerate(islice(fields, number), 1):
             tally.ask(given, given.stars(conditions), looking(solver), conditions.tolerance_rad)
             bar(label, done / number)
@@ -170,7 +170,7 @@ def _print_row(label: str, paper: str, t: montecarlo_fields.Tally, as_json: bool
     low, high = montecarlo_fields.wilson(t.correct, t.fields)
     median, worst = (float(f(t.cpu_ms)) if t.cpu_ms else float("nan") for f in (np.median, np.max))
     if as_json:
-        common.print_json(
+        console.print_json(
             {
                 "row": label, "fields": t.fields, "correct": t.correct, "wrong": t.wrong, "none": t.none,
                 "correct_low": low, "correct_high": high, "cpu_ms_median": median, "cpu_ms_worst": worst,

@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.simulation import montecarlo_nights
 from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos.sky import catalogue
@@ -45,15 +45,15 @@ def define(experiments: "argparse._SubParsersAction[argparse.ArgumentParser]") -
     ):
         parser = experiments.add_parser(name, description=text, help=text.split(":")[0].lower())
         parser.formatter_class = argparse.RawDescriptionHelpFormatter
-        whole = common.number(1, 1_000_000, int)
+        whole = options.number(1, 1_000_000, int)
         parser.add_argument("--nights", type=whole, default=number, metavar="N", help=f"how many ({number})")
-        parser.add_argument("--seed", type=common.number(0, 2**63, int), default=1, metavar="S", help="(1)")
+        parser.add_argument("--seed", type=options.number(0, 2**63, int), default=1, metavar="S", help="(1)")
         parser.add_argument(
             "--jobs", type=whole, default=os.cpu_count(), metavar="N", help="processes (one a processor)"
         )
         parser.add_argument(
             "--tiltmeter",
-            type=common.number(1e-3, 1e3),
+            type=options.number(1e-3, 1e3),
             metavar="ARCSEC",
             help="an inclinometer of this noise a reading instead of a compensated SCA100T's 12.6, and as steady",
         )
@@ -68,7 +68,7 @@ def run_nights(args: argparse.Namespace) -> int:
     # North, east m.
     error = np.abs(off[:, 1::-1]).mean(0) if solved else np.full(2, np.nan)
     if args.json:
-        common.print_json(
+        console.print_json(
             {
                 "nights": args.nights, "solved": len(solved), "mean_abs_north_m": error[0], "mean_abs_east_m": error[1],
                 "mean_abs_latitude_arcsec": error[0] / ARCSEC_M, "mean_abs_east_arcsec": error[1] / ARCSEC_M,
@@ -96,7 +96,7 @@ def run_honesty(args: argparse.Namespace) -> int:
         ratios = _nees(solved)
         if args.json:
             keys = ("position_nees", "ground_nees", "heading_nees")
-            common.print_json(
+            console.print_json(
                 {"row": label, "nights": len(some), "solved": len(solved)}
                 | dict(zip(keys, ratios, strict=True))
             )
@@ -144,17 +144,17 @@ def _either(
 
 def _all(args: argparse.Namespace, night: Callable) -> list[NightOutcome]:
     """Every night's outcome, the same ones however many processes there are."""
-    seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, common.ProgressBar()
+    seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, console.ProgressBar()
     for k, outcome in _each(night, seeds, min(args.jobs, args.nights)):
         outcomes[k] = outcome
         if outcome.trouble:
-            common.complain("montecarlo", f"night {k}: {outcome.trouble}")
+            console.complain("montecarlo", f"night {k}: {outcome.trouble}")
         bar("nights", len(outcomes) / args.nights)
     ordered = [outcomes[k] for k in range(args.nights)]
     if args.json:
         for o in ordered:
             sigma = np.sqrt(np.diag(o.covariance))
-            common.print_json(
+            console.print_json(
                 {
                     "kind": o.kind, "east_m": o.off[0], "north_m": o.off[1], "heading_deg": np.degrees(o.off[2]),
                     "sigma_east_m": sigma[0], "sigma_north_m": sigma[1], "sigma_heading_deg": np.degrees(sigma[2]),

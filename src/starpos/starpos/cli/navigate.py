@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import common, jobs
+from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.fix_output import HEAD, in_degrees
-from starpos.cli.frame_work import Look, Reader, reader_of
+from starpos.cli.frame_work import Look, Reader, reader_of, stars_of
 from starpos.cli.output import Output, add_formats
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
@@ -45,7 +45,7 @@ COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser)
+    options.add_frames(parser)
     add_formats(parser, JSON_HELP, "a row of a CSV a frame")
     parser.add_argument(
         "--imu",
@@ -72,7 +72,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mount-stddev",
-        type=common.number(1e-4, 20),
+        type=options.number(1e-4, 20),
         default=MOUNT_STDDEV_DEG,
         metavar="DEG",
         help="how well the camera sits as the instrument says, an axis: z up, the top of the frame forward "
@@ -80,19 +80,19 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--drift-stddev",
-        type=common.number(0, 50),
+        type=options.number(0, 50),
         default=0.0,
         metavar="M_PER_S",
         help="where --velocity is not over ground but through water or air: 1 sigma of current or wind, an axis; half of "
         "it may change in an hour (0)",
     )
-    common.add_stamps(parser)
+    options.add_stamps(parser)
     parser.add_argument(
         "--instrument", metavar="FILE", help="instrument file (YAML) instead of the next two options"
     )
-    common.add_optics(parser)
-    common.add_clock(parser)
-    common.add_air(parser)
+    options.add_optics(parser)
+    options.add_clock(parser)
+    options.add_air(parser)
     add_vertical(parser)
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -115,7 +115,7 @@ class Seeing:
     instrument: Instrument
 
     def __call__(self, path: str) -> FrameSeen:
-        stars = common.stars_of(self.read(path))
+        stars = stars_of(self.read(path))
         try:
             return FrameSeen(
                 stars.mid_unix_s, sighting_of(stars, Solver(self.instrument, catalogue.load_catalogue()))
@@ -134,19 +134,19 @@ def run(args: argparse.Namespace) -> int:
         (about,) = workers.map([(Look(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
-        instrument = common.instrument_of(args, about)
+        instrument = options.instrument_of(args, about)
         jobs.prepare("navigate", instrument, about)
         answers = jobs.watched(workers.map((Seeing(read, instrument), path) for path in args.frames), number)
         seen = [FrameSeen(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
     for frame in seen:
         if frame.message:
-            common.complain("navigate", frame.message)
+            console.complain("navigate", frame.message)
     vessel = Vessel(
         vehicle=args.vehicle,
         model=model,
         camera_to_body=np.asarray(instrument.link_to_camera, float).T,
         mount_stddev=np.radians(args.mount_stddev),
-        atmosphere=common.atmosphere_of(args),
+        atmosphere=options.atmosphere_of(args),
         clock_stddev_s=instrument.clock_stddev_s,
         drift_stddev=args.drift_stddev,
     )
@@ -155,9 +155,9 @@ def run(args: argparse.Namespace) -> int:
     times = np.array([np.nan if s.utc_unix_s is None else s.utc_unix_s for s in seen])
     sightings = [s.sighting for s in seen if s.sighting is not None]
     try:
-        voyage = navigate(sightings, imu, velocity, vessel, times, common.ProgressBar())
+        voyage = navigate(sightings, imu, velocity, vessel, times, console.ProgressBar())
     except FixError as error:
-        common.complain("navigate", error)
+        console.complain("navigate", error)
         return NO_ANSWER
     return tell(args, seen, voyage, vertical)
 
@@ -166,7 +166,7 @@ def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertic
     """Write the answer for each frame; returns the exit status."""
     output = Output(args, COLUMNS, HEAD)
     for fault in voyage.faults:
-        common.complain("navigate", fault)
+        console.complain("navigate", fault)
     for path, frame, fix in zip(args.frames, seen, voyage.fixes, strict=True):
         status = _status(frame, fix)
         output.put(
@@ -180,9 +180,9 @@ def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertic
     tell_unknown("navigate", args, vertical.at(last.latitude, last.longitude))
     beyond = earth_orientation(last.utc_unix_s).extrapolated_days
     if beyond > 0:
-        common.complain("navigate", f"the Earth's rotation is extrapolated {beyond:.0f} days beyond the IERS table: "
+        console.complain("navigate", f"the Earth's rotation is extrapolated {beyond:.0f} days beyond the IERS table: "
                         "upgrade astropy-iers-data")  # fmt: skip
-    return common.UNREADABLE if any(frame.utc_unix_s is None for frame in seen) else 0
+    return console.UNREADABLE if any(frame.utc_unix_s is None for frame in seen) else 0
 
 
 def _status(frame: FrameSeen, fix: VoyageFix | None) -> str:

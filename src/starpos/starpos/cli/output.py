@@ -6,7 +6,7 @@ import csv
 import sys
 from collections.abc import Sequence
 
-from starpos.cli import common
+from starpos.cli import console
 
 
 def add_formats(parser: argparse.ArgumentParser, json_help: str, csv_help: str | None) -> None:
@@ -31,12 +31,12 @@ class Output:
     def put(self, value: dict, line: str, rows: Sequence[dict] | None = None) -> None:
         """Write an answer; line: the same for people, of one or more lines, or none; rows: if it is not one of a CSV."""
         if self._json:
-            common.print_json(value)
+            console.print_json(value)
         elif self._csv:
             if not self._begun:
                 self._rows.writeheader()
             for row in [value] if rows is None else rows:
-                self._rows.writerow({k: _cell(v) for k, v in common.plain(row).items()})
+                self._rows.writerow({k: _cell(v) for k, v in console.plain(row).items()})
             sys.stdout.flush()
         elif line:
             if self._head and not self._begun:

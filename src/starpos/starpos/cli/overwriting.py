@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starpos import files
-from starpos.cli import common
+from starpos.cli import console
 from starpos.errors import CatalogueError, InstrumentError
 from starpos.instrument import camera_file, instrument_file, instrument_update, yaml_file
 from starpos.instrument.instrument import Instrument
@@ -122,7 +122,7 @@ def save_instrument(
     """Write A3 into an instrument file, new or there already; raises InstrumentError."""
     instrument_update.write(Path(name), found, about, camera_found=camera_found)
     if arcsec := instrument_file.read(name).calibration.remounted_arcsec:
-        common.complain(
+        console.complain(
             command,
             f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again",
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from starpos.averaging.average import Average
 from starpos.calibration.unknown import BY_PARAMETERS, unknown_a3
-from starpos.cli import common, jobs
+from starpos.cli import console, jobs
 from starpos.cli.archive import NightFolder
 from starpos.cli.fix_output import (
     COLUMNS,
@@ -153,26 +153,26 @@ def tell(
 ) -> int:
     """Write the solutions of a bag and the average of its place; returns the exit status."""
     for sentence in night.said:
-        common.complain("replay", f"{bag}: {sentence}")
+        console.complain("replay", f"{bag}: {sentence}")
     solved: list[Solved] = []
     for solution in night.solutions:
         if solution.fix:
             solved.append(Solved.of(solution, solution.fix))
         else:
-            common.complain("replay", f"{bag}: {solution.message}")
+            console.complain("replay", f"{bag}: {solution.message}")
         time = "a frame" if solution.utc_unix_s is None else utc_text(solution.utc_unix_s)
         output.put(
             {"file": bag} | json_of(solution.fix, vertical) | json_about(solution),
             line_of(f"{bag} {time}", solution, turning=False),
         )
-    common.tell_extrapolation("replay", solved)
+    console.tell_extrapolation("replay", solved)
     if solved:
         whole = night.average
         if whole and (unknown := unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS)):
-            common.complain("replay", f"{bag}: {unknown}")
+            console.complain("replay", f"{bag}: {unknown}")
         warnings = {warning for s in night.solutions for warning in s.warnings}
         folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
         put_combined(output, folder, night.average, solved, warnings, vertical)
     # a trouble names its bag
-    common.complain("replay", night.trouble or f"{bag}: {night.summary}")
-    return common.UNREADABLE if night.trouble else 0 if solved else NO_FIX
+    console.complain("replay", night.trouble or f"{bag}: {night.summary}")
+    return console.UNREADABLE if night.trouble else 0 if solved else NO_FIX

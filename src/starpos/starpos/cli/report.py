@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.stars import Stars, no_stars
@@ -38,15 +38,15 @@ def define(parser: argparse.ArgumentParser) -> None:
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
     )
     parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
-    common.add_instrument(parser)
-    common.add_air(parser)
+    options.add_instrument(parser)
+    options.add_air(parser)
     add_vertical(parser)
-    common.add_self_calibration(parser)
+    options.add_self_calibration(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    common.check_self_calibration(args)
+    options.check_self_calibration(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
     from starpos.report.page import page
@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
     nights = [_night(Path(path), args) for path in args.nights]
     for night in nights:
         for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
-            common.complain("report", f"{night.name}: {sentence}")
-    bar, each = common.ProgressBar(), []
+            console.complain("report", f"{night.name}: {sentence}")
+    bar, each = console.ProgressBar(), []
     for k, night in enumerate(nights):
         each.append(
             list(pictures_of(night, catalogue.load_catalogue())) if len(nights) <= ALL_FIGURES else []
@@ -82,12 +82,12 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
     from starpos.report.working import Workshop, worked
 
     shop = Workshop(
-        instrument_for=_once_a_size(lambda stars: common.instrument_of(args, stars)),
+        instrument_for=_once_a_size(lambda stars: options.instrument_of(args, stars)),
         catalogue=catalogue.load_catalogue(),
-        atmosphere=common.atmosphere_of(args),
+        atmosphere=options.atmosphere_of(args),
         vertical=vertical_of(args),
-        turn_stddev_deg=common.turn_of(args) if args.self_calibrate else None,
-        progress=common.ProgressBar(),
+        turn_stddev_deg=options.turn_of(args) if args.self_calibrate else None,
+        progress=console.ProgressBar(),
     )
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
@@ -110,7 +110,7 @@ def _tilt_noise(args: argparse.Namespace) -> float:
 
 def _instrument(args: argparse.Namespace) -> Instrument:
     """The instrument of the options, with any camera."""
-    return common.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
+    return options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
 
 
 def _once_a_size(instrument_for: Callable[[Stars], Instrument]) -> Callable[[Stars], Instrument]:
@@ -132,7 +132,7 @@ def _with_camera(args: argparse.Namespace, found: "Recorded") -> Callable[[Stars
     def instrument_for(stars: Stars) -> Instrument:
         camera = found.cameras.get((stars.width, stars.height))
         if args.focal_mm is not None or camera is None:
-            return common.instrument_of(args, stars)
+            return options.instrument_of(args, stars)
         return replace(_instrument(args), camera=camera, focal_px=camera.fx)
 
     return instrument_for

@@ -5,7 +5,7 @@ import argparse
 
 import numpy as np
 
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.frames.shutter import MOST_READOUT_S
 from starpos.instrument.instrument import focal_px_of
 from starpos.simulation.night_on_disk import write_night
@@ -20,12 +20,12 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="where frame_0000.fits ..., tilt.csv and truth.json go: a new folder, or one that holds a simulated "
         "night, which is replaced",
     )
-    parser.add_argument("-n", "--frames", type=common.number(1, 1e6, int), default=5, help="how many (5)")
+    parser.add_argument("-n", "--frames", type=options.number(1, 1e6, int), default=5, help="how many (5)")
     parser.add_argument(
-        "--latitude", type=common.number(-90, 90), default=35.7046, help="deg, astronomic (35.7046)"
+        "--latitude", type=options.number(-90, 90), default=35.7046, help="deg, astronomic (35.7046)"
     )
     parser.add_argument(
-        "--longitude", type=common.number(-360, 360), default=51.4106, help="deg, east positive (51.4106)"
+        "--longitude", type=options.number(-360, 360), default=51.4106, help="deg, east positive (51.4106)"
     )
     parser.add_argument(
         "--start",
@@ -33,26 +33,26 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="UTC",
         help="start of the first exposure (2026-11-02T18:00:00)",
     )
-    parser.add_argument("--cadence", type=common.number(0, 1e6), default=5.0, help="s between frames (5)")
-    parser.add_argument("--exposure", type=common.number(1e-6, 3600), default=0.5, help="s (0.5)")
+    parser.add_argument("--cadence", type=options.number(0, 1e6), default=5.0, help="s between frames (5)")
+    parser.add_argument("--exposure", type=options.number(1e-6, 3600), default=0.5, help="s (0.5)")
     parser.add_argument(
-        "--azimuth", type=common.number(-360, 360), default=40.0, help="deg, of the optical axis (40)"
+        "--azimuth", type=options.number(-360, 360), default=40.0, help="deg, of the optical axis (40)"
     )
     parser.add_argument(
-        "--altitude", type=common.number(5, 90), default=78.0, help="deg, of the optical axis (78)"
+        "--altitude", type=options.number(5, 90), default=78.0, help="deg, of the optical axis (78)"
     )
     parser.add_argument(
-        "--roll", type=common.number(-360, 360), default=15.0, help="deg, about the optical axis (15)"
+        "--roll", type=options.number(-360, 360), default=15.0, help="deg, about the optical axis (15)"
     )
     parser.add_argument(
-        "--turn", type=common.number(-360, 360), default=0.0, help="deg of azimuth between frames (0)"
+        "--turn", type=options.number(-360, 360), default=0.0, help="deg of azimuth between frames (0)"
     )
     parser.add_argument("--focal-mm", type=float, default=600.0, metavar="MM", help="focal length (600)")
     parser.add_argument("--pixel-um", type=float, default=6.4, metavar="UM", help="pixel size (6.4)")
-    common.add_lens(parser)
+    options.add_lens(parser)
     parser.add_argument(
         "--size",
-        type=common.number(16, 12000, int),
+        type=options.number(16, 12000, int),
         nargs=2,
         default=(5616, 3744),
         metavar=("WIDTH", "HEIGHT"),
@@ -68,13 +68,13 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--tilt-noise",
-        type=common.number(0, 10),
+        type=options.number(0, 10),
         default=0.0035,
         help="deg, of one reading (0.0035, the SCA100T's)",
     )
     parser.add_argument(
         "--tilt-zero",
-        type=common.number(-30, 30),
+        type=options.number(-30, 30),
         nargs=2,
         default=(0.0, 0.0),
         metavar=("X", "Y"),
@@ -82,7 +82,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--readout",
-        type=common.number(-MOST_READOUT_S, MOST_READOUT_S),
+        type=options.number(-MOST_READOUT_S, MOST_READOUT_S),
         default=0.0,
         metavar="S",
         help="rolling shutter: s from the first row to the last, negative: the bottom row is first (0: global)",
@@ -93,9 +93,9 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="lists of detected stars (stars_0000.csv ...) instead of frames",
     )
     parser.add_argument(
-        "--seed", type=common.number(0, 2**63, int), default=1, metavar="S", help="of the random numbers (1)"
+        "--seed", type=options.number(0, 2**63, int), default=1, metavar="S", help="of the random numbers (1)"
     )
-    common.add_air(parser)
+    options.add_air(parser)
     parser.set_defaults(run=run)
 
 
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         focal_px=focal_px_of(args.focal_mm, args.pixel_um),
         latitude_deg=args.latitude,
         longitude_deg=args.longitude,
-        atmosphere=common.atmosphere_of(args),
+        atmosphere=options.atmosphere_of(args),
         pointing_deg=(args.azimuth, args.altitude, args.roll),
         misalignment_deg=tuple(args.misalignment),
         tilt_noise_deg=args.tilt_noise,
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
         turn_deg=args.turn,
         stars_only=args.stars_only,
         rng=np.random.default_rng(args.seed),
-        progress=common.ProgressBar(),
+        progress=console.ProgressBar(),
         pixel_um=args.pixel_um,
     )
     return 0

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from starpos.cli import common, jobs, overwriting, solve_pointings
+from starpos.cli import console, jobs, options, overwriting, solve_pointings
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.doubts import add_near, checked_tilts, near_of
@@ -29,7 +29,7 @@ from starpos.sky import catalogue
 
 
 def define(parser: argparse.ArgumentParser) -> None:
-    common.add_frames(parser, pointings=True)
+    options.add_frames(parser, pointings=True)
     add_formats(parser, JSON_HELP, CSV_HELP)
     parser.add_argument(
         "--tilt",
@@ -37,12 +37,12 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
         "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground",
     )
-    common.add_stamps(parser)
-    common.add_instrument(parser)
-    common.add_air(parser)
+    options.add_stamps(parser)
+    options.add_instrument(parser)
+    options.add_air(parser)
     add_vertical(parser)
     add_near(parser)
-    common.add_self_calibration(parser)
+    options.add_self_calibration(parser)
     parser.add_argument(
         "--save",
         metavar="OUT",
@@ -64,17 +64,17 @@ class Plan:
 
 
 def run(args: argparse.Namespace) -> int:
-    common.check_self_calibration(args)
+    options.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
-    common.check_frames(args)
+    options.check_frames(args)
     if args.save is not None:
         overwriting.check(args, Written("--save", args.save, overwriting.instrument))
     if args.pointings is not None:
         return solve_pointings.run(args)
     vertical, read, output = vertical_of(args), reader_of(args), Output(args, COLUMNS, HEAD)
     near_of(args)
-    given = nights_of(frames_among(args.frames, args.tilt), args.tilt, common.has_own_level(args))
+    given = nights_of(frames_among(args.frames, args.tilt), args.tilt, options.has_own_level(args))
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
@@ -110,20 +110,20 @@ def _refused(why: StarposError, given: list) -> int:
     """Complain about a night that cannot be worked on; raises the error if it is the only night."""
     if len(given) == 1:
         raise why
-    common.complain("solve", why)
-    return common.UNREADABLE
+    console.complain("solve", why)
+    return console.UNREADABLE
 
 
 def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, read: Reader) -> Plan:
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Plan(night, Listing(read))
-    instrument, air = common.instrument_of(args, about), common.atmosphere_of(args)
+    instrument, air = options.instrument_of(args, about), options.atmosphere_of(args)
     check_save(args, instrument)
     noise = instrument.inclinometer.noise_rad
     table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)
     jobs.prepare("solve", instrument, about)
-    solver = Solver(instrument, catalogue.load_catalogue(), air, progress=common.ProgressBar())
+    solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
     return Plan(
         night,
         Listing(read) if args.self_calibrate else Solving(read, instrument, air, night.tilt),

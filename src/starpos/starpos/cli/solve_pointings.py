@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from starpos.averaging.altitudes import Circle, circle_of, place_of_circles
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown, vertical_of
 from starpos.cli.doubts import Near, checked_tilts, far, near_of
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     """Work on the table of --pointings; returns the exit status."""
     near = near_of(args)
     pointings, vertical = read_pointings(args.pointings), vertical_of(args)
-    own_level = common.has_own_level(args)
+    own_level = options.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
     if args.jobs is not None or args.scheduler is not None:
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _solver_of(args: argparse.Namespace) -> Solver:
     """The solver for pointings, which needs no focal length."""
-    instrument = common.instrument_of(args, NO_CAMERA)
-    return Solver(instrument, catalogue.load_catalogue(), common.atmosphere_of(args))
+    instrument = options.instrument_of(args, NO_CAMERA)
+    return Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
 
 
 def _from_elevations(
@@ -84,7 +84,7 @@ def _from_elevations(
             circles.append(_circle(solver, log, p))
             zenith_distance, status = circles[-1].zenith_distance, ELEVATION
         except StarposError as e:
-            common.complain("solve", e)
+            console.complain("solve", e)
             zenith_distance, status = None, status_of(p, e).value
         _put_row(output, p, zenith_distance, status, vertical)
     together = None
@@ -93,12 +93,12 @@ def _from_elevations(
             together = place_of_circles(circles, None if near is None else (near.latitude, near.longitude))
             tell_unknown("solve", args, vertical.at(together.latitude, together.longitude))
         except FixError as e:
-            common.complain("solve", e)
+            console.complain("solve", e)
         about = {}
         if near is not None and together is not None:
             about = {"km_from_near": near.km_from(together.latitude, together.longitude)}
             if away := far(near, together, None, ()):
-                common.complain("solve", away)
+                console.complain("solve", away)
         put_combined(output, NightFolder((), args.tilt), together, [], set(), vertical, about)
     return 0 if together else NO_FIX
 

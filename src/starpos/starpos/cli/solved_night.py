@@ -8,7 +8,7 @@ from pathlib import Path
 from starpos.averaging.average import Average, average
 from starpos.calibration.turning import turn
 from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn, unknown_a3
-from starpos.cli import common
+from starpos.cli import console, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown
 from starpos.cli.doubts import Levelled, Near, far, mistaken, near_of
@@ -58,14 +58,14 @@ def tell(
         if answer.fix:
             solved.append(Solved.of(answer, answer.fix))
         else:
-            common.complain("solve", answer.message)
+            console.complain("solve", answer.message)
         output.put(
             {"file": path} | json_of(answer.fix, vertical) | json_about(answer),
             line_of(path, answer, args.self_calibrate),
         )
     if lost and not solved and fits is not None:
         fits(lost)
-    common.tell_extrapolation("solve", solved)
+    console.tell_extrapolation("solve", solved)
     together = _combine(night, solved)
     if solved:
         last, near = solved[-1].fix, near_of(args)
@@ -78,7 +78,7 @@ def tell(
         _tell_doubts(night, instrument, solved, whole, near)
         about = {} if near is None else {"km_from_near": near.km_from(whole.latitude, whole.longitude)}
         put_combined(output, night, together, solved, warnings, vertical, about)
-    return common.UNREADABLE if unreadable else 0 if together else NO_FIX
+    return console.UNREADABLE if unreadable else 0 if together else NO_FIX
 
 
 def _tell_doubts(
@@ -116,7 +116,7 @@ def solved_by_turning(
     Returns the solutions, and the exit status of saving: NO_FIX where nothing is worth saving.
     """
     try:
-        turned = turn(solver, frames, tilts.average, common.turn_of(args), solver.progress)
+        turned = turn(solver, frames, tilts.average, options.turn_of(args), solver.progress)
     except FixError as e:
         return [Solution.failed(stars, Status.POOR_FIT, str(e)) for stars in frames], NO_FIX
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
@@ -136,7 +136,7 @@ def solved_by_turning(
 
 def _say(night: NightFolder, text: StarposError | str) -> None:
     """Print a line about a whole night on standard error."""
-    common.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
+    console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
 
 
 def _combine(night: NightFolder, solved: list[Solved]) -> Average | None:

@@ -3,8 +3,8 @@
 
 from contextlib import suppress
 
-from starpos.cli.common import complain, stars_of
-from starpos.cli.frame_work import Reader
+from starpos.cli.console import complain
+from starpos.cli.frame_work import Reader, stars_of
 from starpos.errors import StarposError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.other_focal import focal_that_fits

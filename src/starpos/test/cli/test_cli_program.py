@@ -10,7 +10,7 @@ import pytest
 from cli_calls import WIDE
 
 from starpos import cli
-from starpos.cli import common, jobs, parser_for
+from starpos.cli import console, jobs, parser_for
 from starpos.cli.commands import COMMANDS
 from starpos_testing.command_line import run
 from starpos_testing.lacking import require
@@ -134,14 +134,14 @@ def test_a_reader_that_goes_away_is_no_error(lists):
 
 
 def test_progress_is_told_where_no_terminal_is(capsys, monkeypatch):
-    monkeypatch.setattr(common, "LINE_EVERY_S", -1.0)
-    common.ProgressBar()("star triangles", 0.25)
-    common.ProgressBar(terminal_only=True)("frame 1 of 4", 0.25)
+    monkeypatch.setattr(console, "LINE_EVERY_S", -1.0)
+    console.ProgressBar()("star triangles", 0.25)
+    console.ProgressBar(terminal_only=True)("frame 1 of 4", 0.25)
     assert capsys.readouterr().err == "star triangles: 25 % done\n"
 
 
 def test_frames_of_a_turn_whose_lines_wait_are_counted_on_standard_error(capsys, monkeypatch):
-    monkeypatch.setattr(common, "LINE_EVERY_S", -1.0)
+    monkeypatch.setattr(console, "LINE_EVERY_S", -1.0)
     assert list(jobs.watched("ab", 2, silent=False)) == ["a", "b"]
     assert capsys.readouterr().err == "frame 1 of 2: 50 % done\nframe 2 of 2: 100 % done\n"
 

@@ -8,7 +8,7 @@ import pytest
 from solved_night import refused
 
 from starpos.averaging.average import average
-from starpos.cli.common import tell_extrapolation
+from starpos.cli.console import tell_extrapolation
 from starpos.earth.orientation import earth_state
 from starpos.fix.solution import Status
 from starpos.units import ARCSEC

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What commands print: JSON without NaN, complaints, progress; and their exit status."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from starpos.errors import StarposError
+from starpos.fix.fix import Fix
+
+# Exit status.
+UNREADABLE = 2
+# s between lines of progress
+LINE_EVERY_S = 5.0
+
+
+def print_json(value: dict) -> None:
+    """Print an object on one line; NaN and infinity become null."""
+    print(json.dumps(plain(value)), flush=True)
+
+
+def plain(value: Any) -> Any:
+    """The value of types that json knows, without NaN and infinity."""
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+def complain(command: str, error: StarposError | str) -> None:
+    """Print a line on standard error, as the command's."""
+    # clears a progress bar
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr)
+    print(f"starpos {command}: {error}", file=sys.stderr)
+
+
+class HasFix(Protocol):
+    """The fix of a frame, and how many days beyond the IERS table its date lies."""
+
+    @property
+    def fix(self) -> Fix | None:
+        """The fix; None without one."""
+
+    @property
+    def extrapolated_days(self) -> float:
+        """Days beyond the table; 0 within it."""
+
+
+def tell_extrapolation(command: str, solved: Sequence[HasFix]) -> None:
+    """Complain once about all fixes beyond the IERS table: the days and the error of the worst."""
+    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
+    if worst is not None and worst.fix is not None and worst.extrapolated_days > 0:
+        (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
+        complain(
+            command,
+            f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
+            f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data",
+        )
+
+
+class ProgressBar:
+    """Progress on standard error: a bar for work of more than half a second, or lines now and then if it is no terminal.
+
+    terminal_only: no such lines, for work whose results show how far it is.
+    """
+
+    def __init__(self, *, terminal_only: bool = False) -> None:
+        self.begin = self.said = time.monotonic()
+        self.shown = False
+        self._terminal_only = terminal_only
+
+    def __call__(self, what: str, done: float) -> None:
+        if not sys.stderr.isatty():
+            self._say(what, done)
+            return
+        if time.monotonic() - self.begin < 0.5 and not self.shown:
+            return
+        self.shown = True
+        filled = int(30 * min(done, 1.0))
+        end = "\n" if done >= 1 else ""
+        print(
+            f"\r{what:>20} [{'#' * filled}{'.' * (30 - filled)}] {100 * done:3.0f} %",
+            end=end,
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def _say(self, what: str, done: float) -> None:
+        now = time.monotonic()
+        if not self._terminal_only and now - self.said > LINE_EVERY_S:
+            self.said = now
+            print(f"{what}: {100 * done:.0f} % done", file=sys.stderr, flush=True)
