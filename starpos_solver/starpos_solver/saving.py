@@ -5,14 +5,14 @@ from pathlib import Path
 
 from starpos.errors import InstrumentError
 from starpos.files import path_of
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_file, instrument_update
 from starpos.instrument.instrument import Instrument
 
 
 def save(path: str, calibration_url: str, instrument: Instrument) -> Path:
     """Write an instrument file to `path`, or without one to calibration_url; return its Path.
 
-    Raises InstrumentError if it cannot be written, or if the file there is no instrument file.
+    Raises InstrumentError if it cannot be written, or if the file there is no instrument file or has a person's comment.
     """
     if not path and not calibration_url:
         raise InstrumentError("there is no file to write: give a path, or set calibration_url")
@@ -27,8 +27,8 @@ def save(path: str, calibration_url: str, instrument: Instrument) -> Path:
         raise InstrumentError(f"{where}: the file cannot be written there ({e})") from None
     if occupied:
         try:
-            instrument_file.read(where)
+            instrument_update.check_replaceable(where)
         except InstrumentError as e:
-            raise InstrumentError(f"it would replace what is no instrument file: {e}") from None
+            raise InstrumentError(f"{e}: move it away, or give another path") from None
     instrument_file.write(where, instrument)
     return where

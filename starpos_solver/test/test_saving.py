@@ -30,6 +30,16 @@ def test_an_instrument_file_is_replaced_and_nothing_else(tmp_path):
     assert path.read_text() == "a: b"
 
 
+def test_a_comment_in_an_instrument_file_is_not_lost(tmp_path):
+    path = tmp_path / "a.yaml"
+    save(str(path), "", INSTRUMENT)
+    text = path.read_text() + "# the spare camera\n"
+    path.write_text(text)
+    with pytest.raises(InstrumentError, match="a comment, which would be lost: move it away"):
+        save(str(path), "", INSTRUMENT)
+    assert path.read_text() == text
+
+
 @pytest.mark.parametrize(
     "path",
     ["", "a.yaml", "./a.yaml", "~nobody-here/a.yaml", "/dev/null", "/dev/null/a", "/" + "x" * 300, "/a\0b"],

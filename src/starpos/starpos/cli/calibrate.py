@@ -23,7 +23,7 @@ from starpos.errors import CalibrationError, FixError, FrameError, InstrumentErr
 from starpos.frames.pointings import read_pointings
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
-from starpos.instrument import camera_file
+from starpos.instrument import camera_file, instrument_update
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
@@ -127,7 +127,7 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
     if args.map is not None:
         yield Written("--map", args.map, overwriting.picture)
     if args.output is not None:
-        yield Written("--output", args.output, overwriting.instrument)
+        yield Written("--output", args.output, instrument_update.check_replaceable)
 
 
 def _stars_of_all(paths: Sequence[str], read: Reader) -> tuple[list[Stars], bool]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from starpos import files
 from starpos.cli import console
 from starpos.errors import CatalogueError, InstrumentError
-from starpos.instrument import camera_file, instrument_file, instrument_update, yaml_file
+from starpos.instrument import camera_file, instrument_file, instrument_update
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
@@ -70,16 +70,6 @@ def _inputs(args: argparse.Namespace) -> Iterator[str]:
         for path in [given] if isinstance(given, str) else given:
             yield os.path.realpath(path)
             yield os.path.realpath(HDU.sub("", path))
-
-
-def instrument(path: Path) -> None:
-    """The check of an instrument file."""
-    try:
-        instrument_file.read(path)
-    except InstrumentError:
-        raise _there(path, "no instrument file that can be read") from None
-    if line := yaml_file.line_of_comment(yaml_file.text_at(path, "instrument file")):
-        raise _there(path, f"its line {line} has a comment, which would be lost")
 
 
 def camera(path: Path) -> None:

@@ -24,6 +24,7 @@ from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
+from starpos.instrument import instrument_update
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
     options.check_frames(args)
     if args.save is not None:
-        overwriting.check(args, Written("--save", args.save, overwriting.instrument))
+        overwriting.check(args, Written("--save", args.save, instrument_update.check_replaceable))
     if args.pointings is not None:
         return solve_pointings.run(args)
     vertical, read, output = vertical_of(args), reader_of(args), Output(args, COLUMNS, HEAD)

@@ -19,6 +19,23 @@ FOUND = (
 )
 
 
+def check_replaceable(path: Path) -> None:
+    """Raise InstrumentError unless the file there is an instrument file, without a comment that a person wrote.
+
+    The sentence does not say what to do.
+    """
+    try:
+        instrument_file.read(path)
+    except InstrumentError:
+        raise InstrumentError(
+            f"{path}: it is there already, and no instrument file that can be read"
+        ) from None
+    if line := yaml_file.line_of_comment(yaml_file.text_at(path, "instrument file")):
+        raise InstrumentError(
+            f"{path}: it is there already, and its line {line} has a comment, which would be lost"
+        )
+
+
 def check_fits(
     path: Path, instrument: Instrument, *, fixed: bool = False, camera_found: bool = False
 ) -> None:
