@@ -12,11 +12,10 @@ from starpos.core.algebra cimport factored, solved
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
 
 cdef enum:
-    # Parameters: x, y, flux, and a gain for each phase of a mosaic.
-    MOST = 7
-    PHASES = 4
     # Numbers kept of each pixel.
     COLUMNS = 9
+    # Parameters of two stars.
+    LARGEST = 2 * MOST
 
 # Equations whose scaled determinant is smaller have no solution.
 cdef double SINGULAR = log(1e-9)
@@ -31,10 +30,6 @@ cdef class Rules:
     widths                           within which pixels are fitted
     outlier, faint                   sigmas, and the share of the star's brightest pixel, above which a pixel is one
     """
-
-    cdef int phases, own, parameters
-    cdef double[PHASES] gain
-    cdef double held, dn_per_photon, misfit2, widths2, outlier2, faint
 
     def __init__(
         self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier, double faint
@@ -208,13 +203,13 @@ cdef inline double _by_gain(const Star *star, Rules rules, const Pixels *p, int 
     return star.flux * p.value[k] * rules.gain[phase] / star.gain[phase]
 
 
-cdef bint _invert(double *normal, int n, double *out) noexcept nogil:
+cdef bint invert(double *normal, int n, double *out) noexcept nogil:
     """Set `out` (n, n) to the inverse of the lower half of normal (n, n), NaN if singular; whether it is not.
 
     It is scaled first, because fluxes are a million times larger than pixels.
     """
-    cdef double[MOST] scale
-    cdef double[MOST] column
+    cdef double[LARGEST] scale
+    cdef double[LARGEST] column
     cdef double volume
     cdef int a, b
     for a in range(n):
@@ -266,7 +261,7 @@ cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels
         # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
         _weigh(s, star, rules, p, 1 <= round_ < rounds - 1)
         _sum_up(s, star, rules, p, normal)
-        star.solved = _invert(normal, rules.parameters, star.covariance)
+        star.solved = invert(normal, rules.parameters, star.covariance)
         if not star.solved:
             star.x = star.y = star.flux = NAN
             return
@@ -274,24 +269,34 @@ cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels
             _step(star, rules)
 
 
-cdef double _leverage(const Stamp *s, const Star *star, Rules rules, const Pixels *p, int k) noexcept nogil:
-    """How far (0 to 1) a fitted pixel decides what the model has there."""
+cdef void _leverages(const Stamp *s, const Star *star, Rules rules, const Pixels *p, float *leverage) noexcept nogil:
+    """Set how far (0 to 1) each fitted pixel decides what the model has there; NaN if the star has no fit."""
     cdef double[4] slope
-    cdef double total = 0.0
-    cdef int a, b, n = rules.parameters, most = 3, phase = s.phase[p.place[k]], gain = 3 + phase
-    slope[0], slope[1], slope[2] = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
-    if rules.own:
-        slope[3], most = _by_gain(star, rules, p, k, phase), 4
-    for a in range(most):
-        for b in range(most):
-            total += slope[a] * slope[b] * star.covariance[(a if a < 3 else gain) * n + (b if b < 3 else gain)]
-    return total * p.weight[k]
+    cdef int[4] row
+    cdef double total
+    cdef int k, a, b, n = rules.parameters, most = 4 if rules.own else 3, phase
+    if not star.solved:
+        for k in range(s.size * s.size):
+            leverage[k] = NAN
+        return
+    row[0], row[1], row[2] = 0, 1, 2
+    for k in range(p.count):
+        if not p.weight[k] > 0:
+            continue
+        phase, total = s.phase[p.place[k]], 0.0
+        slope[0], slope[1], slope[2] = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
+        if rules.own:
+            slope[3], row[3] = _by_gain(star, rules, p, k, phase), 3 + phase
+        for a in range(most):
+            for b in range(most):
+                total += slope[a] * slope[b] * star.covariance[row[a] * n + row[b]]
+        leverage[k] = <float>(total * p.weight[k])
 
 
 def fitted(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first,
-    const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds,
+    const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds, bint weighed,
 ):
     """Fit N stars to their stamps (N, S, S), as `detection.fit.fit_stars` explains.
 
@@ -299,6 +304,7 @@ def fitted(
     first   (N, 2) px: first places of the stars
     axes    (N, 2, 2) or (1, 2, 2), and
     series  (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
+    weighed  whether the leverage of each pixel is wanted; else it is 0
 
     Returns the columns of `detection.fit.Fit`, in their order. A star whose equations are singular has NaN.
     """
@@ -307,8 +313,10 @@ def fitted(
     cdef Local psf
     cdef Star star
     cdef Stamp s
-    _check(signal, noise, good, phase, corner, first, rules, rounds)
+    sound_stamps(signal, noise, good, phase, rules)
     sound(axes, series, n)
+    if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
+        raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
     stars_, covariances, gains_ = np.empty((n, 5)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
     images_, marks_ = np.zeros((3, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
     cdef double[:, ::1] column = stars_
@@ -333,7 +341,9 @@ def fitted(
                     covariance[k, a, b] = star.covariance[a * most + b]
             for a in range(rules.phases):
                 gains[k, a] = star.gain[a]
-            column[k, 4] = _told(&s, &star, rules, &p, &image[0, k, 0], &image[1, k, 0], &image[2, k, 0], &mark[0, k, 0])
+            column[k, 4] = _told(&s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0])
+            if weighed:
+                _leverages(&s, &star, rules, &p, &image[2, k, 0])
     free(p.dx)
     free(p.place)
     x, y, flux, sigma, chi2 = np.ascontiguousarray(stars_.T)
@@ -343,32 +353,28 @@ def fitted(
 
 
 cdef double _told(
-    const Stamp *s, const Star *star, Rules rules, const Pixels *p, float *residual, float *model, float *leverage,
-    unsigned char *used,
+    const Stamp *s, const Star *star, const Pixels *p, float *residual, float *model, unsigned char *used
 ) noexcept nogil:
     """Set what is told of each pixel; chi-square per degree of freedom."""
     cdef double chi2 = 0.0
     cdef int k, count = 0
-    cdef double u, v
     if not star.solved:
         for k in range(s.size * s.size):
-            residual[k] = model[k] = leverage[k] = NAN
+            residual[k] = model[k] = NAN
             s.outlier[k] = False
         return NAN
     for k in range(p.count):
         residual[k], model[k], used[k] = <float>p.residual[k], <float>(p.signal[k] - p.residual[k]), p.weight[k] > 0
-        if used[k]:
-            leverage[k] = <float>_leverage(s, star, rules, p, k)
-            chi2 += p.residual[k] * p.residual[k] * p.weight[k]
-            count += 1
+        chi2 += p.residual[k] * p.residual[k] * p.weight[k]
+        count += used[k]
     return chi2 / max(count - 3, 1)
 
 
-cdef int _check(
+cdef int sound_stamps(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
-    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first, Rules rules, int rounds,
+    const unsigned char[:, :, ::1] phase, Rules rules,
 ) except -1:
-    """Raise ValueError unless shapes and phases are what `fitted` reads."""
+    """Raise ValueError unless shapes and phases of stamps are what a fit reads."""
     cdef Py_ssize_t n = signal.shape[0], size = signal.shape[1]
     for name, height, width, depth in (
         ("signal", n, size, signal.shape[2]),
@@ -378,8 +384,6 @@ cdef int _check(
     ):
         if (height, width, depth) != (n, size, size):
             raise ValueError(f"{name} has the shape {(height, width, depth)}; {(n, size, size)} is needed")
-    if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
-        raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
     if n and size and np.max(phase) >= rules.phases:
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {rules.phases}")
     return 0

@@ -8,7 +8,8 @@ from typing import TypeVar
 import numpy as np
 from scipy import ndimage
 
-from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at, inverse
+from starpos.core.pairs import fitted_pairs
+from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import LocalPsf, Psf
 from starpos.detection.stamps import Stamps
 
@@ -124,60 +125,13 @@ def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
 
     The companion starts where the single star's fit leaves the most light.
     """
-    n, local = len(fit.x), psf.at(fit.x, fit.y)
-    x, y = (np.stack(v) for v in zip((fit.x, fit.y), _brightest_left(stamps, fit, local), strict=True))
-    colour = np.zeros((2, n, len(response.gain)))
-    flux = np.full((2, n), np.nan)
-    for round_ in range(ROUNDS + 1):
-        places = [stamps.offsets(x[k], y[k]) for k in (0, 1)]
-        shapes = [local.evaluate(*stamps.corner(x[k], y[k]), stamps.size) for k in (0, 1)]
-        gains = response.gain * (1 + colour)
-        own = [gains_at(gains[k], stamps.phase) for k in (0, 1)]
-        inside = local.within(*places[0], FIT_WIDTHS) | local.within(*places[1], FIT_WIDTHS)
-        used = stamps.good & inside
-        if round_ == 0:
-            flux = _fluxes(stamps, used, *(shapes[k][0] * own[k] for k in (0, 1)))
-            flux = np.maximum(flux, LEAST * fit.flux)
-        amount = flux.astype(np.float32)[:, :, None, None]
-        columns = [response.columns(shapes[k], amount[k], own[k], stamps.phase) for k in (0, 1)]
-        models = np.stack([amount[k] * columns[k][2] for k in (0, 1)])
-        root = np.sqrt(used / response.variance(stamps.noise, models.sum(0)))
-        design = np.stack([(c * root).reshape(n, -1) for c in (*columns[0], *columns[1])], 2)
-        residual = ((stamps.signal - models.sum(0)) * root).reshape(n, -1, 1)
-        normal = (design.transpose(0, 2, 1) @ design).astype(np.float64)
-        right = (design.transpose(0, 2, 1) @ residual)[..., 0].astype(np.float64)
-        each = [slice(k * len(columns[0]), (k + 1) * len(columns[0])) for k in (0, 1)]
-        for k in (0, 1):
-            response.hold(normal[:, each[k], each[k]], right[:, each[k]], colour[k])
-        covariance = inverse(normal)
-        if round_ == ROUNDS:
-            break
-        step = np.nan_to_num(covariance @ right[..., None])[..., 0]
-        for k in (0, 1):
-            own_step = step[:, each[k]]
-            x[k] += np.clip(own_step[:, 0], -0.5, 0.5)
-            y[k] += np.clip(own_step[:, 1], -0.5, 0.5)
-            # a star without light could not move any more: its place changes nothing
-            flux[k] = np.maximum(flux[k] + own_step[:, 2], LEAST * flux[k])
-            if response.own_gains:
-                colour[k] = np.clip(colour[k] + own_step[:, 3:], -0.9, 3.0)
-    # the flux's sigma at known colours, as for a single star
-    grey = np.concatenate([np.arange(s.start, s.start + 3) for s in each])
-    known = inverse(normal[:, grey[:, None], grey])
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.stack([known[:, 2, 2], known[:, 5, 5]]))
-    covariance = np.stack([covariance[:, s, s][:, :2, :2] for s in each])
-    return Pairs(
-        x=x,
-        y=y,
-        flux=flux,
-        flux_sigma=sigma,
-        gains=gains,
-        covariance=covariance,
-        models=models,
-        used=used,
-        chi2=(residual**2).sum((1, 2)),
-    )
+    local = psf.at(fit.x, fit.y)
+    first = np.stack([np.stack([fit.x, fit.y], 1), np.stack(_brightest_left(stamps, fit, local), 1)])
+    columns = fitted_pairs(
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, first, LEAST * fit.flux,
+        local.axes, local.series, response.rules, ROUNDS, LEAST,
+    )  # fmt: skip
+    return Pairs(**dict(zip((f.name for f in fields(Pairs)), columns, strict=True)))
 
 
 def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray, np.ndarray]:
@@ -187,15 +141,6 @@ def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray
     left[(dx**2 + dy**2 < 1) | ~psf.within(dx, dy, FIT_WIDTHS + 2)] = -np.inf
     row, column = np.divmod(left.reshape(len(left), -1).argmax(1), left.shape[2])
     return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
-
-
-def _fluxes(stamps: Stamps, used: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Fluxes (2, N) of two stars with unit images a, b (N, S, S): linear least squares, weighted by the sky's noise."""
-    weight = used / stamps.noise**2
-    aa, ab, bb, sa, sb = (
-        (weight * p).sum((1, 2)) for p in (a * a, a * b, b * b, a * stamps.signal, b * stamps.signal)
-    )
-    return np.stack([bb * sa - ab * sb, aa * sb - ab * sa]) / np.maximum(aa * bb - ab * ab, 1e-12)
 
 
 def _rows(fit: Fit, index: np.ndarray) -> Fit:

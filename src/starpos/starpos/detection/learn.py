@@ -82,7 +82,7 @@ def learn(
     for round_ in range(rounds + RING_ROUNDS):
         if len(x) == 0:
             break
-        fit = fit_stars(stamps, psf, x, y, response, rounds=3)
+        fit = fit_stars(stamps, psf, x, y, response, rounds=3, leverage=True)
         sound = np.isfinite(fit.chi2) & (fit.flux > 0) & np.isfinite(fit.covariance).all((1, 2))
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
         if not sound.any():

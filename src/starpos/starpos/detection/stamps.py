@@ -53,6 +53,11 @@ class Stamps:
         """The stamps that index selects."""
         return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    @property
+    def origin(self) -> np.ndarray:
+        """Places (N, 2) px of the first column and row."""
+        return np.stack([self.x, self.y], 1) - float(self.reach)
+
     def corner(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offsets (N,) px of the first column and row from the points x, y (N,) px."""
         return self.x - self.reach - x, self.y - self.reach - y
