@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
 
-from libc.math cimport M_PI, exp, fabs, sqrt
+from libc.math cimport M_PI, fabs, sqrt
 
 import numpy as np
 
@@ -27,6 +27,11 @@ cdef extern from *:
             for (int p = 0; p < STARPOS_BLOCK; p++)
                 out[k + 1][p] = (u[p] * out[k][p] - before * out[k - 1][p]) * over;
         }
+    }
+    /* The Gaussian of a peak at a block's places. */
+    STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, double peak, double *restrict out) {
+        for (int p = 0; p < STARPOS_BLOCK; p++)
+            out[p] = peak * starpos_exp(-0.5 * (u[p] * u[p] + v[p] * v[p]));
     }
     /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
     STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v,
@@ -74,6 +79,7 @@ cdef extern from *:
     }
     """
     double[ORDERS + 2] root "starpos_root"
+    void gauss_at "starpos_gauss"(const double *u, const double *v, double peak, double *out) noexcept nogil
     void series_at "starpos_series"(
         const double *series, int rows, int columns, const double *u, const double *v, double *value, double *by_u,
         double *by_v,
@@ -105,13 +111,13 @@ cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series,
 
 
 cdef void _scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
-    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is 0."""
+    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is the middle."""
     cdef int p
     for p in range(n):
         u[p], v[p] = psf.axes[0] * dx[p] + psf.axes[1] * dy[p], psf.axes[2] * dx[p] + psf.axes[3] * dy[p]
-        gauss[p] = psf.peak * exp(-0.5 * (u[p] * u[p] + v[p] * v[p]))
     for p in range(n, BLOCK):
-        u[p] = v[p] = gauss[p] = 0.0
+        u[p] = v[p] = 0.0
+    gauss_at(u, v, psf.peak, gauss)
 
 
 cdef void evaluate(

@@ -12,6 +12,7 @@ from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
     NARROWEST,
+    centroid,
     frame_shape,
     moments,
     own_shape,
@@ -210,20 +211,6 @@ def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
     signal = ndimage.convolve1d(stamps.signal, SMOOTHING, axis=1, mode="nearest")
     signal = ndimage.convolve1d(signal, SMOOTHING, axis=2, mode="nearest")
     return replace(stamps, signal=signal), SMOOTHING_WIDTH
-
-
-def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Windowed centroids x, y (N,) px of stars of covariance shape px2, at most 2 px from the peak."""
-    x, y = stamps.x.astype(float), stamps.y.astype(float)
-    window = window_for(shape)
-    # through the window an offset looks smaller than it is
-    gain = np.eye(2) + shape @ np.linalg.inv(window)
-    for _ in range(rounds):
-        _, step, _ = moments(stamps, x, y, window)
-        step = np.clip(np.nan_to_num((gain @ step[..., None])[..., 0]), -1, 1)
-        x = np.clip(x + step[:, 0], stamps.x - 2, stamps.x + 2)
-        y = np.clip(y + step[:, 1], stamps.y - 2, stamps.y + 2)
-    return x, y
 
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

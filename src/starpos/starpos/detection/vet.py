@@ -9,9 +9,9 @@ from scipy import spatial
 from starpos.detection.background import Background
 from starpos.detection.blend import with_companions
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
-from starpos.detection.learn import Lesson, centroid, grey
+from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import Psf
-from starpos.detection.shape import moments, relative_widths, window_for
+from starpos.detection.shape import centroid, moments, relative_widths, window_for
 from starpos.detection.stamps import Stamps, cut, uneven
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
 
