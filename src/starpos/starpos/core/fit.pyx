@@ -304,11 +304,12 @@ def fitted(
     first   (N, 2) px: first places of the stars
     axes    (N, 2, 2) or (1, 2, 2), and
     series  (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
-    weighed  whether the leverage of each pixel is wanted; else it is 0
+    weighed  whether the leverage of each pixel is wanted; else there is none
 
     Returns the columns of `detection.fit.Fit`, in their order. A star whose equations are singular has NaN.
     """
     cdef int n = signal.shape[0], size = signal.shape[1], area = size * size, most, k, a, b
+    cdef int seen = size if weighed else 0
     cdef Pixels p
     cdef Local psf
     cdef Star star
@@ -317,12 +318,14 @@ def fitted(
     sound(axes, series, n)
     if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
         raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
-    stars_, covariances, gains_ = np.empty((n, 5)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
-    images_, marks_ = np.zeros((3, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
+    stars_, covariances, gains_ = np.empty((n, 6)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
+    images_, marks_ = np.empty((2, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
+    leverage_ = np.zeros((n, seen, seen), np.float32)
     cdef double[:, ::1] column = stars_
     cdef double[:, :, ::1] covariance = covariances
     cdef double[:, ::1] gains = gains_
-    cdef float[:, :, ::1] image = images_.reshape(3, n, area)
+    cdef float[:, :, ::1] image = images_.reshape(2, n, area)
+    cdef float[:, :, ::1] leverage = leverage_
     cdef unsigned char[:, :, ::1] mark = marks_.reshape(2, n, area)
     _begin(&p, area)
     s.size, most = size, rules.parameters
@@ -341,23 +344,24 @@ def fitted(
                     covariance[k, a, b] = star.covariance[a * most + b]
             for a in range(rules.phases):
                 gains[k, a] = star.gain[a]
-            column[k, 4] = _told(&s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0])
+            column[k, 4] = _told(&s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0], &column[k, 5])
             if weighed:
-                _leverages(&s, &star, rules, &p, &image[2, k, 0])
+                _leverages(&s, &star, rules, &p, &leverage[k, 0, 0])
     free(p.dx)
     free(p.place)
-    x, y, flux, sigma, chi2 = np.ascontiguousarray(stars_.T)
-    residual, model, leverage = images_
+    x, y, flux, sigma, chi2, pixels = np.ascontiguousarray(stars_.T)
+    residual, model = images_
     used, outlier = marks_.view(bool)
-    return x, y, flux, sigma, covariances, gains_, chi2, residual, model, used, outlier, leverage
+    return x, y, flux, sigma, covariances, gains_, chi2, pixels, residual, model, used, outlier, leverage_
 
 
 cdef double _told(
-    const Stamp *s, const Star *star, const Pixels *p, float *residual, float *model, unsigned char *used
+    const Stamp *s, const Star *star, const Pixels *p, float *residual, float *model, unsigned char *used, double *pixels
 ) noexcept nogil:
-    """Set what is told of each pixel; chi-square per degree of freedom."""
+    """Set what is told of each pixel, and how many were fitted; chi-square per degree of freedom."""
     cdef double chi2 = 0.0
     cdef int k, count = 0
+    pixels[0] = 0.0
     if not star.solved:
         for k in range(s.size * s.size):
             residual[k] = model[k] = NAN
@@ -367,6 +371,7 @@ cdef double _told(
         residual[k], model[k], used[k] = <float>p.residual[k], <float>(p.signal[k] - p.residual[k]), p.weight[k] > 0
         chi2 += p.residual[k] * p.residual[k] * p.weight[k]
         count += used[k]
+    pixels[0] = count
     return chi2 / max(count - 3, 1)
 
 

@@ -11,49 +11,57 @@ cimport starpos.core.wide
 
 cdef extern from *:
     """
-    /* Columns that are summed at once. */
+    /* Columns that are summed at once, in quadruples: left to itself a compiler takes them one by one. */
     #define STARPOS_LANES 8
+    #define STARPOS_FOURS 2
+    typedef double starpos_four __attribute__((vector_size(32)));
+    typedef double starpos_anywhere __attribute__((vector_size(32), aligned(8)));
     /* Sums of columns side by side: of their light through a window, and of it times the distance in y and its square.
        A column's neighbours in a Gaussian have a ratio, which changes by a constant factor from row to row. */
     STARPOS_WIDE static void starpos_columns(const double *light, int rows, int stride, int middle, double dx, double dy,
                                              double xx, double xy, double yy, double change, double *out) {
-        double sum[STARPOS_LANES] = {0}, sum_y[STARPOS_LANES] = {0}, sum_yy[STARPOS_LANES] = {0};
-        double first[STARPOS_LANES], down[STARPOS_LANES], up[STARPOS_LANES];
+        starpos_four sum[STARPOS_FOURS] = {{0}}, sum_y[STARPOS_FOURS] = {{0}}, sum_yy[STARPOS_FOURS] = {{0}};
+        starpos_four first[STARPOS_FOURS], down[STARPOS_FOURS], up[STARPOS_FOURS];
         for (int p = 0; p < STARPOS_LANES; p++) {
             const double x = dx + p;
-            first[p] = starpos_exp(-0.5 * (xx * x * x + 2 * xy * x * dy + yy * dy * dy));
-            down[p] = starpos_exp(-(xy * x + yy * (dy + 0.5)));
-            up[p] = change / down[p];
+            ((double *)first)[p] = -0.5 * (xx * x * x + 2 * xy * x * dy + yy * dy * dy);
+            ((double *)down)[p] = -(xy * x + yy * (dy + 0.5));
         }
+        starpos_exps((double *)first, STARPOS_LANES);
+        starpos_exps((double *)down, STARPOS_LANES);
+        for (int k = 0; k < STARPOS_FOURS; k++)
+            up[k] = change / down[k];
         for (int side = 0; side < 2; side++) {
             const int step = side ? -1 : 1, count = side ? middle : rows - middle;
-            const double *row = light + (side ? middle - 1 : middle) * stride;
-            double through[STARPOS_LANES], ratio[STARPOS_LANES], y = side ? dy - 1 : dy;
-            for (int p = 0; p < STARPOS_LANES; p++) {
-                through[p] = side ? first[p] * up[p] : first[p];
-                ratio[p] = side ? up[p] * change : down[p];
+            const double *from = light + (side ? middle - 1 : middle) * stride;
+            starpos_four through[STARPOS_FOURS], ratio[STARPOS_FOURS];
+            double y = side ? dy - 1 : dy;
+            for (int k = 0; k < STARPOS_FOURS; k++) {
+                through[k] = side ? first[k] * up[k] : first[k];
+                ratio[k] = side ? up[k] * change : down[k];
             }
             for (int j = 0; j < count; j++) {
-                for (int p = 0; p < STARPOS_LANES; p++) {
-                    const double some = through[p] * row[p];
-                    sum[p] += some;
-                    sum_y[p] += some * y;
-                    sum_yy[p] += some * y * y;
-                    through[p] *= ratio[p];
-                    ratio[p] *= change;
+                const starpos_anywhere *row = (const starpos_anywhere *)from;
+                for (int k = 0; k < STARPOS_FOURS; k++) {
+                    const starpos_four some = through[k] * row[k], lever = some * y;
+                    sum[k] += some;
+                    sum_y[k] += lever;
+                    sum_yy[k] += lever * y;
+                    through[k] *= ratio[k];
+                    ratio[k] *= change;
                 }
                 y += step;
-                row += step * stride;
+                from += step * stride;
             }
         }
         for (int p = 0; p < STARPOS_LANES; p++) {
-            const double x = dx + p;
-            out[0] += sum[p];
-            out[1] += sum[p] * x;
-            out[2] += sum_y[p];
-            out[3] += sum[p] * x * x;
-            out[4] += sum_y[p] * x;
-            out[5] += sum_yy[p];
+            const double x = dx + p, some = sum[p / 4][p % 4], lever = sum_y[p / 4][p % 4];
+            out[0] += some;
+            out[1] += some * x;
+            out[2] += lever;
+            out[3] += some * x * x;
+            out[4] += lever * x;
+            out[5] += sum_yy[p / 4][p % 4];
         }
     }
     """

@@ -31,7 +31,10 @@ cdef extern from *:
     /* The Gaussian of a peak at a block's places. */
     STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, double peak, double *restrict out) {
         for (int p = 0; p < STARPOS_BLOCK; p++)
-            out[p] = peak * starpos_exp(-0.5 * (u[p] * u[p] + v[p] * v[p]));
+            out[p] = -0.5 * (u[p] * u[p] + v[p] * v[p]);
+        starpos_exps(out, STARPOS_BLOCK);
+        for (int p = 0; p < STARPOS_BLOCK; p++)
+            out[p] *= peak;
     }
     /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
     STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v,
@@ -67,14 +70,14 @@ cdef extern from *:
     }
     /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian. */
     STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
-                                           const double *gauss, int n, Py_ssize_t stride, float *out) {
+                                           const double *gauss, float *out) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
         starpos_hermites(u, highest, fu);
         starpos_hermites(v, highest, fv);
         for (int t = 0; t < count; t++) {
             const double *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
-            for (int p = 0; p < n; p++)
-                out[t * stride + p] = (float)(a[p] * b[p] * gauss[p]);
+            for (int p = 0; p < STARPOS_BLOCK; p++)
+                out[t * STARPOS_BLOCK + p] = (float)(a[p] * b[p] * gauss[p]);
         }
     }
     """
@@ -84,9 +87,8 @@ cdef extern from *:
         const double *series, int rows, int columns, const double *u, const double *v, double *value, double *by_u,
         double *by_v,
     ) noexcept nogil
-    void terms_at "starpos_terms"(
-        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, int n,
-        Py_ssize_t stride, float *out,
+    void each_at "starpos_terms"(
+        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
     ) noexcept nogil
 
 for order in range(ORDERS + 2):
@@ -110,7 +112,7 @@ cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series,
     out.series, out.rows, out.columns = &series[s, 0, 0], <int>series.shape[1], <int>series.shape[2]
 
 
-cdef void _scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
+cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
     """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is the middle."""
     cdef int p
     for p in range(n):
@@ -132,7 +134,7 @@ cdef void evaluate(
     cdef int block, first, p
     for block in range(blocks(n)):
         first = block * BLOCK
-        _scaled(psf, dx + first, dy + first, min(BLOCK, n - first), u, v, gauss)
+        scaled(psf, dx + first, dy + first, min(BLOCK, n - first), u, v, gauss)
         series_at(psf.series, psf.rows, psf.columns, u, v, value + first, by_u, by_v)
         for p in range(BLOCK):
             value[first + p] *= gauss[p]
@@ -180,35 +182,8 @@ def evaluated(
     return out[0], out[1], out[2]
 
 
-def terms(const double[:, :, ::1] axes, const double[::1] left, const double[::1] top, int size, const int[:, ::1] orders):
-    """Single terms h_i(u) h_j(v) of the series times the Gaussian, (N, T, size size), at the pixels of N stamps.
-
-    orders (T, 2): i, j of each; the others as in `evaluated`.
-    """
-    cdef int stars = left.shape[0], area = size * size, count = orders.shape[0], n, k, block, first, highest = 1
-    cdef double[BLOCK] dx
-    cdef double[BLOCK] dy
-    cdef double[BLOCK] u
-    cdef double[BLOCK] v
-    cdef double[BLOCK] gauss
-    cdef double[:, :, ::1] constant = np.ones((1, 1, 1))
-    cdef Local psf
-    sound(axes, constant, stars)
-    if top.shape[0] != stars or orders.shape[1] != 2 or size < 1:
-        raise ValueError("as many rows as stars, two orders of each term, and stamps of at least a pixel are needed")
-    for k in range(count):
-        highest = max(highest, max(orders[k, 0], orders[k, 1]))
-        if not (0 <= orders[k, 0] <= ORDERS and 0 <= orders[k, 1] <= ORDERS):
-            raise ValueError(f"a term of orders {orders[k, 0]} and {orders[k, 1]}: they must be 0 to {ORDERS}")
-    out = np.empty((stars, count, area), np.float32)
-    cdef float[:, :, ::1] term = out
-    with nogil:
-        for k in range(stars):
-            local_of(axes, constant, k, &psf)
-            for block in range(blocks(area)):
-                first = block * BLOCK
-                n = _offsets(left[k], top[k], size, first, dx, dy)
-                _scaled(&psf, dx, dy, n, u, v, gauss)
-                if count:
-                    terms_at(&orders[0, 0], count, highest, u, v, gauss, n, area, &term[k, 0, first])
-    return out
+cdef void terms_at(
+    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
+) noexcept nogil:
+    """Set `out` (T, BLOCK) to single terms h_i(u) h_j(v) of a block's pixels, (i, j) in orders (T, 2), times the Gaussian."""
+    each_at(orders, count, highest, u, v, gauss, out)

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport median
+from starpos.core.algebra cimport middle
 
 cdef enum:
     # No pixel is as bright.
@@ -64,17 +64,6 @@ def around(
     return skies[0], skies[1], good, white, marks[2]
 
 
-cdef double _middle(double *values, int n) noexcept nogil:
-    """The median of values (n,), between the middle two if n is even; it disturbs their order."""
-    cdef double upper = median(values, n), lower = values[0]
-    cdef int k
-    if n % 2:
-        return upper
-    for k in range(1, n // 2):
-        lower = max(lower, values[k])
-    return (lower + upper) / 2
-
-
 def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_mad):
     """Median (N,) and scatter (N,) of signal over noise, of K pixels each: (N, K).
 
@@ -93,9 +82,9 @@ def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_ma
         for k in range(n):
             for j in range(many):
                 score[j] = <double>signal[k, j] / noise[k, j]
-            found[0, k] = _middle(score, many)
+            found[0, k] = middle(score, many)
             for j in range(many):
                 score[j] = fabs(score[j] - found[0, k])
-            found[1, k] = per_mad * _middle(score, many)
+            found[1, k] = per_mad * middle(score, many)
     free(score)
     return out[0], out[1]

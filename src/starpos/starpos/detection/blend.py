@@ -68,10 +68,12 @@ def with_companions(
     odd = np.flatnonzero(_surprising(stamps, fit))
     if len(odd) == 0:
         return stamps, spike, fit
-    before = (stamps.good * fit.residual**2 / response.variance(stamps.noise, fit.model))[odd]
-    pairs = _fit_pairs(stamps.take(odd), _rows(fit, odd), psf, response)
+    crowd, alone = stamps.take(odd), _rows(fit, odd)
+    before = crowd.good * alone.residual**2 / response.variance(crowd.noise, alone.model)
+    pairs = _fit_pairs(crowd, alone, psf, response)
     x, y, flux, used = pairs.x, pairs.y, pairs.flux, pairs.used
-    freedom = np.maximum(used.sum((1, 2)) - 6, 1)
+    pixels = used.sum((1, 2))
+    freedom = np.maximum(pixels - 6, 1)
     apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
     away = np.maximum(np.abs(x - stamps.x[odd]), np.abs(y - stamps.y[odd]))
     with np.errstate(invalid="ignore"):
@@ -89,10 +91,10 @@ def with_companions(
     both = stamps.take(odd)
     first = replace(
         _rows(fit, odd), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
-        chi2=(pairs.chi2 / freedom)[real], residual=both.signal - models.sum(0), model=models[0], used=used,
-        outlier=np.zeros_like(used),
+        chi2=(pairs.chi2 / freedom)[real], pixels=pixels[real], residual=both.signal - models.sum(0), model=models[0],
+        used=used, outlier=np.zeros_like(used),
     )  # fmt: skip
-    stamps = _with_rows(stamps, odd, replace(both, signal=both.signal - models[1]))
+    first_stamps = replace(both, signal=both.signal - models[1])
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
     light = psf.at(x[0], y[0]).evaluate(*second_stamps.corner(x[0], y[0]), stamps.size)[0]
     light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
@@ -106,15 +108,15 @@ def with_companions(
         own = getattr(second, name)
         together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
     return (
-        _joined(Stamps, stamps, second_stamps),
+        _with_pairs(stamps, odd, first_stamps, second_stamps),
         np.concatenate([spike, second_spike]),
-        _joined(Fit, _with_rows(fit, odd, first), replace(second, **together)),
+        _with_pairs(fit, odd, first, replace(second, **together)),
     )
 
 
 def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
-    freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
+    freedom = np.maximum(fit.pixels - 3, 1)
     with np.errstate(invalid="ignore"):
         odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (fit.outlier.sum((1, 2)) > 2)
     return odd & ~stamps.full.any((1, 2)) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
@@ -148,16 +150,10 @@ def _rows(fit: Fit, index: np.ndarray) -> Fit:
     return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
 
 
-def _with_rows(old: Rows, index: np.ndarray, new: Rows) -> Rows:
-    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `new`."""
-    changed = {}
+def _with_pairs(old: Rows, index: np.ndarray, first: Rows, second: Rows) -> Rows:
+    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `first`, and `second` follows."""
+    joined = {}
     for f in fields(old):
-        changed[f.name] = getattr(old, f.name).copy()
-        changed[f.name][index] = getattr(new, f.name)
-    return replace(old, **changed)
-
-
-def _joined(kind: type[Rows], first: Rows, second: Rows) -> Rows:
-    """The rows of two dataclasses of arrays one after the other."""
-    pairs = {f.name: [getattr(first, f.name), getattr(second, f.name)] for f in fields(kind)}
-    return kind(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+        joined[f.name] = np.concatenate([getattr(old, f.name), getattr(second, f.name)])
+        joined[f.name][index] = getattr(first, f.name)
+    return replace(old, **joined)

@@ -56,11 +56,13 @@ class Fit:
     covariance        (N, 2, 2) px2 of x, y
     gains             (N, P): sensitivity of each phase of the mosaic to each star's light
     chi2              (N,) per degree of freedom
+    pixels            (N,) how many pixels took part in the fit
     residual          (N, S, S) DN: signal minus model
     model             (N, S, S) DN
     used              (N, S, S) bool: pixels that took part in the fit
     outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
-    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise; 0 if not asked for
+    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise; empty if not
+                      asked for
     """
 
     x: np.ndarray
@@ -70,6 +72,7 @@ class Fit:
     covariance: np.ndarray
     gains: np.ndarray
     chi2: np.ndarray
+    pixels: np.ndarray
     residual: np.ndarray
     model: np.ndarray
     used: np.ndarray

@@ -125,7 +125,7 @@ def _teachers(
     bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
+    stamps = stamps.take(~stamps.full.any((1, 2)))
     # the shapes of fainter stars are noise
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
@@ -304,4 +304,5 @@ def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Re
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
     variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
     weight = fit.used[sound] * scale**2 / variance
-    return refine(psf, x, y, left, top, stamps.signal / scale, weight, stamps.phase, terms)
+    brightness, phases = stamps.signal / scale, len(response.gain)
+    return refine(psf, x, y, left, top, brightness, weight.astype(np.float32), stamps.phase, phases, terms)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike
 
-from starpos.core.psf import evaluated, terms
+from starpos.core.psf import evaluated
 from starpos.core.shapes import clipped, inverted
 
 # How many monomials describe a variation over the field: up to second order in x and y.
@@ -55,10 +55,6 @@ class LocalPsf:
         left, top (N,) px: of each stamp's first column and row from its star's centre.
         """
         return evaluated(self.axes, self.series, left, top, size)
-
-    def terms(self, left: np.ndarray, top: np.ndarray, size: int, orders: np.ndarray) -> np.ndarray:
-        """Values (N, T, P) of the single terms h_i(u) h_j(v), (i, j) in `orders` (T, 2), at P = size size pixels."""
-        return terms(self.axes, left, top, size, orders.astype(np.int32))
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,7 +50,9 @@ class Stamps:
         return self.signal.shape[1] // 2
 
     def take(self, index: np.ndarray | slice) -> "Stamps":
-        """The stamps that index selects."""
+        """The stamps that index selects; a mask (N,) that selects all copies nothing."""
+        if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
+            return self
         return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @property
