@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Weighted least-squares fit of a star's place, flux and gains to its stamp, by Gauss-Newton, one star after the other."""
 
-from libc.math cimport NAN, isfinite, log, sqrt
+from libc.math cimport NAN, ceil, floor, isfinite, log, sqrt
 from libc.stdlib cimport free, malloc
 from libc.string cimport memset
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.core.algebra cimport factored, solved
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
+from starpos.core.sums cimport products, weigh
 
 cdef enum:
     # Numbers kept of each pixel.
@@ -104,30 +105,41 @@ cdef int _begin(Pixels *p, int area) except -1:
 
 cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
     """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, place, k, n = 0
-    cdef double dx, dy, u, v, gain
-    cdef bint inside
+    cdef int row, column, place, k, first, last, n = 0
+    cdef double dy, gain
+    cdef bint fitted
     for row in range(s.size):
         dy = s.top + row - star.y
-        for column in range(s.size):
-            dx = s.left + column - star.x
-            u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
-            inside = u * u + v * v < rules.widths2
-            if not (inside or all_pixels):
-                continue
+        first, last = _inside(psf, dy, s.left - star.x, s.size, rules.widths2)
+        for column in range(0 if all_pixels else first, s.size if all_pixels else last):
             place = row * s.size + column
-            p.place[n], p.dx[n], p.dy[n], p.signal[n] = place, dx, dy, s.signal[place]
+            p.place[n], p.dx[n], p.dy[n], p.signal[n] = place, s.left + column - star.x, dy, s.signal[place]
             p.noise2[n] = <double>s.noise[place] * s.noise[place]
-            if not (inside and s.good[place]):
-                s.outlier[place] = False
-            p.weight[n] = 1.0 if inside and s.good[place] and not s.outlier[place] else 0.0
+            fitted = first <= column < last and s.good[place]
+            s.outlier[place] &= fitted
+            p.weight[n] = fitted and not s.outlier[place]
             n += 1
     p.count = n
     evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
+    # in whole fours
+    for k in range(n, (n + 3) // 4 * 4):
+        p.weight[k] = p.residual[k] = 0.0
     if rules.own:
         for k in range(n):
             gain = star.gain[s.phase[p.place[k]]]
             p.value[k], p.by_x[k], p.by_y[k] = p.value[k] * gain, p.by_x[k] * gain, p.by_y[k] * gain
+
+
+cdef inline (int, int) _inside(const Local *psf, double dy, double left, int size, double widths2) noexcept nogil:
+    """The first column of a row dy px from the star that lies within so many squared widths, and the one after the last."""
+    cdef double xx = psf.axes[0] * psf.axes[0] + psf.axes[2] * psf.axes[2]
+    cdef double half = (psf.axes[0] * psf.axes[1] + psf.axes[2] * psf.axes[3]) * dy / xx
+    cdef double yy = (psf.axes[1] * psf.axes[1] + psf.axes[3] * psf.axes[3]) * dy * dy
+    cdef double reach2 = half * half - (yy - widths2) / xx, reach
+    if not reach2 > 0:
+        return 0, 0
+    reach = sqrt(reach2)
+    return <int>max(0.0, min(ceil(-half - reach - left), size)), <int>max(0.0, min(floor(-half + reach - left) + 1, size))
 
 
 cdef double _first_flux(const Pixels *p) noexcept nogil:
@@ -143,39 +155,35 @@ cdef double _first_flux(const Pixels *p) noexcept nogil:
 
 cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint mark) noexcept nogil:
     """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
-    cdef double light, most = 0.0, variance
+    cdef double faintest = 0.0, light, variance
     cdef int k
-    if mark:
-        memset(s.outlier, 0, s.size * s.size)
-        for k in range(p.count):
-            most = max(most, p.value[k])
+    weigh(
+        p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual
+    )
+    if not mark:
+        return
+    memset(s.outlier, 0, s.size * s.size)
     for k in range(p.count):
-        light = star.flux * p.value[k]
-        p.residual[k] = p.signal[k] - light
-        light = max(light, 0.0)
-        variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
-        p.weight[k] /= variance
+        faintest = max(faintest, p.value[k])
+    faintest = max(faintest * rules.faint * star.flux, 0.0)
+    for k in range(p.count):
         # most pixels are far from it
-        if mark and p.residual[k] > rules.faint * star.flux * most:
-            s.outlier[p.place[k]] = p.residual[k] > 0 and p.residual[k] * p.residual[k] > rules.outlier2 * variance
+        if p.residual[k] > faintest:
+            light = max(star.flux * p.value[k], 0.0)
+            variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
+            s.outlier[p.place[k]] = p.residual[k] * p.residual[k] > rules.outlier2 * variance
 
 
 cdef void _sum_up(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
     """Set the normal equations, normal (K, K), lower half, and star.right (K,)."""
-    cdef double xx = 0.0, xy = 0.0, yy = 0.0, xf = 0.0, yf = 0.0, ff = 0.0, rx = 0.0, ry = 0.0, rf = 0.0
-    cdef double x, y, f, w
-    cdef int k, n = rules.parameters
-    for k in range(p.count):
-        w = p.weight[k]
-        x, y, f = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
-        xx, xy, yy = xx + w * x * x, xy + w * x * y, yy + w * y * y
-        xf, yf, ff = xf + w * x * f, yf + w * y * f, ff + w * f * f
-        w *= p.residual[k]
-        rx, ry, rf = rx + w * x, ry + w * y, rf + w * f
-    normal[0], normal[n], normal[n + 1] = xx, xy, yy
-    normal[2 * n], normal[2 * n + 1], normal[2 * n + 2] = xf, yf, ff
-    star.right[0], star.right[1], star.right[2] = rx, ry, rf
-    star.information = ff
+    cdef double[9] sums
+    cdef double flux = star.flux
+    cdef int n = rules.parameters
+    products(p.weight, p.by_x, p.by_y, p.value, p.residual, (p.count + 3) // 4 * 4, sums)
+    normal[0], normal[n], normal[n + 1] = flux * flux * sums[0], flux * flux * sums[1], flux * flux * sums[2]
+    normal[2 * n], normal[2 * n + 1], normal[2 * n + 2] = flux * sums[3], flux * sums[4], sums[5]
+    star.right[0], star.right[1], star.right[2] = flux * sums[6], flux * sums[7], sums[8]
+    star.information = sums[5]
     if rules.own:
         _sum_up_gains(s, star, rules, p, normal)
 
