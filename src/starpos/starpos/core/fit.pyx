@@ -157,9 +157,7 @@ cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint 
     """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
     cdef double faintest = 0.0, light, variance
     cdef int k
-    weigh(
-        p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual
-    )
+    weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)
     if not mark:
         return
     memset(s.outlier, 0, s.size * s.size)
@@ -256,7 +254,7 @@ cdef void _step(Star *star, Rules rules) noexcept nogil:
 
 
 cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels *p, Star *star) noexcept nogil:
-    """Fit a star that has a first place; the pixels are those of the last round, all of the stamp."""
+    """Fit a star that has a first place; the pixels are at last all of the stamp."""
     cdef double[MOST * MOST] normal
     cdef int round_, k
     for k in range(rules.phases):
