@@ -2,14 +2,20 @@
 # cython: cdivision=True
 
 cdef enum:
-    # Pixels that are evaluated at once, and terms of a series along one axis.
+    # Pixels that are evaluated together, and in one step, and terms of a series along one axis.
     BLOCK = 64
+    LANES = 8
     ORDERS = 32
 
 
 cdef inline int blocks(int pixels) noexcept nogil:
     """How many blocks hold so many pixels."""
     return (pixels + BLOCK - 1) // BLOCK
+
+
+cdef inline int whole(int pixels) noexcept nogil:
+    """So many pixels, or some more, are evaluated in whole steps."""
+    return (pixels + LANES - 1) // LANES * LANES
 
 
 cdef struct Local:

@@ -16,33 +16,33 @@ cdef extern from *:
     #define STARPOS_LANES 8
     /* Of 0, 1, 2 ...; set when the module is loaded. */
     static double starpos_root[STARPOS_ORDERS + 2];
-    /* Hermite polynomials over sqrt(k!), k = 0 .. order, of a block's numbers u. */
-    static inline void starpos_hermites(const double *u, int order, double (*out)[STARPOS_BLOCK]) {
-        for (int p = 0; p < STARPOS_BLOCK; p++) {
+    /* Hermite polynomials over sqrt(k!), k = 0 .. order, of n of a block's numbers u. */
+    static inline void starpos_hermites(const double *u, int n, int order, double (*out)[STARPOS_BLOCK]) {
+        for (int p = 0; p < n; p++) {
             out[0][p] = 1;
             out[1][p] = u[p];
         }
         for (int k = 1; k < order; k++) {
             const double before = starpos_root[k], over = 1 / starpos_root[k + 1];
-            for (int p = 0; p < STARPOS_BLOCK; p++)
+            for (int p = 0; p < n; p++)
                 out[k + 1][p] = (u[p] * out[k][p] - before * out[k - 1][p]) * over;
         }
     }
-    /* The Gaussian of a peak at a block's places. */
-    STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, double peak, double *restrict out) {
-        for (int p = 0; p < STARPOS_BLOCK; p++)
+    /* The Gaussian of a peak at n of a block's places. */
+    STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, int n, double peak, double *restrict out) {
+        for (int p = 0; p < n; p++)
             out[p] = -0.5 * (u[p] * u[p] + v[p] * v[p]);
-        starpos_exps(out, STARPOS_BLOCK);
-        for (int p = 0; p < STARPOS_BLOCK; p++)
+        starpos_exps(out, n);
+        for (int p = 0; p < n; p++)
             out[p] *= peak;
     }
     /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
-    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v,
+    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v, int n,
                                             double *restrict value, double *restrict by_u, double *restrict by_v) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
-        starpos_hermites(u, rows, fu);
-        starpos_hermites(v, columns, fv);
-        for (int first = 0; first < STARPOS_BLOCK; first += STARPOS_LANES) {
+        starpos_hermites(u, n, rows, fu);
+        starpos_hermites(v, n, columns, fv);
+        for (int first = 0; first < n; first += STARPOS_LANES) {
             double sum[STARPOS_LANES] = {0}, sum_u[STARPOS_LANES] = {0}, sum_v[STARPOS_LANES] = {0};
             for (int i = 0; i < rows; i++) {
                 double across[STARPOS_LANES] = {0}, steeper[STARPOS_LANES] = {0};
@@ -72,8 +72,8 @@ cdef extern from *:
     STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
                                            const double *gauss, float *out) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
-        starpos_hermites(u, highest, fu);
-        starpos_hermites(v, highest, fv);
+        starpos_hermites(u, STARPOS_BLOCK, highest, fu);
+        starpos_hermites(v, STARPOS_BLOCK, highest, fv);
         for (int t = 0; t < count; t++) {
             const double *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
             for (int p = 0; p < STARPOS_BLOCK; p++)
@@ -82,10 +82,10 @@ cdef extern from *:
     }
     """
     double[ORDERS + 2] root "starpos_root"
-    void gauss_at "starpos_gauss"(const double *u, const double *v, double peak, double *out) noexcept nogil
+    void gauss_at "starpos_gauss"(const double *u, const double *v, int n, double peak, double *out) noexcept nogil
     void series_at "starpos_series"(
-        const double *series, int rows, int columns, const double *u, const double *v, double *value, double *by_u,
-        double *by_v,
+        const double *series, int rows, int columns, const double *u, const double *v, int n, double *value,
+        double *by_u, double *by_v,
     ) noexcept nogil
     void each_at "starpos_terms"(
         const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
@@ -113,13 +113,13 @@ cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series,
 
 
 cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
-    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is the middle."""
+    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is finite."""
     cdef int p
     for p in range(n):
         u[p], v[p] = psf.axes[0] * dx[p] + psf.axes[1] * dy[p], psf.axes[2] * dx[p] + psf.axes[3] * dy[p]
     for p in range(n, BLOCK):
-        u[p] = v[p] = 0.0
-    gauss_at(u, v, psf.peak, gauss)
+        u[p] = v[p] = gauss[p] = 0.0
+    gauss_at(u, v, whole(n), psf.peak, gauss)
 
 
 cdef void evaluate(
@@ -131,12 +131,13 @@ cdef void evaluate(
     cdef double[BLOCK] gauss
     cdef double[BLOCK] by_u
     cdef double[BLOCK] by_v
-    cdef int block, first, p
+    cdef int block, first, some, p
     for block in range(blocks(n)):
         first = block * BLOCK
-        scaled(psf, dx + first, dy + first, min(BLOCK, n - first), u, v, gauss)
-        series_at(psf.series, psf.rows, psf.columns, u, v, value + first, by_u, by_v)
-        for p in range(BLOCK):
+        some = min(BLOCK, n - first)
+        scaled(psf, dx + first, dy + first, some, u, v, gauss)
+        series_at(psf.series, psf.rows, psf.columns, u, v, whole(some), value + first, by_u, by_v)
+        for p in range(whole(some)):
             value[first + p] *= gauss[p]
             by_x[first + p] = (psf.axes[0] * by_u[p] + psf.axes[2] * by_v[p]) * gauss[p]
             by_y[first + p] = (psf.axes[1] * by_u[p] + psf.axes[3] * by_v[p]) * gauss[p]
