@@ -11,8 +11,9 @@ from starpos.core.algebra cimport middle
 
 
 cdef struct Rim:
-    # Of a stamp: the pixels at its edges, over their noise, and their noise.
+    # Of a stamp: the pixels at its edges, over their noise, and their noise; whether this is the same in all.
     int count
+    bint even
     double *score
     double *noise
 
@@ -20,11 +21,13 @@ cdef struct Rim:
 cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim) noexcept nogil:
     """Take the pixels at the edges of a stamp (S, S)."""
     cdef int row, column, place, n = 0
+    rim.even = True
     for row in range(size):
         for column in range(size):
             if row == 0 or row == size - 1 or column == 0 or column == size - 1:
                 place = row * size + column
                 rim.score[n], rim.noise[n] = <double>signal[place] / noise[place], noise[place]
+                rim.even = rim.even and noise[place] == noise[0]
                 n += 1
     rim.count = n
 
@@ -63,7 +66,7 @@ def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, doubl
             most = signal[k, 0, 0]
             for j in range(area):
                 most = max(most, (&signal[k, 0, 0])[j])
-            light = own * most / middle(rim.noise, rim.count)
+            light = own * most / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
             up = <float>sky if sky > raised and sky > light else 0
             wider = <float>spread if spread > uneven and spread > light else 1
             if up != 0 or wider != 1:

@@ -128,7 +128,7 @@ def _teachers(
     bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(~stamps.full.any((1, 2)))
+    stamps = stamps.take(np.logical_not(stamps.full.any((1, 2))))
     # the shapes of fainter stars are noise
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))

@@ -76,12 +76,11 @@ def _settled_shape(stamps: Stamps, window: np.ndarray, rounds: int) -> np.ndarra
         if not usable.any():
             break
         seen = np.median(seen[usable], axis=0)
-        narrower = np.linalg.inv(seen) - np.linalg.inv(window)
-        values, vectors = np.linalg.eigh(narrower)
+        of_seen, of_window = inverted(np.stack([seen, window]))
         # a stamp does not hold a wider star
         limit = (stamps.reach / 2.0) ** 2
-        own = vectors @ np.diag(1 / np.clip(values, 1 / limit, 1 / NARROWEST)) @ vectors.T
-        gain = np.eye(2) + own @ np.linalg.inv(window)
+        own = clipped(_each(of_seen - of_window), 1 / limit, 1 / NARROWEST, -1.0)[0]
+        gain = np.eye(2) + own @ of_window
         step = np.where(usable[:, None], step @ gain.T, 0)
         x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
         change = np.inf if shape is None else np.abs(own - shape).max() / own.max()

@@ -69,7 +69,7 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
 
 @pytest.mark.parametrize("phases", [1, 4])
 def test_rims_are_the_edges_of_stamps(phases, rng):
-    """In any order; some lie partly, or wholly, beyond the frame."""
+    """Some lie partly, or wholly, beyond the frame; the order is free."""
     plane = rng.integers(0, 1000, (30, 20)).astype(np.uint16)
     x, y = rng.integers(-9, 29, (2, 40))
     level, noise = rng.uniform(0, 9, (2, 40, phases)).astype(np.float32)
