@@ -165,6 +165,17 @@ cdef inline double median(double *values, int n) noexcept nogil:
     return values[k]
 
 
+cdef inline double middle(double *values, int n) noexcept nogil:
+    """The median of values (n,), between the middle two if n is even; it disturbs their order."""
+    cdef double upper = median(values, n), lower = values[0]
+    cdef int k
+    if n % 2:
+        return upper
+    for k in range(1, n // 2):
+        lower = max(lower, values[k])
+    return (lower + upper) / 2
+
+
 cdef inline int strip_of(double x, const Strips *s) noexcept nogil:
     """The strip in which a point lies, or the nearest one."""
     cdef double strip = (x - s.least) * s.per_px

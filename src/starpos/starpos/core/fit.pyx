@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Weighted least-squares fit of a star's place, flux and gains to its stamp, by Gauss-Newton, one star after the other."""
 
-from libc.math cimport NAN, isfinite, log, sqrt
+from libc.math cimport NAN, ceil, floor, isfinite, log, sqrt
 from libc.stdlib cimport free, malloc
 from libc.string cimport memset
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from starpos.core.algebra cimport factored, solved
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
+from starpos.core.sums cimport products, weigh
 
 cdef enum:
-    # Parameters: x, y, flux, and a gain for each phase of a mosaic.
-    MOST = 7
-    PHASES = 4
     # Numbers kept of each pixel.
     COLUMNS = 9
+    # Parameters of two stars.
+    LARGEST = 2 * MOST
 
 # Equations whose scaled determinant is smaller have no solution.
 cdef double SINGULAR = log(1e-9)
@@ -31,10 +31,6 @@ cdef class Rules:
     widths                           within which pixels are fitted
     outlier, faint                   sigmas, and the share of the star's brightest pixel, above which a pixel is one
     """
-
-    cdef int phases, own, parameters
-    cdef double[PHASES] gain
-    cdef double held, dn_per_photon, misfit2, widths2, outlier2, faint
 
     def __init__(
         self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier, double faint
@@ -109,30 +105,41 @@ cdef int _begin(Pixels *p, int area) except -1:
 
 cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
     """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, place, k, n = 0
-    cdef double dx, dy, u, v, gain
-    cdef bint inside
+    cdef int row, column, place, k, first, last, n = 0
+    cdef double dy, gain
+    cdef bint fitted
     for row in range(s.size):
         dy = s.top + row - star.y
-        for column in range(s.size):
-            dx = s.left + column - star.x
-            u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
-            inside = u * u + v * v < rules.widths2
-            if not (inside or all_pixels):
-                continue
+        first, last = _inside(psf, dy, s.left - star.x, s.size, rules.widths2)
+        for column in range(0 if all_pixels else first, s.size if all_pixels else last):
             place = row * s.size + column
-            p.place[n], p.dx[n], p.dy[n], p.signal[n] = place, dx, dy, s.signal[place]
+            p.place[n], p.dx[n], p.dy[n], p.signal[n] = place, s.left + column - star.x, dy, s.signal[place]
             p.noise2[n] = <double>s.noise[place] * s.noise[place]
-            if not (inside and s.good[place]):
-                s.outlier[place] = False
-            p.weight[n] = 1.0 if inside and s.good[place] and not s.outlier[place] else 0.0
+            fitted = first <= column < last and s.good[place]
+            s.outlier[place] &= fitted
+            p.weight[n] = fitted and not s.outlier[place]
             n += 1
     p.count = n
     evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
+    # in whole fours
+    for k in range(n, (n + 3) // 4 * 4):
+        p.weight[k] = p.residual[k] = 0.0
     if rules.own:
         for k in range(n):
             gain = star.gain[s.phase[p.place[k]]]
             p.value[k], p.by_x[k], p.by_y[k] = p.value[k] * gain, p.by_x[k] * gain, p.by_y[k] * gain
+
+
+cdef inline (int, int) _inside(const Local *psf, double dy, double left, int size, double widths2) noexcept nogil:
+    """The first column of a row dy px from the star that lies within so many squared widths, and the one after the last."""
+    cdef double xx = psf.axes[0] * psf.axes[0] + psf.axes[2] * psf.axes[2]
+    cdef double half = (psf.axes[0] * psf.axes[1] + psf.axes[2] * psf.axes[3]) * dy / xx
+    cdef double yy = (psf.axes[1] * psf.axes[1] + psf.axes[3] * psf.axes[3]) * dy * dy
+    cdef double reach2 = half * half - (yy - widths2) / xx, reach
+    if not reach2 > 0:
+        return 0, 0
+    reach = sqrt(reach2)
+    return <int>max(0.0, min(ceil(-half - reach - left), size)), <int>max(0.0, min(floor(-half + reach - left) + 1, size))
 
 
 cdef double _first_flux(const Pixels *p) noexcept nogil:
@@ -148,39 +155,33 @@ cdef double _first_flux(const Pixels *p) noexcept nogil:
 
 cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint mark) noexcept nogil:
     """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
-    cdef double light, most = 0.0, variance
+    cdef double faintest = 0.0, light, variance
     cdef int k
-    if mark:
-        memset(s.outlier, 0, s.size * s.size)
-        for k in range(p.count):
-            most = max(most, p.value[k])
+    weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)
+    if not mark:
+        return
+    memset(s.outlier, 0, s.size * s.size)
     for k in range(p.count):
-        light = star.flux * p.value[k]
-        p.residual[k] = p.signal[k] - light
-        light = max(light, 0.0)
-        variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
-        p.weight[k] /= variance
+        faintest = max(faintest, p.value[k])
+    faintest = max(faintest * rules.faint * star.flux, 0.0)
+    for k in range(p.count):
         # most pixels are far from it
-        if mark and p.residual[k] > rules.faint * star.flux * most:
-            s.outlier[p.place[k]] = p.residual[k] > 0 and p.residual[k] * p.residual[k] > rules.outlier2 * variance
+        if p.residual[k] > faintest:
+            light = max(star.flux * p.value[k], 0.0)
+            variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
+            s.outlier[p.place[k]] = p.residual[k] * p.residual[k] > rules.outlier2 * variance
 
 
 cdef void _sum_up(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
     """Set the normal equations, normal (K, K), lower half, and star.right (K,)."""
-    cdef double xx = 0.0, xy = 0.0, yy = 0.0, xf = 0.0, yf = 0.0, ff = 0.0, rx = 0.0, ry = 0.0, rf = 0.0
-    cdef double x, y, f, w
-    cdef int k, n = rules.parameters
-    for k in range(p.count):
-        w = p.weight[k]
-        x, y, f = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
-        xx, xy, yy = xx + w * x * x, xy + w * x * y, yy + w * y * y
-        xf, yf, ff = xf + w * x * f, yf + w * y * f, ff + w * f * f
-        w *= p.residual[k]
-        rx, ry, rf = rx + w * x, ry + w * y, rf + w * f
-    normal[0], normal[n], normal[n + 1] = xx, xy, yy
-    normal[2 * n], normal[2 * n + 1], normal[2 * n + 2] = xf, yf, ff
-    star.right[0], star.right[1], star.right[2] = rx, ry, rf
-    star.information = ff
+    cdef double[9] sums
+    cdef double flux = star.flux
+    cdef int n = rules.parameters
+    products(p.weight, p.by_x, p.by_y, p.value, p.residual, (p.count + 3) // 4 * 4, sums)
+    normal[0], normal[n], normal[n + 1] = flux * flux * sums[0], flux * flux * sums[1], flux * flux * sums[2]
+    normal[2 * n], normal[2 * n + 1], normal[2 * n + 2] = flux * sums[3], flux * sums[4], sums[5]
+    star.right[0], star.right[1], star.right[2] = flux * sums[6], flux * sums[7], sums[8]
+    star.information = sums[5]
     if rules.own:
         _sum_up_gains(s, star, rules, p, normal)
 
@@ -208,13 +209,13 @@ cdef inline double _by_gain(const Star *star, Rules rules, const Pixels *p, int 
     return star.flux * p.value[k] * rules.gain[phase] / star.gain[phase]
 
 
-cdef bint _invert(double *normal, int n, double *out) noexcept nogil:
+cdef bint invert(double *normal, int n, double *out) noexcept nogil:
     """Set `out` (n, n) to the inverse of the lower half of normal (n, n), NaN if singular; whether it is not.
 
     It is scaled first, because fluxes are a million times larger than pixels.
     """
-    cdef double[MOST] scale
-    cdef double[MOST] column
+    cdef double[LARGEST] scale
+    cdef double[LARGEST] column
     cdef double volume
     cdef int a, b
     for a in range(n):
@@ -253,7 +254,7 @@ cdef void _step(Star *star, Rules rules) noexcept nogil:
 
 
 cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels *p, Star *star) noexcept nogil:
-    """Fit a star that has a first place; the pixels are those of the last round, all of the stamp."""
+    """Fit a star that has a first place; the pixels are at last all of the stamp."""
     cdef double[MOST * MOST] normal
     cdef int round_, k
     for k in range(rules.phases):
@@ -266,7 +267,7 @@ cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels
         # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
         _weigh(s, star, rules, p, 1 <= round_ < rounds - 1)
         _sum_up(s, star, rules, p, normal)
-        star.solved = _invert(normal, rules.parameters, star.covariance)
+        star.solved = invert(normal, rules.parameters, star.covariance)
         if not star.solved:
             star.x = star.y = star.flux = NAN
             return
@@ -274,24 +275,34 @@ cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels
             _step(star, rules)
 
 
-cdef double _leverage(const Stamp *s, const Star *star, Rules rules, const Pixels *p, int k) noexcept nogil:
-    """How far (0 to 1) a fitted pixel decides what the model has there."""
+cdef void _leverages(const Stamp *s, const Star *star, Rules rules, const Pixels *p, float *leverage) noexcept nogil:
+    """Set how far (0 to 1) each fitted pixel decides what the model has there; NaN if the star has no fit."""
     cdef double[4] slope
-    cdef double total = 0.0
-    cdef int a, b, n = rules.parameters, most = 3, phase = s.phase[p.place[k]], gain = 3 + phase
-    slope[0], slope[1], slope[2] = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
-    if rules.own:
-        slope[3], most = _by_gain(star, rules, p, k, phase), 4
-    for a in range(most):
-        for b in range(most):
-            total += slope[a] * slope[b] * star.covariance[(a if a < 3 else gain) * n + (b if b < 3 else gain)]
-    return total * p.weight[k]
+    cdef int[4] row
+    cdef double total
+    cdef int k, a, b, n = rules.parameters, most = 4 if rules.own else 3, phase
+    if not star.solved:
+        for k in range(s.size * s.size):
+            leverage[k] = NAN
+        return
+    row[0], row[1], row[2] = 0, 1, 2
+    for k in range(p.count):
+        if not p.weight[k] > 0:
+            continue
+        phase, total = s.phase[p.place[k]], 0.0
+        slope[0], slope[1], slope[2] = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
+        if rules.own:
+            slope[3], row[3] = _by_gain(star, rules, p, k, phase), 3 + phase
+        for a in range(most):
+            for b in range(most):
+                total += slope[a] * slope[b] * star.covariance[row[a] * n + row[b]]
+        leverage[k] = <float>(total * p.weight[k])
 
 
 def fitted(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first,
-    const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds,
+    const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds, bint weighed,
 ):
     """Fit N stars to their stamps (N, S, S), as `detection.fit.fit_stars` explains.
 
@@ -299,22 +310,28 @@ def fitted(
     first   (N, 2) px: first places of the stars
     axes    (N, 2, 2) or (1, 2, 2), and
     series  (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
+    weighed  whether the leverage of each pixel is wanted; else there is none
 
     Returns the columns of `detection.fit.Fit`, in their order. A star whose equations are singular has NaN.
     """
     cdef int n = signal.shape[0], size = signal.shape[1], area = size * size, most, k, a, b
+    cdef int seen = size if weighed else 0
     cdef Pixels p
     cdef Local psf
     cdef Star star
     cdef Stamp s
-    _check(signal, noise, good, phase, corner, first, rules, rounds)
+    sound_stamps(signal, noise, good, phase, rules)
     sound(axes, series, n)
-    stars_, covariances, gains_ = np.empty((n, 5)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
-    images_, marks_ = np.zeros((3, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
+    if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
+        raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
+    stars_, covariances, gains_ = np.empty((n, 6)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
+    images_, marks_ = np.empty((2, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
+    leverage_ = np.zeros((n, seen, seen), np.float32)
     cdef double[:, ::1] column = stars_
     cdef double[:, :, ::1] covariance = covariances
     cdef double[:, ::1] gains = gains_
-    cdef float[:, :, ::1] image = images_.reshape(3, n, area)
+    cdef float[:, :, ::1] image = images_.reshape(2, n, area)
+    cdef float[:, :, ::1] leverage = leverage_
     cdef unsigned char[:, :, ::1] mark = marks_.reshape(2, n, area)
     _begin(&p, area)
     s.size, most = size, rules.parameters
@@ -333,42 +350,42 @@ def fitted(
                     covariance[k, a, b] = star.covariance[a * most + b]
             for a in range(rules.phases):
                 gains[k, a] = star.gain[a]
-            column[k, 4] = _told(&s, &star, rules, &p, &image[0, k, 0], &image[1, k, 0], &image[2, k, 0], &mark[0, k, 0])
+            column[k, 4] = _told(&s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0], &column[k, 5])
+            if weighed:
+                _leverages(&s, &star, rules, &p, &leverage[k, 0, 0])
     free(p.dx)
     free(p.place)
-    x, y, flux, sigma, chi2 = np.ascontiguousarray(stars_.T)
-    residual, model, leverage = images_
+    x, y, flux, sigma, chi2, pixels = np.ascontiguousarray(stars_.T)
+    residual, model = images_
     used, outlier = marks_.view(bool)
-    return x, y, flux, sigma, covariances, gains_, chi2, residual, model, used, outlier, leverage
+    return x, y, flux, sigma, covariances, gains_, chi2, pixels, residual, model, used, outlier, leverage_
 
 
 cdef double _told(
-    const Stamp *s, const Star *star, Rules rules, const Pixels *p, float *residual, float *model, float *leverage,
-    unsigned char *used,
+    const Stamp *s, const Star *star, const Pixels *p, float *residual, float *model, unsigned char *used, double *pixels
 ) noexcept nogil:
-    """Set what is told of each pixel; chi-square per degree of freedom."""
+    """Set what is told of each pixel, and how many were fitted; chi-square per degree of freedom."""
     cdef double chi2 = 0.0
     cdef int k, count = 0
-    cdef double u, v
+    pixels[0] = 0.0
     if not star.solved:
         for k in range(s.size * s.size):
-            residual[k] = model[k] = leverage[k] = NAN
+            residual[k] = model[k] = NAN
             s.outlier[k] = False
         return NAN
     for k in range(p.count):
         residual[k], model[k], used[k] = <float>p.residual[k], <float>(p.signal[k] - p.residual[k]), p.weight[k] > 0
-        if used[k]:
-            leverage[k] = <float>_leverage(s, star, rules, p, k)
-            chi2 += p.residual[k] * p.residual[k] * p.weight[k]
-            count += 1
+        chi2 += p.residual[k] * p.residual[k] * p.weight[k]
+        count += used[k]
+    pixels[0] = count
     return chi2 / max(count - 3, 1)
 
 
-cdef int _check(
+cdef int sound_stamps(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
-    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first, Rules rules, int rounds,
+    const unsigned char[:, :, ::1] phase, Rules rules,
 ) except -1:
-    """Raise ValueError unless shapes and phases are what `fitted` reads."""
+    """Raise ValueError unless shapes and phases of stamps are what a fit reads."""
     cdef Py_ssize_t n = signal.shape[0], size = signal.shape[1]
     for name, height, width, depth in (
         ("signal", n, size, signal.shape[2]),
@@ -378,8 +395,6 @@ cdef int _check(
     ):
         if (height, width, depth) != (n, size, size):
             raise ValueError(f"{name} has the shape {(height, width, depth)}; {(n, size, size)} is needed")
-    if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
-        raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
     if n and size and np.max(phase) >= rules.phases:
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {rules.phases}")
     return 0

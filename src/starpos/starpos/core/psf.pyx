@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
 
-from libc.math cimport M_PI, exp, fabs, sqrt
+from libc.math cimport M_PI, fabs, sqrt
 
 import numpy as np
 
@@ -16,25 +16,33 @@ cdef extern from *:
     #define STARPOS_LANES 8
     /* Of 0, 1, 2 ...; set when the module is loaded. */
     static double starpos_root[STARPOS_ORDERS + 2];
-    /* Hermite polynomials over sqrt(k!), k = 0 .. order, of a block's numbers u. */
-    static inline void starpos_hermites(const double *u, int order, double (*out)[STARPOS_BLOCK]) {
-        for (int p = 0; p < STARPOS_BLOCK; p++) {
+    /* Hermite polynomials over sqrt(k!), k = 0 .. order, of n of a block's numbers u. */
+    static inline void starpos_hermites(const double *u, int n, int order, double (*out)[STARPOS_BLOCK]) {
+        for (int p = 0; p < n; p++) {
             out[0][p] = 1;
             out[1][p] = u[p];
         }
         for (int k = 1; k < order; k++) {
             const double before = starpos_root[k], over = 1 / starpos_root[k + 1];
-            for (int p = 0; p < STARPOS_BLOCK; p++)
+            for (int p = 0; p < n; p++)
                 out[k + 1][p] = (u[p] * out[k][p] - before * out[k - 1][p]) * over;
         }
     }
+    /* The Gaussian of a peak at n of a block's places. */
+    STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, int n, double peak, double *restrict out) {
+        for (int p = 0; p < n; p++)
+            out[p] = -0.5 * (u[p] * u[p] + v[p] * v[p]);
+        starpos_exps(out, n);
+        for (int p = 0; p < n; p++)
+            out[p] *= peak;
+    }
     /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
-    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v,
+    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v, int n,
                                             double *restrict value, double *restrict by_u, double *restrict by_v) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
-        starpos_hermites(u, rows, fu);
-        starpos_hermites(v, columns, fv);
-        for (int first = 0; first < STARPOS_BLOCK; first += STARPOS_LANES) {
+        starpos_hermites(u, n, rows, fu);
+        starpos_hermites(v, n, columns, fv);
+        for (int first = 0; first < n; first += STARPOS_LANES) {
             double sum[STARPOS_LANES] = {0}, sum_u[STARPOS_LANES] = {0}, sum_v[STARPOS_LANES] = {0};
             for (int i = 0; i < rows; i++) {
                 double across[STARPOS_LANES] = {0}, steeper[STARPOS_LANES] = {0};
@@ -62,25 +70,25 @@ cdef extern from *:
     }
     /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian. */
     STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
-                                           const double *gauss, int n, Py_ssize_t stride, float *out) {
+                                           const double *gauss, float *out) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
-        starpos_hermites(u, highest, fu);
-        starpos_hermites(v, highest, fv);
+        starpos_hermites(u, STARPOS_BLOCK, highest, fu);
+        starpos_hermites(v, STARPOS_BLOCK, highest, fv);
         for (int t = 0; t < count; t++) {
             const double *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
-            for (int p = 0; p < n; p++)
-                out[t * stride + p] = (float)(a[p] * b[p] * gauss[p]);
+            for (int p = 0; p < STARPOS_BLOCK; p++)
+                out[t * STARPOS_BLOCK + p] = (float)(a[p] * b[p] * gauss[p]);
         }
     }
     """
     double[ORDERS + 2] root "starpos_root"
+    void gauss_at "starpos_gauss"(const double *u, const double *v, int n, double peak, double *out) noexcept nogil
     void series_at "starpos_series"(
-        const double *series, int rows, int columns, const double *u, const double *v, double *value, double *by_u,
-        double *by_v,
+        const double *series, int rows, int columns, const double *u, const double *v, int n, double *value,
+        double *by_u, double *by_v,
     ) noexcept nogil
-    void terms_at "starpos_terms"(
-        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, int n,
-        Py_ssize_t stride, float *out,
+    void each_at "starpos_terms"(
+        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
     ) noexcept nogil
 
 for order in range(ORDERS + 2):
@@ -104,14 +112,14 @@ cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series,
     out.series, out.rows, out.columns = &series[s, 0, 0], <int>series.shape[1], <int>series.shape[2]
 
 
-cdef void _scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
-    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is 0."""
+cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
+    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is finite."""
     cdef int p
     for p in range(n):
         u[p], v[p] = psf.axes[0] * dx[p] + psf.axes[1] * dy[p], psf.axes[2] * dx[p] + psf.axes[3] * dy[p]
-        gauss[p] = psf.peak * exp(-0.5 * (u[p] * u[p] + v[p] * v[p]))
     for p in range(n, BLOCK):
         u[p] = v[p] = gauss[p] = 0.0
+    gauss_at(u, v, whole(n), psf.peak, gauss)
 
 
 cdef void evaluate(
@@ -123,12 +131,13 @@ cdef void evaluate(
     cdef double[BLOCK] gauss
     cdef double[BLOCK] by_u
     cdef double[BLOCK] by_v
-    cdef int block, first, p
+    cdef int block, first, some, p
     for block in range(blocks(n)):
         first = block * BLOCK
-        _scaled(psf, dx + first, dy + first, min(BLOCK, n - first), u, v, gauss)
-        series_at(psf.series, psf.rows, psf.columns, u, v, value + first, by_u, by_v)
-        for p in range(BLOCK):
+        some = min(BLOCK, n - first)
+        scaled(psf, dx + first, dy + first, some, u, v, gauss)
+        series_at(psf.series, psf.rows, psf.columns, u, v, whole(some), value + first, by_u, by_v)
+        for p in range(whole(some)):
             value[first + p] *= gauss[p]
             by_x[first + p] = (psf.axes[0] * by_u[p] + psf.axes[2] * by_v[p]) * gauss[p]
             by_y[first + p] = (psf.axes[1] * by_u[p] + psf.axes[3] * by_v[p]) * gauss[p]
@@ -174,35 +183,8 @@ def evaluated(
     return out[0], out[1], out[2]
 
 
-def terms(const double[:, :, ::1] axes, const double[::1] left, const double[::1] top, int size, const int[:, ::1] orders):
-    """Single terms h_i(u) h_j(v) of the series times the Gaussian, (N, T, size size), at the pixels of N stamps.
-
-    orders (T, 2): i, j of each; the others as in `evaluated`.
-    """
-    cdef int stars = left.shape[0], area = size * size, count = orders.shape[0], n, k, block, first, highest = 1
-    cdef double[BLOCK] dx
-    cdef double[BLOCK] dy
-    cdef double[BLOCK] u
-    cdef double[BLOCK] v
-    cdef double[BLOCK] gauss
-    cdef double[:, :, ::1] constant = np.ones((1, 1, 1))
-    cdef Local psf
-    sound(axes, constant, stars)
-    if top.shape[0] != stars or orders.shape[1] != 2 or size < 1:
-        raise ValueError("as many rows as stars, two orders of each term, and stamps of at least a pixel are needed")
-    for k in range(count):
-        highest = max(highest, max(orders[k, 0], orders[k, 1]))
-        if not (0 <= orders[k, 0] <= ORDERS and 0 <= orders[k, 1] <= ORDERS):
-            raise ValueError(f"a term of orders {orders[k, 0]} and {orders[k, 1]}: they must be 0 to {ORDERS}")
-    out = np.empty((stars, count, area), np.float32)
-    cdef float[:, :, ::1] term = out
-    with nogil:
-        for k in range(stars):
-            local_of(axes, constant, k, &psf)
-            for block in range(blocks(area)):
-                first = block * BLOCK
-                n = _offsets(left[k], top[k], size, first, dx, dy)
-                _scaled(&psf, dx, dy, n, u, v, gauss)
-                if count:
-                    terms_at(&orders[0, 0], count, highest, u, v, gauss, n, area, &term[k, 0, first])
-    return out
+cdef void terms_at(
+    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
+) noexcept nogil:
+    """Set `out` (T, BLOCK) to single terms h_i(u) h_j(v) of a block's pixels, (i, j) in orders (T, 2), times the Gaussian."""
+    each_at(orders, count, highest, u, v, gauss, out)

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport median
+from starpos.core.algebra cimport middle
 
 cdef enum:
     # No pixel is as bright.
@@ -21,6 +21,18 @@ ctypedef fused pixel_t:
 cdef inline Py_ssize_t _inside(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
     """The row or column of n that is nearest to k."""
     return max(0, min(k, n - 1))
+
+
+cdef inline void _take_row(
+    const pixel_t *line, int size, int limit, float level, float noise, float *signal, float *sky, unsigned char *good,
+    unsigned char *full, unsigned char *phase,
+) noexcept nogil:
+    """Take a row of a stamp that lies on the frame, without a mosaic: most are so, and the loop takes wide registers."""
+    cdef int j
+    for j in range(size):
+        signal[j], sky[j], phase[j] = <float>line[j] - level, noise, 0
+        full[j] = line[j] >= limit
+        good[j] = not full[j]
 
 
 def around(
@@ -39,7 +51,7 @@ def around(
     cdef int size = 2 * reach + 1, phases = level.shape[1], phase
     cdef int limit = <int>ceil(saturation) if saturation < BEYOND else BEYOND, value
     cdef const pixel_t *line
-    cdef bint on, full
+    cdef bint on, full, whole
     if not (y.shape[0] == level.shape[0] == noise.shape[0] == n and noise.shape[1] == phases and phases in (1, 4)):
         raise ValueError("a row, and a level and noise for each of 1 or 4 phases, are needed for each column of a star")
     if reach < 0 or not (height and width):
@@ -49,9 +61,16 @@ def around(
     cdef unsigned char[:, :, ::1] mark = marks.reshape(3, n, size * size)
     with nogil:
         for k in range(n):
+            whole = phases == 1 and reach <= x[k] < width - reach
             for i in range(size):
                 row, place = y[k] - reach + i, i * size
                 line = &plane[_inside(row, height), 0]
+                if whole and 0 <= row < height:
+                    _take_row(
+                        line + x[k] - reach, size, limit, level[k, 0], noise[k, 0], &sky[0, k, place], &sky[1, k, place],
+                        &mark[0, k, place], &mark[1, k, place], &mark[2, k, place],
+                    )
+                    continue
                 for j in range(x[k] - reach, x[k] + reach + 1):
                     on = 0 <= row < height and 0 <= j < width
                     phase = <int>(2 * (row & 1) + (j & 1)) if phases > 1 else 0
@@ -64,15 +83,41 @@ def around(
     return skies[0], skies[1], good, white, marks[2]
 
 
-cdef double _middle(double *values, int n) noexcept nogil:
-    """The median of values (n,), between the middle two if n is even; it disturbs their order."""
-    cdef double upper = median(values, n), lower = values[0]
-    cdef int k
-    if n % 2:
-        return upper
-    for k in range(1, n // 2):
-        lower = max(lower, values[k])
-    return (lower + upper) / 2
+def rims(
+    const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach, const float[:, ::1] level,
+    const float[:, ::1] noise,
+):
+    """The edges of squares, reach px from the pixels x, y (N,) of a plane (h, w): signal and noise (N, 8 reach).
+
+    level, noise  (N, P) DN of the sky at each, P = 1, or 4 for the phases of a colour mosaic
+
+    A pixel beyond the frame is the nearest one on it.
+    """
+    cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, row, column
+    cdef int side = 2 * reach, j, i, phase
+    if not (y.shape[0] == level.shape[0] == noise.shape[0] == n and noise.shape[1] == level.shape[1] in (1, 4)):
+        raise ValueError("a row, and a level and noise for each of 1 or 4 phases, are needed for each column of a star")
+    if reach < 1 or not (height and width):
+        raise ValueError(f"squares of {reach} px around stars of a frame of {width} x {height} px: there is nothing to see")
+    out = np.empty((2, n, 4 * side), np.float32)
+    cdef float[:, :, ::1] sky = out
+    with nogil:
+        for k in range(n):
+            for j in range(4 * side):
+                # from corner to corner: along the top, down the right side, and back
+                i = j % side - reach
+                if j // side == 0:
+                    row, column = y[k] - reach, x[k] + i
+                elif j // side == 1:
+                    row, column = y[k] + i, x[k] + reach
+                elif j // side == 2:
+                    row, column = y[k] + reach, x[k] - i
+                else:
+                    row, column = y[k] - i, x[k] - reach
+                row, column = _inside(row, height), _inside(column, width)
+                phase = <int>(2 * (row & 1) + (column & 1)) if level.shape[1] > 1 else 0
+                sky[0, k, j], sky[1, k, j] = <float>plane[row, column] - level[k, phase], noise[k, phase]
+    return out[0], out[1]
 
 
 def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_mad):
@@ -93,9 +138,9 @@ def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_ma
         for k in range(n):
             for j in range(many):
                 score[j] = <double>signal[k, j] / noise[k, j]
-            found[0, k] = _middle(score, many)
+            found[0, k] = middle(score, many)
             for j in range(many):
                 score[j] = fabs(score[j] - found[0, k])
-            found[1, k] = per_mad * _middle(score, many)
+            found[1, k] = per_mad * middle(score, many)
     free(score)
     return out[0], out[1]

@@ -9,4 +9,40 @@ cdef extern from *:
     #else
     #define STARPOS_WIDE
     #endif
+    #include <string.h>
+    /* Put e to the power of each of n numbers in its place, to 3e-16 of it; beyond +-700 as there.
+       Unlike libm's it takes wide registers. */
+    static inline void starpos_exps(double *x, int n) {
+        /* added to a number it leaves a whole one, in the lowest bits */
+        const double rounds = 6755399441055744.0;
+        /* a loop of its own: else the compiler makes branches of it */
+        for (int p = 0; p < n; p++) {
+            x[p] = x[p] < -700 ? -700 : x[p];
+            x[p] = x[p] > 700 ? 700 : x[p];
+        }
+        for (int p = 0; p < n; p++) {
+            const double shifted = x[p] * 1.4426950408889634 + rounds, twos = shifted - rounds;
+            /* the logarithm of 2 in two parts, the first of few bits */
+            const double r = (x[p] - twos * 0.693145751953125) - twos * 1.4286068203094172e-06;
+            double sum = 1.0 / 6227020800, power;
+            unsigned long long bits;
+            sum = sum * r + 1.0 / 479001600;
+            sum = sum * r + 1.0 / 39916800;
+            sum = sum * r + 1.0 / 3628800;
+            sum = sum * r + 1.0 / 362880;
+            sum = sum * r + 1.0 / 40320;
+            sum = sum * r + 1.0 / 5040;
+            sum = sum * r + 1.0 / 720;
+            sum = sum * r + 1.0 / 120;
+            sum = sum * r + 1.0 / 24;
+            sum = sum * r + 1.0 / 6;
+            sum = sum * r + 0.5;
+            sum = sum * r + 1;
+            sum = sum * r + 1;
+            memcpy(&bits, &shifted, sizeof bits);
+            bits = (bits + 1023) << 52;
+            memcpy(&power, &bits, sizeof power);
+            x[p] = sum * power;
+        }
+    }
     """

@@ -8,7 +8,8 @@ from typing import TypeVar
 import numpy as np
 from scipy import ndimage
 
-from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at, inverse
+from starpos.core.pairs import fitted_pairs
+from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import LocalPsf, Psf
 from starpos.detection.stamps import Stamps
 
@@ -67,10 +68,12 @@ def with_companions(
     odd = np.flatnonzero(_surprising(stamps, fit))
     if len(odd) == 0:
         return stamps, spike, fit
-    before = (stamps.good * fit.residual**2 / response.variance(stamps.noise, fit.model))[odd]
-    pairs = _fit_pairs(stamps.take(odd), _rows(fit, odd), psf, response)
+    crowd, alone = stamps.take(odd), _rows(fit, odd)
+    before = crowd.good * alone.residual**2 / response.variance(crowd.noise, alone.model)
+    pairs = _fit_pairs(crowd, alone, psf, response)
     x, y, flux, used = pairs.x, pairs.y, pairs.flux, pairs.used
-    freedom = np.maximum(used.sum((1, 2)) - 6, 1)
+    pixels = used.sum((1, 2))
+    freedom = np.maximum(pixels - 6, 1)
     apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
     away = np.maximum(np.abs(x - stamps.x[odd]), np.abs(y - stamps.y[odd]))
     with np.errstate(invalid="ignore"):
@@ -88,10 +91,10 @@ def with_companions(
     both = stamps.take(odd)
     first = replace(
         _rows(fit, odd), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
-        chi2=(pairs.chi2 / freedom)[real], residual=both.signal - models.sum(0), model=models[0], used=used,
-        outlier=np.zeros_like(used),
+        chi2=(pairs.chi2 / freedom)[real], pixels=pixels[real], residual=both.signal - models.sum(0), model=models[0],
+        used=used, outlier=np.zeros_like(used),
     )  # fmt: skip
-    stamps = _with_rows(stamps, odd, replace(both, signal=both.signal - models[1]))
+    first_stamps = replace(both, signal=both.signal - models[1])
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
     light = psf.at(x[0], y[0]).evaluate(*second_stamps.corner(x[0], y[0]), stamps.size)[0]
     light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
@@ -105,15 +108,15 @@ def with_companions(
         own = getattr(second, name)
         together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
     return (
-        _joined(Stamps, stamps, second_stamps),
+        _with_pairs(stamps, odd, first_stamps, second_stamps),
         np.concatenate([spike, second_spike]),
-        _joined(Fit, _with_rows(fit, odd, first), replace(second, **together)),
+        _with_pairs(fit, odd, first, replace(second, **together)),
     )
 
 
 def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
-    freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
+    freedom = np.maximum(fit.pixels - 3, 1)
     with np.errstate(invalid="ignore"):
         odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (fit.outlier.sum((1, 2)) > 2)
     return odd & ~stamps.full.any((1, 2)) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
@@ -124,60 +127,13 @@ def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
 
     The companion starts where the single star's fit leaves the most light.
     """
-    n, local = len(fit.x), psf.at(fit.x, fit.y)
-    x, y = (np.stack(v) for v in zip((fit.x, fit.y), _brightest_left(stamps, fit, local), strict=True))
-    colour = np.zeros((2, n, len(response.gain)))
-    flux = np.full((2, n), np.nan)
-    for round_ in range(ROUNDS + 1):
-        places = [stamps.offsets(x[k], y[k]) for k in (0, 1)]
-        shapes = [local.evaluate(*stamps.corner(x[k], y[k]), stamps.size) for k in (0, 1)]
-        gains = response.gain * (1 + colour)
-        own = [gains_at(gains[k], stamps.phase) for k in (0, 1)]
-        inside = local.within(*places[0], FIT_WIDTHS) | local.within(*places[1], FIT_WIDTHS)
-        used = stamps.good & inside
-        if round_ == 0:
-            flux = _fluxes(stamps, used, *(shapes[k][0] * own[k] for k in (0, 1)))
-            flux = np.maximum(flux, LEAST * fit.flux)
-        amount = flux.astype(np.float32)[:, :, None, None]
-        columns = [response.columns(shapes[k], amount[k], own[k], stamps.phase) for k in (0, 1)]
-        models = np.stack([amount[k] * columns[k][2] for k in (0, 1)])
-        root = np.sqrt(used / response.variance(stamps.noise, models.sum(0)))
-        design = np.stack([(c * root).reshape(n, -1) for c in (*columns[0], *columns[1])], 2)
-        residual = ((stamps.signal - models.sum(0)) * root).reshape(n, -1, 1)
-        normal = (design.transpose(0, 2, 1) @ design).astype(np.float64)
-        right = (design.transpose(0, 2, 1) @ residual)[..., 0].astype(np.float64)
-        each = [slice(k * len(columns[0]), (k + 1) * len(columns[0])) for k in (0, 1)]
-        for k in (0, 1):
-            response.hold(normal[:, each[k], each[k]], right[:, each[k]], colour[k])
-        covariance = inverse(normal)
-        if round_ == ROUNDS:
-            break
-        step = np.nan_to_num(covariance @ right[..., None])[..., 0]
-        for k in (0, 1):
-            own_step = step[:, each[k]]
-            x[k] += np.clip(own_step[:, 0], -0.5, 0.5)
-            y[k] += np.clip(own_step[:, 1], -0.5, 0.5)
-            # a star without light could not move any more: its place changes nothing
-            flux[k] = np.maximum(flux[k] + own_step[:, 2], LEAST * flux[k])
-            if response.own_gains:
-                colour[k] = np.clip(colour[k] + own_step[:, 3:], -0.9, 3.0)
-    # the flux's sigma at known colours, as for a single star
-    grey = np.concatenate([np.arange(s.start, s.start + 3) for s in each])
-    known = inverse(normal[:, grey[:, None], grey])
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.stack([known[:, 2, 2], known[:, 5, 5]]))
-    covariance = np.stack([covariance[:, s, s][:, :2, :2] for s in each])
-    return Pairs(
-        x=x,
-        y=y,
-        flux=flux,
-        flux_sigma=sigma,
-        gains=gains,
-        covariance=covariance,
-        models=models,
-        used=used,
-        chi2=(residual**2).sum((1, 2)),
-    )
+    local = psf.at(fit.x, fit.y)
+    first = np.stack([np.stack([fit.x, fit.y], 1), np.stack(_brightest_left(stamps, fit, local), 1)])
+    columns = fitted_pairs(
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, first, LEAST * fit.flux,
+        local.axes, local.series, response.rules, ROUNDS, LEAST,
+    )  # fmt: skip
+    return Pairs(**dict(zip((f.name for f in fields(Pairs)), columns, strict=True)))
 
 
 def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray, np.ndarray]:
@@ -189,30 +145,15 @@ def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray
     return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
 
 
-def _fluxes(stamps: Stamps, used: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Fluxes (2, N) of two stars with unit images a, b (N, S, S): linear least squares, weighted by the sky's noise."""
-    weight = used / stamps.noise**2
-    aa, ab, bb, sa, sb = (
-        (weight * p).sum((1, 2)) for p in (a * a, a * b, b * b, a * stamps.signal, b * stamps.signal)
-    )
-    return np.stack([bb * sa - ab * sb, aa * sb - ab * sa]) / np.maximum(aa * bb - ab * ab, 1e-12)
-
-
 def _rows(fit: Fit, index: np.ndarray) -> Fit:
     """The rows `index` of a Fit."""
     return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
 
 
-def _with_rows(old: Rows, index: np.ndarray, new: Rows) -> Rows:
-    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `new`."""
-    changed = {}
+def _with_pairs(old: Rows, index: np.ndarray, first: Rows, second: Rows) -> Rows:
+    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `first`, and `second` follows."""
+    joined = {}
     for f in fields(old):
-        changed[f.name] = getattr(old, f.name).copy()
-        changed[f.name][index] = getattr(new, f.name)
-    return replace(old, **changed)
-
-
-def _joined(kind: type[Rows], first: Rows, second: Rows) -> Rows:
-    """The rows of two dataclasses of arrays one after the other."""
-    pairs = {f.name: [getattr(first, f.name), getattr(second, f.name)] for f in fields(kind)}
-    return kind(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+        joined[f.name] = np.concatenate([getattr(old, f.name), getattr(second, f.name)])
+        joined[f.name][index] = getattr(first, f.name)
+    return replace(old, **joined)

@@ -16,7 +16,7 @@ from starpos.normal import SIGMA_PER_MAD
 # Rows of a strip, which has one limit.
 STRIP = 64
 # Peaks whose surroundings are looked at together.
-CHUNK = 4096
+CHUNK = 1024
 # Parts of a strip in which the sky is compared; the whole frame is at most so many times less even than the typical one.
 PARTS, UNEVENEST = 4, 1.4
 # With fewer values in a part its quantiles are chance.

@@ -31,35 +31,15 @@ class Response:
     misfit: float
 
     @property
-    def own_gains(self) -> int:
-        """Number of gains that are fitted for each star: P, or 0 without a mosaic."""
-        return len(self.gain) if len(self.gain) > 1 else 0
+    def rules(self) -> Rules:
+        """The rules by which the compiled core fits stars."""
+        return Rules(
+            self.gain, self.colour_spread, self.dn_per_photon, self.misfit, FIT_WIDTHS, OUTLIER, FAINT
+        )
 
     def of_phase(self, phase: np.ndarray) -> np.ndarray:
         """The frame's gain (float32) of pixels of these phases; 1 without a mosaic."""
-        return self.gain.astype(np.float32)[phase] if self.own_gains else np.ones(1, np.float32)
-
-    def columns(
-        self,
-        shape: tuple[np.ndarray, np.ndarray, np.ndarray],
-        amount: np.ndarray,
-        own: np.ndarray,
-        phase: np.ndarray,
-    ) -> list[np.ndarray]:
-        """Derivatives (N, S, S) of the pixels with respect to a star's x, y, flux and own gains, in this order.
-
-        shape: what LocalPsf.evaluate returns; amount: the star's flux; own: its gain at each pixel.
-        """
-        value, by_x, by_y = shape
-        gain = self.gain.astype(np.float32)
-        by_gain = [amount * value * np.where(phase == p, gain[p], 0) for p in range(self.own_gains)]
-        return [amount * by_x * own, amount * by_y * own, value * own, *by_gain]
-
-    def hold(self, normal: np.ndarray, right: np.ndarray, colour: np.ndarray) -> None:
-        """Add to the normal equations, in place, the prior that a star's own gains are near the frame's."""
-        for p in range(self.own_gains):
-            normal[:, 3 + p, 3 + p] += self.colour_spread**-2
-            right[:, 3 + p] -= colour[:, p] * self.colour_spread**-2
+        return self.gain.astype(np.float32)[phase] if len(self.gain) > 1 else np.ones(1, np.float32)
 
     def variance(self, noise: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Variance, DN2, of pixels with the sky's noise (DN) and a star's light (DN) on them."""
@@ -76,11 +56,13 @@ class Fit:
     covariance        (N, 2, 2) px2 of x, y
     gains             (N, P): sensitivity of each phase of the mosaic to each star's light
     chi2              (N,) per degree of freedom
+    pixels            (N,) how many pixels took part in the fit
     residual          (N, S, S) DN: signal minus model
     model             (N, S, S) DN
     used              (N, S, S) bool: pixels that took part in the fit
     outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
-    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise
+    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise; empty if not
+                      asked for
     """
 
     x: np.ndarray
@@ -90,6 +72,7 @@ class Fit:
     covariance: np.ndarray
     gains: np.ndarray
     chi2: np.ndarray
+    pixels: np.ndarray
     residual: np.ndarray
     model: np.ndarray
     used: np.ndarray
@@ -98,48 +81,29 @@ class Fit:
 
 
 def fit_stars(
-    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, response: Response, rounds: int = 5
+    stamps: Stamps,
+    psf: Psf,
+    x: np.ndarray,
+    y: np.ndarray,
+    response: Response,
+    rounds: int = 5,
+    leverage: bool = False,
 ) -> Fit:
-    """Fit stars by Gauss-Newton, starting at the points x, y (N,) px.
+    """Fit stars by Gauss-Newton, starting at the points x, y (N,) px; the leverage of pixels is told if it is asked for.
 
     On a mosaic nothing is interpolated: each pixel is compared with the PSF at its own place, times the gain of its
     colour. Each star's four gains are fitted too, held near the frame's by colour_spread, so that neither the mosaic's
     phase nor the star's colour moves the position. The weights come from the model: the pixels' own noise would bias
     the fit.
     """
-    local, rules = (
-        psf.at(x, y),
-        Rules(
-            response.gain,
-            response.colour_spread,
-            response.dn_per_photon,
-            response.misfit,
-            FIT_WIDTHS,
-            OUTLIER,
-            FAINT,
-        ),
-    )
-    signal, noise = (np.ascontiguousarray(a, np.float32) for a in (stamps.signal, stamps.noise))
-    corner = np.stack([stamps.x - stamps.reach, stamps.y - stamps.reach], 1).astype(float)
-    first = np.stack([x, y], 1)
+    local = psf.at(x, y)
     columns = fitted(
-        signal, noise, stamps.good, stamps.phase, corner, first, local.axes, local.series, rules, rounds
-    )
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, np.stack([x, y], 1), local.axes,
+        local.series, response.rules, rounds, leverage,
+    )  # fmt: skip
     return Fit(**dict(zip((f.name for f in fields(Fit)), columns, strict=True)))
 
 
 def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:
     """The gain (N, S, S) float32 of each pixel: stars' gains (N, P) taken at the pixels' phases (N, S, S)."""
     return gains.astype(np.float32)[np.arange(len(gains))[:, None, None], phase]
-
-
-def inverse(normal: np.ndarray) -> np.ndarray:
-    """Inverses of (N, K, K), NaN where singular; scaled first, because fluxes are a million times larger than pixels."""
-    scale = np.sqrt(np.einsum("nii->ni", normal))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = normal / (scale[:, :, None] * scale[:, None, :])
-    sound = np.isfinite(scaled).all((1, 2))
-    sound[sound] = np.linalg.det(scaled[sound]) > 1e-9
-    out = np.full(normal.shape, np.nan)
-    out[sound] = np.linalg.inv(scaled[sound]) / (scale[:, :, None] * scale[:, None, :])[sound]
-    return out

@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, spatial
 
+from starpos.core.noise import light_noise
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
     NARROWEST,
+    centroid,
     frame_shape,
     moments,
     own_shape,
@@ -41,6 +43,8 @@ FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 # Stars of at least this FWHM (px) may be rings with sharp edges if the PSF describes more than this share of the light
 # wrongly: then up to so many more rounds are made, with terms of this order.
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
+# Residuals of more sigma teach nothing of the noise.
+DEVIANT = 5.0
 # Largest distance from a star's centre to its stamp's edge, px.
 MAX_REACH = 20
 # Brighter stars than this SNR get no more weight when the widths over the field are fitted.
@@ -82,7 +86,7 @@ def learn(
     for round_ in range(rounds + RING_ROUNDS):
         if len(x) == 0:
             break
-        fit = fit_stars(stamps, psf, x, y, response, rounds=3)
+        fit = fit_stars(stamps, psf, x, y, response, rounds=3, leverage=True)
         sound = np.isfinite(fit.chi2) & (fit.flux > 0) & np.isfinite(fit.covariance).all((1, 2))
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
         if not sound.any():
@@ -124,7 +128,7 @@ def _teachers(
     bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(np.flatnonzero(~stamps.full.any((1, 2))))
+    stamps = stamps.take(np.logical_not(stamps.full.any((1, 2))))
     # the shapes of fainter stars are noise
     if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
@@ -212,20 +216,6 @@ def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
     return replace(stamps, signal=signal), SMOOTHING_WIDTH
 
 
-def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Windowed centroids x, y (N,) px of stars of covariance shape px2, at most 2 px from the peak."""
-    x, y = stamps.x.astype(float), stamps.y.astype(float)
-    window = window_for(shape)
-    # through the window an offset looks smaller than it is
-    gain = np.eye(2) + shape @ np.linalg.inv(window)
-    for _ in range(rounds):
-        _, step, _ = moments(stamps, x, y, window)
-        step = np.clip(np.nan_to_num((gain @ step[..., None])[..., 0]), -1, 1)
-        x = np.clip(x + step[:, 0], stamps.x - 2, stamps.x + 2)
-        y = np.clip(y + step[:, 1], stamps.y - 2, stamps.y + 2)
-    return x, y
-
-
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which peaks (N,) have no neighbour within 12 px above a fiftieth of their height, and which have no higher one."""
     pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(12, output_type="ndarray")
@@ -251,37 +241,14 @@ def respond(
     stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, fit: Fit, sound: np.ndarray, before: Response
 ) -> Response:
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
-    used = fit.used[sound]
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
         gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)[0], before)
-    noise2 = (stamps.noise**2)[used]
-    light, square = np.maximum(fit.model[sound][used], 0), fit.residual[sound][used] ** 2
-    square = square / np.maximum(1 - fit.leverage[sound][used], 0.1)
-    photon, misfit2 = before.dn_per_photon, before.misfit**2
-    for _ in range(4):
-        variance = noise2 + photon * light + misfit2 * light**2
-        keep = square < 25 * variance if photon + misfit2 > 0 else np.ones(len(square), bool)
-        photon, misfit2 = _two_terms(light[keep], (square - noise2)[keep], variance[keep])
-    # plus 1 sigma of its error, because errors given too small do more harm than too large ones
-    photon += float(np.sqrt(2 / max(((light / variance) ** 2).sum(), 1e-12)))
-    return Response(gain, spread, photon, float(np.sqrt(misfit2)))
-
-
-def _two_terms(light: np.ndarray, excess: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """Least-squares a, b >= 0 of a * light + b * light^2 = excess, whose variance is given."""
-    terms = np.stack([light, light * light]).astype(np.float64) / variance
-    normal = np.einsum("ik,jk->ij", terms, terms)
-    right = np.einsum("ik,k->i", terms, excess / variance)
-    if normal[0, 0] <= 0:
-        return 0.0, 0.0
-    both = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
-    if both.min() >= 0:
-        return float(both[0]), float(both[1])
-    alone = np.maximum(right / np.diag(normal), 0)
-    # the one that lowers the sum of squares more
-    best = int(np.argmax(right * alone))
-    return (float(alone[0]), 0.0) if best == 0 else (0.0, float(alone[1]))
+    photon, misfit = light_noise(
+        stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, np.flatnonzero(sound), before.dn_per_photon,
+        before.misfit, DEVIANT,
+    )  # fmt: skip
+    return Response(gain, spread, photon, misfit)
 
 
 def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndarray, float]:
@@ -317,4 +284,5 @@ def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Re
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
     variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
     weight = fit.used[sound] * scale**2 / variance
-    return refine(psf, x, y, left, top, stamps.signal / scale, weight, stamps.phase, terms)
+    brightness, phases = stamps.signal / scale, len(response.gain)
+    return refine(psf, x, y, left, top, brightness, weight.astype(np.float32), stamps.phase, phases, terms)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike
 
-from starpos.core.psf import evaluated, terms
+from starpos.core.psf import evaluated
+from starpos.core.shapes import clipped, inverted
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
@@ -38,8 +39,7 @@ class LocalPsf:
     @property
     def shape(self) -> np.ndarray:
         """Covariances (N, 2, 2) px2 of the Gaussians that the series multiply."""
-        inverse = np.linalg.inv(self.axes)
-        return inverse @ inverse.transpose(0, 2, 1)
+        return inverted(self.axes.transpose(0, 2, 1) @ self.axes)
 
     def within(self, dx: np.ndarray, dy: np.ndarray, widths: float) -> np.ndarray:
         """Whether pixels at the offsets dx, dy px from the stars' centres lie within so many widths of them."""
@@ -55,10 +55,6 @@ class LocalPsf:
         left, top (N,) px: of each stamp's first column and row from its star's centre.
         """
         return evaluated(self.axes, self.series, left, top, size)
-
-    def terms(self, left: np.ndarray, top: np.ndarray, size: int, orders: np.ndarray) -> np.ndarray:
-        """Values (N, T, P) of the single terms h_i(u) h_j(v), (i, j) in `orders` (T, 2), at P = size size pixels."""
-        return terms(self.axes, left, top, size, orders.astype(np.int32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +136,4 @@ def trailed(sigma: float, trail: np.ndarray) -> Psf:
 
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:
     """Powers of the symmetric matrices of squared widths (N, 2, 2), with eigenvalues limited to NARROW..BROAD."""
-    values, vectors = np.linalg.eigh(widths)
-    values = np.clip(values, NARROW, BROAD) ** exponent
-    return (vectors * values[:, None]) @ vectors.transpose(0, 2, 1)
+    return clipped(widths, NARROW, BROAD, exponent)

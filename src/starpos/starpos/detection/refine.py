@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.detection.psf import MONOMIALS, LocalPsf, Psf, power
+from starpos.core.marginal import marginal
+from starpos.detection.psf import MONOMIALS, Psf, power
 
 # A variation over the field needs at least so many stars,
 PLACES = 12
@@ -105,6 +106,7 @@ def refine(
     brightness: np.ndarray,
     weight: np.ndarray,
     phase: np.ndarray,
+    phases: int,
     terms: Terms,
 ) -> Psf:
     """The Psf whose series fits N stars best, by weighted linear least squares with free positions and gains.
@@ -113,14 +115,18 @@ def refine(
     left, top   (N,) px: of each stamp's first column and row from its star's centre
     brightness  (N, S, S): the pixels over their stars' fluxes and gains
     weight      (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
-    phase       (N, S, S): the pixels' numbers in the mosaic
+    phase       (N, S, S): the pixels' numbers in the mosaic, of so many phases
     terms       the terms that are tried; they are taken if they are worth their price
     """
-    normal, right = _marginal(psf.at(x, y), left, top, brightness, weight, phase, terms.orders)
+    local = psf.at(x, y)
+    normal, right = marginal(
+        local.axes, local.series, left, top, brightness, weight, phase, phases, terms.orders.astype(np.int32)
+    )
     count, places = terms.candidates.shape[1:]
     field = psf.monomials(x, y)[:, :places]
-    normal = np.einsum("nab,nk,nl->akbl", normal, field, field, optimize=True).reshape(count * places, -1)
-    right = np.einsum("na,nk->ak", right, field).ravel()
+    each = (field[:, :, None] * field[:, None]).reshape(len(x), -1).T @ normal.reshape(len(x), -1)
+    normal = each.reshape(places, places, count, count).transpose(2, 0, 3, 1).reshape(count * places, -1)
+    right = (right.T @ field).ravel()
     candidates = terms.candidates.reshape(-1, len(right))
     found = _chosen(normal + np.eye(len(right)) / LIKELY**2, right, candidates, terms.price.ravel())
     if not np.all(np.isfinite(found)):
@@ -135,33 +141,6 @@ def refine(
     series[0, 0, 0] = 1
     series[:, i[1:], j[1:]] = found[used, : len(series)].T
     return replace(psf, series=series)
-
-
-def _marginal(
-    local: LocalPsf,
-    left: np.ndarray,
-    top: np.ndarray,
-    brightness: np.ndarray,
-    weight: np.ndarray,
-    phase: np.ndarray,
-    orders: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations (N, T, T) and (N, T) of each star for the terms, with its position and gains eliminated."""
-    (n, size, _), count = brightness.shape, len(orders)
-    weight = weight.reshape(n, 1, -1)
-    value, by_x, by_y = (a.reshape(n, 1, -1) for a in local.evaluate(left, top, size))
-    mean = local.terms(left, top, size, np.zeros((1, 2), int))
-    gains = value * (phase.reshape(n, 1, -1) == np.arange(phase.max() + 1)[:, None])
-    design = np.concatenate([local.terms(left, top, size, orders), gains, by_x, by_y], axis=1)
-    weighted = design * weight
-    normal = (weighted @ design.transpose(0, 2, 1)).astype(np.float64)
-    left = brightness.reshape(n, 1, -1) - mean
-    right = np.einsum("ntp,np->nt", weighted, left[:, 0]).astype(np.float64)
-    free = normal[:, count:, count:]
-    free = free + np.eye(free.shape[1]) * (1e-9 * np.trace(free, axis1=1, axis2=2)[:, None, None] + 1e-30)
-    share = normal[:, :count, count:] @ np.linalg.inv(free)
-    normal = normal[:, :count, :count] - share @ normal[:, count:, :count]
-    return normal, right[:, :count] - np.einsum("ntk,nk->nt", share, right[:, count:])
 
 
 def _chosen(normal: np.ndarray, right: np.ndarray, candidates: np.ndarray, price: np.ndarray) -> np.ndarray:

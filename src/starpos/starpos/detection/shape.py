@@ -7,7 +7,8 @@ a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 
 
 import numpy as np
 
-from starpos.core.moments import windowed
+from starpos.core.moments import centred, windowed
+from starpos.core.shapes import before, clipped, inverted, relative, through
 from starpos.detection.stamps import Stamps
 
 # px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
@@ -18,8 +19,12 @@ NARROWEST_WINDOW = 1.2
 
 def at_least(shape: np.ndarray, floor: float) -> np.ndarray:
     """The covariance shape (..., 2, 2) px2 with no principal axis below floor px2."""
-    values, vectors = np.linalg.eigh(shape)
-    return (vectors * np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return clipped(_each(shape), floor, np.inf, 1.0).reshape(shape.shape)
+
+
+def _each(shape: np.ndarray) -> np.ndarray:
+    """Covariances (..., 2, 2) in one row (N, 2, 2)."""
+    return shape.reshape(-1, 2, 2)
 
 
 def moments(
@@ -31,9 +36,15 @@ def moments(
     NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the centroid
     would be biased away from the edge.
     """
-    signal = np.ascontiguousarray(stamps.signal, np.float32)
-    left, top = stamps.corner(x, y)
-    return windowed(signal, left, top, np.linalg.inv(window).reshape(-1, 2, 2))
+    return windowed(stamps.signal, *stamps.corner(x, y), _each(window))
+
+
+def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Windowed centroids x, y (N,) px of stars of covariance shape px2, at most 2 px from the peak."""
+    window = window_for(shape)
+    # through the window an offset looks smaller than it is
+    gain = np.eye(2) + shape @ inverted(_each(window)).reshape(window.shape)
+    return centred(stamps.signal, stamps.x, stamps.y, _each(window), _each(gain), rounds, 2.0)
 
 
 def window_for(shape: np.ndarray) -> np.ndarray:
@@ -65,12 +76,11 @@ def _settled_shape(stamps: Stamps, window: np.ndarray, rounds: int) -> np.ndarra
         if not usable.any():
             break
         seen = np.median(seen[usable], axis=0)
-        narrower = np.linalg.inv(seen) - np.linalg.inv(window)
-        values, vectors = np.linalg.eigh(narrower)
+        of_seen, of_window = inverted(np.stack([seen, window]))
         # a stamp does not hold a wider star
         limit = (stamps.reach / 2.0) ** 2
-        own = vectors @ np.diag(1 / np.clip(values, 1 / limit, 1 / NARROWEST)) @ vectors.T
-        gain = np.eye(2) + own @ np.linalg.inv(window)
+        own = clipped(_each(of_seen - of_window), 1 / limit, 1 / NARROWEST, -1.0)[0]
+        gain = np.eye(2) + own @ of_window
         step = np.where(usable[:, None], step @ gain.T, 0)
         x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
         change = np.inf if shape is None else np.abs(own - shape).max() / own.max()
@@ -89,11 +99,7 @@ def _narrow_side(seen: np.ndarray) -> np.ndarray:
 
 def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:
     """Covariances (N, 2, 2) px2 of stars from those of their windowed images, seen (N, 2, 2); NaN where impossible."""
-    sound = np.isfinite(seen).all((1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(seen))) > 1e-6)
-    narrower = np.linalg.inv(np.where(sound[:, None, None], seen, np.eye(2))) - np.linalg.inv(window)
-    sound &= np.abs(np.linalg.det(narrower)) > 1e-9
-    own = np.linalg.inv(np.where(sound[:, None, None], narrower, np.eye(2)))
-    return np.where(sound[:, None, None], own, np.nan)
+    return before(seen, _each(window))
 
 
 def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -102,7 +108,4 @@ def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> 
     Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
     the shape. NaN counts as 0.
     """
-    expected = np.linalg.inv(np.linalg.inv(shape) + np.linalg.inv(window))
-    root = np.linalg.inv(np.linalg.cholesky(expected))
-    with np.errstate(invalid="ignore"):
-        return np.linalg.eigvalsh(np.nan_to_num(root @ seen @ np.swapaxes(root, -1, -2)))
+    return relative(seen, through(_each(shape), _each(window)))

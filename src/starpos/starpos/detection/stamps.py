@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core.stamps import around, scatter
+from starpos.core.stamps import around, rims, scatter
 from starpos.detection.background import Background
 from starpos.normal import SIGMA_PER_MAD
 
@@ -50,8 +50,15 @@ class Stamps:
         return self.signal.shape[1] // 2
 
     def take(self, index: np.ndarray | slice) -> "Stamps":
-        """The stamps that index selects."""
+        """The stamps that index selects; a mask (N,) that selects all copies nothing."""
+        if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
+            return self
         return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @property
+    def origin(self) -> np.ndarray:
+        """Places (N, 2) px of the first column and row."""
+        return np.stack([self.x, self.y], 1) - float(self.reach)
 
     def corner(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offsets (N,) px of the first column and row from the points x, y (N,) px."""
@@ -99,19 +106,11 @@ def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.nd
 def surroundings(
     plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The sky's level and scatter (`uneven`) on the edges of squares, reach px from the pixels x, y (N,) int."""
-    side, end = np.arange(-reach, reach), np.full(2 * reach, reach)
-    columns = np.clip(x[:, None] + np.concatenate([side, end, -side, -end]), 0, plane.shape[1] - 1)
-    rows = np.clip(y[:, None] + np.concatenate([-end, side, end, -side]), 0, plane.shape[0] - 1)
-    level, noise = background.of_pixels(x, y, rows, columns)
-    return uneven(plane[rows, columns] - level, noise)
-
-
-def uneven(signal: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level (N,) and scatter (N,) of the pixels (N, K) around stars, both over the noise.
+    """The sky's level and scatter on the edges of squares, reach px from the pixels x, y (N,) int, over the noise.
 
     0 and 1 where a difference may be chance. Beside a roof, among twigs or under a cloud the sky is brighter and less
     even than the background's mesh says.
     """
-    level, spread = scatter(*(np.ascontiguousarray(a, np.float32) for a in (signal, noise)), SIGMA_PER_MAD)
+    x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
+    level, spread = scatter(*rims(plane, x, y, reach, *background.near(x, y)), SIGMA_PER_MAD)
     return np.where(level > RAISED, level, 0), np.where(spread > UNEVEN, spread, 1)

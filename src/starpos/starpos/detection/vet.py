@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turn peaks into measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy import spatial
 
+from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
 from starpos.detection.blend import with_companions
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
-from starpos.detection.learn import Lesson, centroid, grey
+from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import Psf
-from starpos.detection.shape import moments, relative_widths, window_for
-from starpos.detection.stamps import Stamps, cut, uneven
+from starpos.detection.shape import centroid, moments, relative_widths, window_for
+from starpos.detection.stamps import RAISED, UNEVEN, Stamps, cut
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos.normal import SIGMA_PER_MAD
 
 # Outliers of up to so many pixels are a hot pixel or a cosmic ray on the star, not another source.
 SPECK = 3
@@ -27,6 +27,10 @@ STRANGE = 3.0
 WIDE = 1.7
 # If it is narrower than this across, and has this SNR, it may be several stars in a row: it is kept, with a flag.
 NARROW, CERTAIN = 1.2, 60
+# Widths of the PSF around a star, within which a saturated pixel, and one that is cut off, spoil it.
+CORE = 2.0, 3.0
+# The rim of a very bright star is its own light: this share of its brightest pixel.
+OWN = 0.01
 # Pixels with so many times the noise of the quietest pixel of their stamp lie on a streak.
 LOUD = 3
 
@@ -47,44 +51,45 @@ def measure(
     psf = lesson.psf
 
     def cut_at(x: np.ndarray, y: np.ndarray) -> tuple[Stamps, np.ndarray]:
-        stamps = _levelled(cut(plane, background, x, y, lesson.reach, saturation))
-        spike, around = _spikes(stamps, lesson)
-        signal = np.where(spike, around, stamps.signal)
-        return replace(stamps, signal=signal, good=stamps.good & ~spike), spike
+        stamps = cut(plane, background, x, y, lesson.reach, saturation)
+        level(stamps.signal, stamps.noise, SIGMA_PER_MAD, RAISED, UNEVEN, OWN)
+        return stamps, _take_spikes(stamps, lesson)
 
     stamps, spike = cut_at(x, y)
     shape = psf.at(x, y).shape
     x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
     stamps, spike, fit = with_companions(stamps, spike, fit, psf, lesson.response, cut_at)
-    smooth, blur = grey(_own_light(stamps, fit, spike), background)
+    local = psf.at(fit.x, fit.y)
+    matched, foreign, full, edge = looks(
+        stamps.signal, stamps.noise, stamps.good, stamps.full, spike, fit.residual, fit.model, fit.used, fit.outlier,
+        *stamps.corner(fit.x, fit.y), local.axes, *CORE,
+    )  # fmt: skip
+    dot = _is_dot(stamps, fit, lesson.response)
+    own_light(stamps.signal, stamps.noise, spike, fit.model, fit.outlier, SPECK, LOUD)
+    smooth, blur = grey(stamps, background)
     shape = psf.at(stamps.x, stamps.y).shape
     window = window_for(shape)
     _, _, seen = moments(smooth, fit.x, fit.y, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
+    misfit = _misfit(fit)
     with np.errstate(invalid="ignore", divide="ignore"):
         snr = fit.flux / fit.flux_sigma
-        c = fit.covariance * _misfit(fit)[:, None, None]
-        # SNR in the sky's noise
-        matched = np.sqrt(((fit.model / stamps.noise) ** 2 * fit.used).sum((1, 2)))
+        c = fit.covariance * misfit[:, None, None]
         sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
-        sound &= (fit.flux > 0) & (matched >= min_snr)
-        sound &= ~_is_dot(stamps, fit, lesson.response)
+        sound &= (fit.flux > 0) & (matched >= min_snr) & ~dot
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
         slack = 3 / matched
         # through a window wider than the star, noise changes the width more
         loose = slack * np.sqrt(np.linalg.det(window) / np.linalg.det(shape))
-        full = (stamps.full & _core(stamps, fit, psf, 2)).any((1, 2))
         wide = (widths[:, 1] > WIDE + loose - slack) & ~full
         sound &= full | (widths[:, 0] > 0.45 - loose)
         sound &= ~wide | ((widths[:, 0] < NARROW) & (matched > CERTAIN))
-        edge = (~stamps.good & ~stamps.full & ~spike & _core(stamps, fit, psf, 3)).any((1, 2))
-        foreign = (np.maximum(fit.residual, 0) * fit.outlier).sum((1, 2)) > 0.05 * fit.flux
-        foreign |= (_misfit(fit) > STRANGE) | wide
+        blended = (foreign > 0.05 * fit.flux) | (misfit > STRANGE) | wide
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
-    flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * foreign
+    flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * blended
     columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
     columns |= {"chi2": fit.chi2, "wide": wide}
     return {name: column[sound] for name, column in columns.items()}
@@ -92,58 +97,19 @@ def measure(
 
 def _misfit(fit: Fit) -> np.ndarray:
     """Factors (N,) on the covariance: chi2 where it is above what chance allows, else 1."""
-    freedom = np.maximum(fit.used.sum((1, 2)) - 3, 1)
+    freedom = np.maximum(fit.pixels - 3, 1)
     return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
 
 
-def _levelled(stamps: Stamps) -> Stamps:
-    """Stamps with level and noise of the sky corrected by what the pixels at their rims show."""
-    rim = np.ones(stamps.signal.shape[1:], bool)
-    rim[1:-1, 1:-1] = False
-    signal, noise = stamps.signal[:, rim], stamps.noise[:, rim]
-    # the rim of a very bright star is its own light
-    own = 0.01 * stamps.signal.max((1, 2)) / np.median(noise, axis=1)
-    level, noise = uneven(signal, noise)
-    level, noise = (np.where(v > own, v, least)[:, None, None] for v, least in ((level, 0), (noise, 1)))
-    level, noise = (v.astype(np.float32) for v in (level, noise))
-    return replace(stamps, signal=stamps.signal - level * stamps.noise, noise=stamps.noise * noise)
-
-
-def _spikes(stamps: Stamps, lesson: Lesson) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, S, S) bool much brighter than their neighbours, as in no star, and the mean of their neighbours."""
+def _take_spikes(stamps: Stamps, lesson: Lesson) -> np.ndarray:
+    """Pixels (N, S, S) much brighter than their neighbours, as in no star: the stamps have the mean of these there."""
     beside = np.full(len(stamps.x), -1.0)
     star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)[0]
-    top, beside = star[:, 1, 1], _four(star)[:, 1, 1]
+    top, four = star[:, 1, 1], (star[:, 0, 1] + star[:, 2, 1] + star[:, 1, 0] + star[:, 1, 2]) * 0.25
     # at least 1, because a ring has a dark middle
-    sharpest = np.maximum(1.0, top / np.maximum(beside, 1e-3 * np.abs(top)))[:, None, None].astype(np.float32)
-    gain = lesson.response.of_phase(stamps.phase)
-    grey = stamps.signal / gain
-    around = _four(grey)
-    spike = (grey > SPIKE * sharpest * (around + stamps.noise)) & (stamps.signal > OUTLIER * stamps.noise)
-    return spike, around * gain
-
-
-def _four(image: np.ndarray) -> np.ndarray:
-    """The mean of the four pixels beside each of images (N, S, S); beyond the edges the image goes on as on them."""
-    wide = np.pad(image, ((0, 0), (1, 1), (1, 1)), "edge")
-    return (wide[:, :-2, 1:-1] + wide[:, 2:, 1:-1] + wide[:, 1:-1, :-2] + wide[:, 1:-1, 2:]) * np.float32(
-        0.25
-    )
-
-
-def _own_light(stamps: Stamps, fit: Fit, spike: np.ndarray) -> Stamps:
-    """Stamps with the model in place of pixels that say nothing about the star's own shape.
-
-    These are hot pixels and cosmic rays, if there are not more than a few, and pixels on a streak, which are noisy.
-    """
-    speck = fit.outlier & (fit.outlier.sum((1, 2)) <= SPECK)[:, None, None]
-    loud = stamps.noise > LOUD * stamps.noise.min((1, 2), keepdims=True)
-    return replace(stamps, signal=np.where(speck | loud | spike, fit.model, stamps.signal))
-
-
-def _core(stamps: Stamps, fit: Fit, psf: Psf, widths: float) -> np.ndarray:
-    """Pixels (N, S, S) bool within so many widths of the star's centre."""
-    return psf.at(fit.x, fit.y).within(*stamps.offsets(fit.x, fit.y), widths)
+    sharpest = SPIKE * np.maximum(1.0, top / np.maximum(four, 1e-3 * np.abs(top))).astype(np.float32)
+    gain = lesson.response.gain.astype(np.float32)
+    return without_spikes(stamps.signal, stamps.noise, stamps.good, stamps.phase, gain, sharpest, OUTLIER)
 
 
 def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
@@ -151,19 +117,12 @@ def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
 
     Where one pixel does not describe them well either (a star on coarse pixels), the PSF must be twice as bad.
     """
-    half = max(2, stamps.reach // 2 - 1)
-    c = slice(stamps.reach - half, stamps.reach + half + 1)
-    signal, noise, residual, model, good = (
-        a[:, c, c] for a in (stamps.signal, stamps.noise, fit.residual, fit.model, stamps.good)
-    )
-    score = good * (signal / noise) ** 2
-    one_pixel = score.sum((1, 2)) - (score * (signal > 0)).max((1, 2))
-    variance = response.variance(noise, model)
-    star = (good * (residual**2 / variance + np.log(variance / noise**2))).sum((1, 2))
-    pixels = good.sum((1, 2))
-    likely = one_pixel < pixels + 4 * np.sqrt(2 * pixels)
-    dot = (one_pixel < star) & (likely | (one_pixel < 0.5 * star))
-    return dot & (stamps.full[:, c, c].sum((1, 2)) < SPECK)
+    one, star, pixels, full = one_pixel(
+        stamps.signal, stamps.noise, stamps.good, stamps.full, fit.residual, fit.model, response.dn_per_photon,
+        response.misfit, max(2, stamps.reach // 2 - 1),
+    )  # fmt: skip
+    likely = one < pixels + 4 * np.sqrt(2 * pixels)
+    return (one < star) & (likely | (one < 0.5 * star)) & (full < SPECK)
 
 
 def resolve(columns: dict[str, np.ndarray], psf: Psf) -> dict[str, np.ndarray]:

@@ -4,11 +4,12 @@
 import numpy as np
 import pytest
 
-from starpos.core.moments import windowed
+from starpos.core.moments import centred, windowed
 
 
-def plain(signal, left, top, inverse):
+def plain(signal, left, top, window):
     """Moments of images (N, S, S), summed pixel by pixel."""
+    inverse = np.linalg.inv(window)
     grid = np.arange(signal.shape[1])
     d = np.stack(
         np.broadcast_arrays((left[:, None] + grid)[:, None, :], (top[:, None] + grid)[:, :, None]), -1
@@ -27,9 +28,9 @@ def test_moments_are_those_of_plain_sums(size, off_px, rng):
     signal = rng.uniform(1, 2, (n, size, size)).astype(np.float32)
     left, top = -(size // 2) + rng.uniform(-off_px, off_px, (2, n))
     root = rng.normal(0, 1, (n, 2, 2))
-    inverse = np.linalg.inv(root @ root.transpose(0, 2, 1) + (1 + off_px**2) * np.eye(2))
+    window = root @ root.transpose(0, 2, 1) + (1 + off_px**2) * np.eye(2)
     for found, expected in zip(
-        windowed(signal, left, top, inverse), plain(signal, left, top, inverse), strict=True
+        windowed(signal, left, top, window), plain(signal, left, top, window), strict=True
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
@@ -39,3 +40,40 @@ def test_without_light_there_is_no_place():
     mass, mean, shape = windowed(signal, np.array([-3.0]), np.array([-3.0]), np.eye(2)[None])
     assert mass[0] < 0
     assert np.isnan(mean).all() and np.isnan(shape).all()
+
+
+def images(rng, n, size=13):
+    """Stars (N, S, S) near the middles of their images, the first without light, and a window and a gain each."""
+    grid = np.arange(size) - size // 2
+    x, y = rng.uniform(-2.5, 2.5, (2, n, 1))
+    signal = np.exp(-0.3 * (grid - y) ** 2)[:, :, None] * np.exp(-0.2 * (grid - x) ** 2)[:, None, :]
+    signal[0] = -1
+    root = rng.normal(0, 0.3, (n, 2, 2))
+    window = root @ root.transpose(0, 2, 1) + 2 * np.eye(2)
+    return signal.astype(np.float32), window, np.eye(2) + rng.uniform(0, 0.5, (n, 2, 2))
+
+
+@pytest.mark.parametrize("rounds", [1, 4])
+def test_places_are_those_of_means_through_windows(rounds, rng):
+    n, half = 20, 6
+    signal, window, gain = images(rng, n)
+    column, row = rng.integers(0, 100, (2, n))
+    x, y = column.astype(float), row.astype(float)
+    for _ in range(rounds):
+        mean = plain(signal, column - half - x, row - half - y, window)[1]
+        step = np.clip((gain @ mean[..., None])[..., 0], -1, 1)
+        step[0] = 0
+        x, y = np.clip(x + step[:, 0], column - 2, column + 2), np.clip(y + step[:, 1], row - 2, row + 2)
+    found = centred(signal, column, row, window, gain, rounds, 2.0)
+    np.testing.assert_allclose(found, (x, y), rtol=0, atol=1e-9)
+    alone = centred(signal[1:2], column[1:2], row[1:2], window[1:2], gain[1:2], rounds, 2.0)
+    np.testing.assert_allclose(np.ravel(alone), (x[1], y[1]), rtol=0, atol=1e-9)
+
+
+def test_a_window_for_each_image_is_needed(rng):
+    signal, window, gain = images(rng, 4)
+    place = np.zeros(4, int)
+    with pytest.raises(ValueError, match="windows"):
+        centred(signal, place, place, window[:2], gain, 3, 2.0)
+    with pytest.raises(ValueError, match="places"):
+        windowed(signal, np.zeros(3), np.zeros(4), window)

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Normal equations of a PSF's terms, star by star, with the star's own place and gains eliminated."""
+
+from libc.math cimport isnan
+from libc.stdlib cimport free, malloc
+from libc.string cimport memset
+
+import numpy as np
+
+cimport starpos.core.wide
+from starpos.core.algebra cimport factored, solved
+from starpos.core.psf cimport BLOCK, ORDERS, Local, evaluate, local_of, scaled, sound, terms_at
+
+cdef extern from *:
+    """
+    /* As BLOCK; in eights, which a compiler left to itself takes one by one. */
+    #define STARPOS_EIGHTS 8
+    typedef float starpos_eight __attribute__((vector_size(32)));
+    typedef float starpos_floats __attribute__((vector_size(32), aligned(4)));
+    /* Add to the lower half of normal (k, k) and to right (k,) what a block of pixels says; design (k, block). */
+    STARPOS_WIDE static void starpos_gram(const float *design, const float *weight, const float *value, int k,
+                                          double *normal, double *right) {
+        const starpos_floats *row = (const starpos_floats *)design, *w = (const starpos_floats *)weight;
+        const starpos_floats *v = (const starpos_floats *)value;
+        for (int a = 0; a < k; a++) {
+            starpos_eight weighted[STARPOS_EIGHTS], sum = {0};
+            for (int p = 0; p < STARPOS_EIGHTS; p++) {
+                weighted[p] = row[a * STARPOS_EIGHTS + p] * w[p];
+                sum += weighted[p] * v[p];
+            }
+            for (int p = 0; p < 8; p++)
+                right[a] += sum[p];
+            for (int b = 0; b <= a; b++) {
+                starpos_eight even = {0}, odd = {0};
+                for (int p = 0; p < STARPOS_EIGHTS; p += 2) {
+                    even += weighted[p] * row[b * STARPOS_EIGHTS + p];
+                    odd += weighted[p + 1] * row[b * STARPOS_EIGHTS + p + 1];
+                }
+                even += odd;
+                normal[a * k + b] += (double)((even[0] + even[4]) + (even[1] + even[5]))
+                    + (double)((even[2] + even[6]) + (even[3] + even[7]));
+            }
+        }
+    }
+    """
+    void gram "starpos_gram"(
+        const float *design, const float *weight, const float *value, int k, double *normal, double *right
+    ) noexcept nogil
+
+
+cdef struct Block:
+    # Pixels side by side: offsets px, weights, brightness without the mean star, and phases; the columns of the equations.
+    int count
+    double[BLOCK] dx
+    double[BLOCK] dy
+    float[BLOCK] weight
+    float[BLOCK] value
+    unsigned char[BLOCK] phase
+    float *design
+
+
+cdef void _add(Block *block, const Local *psf, const int[:, ::1] orders, int highest, int phases, double *normal, double *right) noexcept nogil:
+    """Add a block's pixels to the equations: of the terms, then of the gains, x and y."""
+    cdef double[BLOCK] u
+    cdef double[BLOCK] v
+    cdef double[BLOCK] gauss
+    cdef double[3][BLOCK] star
+    cdef int terms = orders.shape[0], free_ = phases + 2, p, k
+    cdef float *own = block.design + terms * BLOCK
+    scaled(psf, block.dx, block.dy, block.count, u, v, gauss)
+    if terms:
+        terms_at(&orders[0, 0], terms, highest, u, v, gauss, block.design)
+    evaluate(psf, block.dx, block.dy, block.count, star[0], star[1], star[2])
+    memset(own, 0, free_ * BLOCK * sizeof(float))
+    for p in range(block.count):
+        own[block.phase[p] * BLOCK + p] = <float>star[0][p]
+        own[phases * BLOCK + p], own[(phases + 1) * BLOCK + p] = <float>star[1][p], <float>star[2][p]
+        block.value[p] -= <float>gauss[p]
+    for p in range(block.count, BLOCK):
+        block.weight[p] = block.value[p] = 0.0
+    gram(block.design, block.weight, block.value, terms + free_, normal, right)
+    block.count = 0
+
+
+cdef void _eliminate(double *normal, double *right, int terms, int free_, double[:, ::1] out, double[::1] out_right) noexcept nogil:
+    """Set the equations of the terms with the others eliminated; 0 if these have no solution."""
+    cdef int n = terms + free_, a, b, c
+    cdef double[36] factor
+    cdef double[6] share
+    cdef double trace = 0.0
+    for a in range(free_):
+        trace += normal[(terms + a) * n + terms + a]
+    for a in range(free_):
+        for b in range(a + 1):
+            factor[a * free_ + b] = normal[(terms + a) * n + terms + b]
+        factor[a * free_ + a] += 1e-9 * trace + 1e-30
+    if isnan(factored(factor, free_)):
+        out[:, :], out_right[:] = 0.0, 0.0
+        return
+    for a in range(terms):
+        for c in range(free_):
+            share[c] = normal[(terms + c) * n + a]
+        solved(factor, share, free_)
+        out_right[a] = right[a]
+        for c in range(free_):
+            out_right[a] -= share[c] * right[terms + c]
+        for b in range(a + 1):
+            out[a, b] = normal[a * n + b]
+            for c in range(free_):
+                out[a, b] -= share[c] * normal[(terms + c) * n + b]
+            out[b, a] = out[a, b]
+
+
+def marginal(
+    const double[:, :, ::1] axes, const double[:, :, ::1] series, const double[::1] left, const double[::1] top,
+    const float[:, :, ::1] brightness, const float[:, :, ::1] weight, const unsigned char[:, :, ::1] phase, int phases,
+    const int[:, ::1] orders,
+):
+    """Normal equations, (N, T, T) and (N, T), of each of N stars for T terms of the PSF beside its mean Gaussian.
+
+    axes, series  (N, ...) or (1, ...): as `detection.psf.LocalPsf` has them
+    left, top     (N,) px: of each stamp's first column and row from its star's centre
+    brightness    (N, S, S): the pixels over their stars' fluxes and gains
+    weight        (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
+    phase         (N, S, S): the pixels' numbers in the mosaic of so many phases, 1 or 4
+    orders        (T, 2): i, j of each term h_i(u) h_j(v)
+
+    A star's place and its gain at each phase are free.
+    """
+    cdef int n = left.shape[0], size = brightness.shape[1], count = orders.shape[0], highest = 1, k, row, column
+    cdef int each = count + phases + 2
+    cdef Block block
+    cdef Local psf
+    sound(axes, series, n)
+    for images, rows, columns in (
+        (brightness.shape[0], brightness.shape[1], brightness.shape[2]),
+        (weight.shape[0], weight.shape[1], weight.shape[2]),
+        (phase.shape[0], phase.shape[1], phase.shape[2]),
+    ):
+        if (images, rows, columns) != (n, size, size):
+            raise ValueError(f"pixels {(images, rows, columns)}: {(n, size, size)} are needed")
+    if top.shape[0] != n or orders.shape[1] != 2 or phases not in (1, 4) or (n and np.max(phase) >= phases):
+        raise ValueError(f"{top.shape[0]} rows, {phases} phases, orders of {orders.shape[1]} numbers: {n} rows, 1 or 4, 2")
+    if count and not 0 <= np.min(orders) <= np.max(orders) <= ORDERS:
+        raise ValueError(f"terms of orders to {np.max(orders)}: they must be 0 to {ORDERS}")
+    highest = max(1, np.max(orders, initial=1))
+    out, right_ = np.empty((n, count, count)), np.empty((n, count))
+    cdef double[:, :, ::1] normals = out
+    cdef double[:, ::1] rights = right_
+    cdef double *normal = <double *>malloc(each * (each + 1) * sizeof(double))
+    block.design = <float *>malloc(each * BLOCK * sizeof(float))
+    if normal == NULL or block.design == NULL:
+        free(normal)
+        free(block.design)
+        raise MemoryError
+    with nogil:
+        for k in range(n):
+            local_of(axes, series, k, &psf)
+            memset(normal, 0, each * (each + 1) * sizeof(double))
+            block.count = 0
+            for row in range(size):
+                for column in range(size):
+                    if not weight[k, row, column] > 0:
+                        continue
+                    block.dx[block.count], block.dy[block.count] = left[k] + column, top[k] + row
+                    block.weight[block.count] = weight[k, row, column]
+                    block.value[block.count] = brightness[k, row, column]
+                    block.phase[block.count] = phase[k, row, column]
+                    block.count += 1
+                    if block.count == BLOCK:
+                        _add(&block, &psf, orders, highest, phases, normal, normal + each * each)
+            if block.count:
+                _add(&block, &psf, orders, highest, phases, normal, normal + each * each)
+            _eliminate(normal, normal + each * each, count, phases + 2, normals[k], rights[k])
+    free(normal)
+    free(block.design)
+    return out, right_

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The noise that grows with a star's light, from what fits leave."""
+
+from libc.math cimport hypot, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+cdef enum:
+    ROUNDS = 4
+
+# Smaller singular values, as a share of the largest, are 0; residuals are at most so much more certain than they look.
+cdef double SINGULAR = 1e-12, CERTAIN = 0.1
+
+
+cdef struct Pixel:
+    # The sky's variance, the light, and the residual's square as it would be without the fit.
+    double noise2
+    double light
+    double square
+
+
+cdef (double, double) _two_terms(double pp, double pq, double qq, double p, double q) noexcept nogil:
+    """Least-squares a, b >= 0 of a symmetric system of two equations; of both or, where one were negative, the better one."""
+    cdef double large, small, a, b
+    if not pp > 0:
+        return 0.0, 0.0
+    large = (pp + qq) / 2 + hypot((pp - qq) / 2, pq)
+    small = (pp * qq - pq * pq) / large
+    if small > SINGULAR * large:
+        a, b = (qq * p - pq * q) / (small * large), (pp * q - pq * p) / (small * large)
+    else:
+        a, b = (pp * p + pq * q) / (large * large), (pq * p + qq * q) / (large * large)
+    if a >= 0 and b >= 0:
+        return a, b
+    a, b = max(p / pp, 0.0), max(q / qq, 0.0)
+    # the one that lowers the sum of squares more
+    if p * a >= q * b:
+        return a, 0.0
+    return 0.0, b
+
+
+cdef (double, double) _fitted(const Pixel *each, Py_ssize_t n, double photon, double misfit2, double outlier2) noexcept nogil:
+    """DN of a photon, with 1 sigma of its error, and misfit squared, from those before."""
+    cdef double pp, pq, qq, p, q, information = 0.0, a, b, variance, excess
+    cdef bint first
+    cdef Py_ssize_t k
+    cdef int round_
+    for round_ in range(ROUNDS):
+        pp = pq = qq = p = q = information = 0.0
+        first = not photon + misfit2 > 0
+        for k in range(n):
+            variance = each[k].noise2 + (photon + misfit2 * each[k].light) * each[k].light
+            a = each[k].light / variance
+            information += a * a
+            if first or each[k].square < outlier2 * variance:
+                b, excess = a * each[k].light, (each[k].square - each[k].noise2) / variance
+                pp, pq, qq, p, q = pp + a * a, pq + a * b, qq + b * b, p + a * excess, q + b * excess
+        photon, misfit2 = _two_terms(pp, pq, qq, p, q)
+    # because errors given too small do more harm than too large ones
+    return photon + sqrt(2 / max(information, 1e-12)), misfit2
+
+
+def light_noise(
+    const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
+    const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage, const Py_ssize_t[::1] rows, double photon,
+    double misfit, double outlier,
+):
+    """DN of a photon and misfit: a star's light s adds the variance photon s + (misfit s)^2 to that of the sky.
+
+    noise                            (M, S, S) of the sky, of the stars that teach
+    model, residual, used, leverage  (N, S, S) of a fit, in which these are `rows` (M,)
+    photon, misfit                   before
+    outlier                          sigmas beyond which a residual teaches nothing
+    """
+    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], count = 0, k, j, row
+    cdef double misfit2
+    for name, fits, height, width in (
+        ("model", model.shape[0], model.shape[1], model.shape[2]),
+        ("residual", residual.shape[0], residual.shape[1], residual.shape[2]),
+        ("used", used.shape[0], used.shape[1], used.shape[2]),
+        ("leverage", leverage.shape[0], leverage.shape[1], leverage.shape[2]),
+    ):
+        if (fits, height, width) != (model.shape[0], noise.shape[1], noise.shape[2]):
+            raise ValueError(f"{name} has the shape {(fits, height, width)}: as the model, and stamps as of the noise")
+    if noise.shape[0] != n or (n and not 0 <= np.min(rows) <= np.max(rows) < model.shape[0]):
+        raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
+    cdef Pixel *each = <Pixel *>malloc(max(n * area, 1) * sizeof(Pixel))
+    if each == NULL:
+        raise MemoryError
+    with nogil:
+        for k in range(n if area else 0):
+            row = rows[k]
+            for j in range(area):
+                if (&used[row, 0, 0])[j]:
+                    each[count].noise2 = <double>(&noise[k, 0, 0])[j] * (&noise[k, 0, 0])[j]
+                    each[count].light = max((&model[row, 0, 0])[j], 0.0)
+                    each[count].square = <double>(&residual[row, 0, 0])[j] * (&residual[row, 0, 0])[j]
+                    each[count].square /= max(1.0 - (&leverage[row, 0, 0])[j], CERTAIN)
+                    count += 1
+        photon, misfit2 = _fitted(each, count, photon, misfit * misfit, outlier * outlier)
+    free(each)
+    return photon, sqrt(misfit2)

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Weighted least-squares fit of two stars to one stamp: places, fluxes and gains of both, by Gauss-Newton."""
+
+from libc.math cimport NAN, fabs, sqrt
+from libc.stdlib cimport free, malloc
+from libc.string cimport memset
+
+import numpy as np
+
+from starpos.core.fit cimport MOST, PHASES, Rules, invert, sound_stamps
+from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
+
+cdef enum:
+    # Parameters of both stars.
+    ALL = 2 * MOST
+    # Numbers kept of each pixel: of each star 5, and 5 of their light.
+    COLUMNS = 15
+
+# One step moves a star so far (px) at most; if none moves so far, and no flux changes by that share, the fit has settled.
+cdef double FARTHEST = 0.5, SETTLED = 1e-9
+
+
+cdef struct Image:
+    # Of one of the stars, at the pixels one after the other: offsets px, and the PSF and its derivatives times the gain.
+    double *dx
+    double *dy
+    double *value
+    double *by_x
+    double *by_y
+
+
+cdef struct Pixels:
+    int count
+    int *place
+    double *signal
+    double *noise2
+    double *light
+    double *weight
+    double *residual
+    Image[2] of
+
+
+cdef struct Star:
+    double x
+    double y
+    double flux
+    double[PHASES] gain
+    double[PHASES] colour
+
+
+cdef struct Stamp:
+    double left
+    double top
+    int size
+    const float *signal
+    const float *noise
+    const unsigned char *good
+    const unsigned char *phase
+
+
+cdef int _begin(Pixels *p, int area) except -1:
+    """Take memory for so many pixels, and for whole blocks of them."""
+    cdef int room = blocks(area) * BLOCK, k
+    cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
+    p.place = <int *>malloc(room * sizeof(int))
+    if columns == NULL or p.place == NULL:
+        free(columns)
+        free(p.place)
+        raise MemoryError
+    p.signal, p.noise2, p.light = columns, columns + room, columns + 2 * room
+    p.weight, p.residual = columns + 3 * room, columns + 4 * room
+    for k in range(2):
+        columns += 5 * room
+        p.of[k].dx, p.of[k].dy, p.of[k].value = columns, columns + room, columns + 2 * room
+        p.of[k].by_x, p.of[k].by_y = columns + 3 * room, columns + 4 * room
+    return 0
+
+
+cdef void _gather(
+    const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p
+) noexcept nogil:
+    """Take the pixels of a stamp within reach of a star, or all; the weight is 1 for those to be fitted, else 0."""
+    cdef int row, column, place, k, j, n = 0
+    cdef double dx, dy, u, v, gain
+    cdef bint inside
+    for row in range(s.size):
+        for column in range(s.size):
+            inside = False
+            for k in range(2):
+                dx, dy = s.left + column - star[k].x, s.top + row - star[k].y
+                u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
+                inside = inside or u * u + v * v < rules.widths2
+                p.of[k].dx[n], p.of[k].dy[n] = dx, dy
+            place = row * s.size + column
+            if all_pixels or (inside and s.good[place]):
+                p.place[n], p.signal[n], p.noise2[n] = place, s.signal[place], <double>s.noise[place] * s.noise[place]
+                p.weight[n] = 1.0 if inside and s.good[place] else 0.0
+                n += 1
+    p.count = n
+    for k in range(2):
+        evaluate(psf, p.of[k].dx, p.of[k].dy, n, p.of[k].value, p.of[k].by_x, p.of[k].by_y)
+        for j in range(n if rules.own else 0):
+            gain = star[k].gain[s.phase[p.place[j]]]
+            p.of[k].value[j] *= gain
+            p.of[k].by_x[j] *= gain
+            p.of[k].by_y[j] *= gain
+
+
+cdef void _first_fluxes(const Pixels *p, Star *star) noexcept nogil:
+    """Set the fluxes that explain the light at the first places, weighted by the sky's noise, and at least the given ones."""
+    cdef double aa = 0.0, ab = 0.0, bb = 0.0, sa = 0.0, sb = 0.0, a, b, w, volume
+    cdef int k
+    for k in range(p.count):
+        a, b, w = p.of[0].value[k], p.of[1].value[k], p.weight[k] / p.noise2[k]
+        aa, ab, bb = aa + w * a * a, ab + w * a * b, bb + w * b * b
+        sa, sb = sa + w * a * p.signal[k], sb + w * b * p.signal[k]
+    volume = max(aa * bb - ab * ab, 1e-12)
+    star[0].flux = max((bb * sa - ab * sb) / volume, star[0].flux)
+    star[1].flux = max((aa * sb - ab * sa) / volume, star[1].flux)
+
+
+cdef void _weigh(const Star *star, Rules rules, Pixels *p) noexcept nogil:
+    """Set residuals and weights by the model."""
+    cdef double light
+    cdef int k
+    for k in range(p.count):
+        light = star[0].flux * p.of[0].value[k] + star[1].flux * p.of[1].value[k]
+        p.residual[k] = p.signal[k] - light
+        light = max(light, 0.0)
+        p.weight[k] /= p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
+
+
+cdef void _sum_up(const Stamp *s, const Star *star, Rules rules, const Pixels *p, double *normal, double *right) noexcept nogil:
+    """Set the normal equations of both stars, normal (K, K), lower half, and right (K,).
+
+    A pixel knows of each star the place, the flux and the gain of its own phase, which is held near the frame's.
+    """
+    cdef double[8] slope
+    cdef int[8] row
+    cdef int n = 2 * rules.parameters, each = 4 if rules.own else 3, k, j, a, b, phase
+    cdef double w
+    memset(normal, 0, n * n * sizeof(double))
+    memset(right, 0, n * sizeof(double))
+    for k in range(2):
+        for a in range(3):
+            row[k * each + a] = k * rules.parameters + a
+        for a in range(rules.own):
+            b = k * rules.parameters + 3 + a
+            normal[b * n + b], right[b] = rules.held, -star[k].colour[a] * rules.held
+    for j in range(p.count):
+        phase = s.phase[p.place[j]]
+        for k in range(2):
+            a = k * each
+            slope[a], slope[a + 1] = star[k].flux * p.of[k].by_x[j], star[k].flux * p.of[k].by_y[j]
+            slope[a + 2] = p.of[k].value[j]
+            if rules.own:
+                slope[a + 3] = star[k].flux * p.of[k].value[j] * rules.gain[phase] / star[k].gain[phase]
+                row[a + 3] = k * rules.parameters + 3 + phase
+        for a in range(2 * each):
+            w = p.weight[j] * slope[a]
+            right[row[a]] += w * p.residual[j]
+            for b in range(a + 1):
+                normal[row[a] * n + row[b]] += w * slope[b]
+
+
+cdef bint _move(Star *star, Rules rules, const double *covariance, const double *right, double least) noexcept nogil:
+    """Move both stars to where their equations say; whether they have settled.
+
+    A flux keeps the share `least` in one step: a star without light could not move any more, its place changes nothing.
+    """
+    cdef int n = 2 * rules.parameters, k, a, b
+    cdef double[MOST] step
+    cdef double before
+    cdef bint settled = True
+    for k in range(2):
+        for a in range(rules.parameters):
+            step[a] = 0.0
+            for b in range(n):
+                step[a] += covariance[(k * rules.parameters + a) * n + b] * right[b]
+        star[k].x += max(-FARTHEST, min(step[0], FARTHEST))
+        star[k].y += max(-FARTHEST, min(step[1], FARTHEST))
+        before = star[k].flux
+        star[k].flux = max(before + step[2], least * before)
+        settled = settled and fabs(step[0]) + fabs(step[1]) < SETTLED and fabs(step[2]) < SETTLED * fabs(before)
+        for a in range(rules.own):
+            star[k].colour[a] = max(-0.9, min(star[k].colour[a] + step[3 + a], 3.0))
+            star[k].gain[a] = rules.gain[a] * (1 + star[k].colour[a])
+            settled = settled and fabs(step[3 + a]) < SETTLED
+    return settled
+
+
+cdef void _fit(
+    const Stamp *s, const Local *psf, Rules rules, int rounds, double least, Pixels *p, Star *star, double *covariance,
+    double *sigma,
+) noexcept nogil:
+    """Fit two stars that have first places, and least fluxes; the pixels are at last all of the stamp.
+
+    Sets covariance (K, K), and each flux's sigma at known gains.
+    """
+    cdef double[ALL * ALL] normal
+    cdef double[36] known
+    cdef double[36] inverse
+    cdef double[ALL] right
+    cdef int round_, k, a, b, n = 2 * rules.parameters
+    cdef bint settled = False
+    for k in range(2):
+        for a in range(rules.phases):
+            star[k].colour[a], star[k].gain[a] = 0.0, rules.gain[a]
+    for round_ in range(rounds + 1):
+        settled = settled or round_ == rounds
+        _gather(s, star, psf, rules, settled, p)
+        if round_ == 0:
+            _first_fluxes(p, star)
+        _weigh(star, rules, p)
+        _sum_up(s, star, rules, p, normal, right)
+        for a in range(6):
+            for b in range(6):
+                known[6 * a + b] = normal[(a // 3 * rules.parameters + a % 3) * n + b // 3 * rules.parameters + b % 3]
+        if not invert(normal, n, covariance):
+            # without a solution nothing moves any more
+            if settled:
+                break
+            settled = True
+            continue
+        if settled:
+            break
+        settled = _move(star, rules, covariance, right, least)
+    invert(known, 6, inverse)
+    sigma[0], sigma[1] = sqrt(inverse[14]), sqrt(inverse[35])
+
+
+def fitted_pairs(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, :, ::1] first,
+    const double[::1] least_flux, const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds,
+    double least,
+):
+    """Fit a pair of stars to each of N stamps (N, S, S), as `detection.blend` explains.
+
+    corner      (N, 2) px: x and y of each stamp's first pixel
+    first       (2, N, 2) px: first places of the stars and of their companions
+    least_flux  (N,) DN: of both at the beginning
+    axes        (N, 2, 2) or (1, 2, 2), and
+    series      (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
+    least       share of its flux that a star keeps in one step
+
+    Returns the columns of `detection.blend.Pairs`, in their order. Where the equations are singular errors are NaN.
+    """
+    cdef int n = signal.shape[0], size = signal.shape[1], area = size * size, k, j, a, b, most
+    cdef Pixels p
+    cdef Local psf
+    cdef Star[2] star
+    cdef Stamp s
+    cdef double[ALL * ALL] covariance
+    cdef double[2] sigma
+    sound_stamps(signal, noise, good, phase, rules)
+    sound(axes, series, n)
+    if not (corner.shape[0] == first.shape[1] == least_flux.shape[0] == n and rounds > 0):
+        raise ValueError(f"{corner.shape[0]} corners, {first.shape[1]} places, {rounds} rounds: {n} pairs, 1 round or more")
+    if not (first.shape[0] == corner.shape[1] == first.shape[2] == 2):
+        raise ValueError("places of two stars, of two numbers each, are needed")
+    stars_, gains_ = np.empty((4, 2, n)), np.empty((2, n, rules.phases))
+    covariances_, chi2_ = np.empty((2, n, 2, 2)), np.zeros(n)
+    models_, used_ = np.zeros((2, n, size, size), np.float32), np.zeros((n, size, size), np.uint8)
+    cdef double[:, :, ::1] column = stars_
+    cdef double[:, :, ::1] gains = gains_
+    cdef double[:, :, :, ::1] covariances = covariances_
+    cdef double[::1] chi2 = chi2_
+    cdef float[:, :, ::1] model = models_.reshape(2, n, area)
+    cdef unsigned char[:, ::1] used = used_.reshape(n, area)
+    s.size, most = size, 2 * rules.parameters
+    _begin(&p, area)
+    with nogil:
+        for k in range(n):
+            s.left, s.top, s.signal, s.noise = corner[k, 0], corner[k, 1], &signal[k, 0, 0], &noise[k, 0, 0]
+            s.good, s.phase = &good[k, 0, 0], &phase[k, 0, 0]
+            for j in range(2):
+                star[j].x, star[j].y, star[j].flux = first[j, k, 0], first[j, k, 1], least_flux[k]
+            local_of(axes, series, k, &psf)
+            _fit(&s, &psf, rules, rounds, least, &p, star, covariance, sigma)
+            for j in range(2):
+                column[0, j, k], column[1, j, k], column[2, j, k] = star[j].x, star[j].y, star[j].flux
+                column[3, j, k] = sigma[j]
+                for a in range(2):
+                    for b in range(2):
+                        covariances[j, k, a, b] = covariance[(j * rules.parameters + a) * most + j * rules.parameters + b]
+                for a in range(rules.phases):
+                    gains[j, k, a] = star[j].gain[a]
+                for a in range(area):
+                    model[j, k, a] = <float>(star[j].flux * p.of[j].value[a])
+            for a in range(area):
+                used[k, a] = p.weight[a] > 0
+                chi2[k] += p.residual[a] * p.residual[a] * p.weight[a]
+    free(p.signal)
+    free(p.place)
+    x, y, flux, sigmas = stars_
+    return x, y, flux, sigmas, gains_, covariances_, models_, used_.view(bool), chi2_

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""What the pixels of stamps say of their stars: the sky at their rims, spikes, other light, and whether one pixel is all."""
+
+from libc.math cimport fabs, log, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+from starpos.core.algebra cimport middle
+
+
+cdef struct Rim:
+    # Of a stamp: the pixels at its edges, over their noise, and their noise; whether this is the same in all.
+    int count
+    bint even
+    double *score
+    double *noise
+
+
+cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim) noexcept nogil:
+    """Take the pixels at the edges of a stamp (S, S)."""
+    cdef int row, column, place, n = 0
+    rim.even = True
+    for row in range(size):
+        for column in range(size):
+            if row == 0 or row == size - 1 or column == 0 or column == size - 1:
+                place = row * size + column
+                rim.score[n], rim.noise[n] = <double>signal[place] / noise[place], noise[place]
+                rim.even = rim.even and noise[place] == noise[0]
+                n += 1
+    rim.count = n
+
+
+cdef (double, double) _sky_of(Rim *rim, double per_mad) noexcept nogil:
+    """Median and scatter of a rim's scores."""
+    cdef double level = middle(rim.score, rim.count)
+    cdef int k
+    for k in range(rim.count):
+        rim.score[k] = fabs(rim.score[k] - level)
+    return level, per_mad * middle(rim.score, rim.count)
+
+
+def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, double raised, double uneven, double own):
+    """Correct level and noise of the sky in stamps (N, S, S), in place, by what the pixels at their rims show.
+
+    per_mad          sigma over the median of the absolute differences
+    raised, uneven   level and scatter in units of the noise, below which they may be chance
+    own              share of the brightest pixel that at the rim may be the star's own light
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int size = signal.shape[1], area = size * size, j
+    cdef double sky, spread, light
+    cdef float up, wider
+    cdef float most
+    cdef Rim rim
+    _alike(signal.shape, noise.shape)
+    rim.score = <double *>malloc(2 * area * sizeof(double))
+    if rim.score == NULL:
+        raise MemoryError
+    rim.noise = rim.score + area
+    with nogil:
+        for k in range(n):
+            _take_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
+            sky, spread = _sky_of(&rim, per_mad)
+            most = signal[k, 0, 0]
+            for j in range(area):
+                most = max(most, (&signal[k, 0, 0])[j])
+            light = own * most / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
+            up = <float>sky if sky > raised and sky > light else 0
+            wider = <float>spread if spread > uneven and spread > light else 1
+            if up != 0 or wider != 1:
+                for j in range(area):
+                    (&signal[k, 0, 0])[j] -= up * (&noise[k, 0, 0])[j]
+                    (&noise[k, 0, 0])[j] *= wider
+    free(rim.score)
+
+
+def without_spikes(
+    float[:, :, ::1] signal, const float[:, :, ::1] noise, unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] phase, const float[::1] gain, const float[::1] sharpest, float above,
+):
+    """Put the mean of their neighbours into pixels of stamps (N, S, S) that are much brighter than these, in place.
+
+    gain      (P,): of each phase, by which pixels are compared
+    sharpest  (N,): a spike is so many times brighter than its four neighbours and the noise, and
+    above     so many sigma above the sky
+
+    Returns which pixels they are, (N, S, S) bool; they are not good any more.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int size = signal.shape[1], row, column, place, count
+    cdef float grey, around
+    cdef float *own
+    cdef const float *sky
+    cdef const unsigned char *part
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, good.shape)
+    _alike(signal.shape, phase.shape)
+    if sharpest.shape[0] != n or (n and np.max(phase) >= gain.shape[0]):
+        raise ValueError(f"{sharpest.shape[0]} sharpest and {gain.shape[0]} gains for {n} stars: one each, and of each phase")
+    out = np.zeros((n, size, size), np.uint8)
+    cdef unsigned char[:, :, ::1] spike = out
+    cdef float *mean = <float *>malloc(size * size * sizeof(float))
+    if mean == NULL:
+        raise MemoryError
+    with nogil:
+        for k in range(n):
+            own, sky, part, count = &signal[k, 0, 0], &noise[k, 0, 0], &phase[k, 0, 0], 0
+            for row in range(size):
+                for column in range(size):
+                    place = row * size + column
+                    if not own[place] > above * sky[place]:
+                        continue
+                    grey = own[place] / gain[part[place]]
+                    around = _beside(own, part, &gain[0], size, row, column)
+                    if grey > sharpest[k] * (around + sky[place]):
+                        spike[k, row, column], mean[place] = True, around * gain[part[place]]
+                        count += 1
+            # only now: a spike may have a spike beside it
+            for place in range(size * size if count else 0):
+                if (&spike[k, 0, 0])[place]:
+                    own[place], (&good[k, 0, 0])[place] = mean[place], False
+    free(mean)
+    return out.view(bool)
+
+
+cdef float _beside(const float *signal, const unsigned char *phase, const float *gain, int size, int row, int column) noexcept nogil:
+    """The mean of the four pixels beside one, over their gains; beyond the edges the image goes on as on them."""
+    cdef int up = max(row - 1, 0) * size + column, down = min(row + 1, size - 1) * size + column
+    cdef int left = row * size + max(column - 1, 0), right = row * size + min(column + 1, size - 1)
+    cdef float total = signal[up] / gain[phase[up]] + signal[down] / gain[phase[down]]
+    total += signal[left] / gain[phase[left]]
+    total += signal[right] / gain[phase[right]]
+    return total * <float>0.25
+
+
+cdef int _alike(const Py_ssize_t *stamps, const Py_ssize_t *other) except -1:
+    """Raise ValueError unless other pixels have the shape of stamps, which are squares."""
+    if stamps[1] != stamps[2] or not stamps[1] or not (other[0] == stamps[0] and other[1] == other[2] == stamps[1]):
+        raise ValueError(
+            f"pixels {(other[0], other[1], other[2])} of stamps {(stamps[0], stamps[1], stamps[2])}: as many are needed"
+        )
+    return 0
+
+
+def own_light(
+    float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] spike,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] outlier, int speck, float loud,
+):
+    """Put the model into pixels of stamps (N, S, S), in place, that say nothing about the star's own shape.
+
+    These are spikes; outliers, if there are not more than `speck`; and pixels with `loud` times the quietest one's noise.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int area = signal.shape[1] * signal.shape[1], j, outliers
+    cdef float least
+    cdef float *own
+    cdef const float *sky
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, spike.shape)
+    _alike(signal.shape, model.shape)
+    _alike(signal.shape, outlier.shape)
+    with nogil:
+        for k in range(n):
+            own, sky, outliers, least = &signal[k, 0, 0], &noise[k, 0, 0], 0, noise[k, 0, 0]
+            for j in range(area):
+                outliers += (&outlier[k, 0, 0])[j]
+                least = min(least, sky[j])
+            for j in range(area):
+                if (&spike[k, 0, 0])[j] or sky[j] > loud * least or (outliers <= speck and (&outlier[k, 0, 0])[j]):
+                    own[j] = (&model[k, 0, 0])[j]
+
+
+def looks(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] full, const unsigned char[:, :, ::1] spike, const float[:, :, ::1] residual,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const unsigned char[:, :, ::1] outlier,
+    const double[::1] left, const double[::1] top, const double[:, :, ::1] axes, double core, double wider,
+):
+    """How fitted stars look in their stamps (N, S, S).
+
+    left, top    (N,) px: of each stamp's first column and row from its star
+    axes         (N, 2, 2) or (1, 2, 2): of the PSF
+    core, wider  widths of the PSF around the star
+
+    Returns columns (N,): the star's SNR in the sky's noise; the light of the outliers; and whether a pixel is saturated
+    within the core, and whether one is neither good nor saturated nor a spike within the wider one.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k, a
+    cdef int size = signal.shape[1], row, column, place
+    cdef double dx, dy, u, v, distance2, score, matched, foreign, near2 = core * core, far2 = wider * wider
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, good.shape)
+    _alike(signal.shape, full.shape)
+    _alike(signal.shape, spike.shape)
+    _alike(signal.shape, residual.shape)
+    _alike(signal.shape, model.shape)
+    _alike(signal.shape, used.shape)
+    _alike(signal.shape, outlier.shape)
+    if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
+        raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
+    sums_, marks_ = np.empty((2, n)), np.zeros((2, n), np.uint8)
+    cdef double[:, ::1] sums = sums_
+    cdef unsigned char[:, ::1] marks = marks_
+    with nogil:
+        for k in range(n):
+            matched = foreign = 0.0
+            a = k if axes.shape[0] > 1 else 0
+            for row in range(size):
+                dy = top[k] + row
+                for column in range(size):
+                    if used[k, row, column]:
+                        score = model[k, row, column] / noise[k, row, column]
+                        matched += score * score
+                    if outlier[k, row, column] and residual[k, row, column] > 0:
+                        foreign += residual[k, row, column]
+                    if good[k, row, column]:
+                        continue
+                    dx = left[k] + column
+                    u, v = axes[a, 0, 0] * dx + axes[a, 0, 1] * dy, axes[a, 1, 0] * dx + axes[a, 1, 1] * dy
+                    distance2 = u * u + v * v
+                    if full[k, row, column]:
+                        marks[0, k] |= distance2 < near2
+                    elif not spike[k, row, column]:
+                        marks[1, k] |= distance2 < far2
+            sums[0, k], sums[1, k] = sqrt(matched), foreign
+    at_limit, cut_off = marks_.view(bool)
+    return sums_[0], sums_[1], at_limit, cut_off
+
+
+def one_pixel(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] full, const float[:, :, ::1] residual, const float[:, :, ::1] model,
+    double dn_per_photon, double misfit, int half,
+):
+    """How well a single pixel on the sky describes stars, and how well their fits do, `half` px around the middle.
+
+    Returns columns (N,): chi-square of the one pixel, chi-square of the star with the logarithm of its variance, and how
+    many pixels are good, and how many are saturated.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int size = signal.shape[1], middle_ = size // 2, row, column, count, white
+    cdef double score, most, one, star, light, sky2, variance
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, good.shape)
+    _alike(signal.shape, full.shape)
+    _alike(signal.shape, residual.shape)
+    _alike(signal.shape, model.shape)
+    if not 0 <= half <= middle_:
+        raise ValueError(f"{half} px around the middle of stamps of {size} px: they have no such pixels")
+    sums_, counts_ = np.empty((2, n)), np.empty((2, n), np.int64)
+    cdef double[:, ::1] sums = sums_
+    cdef long long[:, ::1] counts = counts_
+    with nogil:
+        for k in range(n):
+            most = one = star = 0.0
+            count = white = 0
+            for row in range(middle_ - half, middle_ + half + 1):
+                for column in range(middle_ - half, middle_ + half + 1):
+                    white += full[k, row, column]
+                    if not good[k, row, column]:
+                        continue
+                    count += 1
+                    score = signal[k, row, column] / noise[k, row, column]
+                    one += score * score
+                    if signal[k, row, column] > 0:
+                        most = max(most, score * score)
+                    light, sky2 = max(model[k, row, column], 0.0), <double>noise[k, row, column] * noise[k, row, column]
+                    variance = sky2 + dn_per_photon * light + misfit * misfit * light * light
+                    star += residual[k, row, column] * residual[k, row, column] / variance + log(variance / sky2)
+            sums[0, k], sums[1, k], counts[0, k], counts[1, k] = one - most, star, count, white
+    return sums_[0], sums_[1], counts_[0], counts_[1]

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fit of two stars at once of the compiled core beside its plain form."""
+
+import numpy as np
+import pytest
+from test_fit import DN_PER_PHOTON, MISFIT, SIZE, SPREAD, plain_psf, psfs, rules, scaled
+
+from starpos.core.pairs import fitted_pairs
+from starpos.detection.fit import FIT_WIDTHS
+
+LEAST = 0.05
+
+
+def inverses(normal):
+    """Inverses of (N, K, K), whose fluxes are a million times larger than pixels."""
+    scale = np.sqrt(np.einsum("nii->ni", normal))
+    scale = scale[:, :, None] * scale[:, None, :]
+    return np.linalg.inv(normal / scale) / scale
+
+
+def plain_pairs(signal, noise, good, phase, corner, first, least_flux, axes, series, gain, rounds):
+    """The fit of all pairs at once: what `fitted_pairs` does with one after the other."""
+    n, own = len(signal), len(gain) if len(gain) > 1 else 0
+    x, y, colour = first[..., 0].copy(), first[..., 1].copy(), np.zeros((2, n, len(gain)))
+    each, noise2 = [slice(k * (3 + own), (k + 1) * (3 + own)) for k in (0, 1)], noise.astype(float) ** 2
+    for round_ in range(rounds + 1):
+        gains, images, inside = gain * (1 + colour), [], np.zeros(signal.shape, bool)
+        for k in (0, 1):
+            offset = corner[:, 0] - x[k], corner[:, 1] - y[k]
+            at = gains[k][np.arange(n)[:, None, None], phase]
+            images.append([image * at for image in plain_psf(axes, series, *offset, SIZE)])
+            u, v = scaled(axes, *offset, SIZE)
+            inside |= u * u + v * v < FIT_WIDTHS**2
+        used = good & inside
+        a, b = images[0][0], images[1][0]
+        if round_ == 0:
+            weight = used / noise2
+            aa, ab, bb, sa, sb = (
+                (weight * p).sum((1, 2)) for p in (a * a, a * b, b * b, a * signal, b * signal)
+            )
+            flux = np.stack([bb * sa - ab * sb, aa * sb - ab * sa]) / (aa * bb - ab * ab)
+            flux = np.maximum(flux, least_flux)
+        models = flux[:, :, None, None] * np.stack([a, b])
+        light = np.maximum(models.sum(0), 0)
+        weight = used / (noise2 + DN_PER_PHOTON * light + MISFIT**2 * light**2)
+        columns = []
+        for k in (0, 1):
+            value, by_x, by_y = images[k]
+            amount = flux[k][:, None, None]
+            columns += [amount * by_x, amount * by_y, value]
+            for p in range(own):
+                columns.append(amount * value * gain[p] / gains[k][:, p, None, None] * (phase == p))
+        design = np.stack([c.reshape(n, -1) for c in columns], 2)
+        residual, weighted = (signal - models.sum(0)).reshape(n, -1, 1), weight.reshape(n, -1, 1)
+        normal = np.swapaxes(design, 1, 2) @ (design * weighted)
+        right = (np.swapaxes(design, 1, 2) @ (weighted * residual))[..., 0]
+        for k in (0, 1):
+            for p in range(own):
+                row = each[k].start + 3 + p
+                normal[:, row, row] += SPREAD**-2
+                right[:, row] -= colour[k][:, p] * SPREAD**-2
+        covariance = inverses(normal)
+        if round_ == rounds:
+            break
+        step = (covariance @ right[..., None])[..., 0]
+        for k in (0, 1):
+            x[k] += np.clip(step[:, each[k]][:, 0], -0.5, 0.5)
+            y[k] += np.clip(step[:, each[k]][:, 1], -0.5, 0.5)
+            flux[k] = np.maximum(flux[k] + step[:, each[k]][:, 2], LEAST * flux[k])
+            if own:
+                colour[k] = np.clip(colour[k] + step[:, each[k]][:, 3:], -0.9, 3.0)
+    grey = np.concatenate([np.arange(s.start, s.start + 3) for s in each])
+    known = inverses(normal[:, grey[:, None], grey])
+    sigma = np.sqrt(np.stack([known[:, 2, 2], known[:, 5, 5]]))
+    covariances = np.stack([covariance[:, s, s][:, :2, :2] for s in each])
+    return x, y, flux, sigma, gains, covariances, models, used, (weighted * residual**2).sum((1, 2))
+
+
+def pairs_of_stars(rng, n, gain):
+    """Noisy stamps of n pairs, their first places, and least fluxes; a pixel of the second is bad."""
+    axes, series = psfs(rng, n)
+    corner = rng.integers(0, 100, (n, 2)).astype(float)
+    place = corner + SIZE // 2 + np.array([[[-2.0, -1.0]], [[2.5, 1.0]]]) + rng.uniform(-1, 1, (2, n, 2))
+    phase = np.zeros((n, SIZE, SIZE), np.uint8)
+    if len(gain) > 1:
+        phase[:, 1::2] += 2
+        phase[:, :, 1::2] += 1
+    light = sum(
+        plain_psf(axes, series, *(corner - star).T, SIZE)[0] * rng.uniform(3e3, 3e4, (n, 1, 1))
+        for star in place
+    )
+    light *= gain[phase]
+    noise = np.full(light.shape, 7, np.float32)
+    signal = (light + rng.normal(0, 1, light.shape) * np.sqrt(49 + DN_PER_PHOTON * light)).astype(np.float32)
+    good = np.ones(light.shape, bool)
+    good[1, 4, 5] = False
+    first = place + rng.uniform(-0.3, 0.3, place.shape)
+    return signal, noise, good, phase, corner, first, np.full(n, 100.0), axes, series
+
+
+@pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
+@pytest.mark.parametrize("rounds", [1, 3, 12])
+def test_pairs_are_those_of_plain_sums(gain, rounds, rng):
+    """It ends early where nothing moves any more, which leaves less than 1e-8 px."""
+    given = pairs_of_stars(rng, 12, gain)
+    found = fitted_pairs(*given, rules(gain), rounds, LEAST)
+    expected = plain_pairs(*given, gain, rounds)
+    for k in (0, 1, 2, 3, 4, 5, 8):
+        np.testing.assert_allclose(found[k], expected[k], rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(found[6], expected[6], rtol=1e-5, atol=1e-3)
+    np.testing.assert_array_equal(found[7], expected[7])
+
+
+def test_two_stars_at_one_place_have_no_errors(rng):
+    given = list(pairs_of_stars(rng, 3, np.ones(1)))
+    given[5] = given[5].copy()
+    given[5][1, 0] = given[5][0, 0]
+    _, _, _, sigma, _, covariance, models, _, chi2 = fitted_pairs(*given, rules(np.ones(1)), 10, LEAST)
+    assert np.isnan(sigma[:, 0]).all() and np.isnan(covariance[:, 0]).all()
+    assert np.isfinite(sigma[:, 1:]).all() and np.isfinite(models).all() and np.isfinite(chi2).all()
+
+
+def test_places_of_as_many_pairs_are_needed(rng):
+    given = list(pairs_of_stars(rng, 3, np.ones(1)))
+    given[5] = given[5][:, :2].copy()
+    with pytest.raises(ValueError, match="pairs"):
+        fitted_pairs(*given, rules(np.ones(1)), 10, LEAST)
