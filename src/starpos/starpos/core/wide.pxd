@@ -9,7 +9,6 @@ cdef extern from *:
     #else
     #define STARPOS_WIDE
     #endif
-    #include <string.h>
     /* Put e to the power of each of n numbers in its place, to 3e-16 of it; beyond +-700 as there.
        Unlike libm's it takes wide registers. */
     static inline void starpos_exps(double *x, int n) {
