@@ -41,7 +41,7 @@ def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dic
     # no single hot pixel
     height = np.minimum.reduce([plane[y + i, x + j] for i in (0, 1) for j in (0, 1)]).astype(float)
     if height.max(initial=0) < level + CLEAR * noise:
-        return _columns([], fwhm_px, 0.0)
+        return columns_of([], fwhm_px, 0.0)
     top = float(height.max())
     limit = level + FLAT * (top - level)
     bright = height >= limit
@@ -49,7 +49,7 @@ def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dic
     most = WIDEST * min(plane.shape)
     fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
     discs = [_disc(plane, box[:4] * step, 2 * step, limit) for box in boxes[fits][:MOST]]
-    return _columns([d for d in discs if d is not None and least < d[2] < most], fwhm_px, top - level)
+    return columns_of([d for d in discs if d is not None and least < d[2] < most], fwhm_px, top - level)
 
 
 def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -101,7 +101,9 @@ def _disc(plane: np.ndarray, box: np.ndarray, around: int, limit: float) -> tupl
     return left + x0 + columns.mean(), top + y0 + rows.mean(), float(np.sqrt(area / np.pi))
 
 
-def _columns(discs: list[tuple[float, float, float]], fwhm_px: float, height: float) -> dict[str, np.ndarray]:
+def columns_of(
+    discs: list[tuple[float, float, float]], fwhm_px: float, height: float
+) -> dict[str, np.ndarray]:
     """Discs as columns; height: of their tops above the sky, DN. One as wide as a star's FWHM has that star's flux."""
     x, y, radius = np.array(discs, float).reshape(-1, 3).T
     flux = 1.133 * fwhm_px**2 * height * (2 * radius / fwhm_px) ** (2 * GROWTH)

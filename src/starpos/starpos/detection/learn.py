@@ -137,8 +137,7 @@ def _teachers(
     if shape is not None and np.linalg.eigvalsh(shape)[0] > 0.9 * (stamps.reach / 2) ** 2:
         shape = None
     if shape is None or len(stamps.x) < ALIKE:
-        few = np.flatnonzero(clear)[:FEW]
-        around = cut(plane, background, x[few], y[few], 12, saturation)
+        around = _highest(plane, background, x[clear], y[clear], saturation)
         shape, learnt = _likeliest(around, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
         if not learnt:
             return gaussian(shape), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
@@ -157,6 +156,15 @@ def _teachers(
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
+
+
+def _highest(
+    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, saturation: float
+) -> Stamps:
+    """Stamps of the first FEW of the peaks x, y (N,) int px, of those that are not saturated if there are any."""
+    full = cut(plane, background, x[:TEACHERS], y[:TEACHERS], 1, saturation).full.any((1, 2))
+    few = np.argsort(full, kind="stable")[:FEW]
+    return cut(plane, background, x[few], y[few], 12, saturation)
 
 
 def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> tuple[np.ndarray, bool]:

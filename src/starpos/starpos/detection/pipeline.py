@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from starpos.detection.background import measure_background
+from starpos.detection.clipped import with_clipped
 from starpos.detection.discs import find_discs, with_discs
 from starpos.detection.finding import find_peaks
 from starpos.detection.learn import learn
@@ -205,7 +206,10 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     columns = resolve(columns, lesson.psf)
-    columns = with_discs(columns, find_discs(plane, background, lesson.psf.fwhm_px), lesson.psf.fwhm_px)
+    fwhm_px = lesson.psf.fwhm_px
+    columns = with_discs(columns, find_discs(plane, background, fwhm_px), fwhm_px)
+    if fwhm_px < WIDE_FWHM:
+        columns = with_clipped(columns, plane, background, x, y, fwhm_px)
     columns = {name: column[: settings.max_stars] for name, column in columns.items()}
     stars = Stars(
         x=columns["x"],
@@ -214,15 +218,14 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         snr=columns["snr"],
         covariance=columns["covariance"],
         flags=columns["flags"],
-        fwhm_px=lesson.psf.fwhm_px,
+        fwhm_px=fwhm_px,
         **about,
     )
-    fwhm_px = lesson.psf.fwhm_px if len(stars) else float("nan")
     return Detection(
         stars=stars,
         background=level,
         noise=noise,
-        fwhm_px=fwhm_px,
+        fwhm_px=fwhm_px if len(stars) else float("nan"),
         chi2=columns["chi2"],
         left_out=peaks.left_out + len(x) - most,
     )

@@ -12,7 +12,7 @@ from starpos.core.search import Limits, Lost
 from starpos.identification import wide
 from starpos.identification.evidence import anywhere
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified, judge
-from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, FrameStars
+from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, TEST_STARS, FrameStars
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
@@ -25,6 +25,9 @@ EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
 # Triangles of the brightest stars, and the error in px, where a crowd of them is false.
 CROWD_STAGES = (60, 0.3), (140, 0.1)
+# Cells along each side of a frame, of each of which the brightest star is taken if this leaves less than that share of
+# the brightest: else these are spread evenly already. Half of the cells decide. Such a second try needs more evidence.
+CELLS, MOST_EVEN, SECOND_TRY = 10, 0.65, math.log(10)
 LIMITS = Limits(
     match_sigma=MATCH_SIGMA,
     log_false=math.log(0.35),
@@ -108,12 +111,41 @@ def identify_frame(
 def identifications(
     field: FrameStars, sky: Sky, priors: Priors, enough: float = ENOUGH
 ) -> Iterator[Identification]:
-    """Yield all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order."""
-    if len(field) >= FEWEST_STARS:
-        yield from near_or_lost(field, sky, priors, STAGES, enough)
-        crowd = replace(field, tested=CROWD_STARS)
-        stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
-        yield from near_or_lost(crowd, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
+    """Yield all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order.
+
+    Then those of stars that are spread evenly, if the brightest are not.
+    """
+    if len(field) < FEWEST_STARS:
+        return
+    yield from _first_or_crowded(field, sky, priors, enough)
+    rows = evenly_spread(field)
+    # each star found keeps those of its cell away: that leaves less area for the others
+    left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
+    uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
+    if uneven and len(rows) >= FEWEST_STARS and left_px2 > 0:
+        even = replace(field.take(rows), area_px2=left_px2)
+        for found in _first_or_crowded(even, sky, (), enough + SECOND_TRY, CELLS**2 // 2):
+            yield replace(found, star=rows[found.star])
+
+
+def _first_or_crowded(
+    field: FrameStars, sky: Sky, priors: Priors, enough: float, crowd: int = CROWD_STARS
+) -> Iterator[Identification]:
+    """Yield what the brightest stars of a field show, then what shows if nearly all of them are false."""
+    yield from near_or_lost(field, sky, priors, STAGES, enough)
+    stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
+    crowded = replace(field, tested=crowd)
+    yield from near_or_lost(crowded, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
+
+
+def evenly_spread(field: FrameStars) -> np.ndarray:
+    """Rows of the brightest star of each of CELLS x CELLS cells of a field, brightest first.
+
+    The lights of a town, a trail or a line of text lie in few cells.
+    """
+    place = 0.5 + 0.5 * (field.xy[0] - field.middle) / field.half
+    column, row = np.clip((CELLS * place).astype(int), 0, CELLS - 1).T
+    return np.sort(np.unique(CELLS * row + column, return_index=True)[1])
 
 
 def near_or_lost(

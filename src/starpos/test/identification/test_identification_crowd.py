@@ -36,6 +36,31 @@ def test_fields_are_found_under_so_many_brighter_false_stars(crowd, sky, rng):
     assert found >= 4
 
 
+def test_fields_are_found_beside_lights_that_fill_a_part_of_the_frame(sky, rng):
+    """A town's windows, or an aeroplane's trail: more lights than are looked at, all of them brighter than any star."""
+    found = fields = 0
+    while fields < 5:
+        attitude = random_attitude(rng)
+        xy = stars_on(sky, attitude, rng)
+        xy = xy[xy[:, 1] < 0.8 * CAMERA.height]
+        if len(xy) >= 15:
+            fields += 1
+            town = rng.uniform([0, 0.82 * CAMERA.height], [CAMERA.width - 1, CAMERA.height - 1], (300, 2))
+            answer = found_in(np.concatenate([town, xy]), sky)
+            if answer is not None:
+                assert_looks(answer, attitude)
+                assert answer.star.min() >= 300
+                found += 1
+    assert found >= 4
+
+
+def test_lights_that_fill_a_part_of_the_frame_are_no_sky(sky, rng):
+    town = rng.uniform([0, 0.7 * CAMERA.height], [CAMERA.width - 1, CAMERA.height - 1], (300, 2))
+    for _ in range(5):
+        stray = rng.uniform(0, [CAMERA.width - 1, CAMERA.height - 1], (30, 2))
+        assert found_in(np.concatenate([town, stray]), sky) is None
+
+
 def test_a_prior_finds_a_field_under_a_hundred_brighter_false_stars_where_a_few_true_ones_are_left(sky, rng):
     for _ in range(3):
         attitude = random_attitude(rng)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stars clipped to a few pixels of one height without wings: of a stretched picture, or bright ones on sharp lenses.
+
+No PSF fits them, and they are too small to be looked for as discs, but each is a peak. Place and light are told by the
+pixels above half its height.
+"""
+
+import cv2
+import numpy as np
+from scipy import spatial
+
+from starpos.detection.background import Background
+from starpos.detection.discs import FLAT, FULLEST, LONGEST, MOST, columns_of, with_discs
+from starpos.frames.stars import SATURATED
+
+# A fit tells a clipped star's light if it does so to this share of it; and that of any other if chi2 is below this.
+TOLD, STRANGE = 0.1, 3.0
+# px. A star measured so near a peak is the peak's.
+NEAR = 2.0
+# At least this share of its light above the sky is its own, not that of what is around it.
+OWN = 0.5
+# A clipped image has at least so many pixels, and this share of those of a star that is just not clipped.
+FEWEST, NARROWER = 4, 0.8
+# It is looked at in a window that reaches so many widths of a star from the peak, and at least so many px.
+REACH, LEAST_REACH = 6.0, 12
+
+
+def with_clipped(
+    stars: dict[str, np.ndarray],
+    plane: np.ndarray,
+    background: Background,
+    x: np.ndarray,
+    y: np.ndarray,
+    fwhm_px: float,
+) -> dict[str, np.ndarray]:
+    """The columns of measured stars with those of clipped ones among the peaks x, y (N,) int px, brightest first.
+
+    A saturated star is measured anew if its wings tell little of its light, and so is what seems to be several stars in
+    one flat image.
+    """
+    saturated = (stars["flags"] & SATURATED) != 0
+    told = np.sqrt(np.maximum(stars["chi2"], 1.0)) < TOLD * stars["snr"]
+    told |= ~saturated & (stars["chi2"] < STRANGE)
+    level, top = background.near(x, y)[0].mean(1), _tops(plane, x, y)
+    sky = float(np.median(background.level))
+    peaks, places = np.stack([x, y], 1), np.stack([stars["x"], stars["y"]], 1)
+    lost = (top - sky > FLAT * (top.max() - sky)) & ~_near(places[told], peaks)
+    lost |= _near(places[saturated & ~told], peaks)
+    # what stands on a roof is the roof's
+    lost = np.flatnonzero(lost & (top - level > OWN * (top - sky)))[:MOST]
+    reach = max(LEAST_REACH, round(REACH * fwhm_px))
+    images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
+    least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)
+    # several peaks may be those of one image
+    clipped = [
+        image for image in dict.fromkeys(images) if image is not None and np.pi * image[2] ** 2 >= least
+    ]
+    if not clipped:
+        return stars
+    discs = columns_of(clipped, fwhm_px, float(top.max()) - sky)
+    apart = np.hypot(places[:, :1] - discs["x"], places[:, 1:] - discs["y"])
+    known = told | ~(apart < discs["radius"]).any(1)
+    return with_discs({name: column[known] for name, column in stars.items()}, discs, fwhm_px)
+
+
+def _tops(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The third highest (N,) of the nine pixels around x, y (N,) int, because hot ones may exceed saturation."""
+    rows, columns = (
+        np.clip(v[:, None] + np.arange(-1, 2), 0, n - 1) for v, n in zip((y, x), plane.shape, strict=True)
+    )
+    around = plane[rows[:, :, None], columns[:, None, :]].reshape(len(x), 9)
+    return np.partition(around, -3, axis=1)[:, -3].astype(float)
+
+
+def _near(places: np.ndarray, peaks: np.ndarray) -> np.ndarray:
+    """Whether one of the places (M, 2) is near each of the peaks (N, 2), px."""
+    if not len(places):
+        return np.zeros(len(peaks), bool)
+    return spatial.cKDTree(places).query(peaks, distance_upper_bound=NEAR)[0] < NEAR
+
+
+def _image(
+    plane: np.ndarray, x: int, y: int, level: float, highest: float, reach: int
+) -> tuple[float, float, float] | None:
+    """Centre x, y and radius (px) of the pixels around a peak above half its height; None if they are not round."""
+    left, top, half = max(0, x - reach), max(0, y - reach), (highest - level) / 2
+    signal = plane[top : y + reach + 1, left : x + reach + 1] - (level + half)
+    _, group, boxes, _ = cv2.connectedComponentsWithStats((signal > 0).astype(np.uint8), connectivity=8)
+    k = group[y - top, x - left]
+    x0, y0, across, down, area = boxes[k]
+    if k == 0 or min(x0, y0) == 0 or x0 + across == signal.shape[1] or y0 + down == signal.shape[0]:
+        return None
+    rows, columns = np.nonzero(group == k)
+    # with a pixel's own width
+    low, high = np.linalg.eigvalsh(np.cov(columns, rows, bias=True) + np.eye(2) / 12)
+    if high > LONGEST * low or area < FULLEST * 4 * np.pi * np.sqrt(low * high):
+        return None
+    weight = np.minimum(signal[rows, columns], half)
+    centre = np.average(columns, weights=weight), np.average(rows, weights=weight)
+    return left + float(centre[0]), top + float(centre[1]), float(np.sqrt(area / np.pi))
