@@ -50,7 +50,8 @@ def test_a_step_is_in_the_stamps_one_line_of_the_log_and_the_diagnostics(spin, c
     levels.clear()
     spin(lambda: sum(level == b"\x01" and "-2.0" in text for level, text in levels) >= 2)
     stamps = [t.header.stamp.sec + t.header.stamp.nanosec * 1e-9 for t in tilts]
-    back = [b - a for a, b in pairwise(stamps) if b < a]
+    # a line that comes sooner than those before it, on a busy machine, corrects some ms
+    back = [b - a for a, b in pairwise(stamps) if b < a - 0.1]
     assert len(back) == 1 and back[0] == pytest.approx(-1.98, abs=0.05)
     assert [b.sequence - a.sequence for a, b in pairwise(tilts)] == [1] * (len(tilts) - 1)
     out, err = capfd.readouterr()
