@@ -4,6 +4,7 @@
 import gzip
 import io
 import itertools
+import math
 import warnings
 import zlib
 from collections.abc import Iterable, Mapping
@@ -19,6 +20,8 @@ from starpos.frames.frame import PATTERNS, Frame, to_unsigned
 from starpos.frames.header import KEYS, focal_px, shutter, times
 
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
+# Planes of a stack or of a camera of colours.
+COLOURS = 3
 # The image is among so many first parts (HDUs) of a file.
 MOST_PARTS = 100
 # Columns of a .fz whose cells may be gzip.
@@ -118,23 +121,23 @@ class _Image:
 
 
 def _image(hdus: Iterable, place: str, part: str) -> _Image:
-    """The image that is the part, a number or a name, of a file's HDUs; the first plane if that is empty."""
+    """The image that is the part, a number or a name, of a file's HDUs; the first frame if that is empty."""
     parts = _parts(hdus)
     primary = parts[0].header if parts else {}
     if part:
         for number, hdu in enumerate(parts):
             if part.upper() in (str(number), str(hdu.name).upper(), f"{hdu.name},{hdu.ver}".upper()):
-                _check_plane(hdu, place)
+                _check_frame(hdu, place)
                 return _Image(hdu, number, primary, ())
         names = ", ".join(f"{n} {hdu.name}".strip() for n, hdu in enumerate(parts) if _axes(hdu))
         raise FrameError(f"{place}: there is no such HDU; its images are {one_line(names) or 'none'}.")
     images = [number for number, hdu in enumerate(parts) if _axes(hdu)]
     if not images:
         raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
-    planes = [number for number in images if _is_plane(_axes(parts[number]))]
-    if not planes:
-        _check_plane(parts[images[0]], place)
-    return _Image(parts[planes[0]], planes[0], primary, tuple(planes[1:]))
+    frames = [number for number in images if _is_frame(_axes(parts[number]))]
+    if not frames:
+        _check_frame(parts[images[0]], place)
+    return _Image(parts[frames[0]], frames[0], primary, tuple(frames[1:]))
 
 
 def _parts(hdus: Iterable) -> list[Any]:
@@ -154,33 +157,43 @@ def _axes(hdu: Any) -> list[int]:
     return [int(n) for n in hdu.shape] if hdu.is_image else []
 
 
-def _is_plane(axes: list[int]) -> bool:
-    return len(axes) == 2 or (len(axes) > 2 and max(axes[:-2]) == 1)
+def _is_frame(axes: list[int]) -> bool:
+    """Whether they are those of one plane, or of three colours."""
+    return len(axes) > 1 and [n for n in axes[:-2] if n != 1] in ([], [COLOURS])
 
 
-def _check_plane(hdu: Any, place: str) -> None:
-    """Raise FrameError unless an HDU is an image of one plane."""
+def _check_frame(hdu: Any, place: str) -> None:
+    """Raise FrameError unless an HDU is an image of one plane, or of three colours."""
     axes = _axes(hdu)
     if not axes:
         raise FrameError(f"{place}: this HDU is no image; give one that is.")
-    if not _is_plane(axes):
+    if not _is_frame(axes):
         size = " x ".join(map(str, reversed(axes)))
         raise FrameError(
-            f"{place}: the image has {len(axes)} axes ({size}); give one monochrome plane a file."
+            f"{place}: the image has {len(axes)} axes ({size}); give one plane a file, or three colours."
         )
 
 
 def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any], np.ndarray]:
-    """Header (a dict of KEYS) and data (h, w) of an image; what its header lacks is that of the primary one."""
+    """Header (a dict of KEYS) and data (h, w) of an image; what its header lacks is that of the primary one.
+
+    Colours become their mean.
+    """
     from astropy.io import fits
 
     hdu, shape = image.hdu, _axes(image.hdu)
-    check_pixels(shape[-1], shape[-2], abs(int(hdu.header["BITPIX"])) / 8, place)
+    planes = math.prod(shape[:-2])
+    check_pixels(shape[-1], shape[-2], planes * abs(int(hdu.header["BITPIX"])) / 8, place)
     if isinstance(hdu, fits.CompImageHDU):
         _check_tiles(file, image.number, place)
     headers = (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
     known = {key: header[key] for header in headers for key in KEYS if key in header}
-    return known, np.asarray(hdu.data).reshape(shape[-2:])
+    values = np.asarray(hdu.data)
+    if planes == 1:
+        return known, values.reshape(shape[-2:])
+    # its colours are made from the mosaic that the header may still name
+    known.pop("BAYERPAT", None)
+    return known, values.reshape(planes, *shape[-2:]).mean(0, dtype=np.float32)
 
 
 def _check_tiles(file: BinaryIO, number: int, place: str) -> None:

@@ -38,6 +38,7 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
     light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken, with a warning; `a.fits[2]` or
     `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header lacks is that of the primary one.
+    Three planes (NAXIS3 = 3) are colours, and become their mean.
     TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour; TIFF also of floats, by the rule above. Colours of more than 8
     bits become the mean of the three. HEIF: the same, through pillow-heif.
     Camera raw: the mosaic as the sensor gave it, through rawpy.

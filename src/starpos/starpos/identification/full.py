@@ -14,7 +14,7 @@ from starpos.normal import SIGMA_PER_MAD
 
 # An identification has at least so many stars.
 FEWEST_STARS = 4
-# Log-odds: at most one of 1e9 frames without stars is identified.
+# Log-odds: one try identifies at most one of 1e9 frames without stars.
 ENOUGH = np.log(1e9)
 ROUNDS = 3
 # A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least LEAST_SPREAD_PX.

@@ -19,7 +19,7 @@ def several(tmp_path):
     table = fits.BinTableHDU.from_columns([fits.Column("a", "I", array=[1])], name="LOG")
     packed = fits.CompImageHDU(SKY + 2, name="DQ", compression_type="RICE_1")
     packed.header["EXPTIME"] = 4.0
-    parts = [table, fits.ImageHDU(SKY, name="SCI"), fits.ImageHDU(np.zeros((3, 4, 5)), name="CUBE"), packed]
+    parts = [table, fits.ImageHDU(SKY, name="SCI"), fits.ImageHDU(np.zeros((4, 4, 5)), name="CUBE"), packed]
     again = fits.ImageHDU(SKY + 5, name="SCI")
     again.ver, again.header["INHERIT"] = 2, False
     path = tmp_path / "a.fits"
@@ -57,6 +57,25 @@ def test_another_image_is_named_by_its_number_or_its_name(several, part, more, e
 def test_a_part_that_is_no_frame_is_refused(several, part, words):
     with pytest.raises(FrameError, match=words):
         read_frame(f"{several}[{part}]")
+
+
+def test_three_colours_become_their_mean_without_a_mosaic(tmp_path):
+    colours = np.stack([SKY, SKY + 5000, SKY * 2]).astype(np.uint16)
+    hdu = fits.PrimaryHDU(colours)
+    hdu.header["BAYERPAT"] = "RGGB"
+    hdu.writeto(tmp_path / "a.fits")
+    frame = read_frame(tmp_path / "a.fits")
+    assert np.corrcoef(frame.pixels.ravel(), colours.mean(0).ravel())[0, 1] > 0.999999 and frame.pattern == ""
+    # as stacking programs write them, from 0 to 1
+    fits.PrimaryHDU((colours / 65535).astype(np.float32)).writeto(tmp_path / "b.fits")
+    stacked = read_frame(tmp_path / "b.fits").pixels.astype(float)
+    assert np.corrcoef(stacked.ravel(), frame.pixels.ravel())[0, 1] > 0.999999
+
+
+def test_two_planes_are_no_colours(tmp_path):
+    fits.PrimaryHDU(np.stack([SKY, SKY])).writeto(tmp_path / "a.fits")
+    with pytest.raises(FrameError, match=r"3 axes \(80 x 60 x 2\); give one plane a file, or three colours"):
+        read_frame(tmp_path / "a.fits")
 
 
 def test_a_file_whose_name_ends_in_brackets_is_itself(tmp_path):

@@ -220,7 +220,7 @@ def test_a_file_that_is_no_frame_is_refused_in_one_sentence(tmp_path, name, cont
 @pytest.mark.parametrize(
     ("data", "cards"),
     [
-        (np.zeros((3, 4, 5), np.uint16), {}),
+        (np.zeros((4, 4, 5), np.uint16), {}),
         (np.full((4, 4), np.nan, np.float32), {}),
         (np.array([[0.0, np.inf]]), {}),
         (PIXELS, {"DATE-OBS": "yesterday T", "EXPTIME": 1}),
