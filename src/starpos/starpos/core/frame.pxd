@@ -4,29 +4,39 @@
 from libc.math cimport fabs, sqrt
 
 
-cdef class Frame:
-    cdef const double[:, :, ::1] xy
-    cdef const double[::1] sigma
-    cdef double focal
+cdef class FrameStars:
+    cdef readonly object xy
+    cdef readonly object sigma
+    cdef readonly double focal_px
+    cdef readonly double area_px2
+    cdef readonly int tested
+    # the same in C, and the radius (rad) of a cone about the frame's centre that contains the frame
+    cdef const double[:, :, ::1] pixel
+    cdef const double[::1] error
+    cdef double[2] centre
+    cdef double[2] reach
     cdef double radius
-    cdef double area
-    cdef int tested
-    cdef double[2] middle
-    cdef double[2] half
 
 
-cdef inline bint on_frame(Frame frame, const double *pixel, double margin) noexcept nogil:
+cdef inline bint on_frame(FrameStars frame, const double *pixel, double margin) noexcept nogil:
     """Whether a pixel (2,) lies on a frame or within a margin (px) of it."""
-    return (fabs(pixel[0] - frame.middle[0]) < frame.half[0] + margin) & (
-        fabs(pixel[1] - frame.middle[1]) < frame.half[1] + margin
+    return (fabs(pixel[0] - frame.centre[0]) < frame.reach[0] + margin) & (
+        fabs(pixel[1] - frame.centre[1]) < frame.reach[1] + margin
     )
 
 
-cdef inline void axis_of(Frame frame, const double *attitude, double *axis) noexcept nogil:
+cdef inline bint seen_on(FrameStars frame, const double *u, double focal, double margin) noexcept nogil:
+    """Whether the pixel of a direction (3,) in C lies on a frame or within a margin (px) of it; nothing behind the camera."""
+    return (fabs(u[0] * focal - frame.centre[0] * u[2]) < (frame.reach[0] + margin) * u[2]) & (
+        fabs(u[1] * focal - frame.centre[1] * u[2]) < (frame.reach[1] + margin) * u[2]
+    )
+
+
+cdef inline void axis_of(FrameStars frame, const double *attitude, double *axis) noexcept nogil:
     """Set axis (3,) to the direction, of any length, of a frame's centre in an attitude (3, 3)."""
     cdef int i
     for i in range(3):
-        axis[i] = (frame.middle[0] * attitude[i] + frame.middle[1] * attitude[3 + i]) / frame.focal + attitude[6 + i]
+        axis[i] = (frame.centre[0] * attitude[i] + frame.centre[1] * attitude[3 + i]) / frame.focal_px + attitude[6 + i]
 
 
 cdef inline void direction_of(double x, double y, double focal, double *v) noexcept nogil:
