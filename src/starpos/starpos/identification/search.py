@@ -165,18 +165,29 @@ def near_or_lost(
     Half of the probability is that of the priors, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
-    lost = judge(field, sky, anywhere(field.focal_px, LOG_HALF if priors else 0.0), enough)
-    found = Lost(lost, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS)
-    elsewhere = map(Identification.of, found, repeat(field))
-    return chain(_near(field, sky, priors, enough), elsewhere) if priors else elsewhere
+    if priors:
+        return _near_or_lost(field, sky, priors, stages, enough, crowded)
+    return _lost(field, sky, stages, 0.0, enough, crowded)
 
 
-def _near(field: FrameStars, sky: Sky, priors: Priors, enough: float) -> Iterator[Identification]:
-    """Yield what is identified by the priors."""
+def _near_or_lost(
+    field: FrameStars, sky: Sky, priors: Priors, stages: Stages, enough: float, crowded: bool
+) -> Iterator[Identification]:
+    """Yield what is identified by the priors, which have half of the probability, then what is without them."""
     for prior in priors:
         for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
             if found := identified(field, sky, pose, radius_px, known, enough):
                 yield found
+    yield from _lost(field, sky, stages, LOG_HALF, enough, crowded)
+
+
+def _lost(
+    field: FrameStars, sky: Sky, stages: Stages, log_share: float, enough: float, crowded: bool
+) -> Iterator[Identification]:
+    """What is identified lost in space, which has that share of the probability."""
+    judged = judge(field, sky, anywhere(field.focal_px, log_share), enough)
+    found = Lost(judged, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS)
+    return map(Identification.of, found, repeat(field))
 
 
 def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification | None:
