@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import peers
 from peers import Absent
-from table import Cost, Row
+from table import Cost, Row, time_text
 
 from starpos import table_cache
 from starpos.cli.console import ProgressBar
@@ -224,6 +224,7 @@ def cost(tally: Tally) -> Cost:
         if tally.correct
         else f"{tally.none} of {tally.fields} none"
     )
+    text += f", p99 {time_text(float(np.percentile(tally.cpu_ms, 99)))}"
     return Cost(float(np.median(tally.cpu_ms)), text + f", {tally.wrong} wrong" * (tally.wrong > 0))
 
 
