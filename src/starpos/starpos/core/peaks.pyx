@@ -104,20 +104,34 @@ cdef void _smooth_row(const pixel_t[:, ::1] plane, const Smoother *s, Py_ssize_t
     _along_row(s, plane.shape[1], out)
 
 
-def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, int first, int last):
-    """Rows first .. last - 1 of a plane (h, w) smoothed along both axes by weights (reach + 1,) from the middle outwards.
+def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
+    """Some rows (R,) of a plane (h, w), and of these every so manieth pixel, smoothed along both axes.
+
+    weight  (reach + 1,): from the middle outwards
 
     Beyond its edges the plane continues as in a mirror.
     """
+    cdef Py_ssize_t width = plane.shape[1], k, x
     cdef Smoother s
-    cdef int row
-    out = np.empty((max(last - first, 0), plane.shape[1]), np.float32)
+    if step < 1 or not width or np.min(rows, initial=0) < 0 or np.max(rows, initial=-1) >= plane.shape[0]:
+        raise ValueError(f"rows and steps of {step} px beyond the {width} x {plane.shape[0]} px of the frame")
+    out = np.empty((rows.shape[0], (width + step - 1) // step), np.float32)
     cdef float[:, ::1] smooth = out
-    _begin(&s, plane.shape[1], weight)
+    cdef float *whole = <float *>malloc(width * sizeof(float))
+    if whole == NULL:
+        raise MemoryError
+    try:
+        _begin(&s, width, weight)
+    except MemoryError:
+        free(whole)
+        raise
     with nogil:
-        for row in range(first, last):
-            _smooth_row(plane, &s, row, &smooth[row - first, 0])
+        for k in range(rows.shape[0]):
+            _smooth_row(plane, &s, rows[k], whole)
+            for x in range(smooth.shape[1]):
+                smooth[k, x] = whole[x * step]
     free(s.margined)
+    free(whole)
     return out
 
 

@@ -7,6 +7,7 @@ Their light is told by the area of the disc. Nothing else puts the brightest sta
 import cv2
 import numpy as np
 
+from starpos.core.sparse import bright_squares
 from starpos.detection.background import Background
 from starpos.frames.stars import SATURATED
 
@@ -30,22 +31,18 @@ GROWTH = 2.0
 
 def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dict[str, np.ndarray]:
     """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2."""
-    level, noise = float(np.median(background.level)), float(np.median(background.noise))
+    level, noise = background.typical
     least = max(WIDER * fwhm_px, LEAST_PX)
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
-    sample = plane[:-1:step, :-1:step]
-    # whole numbers, else pixels would become floating-point ones; flat, because two axes take longer
-    row, column = np.divmod(np.flatnonzero(sample > int(level + CLEAR * noise)), sample.shape[1])
-    y, x = step * row, step * column
     # no single hot pixel
-    height = np.minimum.reduce([plane[y + i, x + j] for i in (0, 1) for j in (0, 1)]).astype(float)
+    y, x, height = bright_squares(plane, step, int(level + CLEAR * noise))
     if height.max(initial=0) < level + CLEAR * noise:
         return columns_of([], fwhm_px, 0.0)
     top = float(height.max())
     limit = level + FLAT * (top - level)
     bright = height >= limit
-    boxes = _groups(row[bright], column[bright])
+    boxes = _groups(y[bright] // step, x[bright] // step)
     most = WIDEST * min(plane.shape)
     fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
     discs = [_disc(plane, box[:4] * step, 2 * step, limit) for box in boxes[fits][:MOST]]

@@ -8,6 +8,8 @@ import numpy as np
 from scipy import sparse, spatial
 
 from starpos.core.background import between
+from starpos.core.mesh import above
+from starpos.core.order import median
 from starpos.core.peaks import peaks, smoothed
 from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
@@ -216,22 +218,20 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     SNR of a star. The second is the sky's unevenness within the background's cells, from clouds: it raises the threshold.
     """
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
-    strips = [smoothed(plane, kernel.weight, top, min(top + 16, len(plane))) for top in tops.tolist()]
-    value = np.concatenate([smooth[::4, ::4] for smooth in strips])
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
-    x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
-    level, noise = background.at(x.ravel(), y.ravel())
-    level, noise = level.mean(1).astype(np.float32), np.sqrt((noise**2).mean(1)).astype(np.float32)
-    score = (value - level.reshape(x.shape)) / noise.reshape(x.shape)
+    value = smoothed(plane, kernel.weight, rows, 4)
+    place = background.cell(np.arange(0, plane.shape[1], 4), rows)
+    score = above(value, background.level, background.noise, *place)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
-    low, sigma_below, median = _low_side(score)
+    low, sigma_below, usual = _low_side(score.ravel())
     # a roof or a tree that covers a part of the frame must not raise the threshold elsewhere
     columns = min(PARTS, score.shape[1])
-    parts = [part for row in np.split(score, len(tops)) for part in np.array_split(row, columns, axis=1)]
-    part_low, part_below, part_median = np.array([_low_side(part) for part in parts]).T
-    typical = np.median(np.minimum(part_median - part_below, part_below - part_low))
-    typical = typical if score.size > SAMPLES * len(parts) else np.inf
-    whole = tied = min(median - sigma_below, sigma_below - low, UNEVENEST * typical) / kernel.norm
+    parts = np.array_split(score.reshape(len(tops), -1, score.shape[1]), columns, axis=2)
+    sides = [_low_side(part.reshape(len(tops), -1)) for part in parts]
+    part_low, part_below, part_usual = np.concatenate(sides, axis=1)
+    typical = median(np.minimum(part_usual - part_below, part_below - part_low))
+    typical = typical if score.size > SAMPLES * part_low.size else np.inf
+    whole = tied = min(usual - sigma_below, sigma_below - low, UNEVENEST * typical) / kernel.norm
     # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone
     lag = round(1.7 * kernel.sigma)
     if score.shape[1] > 2 * lag:
@@ -242,12 +242,16 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
 
 
 def _low_side(score: np.ndarray) -> np.ndarray:
-    """Quantiles (3,) of scores at -2, -1 and 0 sigma of a Gaussian, as np.quantile has them: it takes longer to begin."""
-    ordered = np.sort(score, axis=None)
-    place = np.array([0.0228, 0.1587, 0.5]) * (len(ordered) - 1)
+    """Quantiles (3, ...) of scores (..., N) at -2, -1 and 0 sigma of a Gaussian.
+
+    np.quantile has the same: it takes longer to begin.
+    """
+    ordered = np.sort(score, axis=-1)
+    place = np.array([0.0228, 0.1587, 0.5]) * (ordered.shape[-1] - 1)
     low = place.astype(int)
-    above = ordered[np.minimum(low + 1, len(ordered) - 1)]
-    return ordered[low] + (place - low) * (above - ordered[low])
+    above_it = ordered[..., np.minimum(low + 1, ordered.shape[-1] - 1)]
+    ordered = ordered[..., low]
+    return np.moveaxis(ordered + (place - low) * (above_it - ordered), -1, 0)
 
 
 def _above_tail(height: np.ndarray, threshold: float) -> float:

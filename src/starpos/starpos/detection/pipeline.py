@@ -187,14 +187,16 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
     background = measure_background(plane, settings.mesh_px, picture.mosaic)
-    level, noise = float(np.median(background.level)), float(np.median(background.noise))
+    level, noise = background.typical
     limit = max(PEAKS, 2 * settings.max_stars)
     peaks = find_peaks(plane, background, settings.threshold, limit, settings.threads)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return _starless(about, level, noise)
     background = replace(background, correlation=peaks.correlation)
-    background = replace(background, streaks=find_streaks(plane, background, x, y))
+    streaks = find_streaks(plane, background, x, y)
+    if streaks:
+        background = replace(background, streaks=streaks)
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
     if picture.trail_px is not None:
