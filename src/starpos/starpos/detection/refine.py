@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.core.marginal import marginal
+from starpos.core.marginal import chosen, marginal
+from starpos.core.order import median
 from starpos.detection.psf import MONOMIALS, Psf, power
 
 # A variation over the field needs at least so many stars,
@@ -39,7 +40,7 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
         fitted = np.linalg.lstsq(field * scale, own * scale, rcond=None)[0]
         off = np.sqrt(weight) * np.abs(own - field @ fitted).max(1)
         # pairs are wide but tell nothing of the optics
-        keep = off < 6 * np.median(off)
+        keep = off < 6 * median(off)
         if keep.sum() < PLACES:
             return psf
     used = (weight * keep)[:, None]
@@ -127,8 +128,8 @@ def refine(
     each = (field[:, :, None] * field[:, None]).reshape(len(x), -1).T @ normal.reshape(len(x), -1)
     normal = each.reshape(places, places, count, count).transpose(2, 0, 3, 1).reshape(count * places, -1)
     right = (right.T @ field).ravel()
-    candidates = terms.candidates.reshape(-1, len(right))
-    found = _chosen(normal + np.eye(len(right)) / LIKELY**2, right, candidates, terms.price.ravel())
+    candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
+    found = chosen(normal + np.eye(len(right)) / LIKELY**2, right, candidates, terms.price.ravel())
     if not np.all(np.isfinite(found)):
         return psf
     found = found.reshape(count, places)
@@ -141,20 +142,6 @@ def refine(
     series[0, 0, 0] = 1
     series[:, i[1:], j[1:]] = found[used, : len(series)].T
     return replace(psf, series=series)
-
-
-def _chosen(normal: np.ndarray, right: np.ndarray, candidates: np.ndarray, price: np.ndarray) -> np.ndarray:
-    """The coefficients that minimise chi-square plus price; 0 for those not worth their price."""
-    found, taken, most = np.zeros(len(right)), np.zeros(len(right), bool), 0.0
-    for candidate in candidates:
-        index = np.flatnonzero(taken | candidate)
-        solution = np.linalg.solve(normal[np.ix_(index, index)], right[index])
-        gain = right[index] @ solution - price[index].sum()
-        if gain > most:
-            most, taken = gain, taken | candidate
-            found = np.zeros(len(right))
-            found[index] = solution
-    return found
 
 
 def _absorbed(psf: Psf, field: np.ndarray, orders: np.ndarray, found: np.ndarray) -> tuple[Psf, np.ndarray]:
