@@ -111,30 +111,39 @@ def above(
     cdef double sky, noise2, one, share, down
     if row.shape[0] != tall or column.shape[0] != wide:
         raise ValueError(f"{row.shape[0]} rows and {column.shape[0]} columns of {tall} x {wide} values: as many are needed")
-    for name, least, most, cells in (
+    for name, least, most, size in (
         ("rows", np.min(row, initial=0), np.max(row, initial=0), level.shape[1]),
         ("columns", np.min(column, initial=0), np.max(column, initial=0), level.shape[2]),
     ):
-        if not 0 <= least <= most < cells - 1:
-            raise ValueError(f"{name} {least} to {most} in a mesh of {cells}")
+        if not 0 <= least <= most < size - 1:
+            raise ValueError(f"{name} {least} to {most} in a mesh of {size}")
     if level.shape[0] != noise.shape[0] or level.shape[1] != noise.shape[1] or level.shape[2] != noise.shape[2]:
         raise ValueError("as many cells of noise as of level are needed")
+    cdef Py_ssize_t cells = level.shape[2], phases = level.shape[0]
     out = np.empty((tall, wide), np.float32)
     cdef float[:, ::1] score = out
+    # level and noise of each phase along a row
+    cdef double *along = <double *>malloc(2 * phases * cells * sizeof(double))
+    if along == NULL:
+        raise MemoryError
+    cdef double *own
     with nogil:
         for i in range(tall):
             y, down = <Py_ssize_t>row[i], row[i] - <Py_ssize_t>row[i]
+            for p in range(phases):
+                own = along + 2 * p * cells
+                for x in range(cells):
+                    own[x] = (1 - down) * level[p, y, x] + down * level[p, y + 1, x]
+                    own[cells + x] = (1 - down) * noise[p, y, x] + down * noise[p, y + 1, x]
             for j in range(wide):
-                x, share = <Py_ssize_t>column[j], column[j] - <Py_ssize_t>column[j]
-                sky = noise2 = 0.0
-                for p in range(level.shape[0]):
-                    sky += _between(&level[p, y, x], level.shape[2], down, share)
-                    one = _between(&noise[p, y, x], level.shape[2], down, share)
+                x = <Py_ssize_t>column[j]
+                share, sky, noise2 = column[j] - x, 0.0, 0.0
+                for p in range(phases):
+                    own = along + 2 * p * cells + x
+                    sky += (1 - share) * own[0] + share * own[1]
+                    one = (1 - share) * own[cells] + share * own[cells + 1]
                     noise2 += one * one
-                score[i, j] = (value[i, j] - <float>(sky / level.shape[0])) / <float>sqrt(noise2 / level.shape[0])
+                one = one if phases == 1 else sqrt(noise2 / phases)
+                score[i, j] = (value[i, j] - <float>(sky / phases)) / <float>one
+    free(along)
     return out
-
-
-cdef inline double _between(const double *cell, Py_ssize_t stride, double down, double share) noexcept nogil:
-    """A value between a cell, the one to the right, and the two below."""
-    return (1 - down) * ((1 - share) * cell[0] + share * cell[1]) + down * ((1 - share) * cell[stride] + share * cell[stride + 1])

@@ -92,3 +92,37 @@ def bright_squares(const pixel_t[:, ::1] plane, int step, int limit):
                     count += 1
     free(bright)
     return places_[0], places_[1], lowest_
+
+
+def third_highest(const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach):
+    """The highest third value of the squares around pixels x, y (N,), N > 0, and how many pixels of one square share it.
+
+    A square reaches so far (px); beyond the frame it holds 0.
+    """
+    cdef Py_ssize_t k, row, column, height = plane.shape[0], width = plane.shape[1]
+    cdef int value, highest = -1, count, most = 0
+    cdef int[3] top
+    cdef const pixel_t *line
+    if not x.shape[0] or y.shape[0] != x.shape[0] or reach < 1:
+        raise ValueError(f"{x.shape[0]} columns and {y.shape[0]} rows of squares of {reach} px: as many are needed, at least one")
+    with nogil:
+        for k in range(x.shape[0]):
+            top[0] = top[1] = top[2] = count = 0
+            for row in range(max(y[k] - reach, 0), min(y[k] + reach + 1, height)):
+                line = &plane[row, 0]
+                for column in range(max(x[k] - reach, 0), min(x[k] + reach + 1, width)):
+                    value = line[column]
+                    if value > top[2]:
+                        top[2] = value
+                        if top[2] > top[1]:
+                            top[1], top[2] = top[2], top[1]
+                        if top[1] > top[0]:
+                            top[0], top[1] = top[1], top[0]
+            if top[2] < highest:
+                continue
+            for row in range(max(y[k] - reach, 0), min(y[k] + reach + 1, height)):
+                for column in range(max(x[k] - reach, 0), min(x[k] + reach + 1, width)):
+                    count += plane[row, column] == top[2]
+            most = count if top[2] > highest else max(most, count)
+            highest = top[2]
+    return highest, most

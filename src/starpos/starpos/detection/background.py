@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from starpos.core.background import between, sampled
+from starpos.core.background import near, sampled
 from starpos.core.mesh import evened
 from starpos.core.order import median
 from starpos.core.sparse import any_flat
@@ -54,11 +54,6 @@ class Background:
         """Level and noise, DN: medians over the cells."""
         return median(self.level.ravel()), median(self.noise.ravel())
 
-    def at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
-        place = self.cell(x, y)
-        return between(self.level, *place), between(self.noise, *place)
-
     def cell(self, x: np.ndarray | int, y: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
         """Row and column in the meshes, with fractions, of the pixels x, y."""
         row = (np.asarray(y) + 0.5) * (self.level.shape[1] - 2) / self.height + 0.5
@@ -66,9 +61,9 @@ class Background:
         return row, column
 
     def near(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Level and noise (N, P) float32, DN, for sums over pixels around x, y (N,): with the correlation."""
-        level, noise = (v.astype(np.float32) for v in self.at(x, y))
-        return level, noise * np.float32(self.correlation)
+        """Level and noise (N, P) float32, DN, for sums over pixels around the pixels x, y (N,): with the correlation."""
+        x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
+        return near(self.level, self.noise, x, y, self.width, self.height, self.correlation)
 
     def of_pixels(
         self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray

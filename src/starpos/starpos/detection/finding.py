@@ -21,8 +21,8 @@ STRIP = 64
 CHUNK = 1024
 # Parts of a strip in which the sky is compared; the whole frame is at most so many times less even than the typical one.
 PARTS, UNEVENEST = 4, 1.4
-# With fewer values in a part its quantiles are chance.
-SAMPLES = 32
+# With fewer values in a part its quantiles are chance; a smaller factor may be chance too.
+SAMPLES, CORRELATED = 32, 1.1
 # Diameter of the widest defocused star, px.
 CROWD = 14
 # So many of the brightest peaks decide whether the frame's stars are rings,
@@ -163,12 +163,12 @@ def _peaks_of(
     threshold = threshold * unevenness
     level, noise = background.level.mean(0), np.sqrt((background.noise**2).mean(0))
     noise = noise * kernel.norm * correlation
-    wanted = (level + threshold * noise).astype(np.float32)
-    lowest = _columns(wanted, background)
-    strips = np.arange(0, plane.shape[0], STRIP)
     # each strip against the lowest threshold of its mesh rows; the exact threshold follows below
+    strips = np.arange(0, plane.shape[0], STRIP)
     (first, last), _ = background.cell(0, np.stack([strips, np.minimum(strips + STRIP, plane.shape[0]) - 1]))
-    floor = np.stack([lowest[int(i) : int(j) + 2].min(0) for i, j in zip(first, last, strict=True)])
+    first, last = first.astype(int), last.astype(int) + 1
+    rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+    floor = _columns((level + threshold * noise).astype(np.float32)[rows].min(1), background)
     x, y, value = _in_parts(plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
     local, sigma = between(np.stack([level, noise]), *background.cell(x, y)).T
@@ -224,6 +224,9 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     score = above(value, background.level, background.noise, *place)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
     low, sigma_below, usual = _low_side(score.ravel())
+    scatter = min(usual - sigma_below, sigma_below - low) / kernel.norm
+    if not scatter > 1:
+        return 1.0, 1.0
     # a roof or a tree that covers a part of the frame must not raise the threshold elsewhere
     columns = min(PARTS, score.shape[1])
     parts = np.array_split(score.reshape(len(tops), -1, score.shape[1]), columns, axis=2)
@@ -231,14 +234,14 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     part_low, part_below, part_usual = np.concatenate(sides, axis=1)
     typical = median(np.minimum(part_usual - part_below, part_below - part_low))
     typical = typical if score.size > SAMPLES * part_low.size else np.inf
-    whole = tied = min(usual - sigma_below, sigma_below - low, UNEVENEST * typical) / kernel.norm
+    whole = tied = float(min(scatter, UNEVENEST * typical / kernel.norm))
     # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone
     lag = round(1.7 * kernel.sigma)
-    if score.shape[1] > 2 * lag:
+    if whole > CORRELATED and score.shape[1] > 2 * lag:
         steps = (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])) / 1.5**0.5
-        tied = min(whole, SIGMA_PER_MAD * np.median(np.abs(steps)) / kernel.norm)
-    tied = float(tied) if tied > 1.1 else 1.0
-    return tied, max(1.0, float(whole) / tied)
+        tied = min(whole, SIGMA_PER_MAD * float(np.median(np.abs(steps))) / kernel.norm)
+    tied = tied if tied > CORRELATED else 1.0
+    return tied, max(1.0, whole / tied)
 
 
 def _low_side(score: np.ndarray) -> np.ndarray:

@@ -105,5 +105,7 @@ def fit_stars(
 
 
 def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """The gain (N, S, S) float32 of each pixel: stars' gains (N, P) taken at the pixels' phases (N, S, S)."""
+    """The gain float32 of each pixel: stars' gains (N, P) at the pixels' phases (N, S, S); (N, 1, 1) without a mosaic."""
+    if gains.shape[1] == 1:
+        return gains.astype(np.float32)[:, :, None]
     return gains.astype(np.float32)[np.arange(len(gains))[:, None, None], phase]

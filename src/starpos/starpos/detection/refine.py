@@ -2,6 +2,7 @@
 """Refine a PSF by stars that were fitted with it, and find whether it varies over the field."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -40,9 +41,11 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
         fitted = np.linalg.lstsq(field * scale, own * scale, rcond=None)[0]
         off = np.sqrt(weight) * np.abs(own - field @ fitted).max(1)
         # pairs are wide but tell nothing of the optics
-        keep = off < 6 * median(off)
+        kept, keep = keep, off < 6 * median(off)
         if keep.sum() < PLACES:
             return psf
+        if np.array_equal(keep, kept):
+            break
     used = (weight * keep)[:, None]
     mean = (used * own).sum(0) / used.sum()
     before, after = ((used * (own - model) ** 2).sum() for model in (mean, field @ fitted))
@@ -68,14 +71,18 @@ class Terms:
 
 def even_terms(psf: Psf, highest: int) -> Terms:
     """Terms of even order, up to `highest` across the trail and, for a long star, up to twice that along it."""
-    grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
-    # without (0, 0)
-    orders = np.array(grid[1:])
-    orders = orders[_rank(psf, *orders.T) <= highest]
+    orders = _even_orders(highest)
+    rank = _rank(psf, *orders.T)
+    orders, rank = orders[rank <= highest], rank[rank <= highest]
     steps = np.arange(2, highest + 1, 2)
-    return Terms(
-        orders, (_rank(psf, *orders.T) <= steps[:, None])[..., None], np.full((len(orders), 1), WORTH)
-    )
+    return Terms(orders, (rank <= steps[:, None])[..., None], np.full((len(orders), 1), WORTH))
+
+
+@cache
+def _even_orders(highest: int) -> np.ndarray:
+    """All i, j (T, 2) of even terms that can be of use, without (0, 0)."""
+    grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
+    return np.array(grid[1:])
 
 
 def all_terms(psf: Psf, highest: int, count: int) -> Terms:
@@ -84,7 +91,7 @@ def all_terms(psf: Psf, highest: int, count: int) -> Terms:
     odd = np.array([(i, COMA - i) for i in range(COMA + 1)])
     orders = np.concatenate([even.orders, odd])
     first = np.arange(MONOMIALS if count >= PLACES else 1) == 0
-    steps = np.pad(even.candidates[..., 0], ((0, 0), (0, len(odd))))
+    steps = np.concatenate([even.candidates[..., 0], np.zeros((len(even.candidates), len(odd)), bool)], 1)
     width, coma = orders.sum(1) == 2, orders.sum(1) == COMA
     shape = (_rank(psf, *orders.T) <= FIELD_ORDER) & ~width & ~coma
     everywhere = [terms[:, None] & first for terms in (*steps, coma)]

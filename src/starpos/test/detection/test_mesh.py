@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.core.background import between
+from starpos.core.background import between, near
 from starpos.core.mesh import above, evened
 from starpos.core.order import median, quantile
 from starpos.core.peaks import smoothed
-from starpos.core.sparse import any_flat, bright_squares
+from starpos.core.sparse import any_flat, bright_squares, third_highest
 
 
 def plain_evened(mesh, steep, level):
@@ -97,3 +97,32 @@ def test_nothing_has_no_median_and_no_quantile():
     assert np.isnan(median(np.zeros(0)))
     with pytest.raises(ValueError, match="there is none"):
         quantile(np.zeros(0), 0.5)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_the_third_highest_pixel_is_that_of_sorted_squares(kind, rng):
+    """Some squares lie partly beyond the frame."""
+    for most in (3, 9, 200):
+        plane = rng.integers(0, most, (20, 30)).astype(kind)
+        x, y = rng.integers(0, 30, 12), rng.integers(0, 20, 12)
+        around = np.pad(plane, 2)
+        squares = np.stack([around[j : j + 5, i : i + 5].ravel() for i, j in zip(x, y, strict=True)])
+        third = np.sort(squares, axis=1)[:, -3].max()
+        shared = (squares == third).sum(1)[np.sort(squares, axis=1)[:, -3] == third].max()
+        assert third_highest(plane, x, y, 2) == (third, shared)
+    with pytest.raises(ValueError, match="at least one"):
+        third_highest(plane, x[:0], y[:0], 2)
+
+
+@pytest.mark.parametrize("phases", [1, 4])
+def test_the_sky_near_a_pixel_lies_between_cells(phases, rng):
+    level, noise = rng.uniform(5, 9, (2, phases, 5, 8))
+    x, y = rng.integers(-3, 63, 40), rng.integers(-3, 33, 40)
+    place = (y + 0.5) * 3 / 30 + 0.5, (x + 0.5) * 6 / 60 + 0.5
+    plain = between(level, *place), between(noise, *place) * 1.5
+    for found, expected in zip(near(level, noise, x, y, 60, 30, 1.5), plain, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    with pytest.raises(ValueError, match="as many"):
+        near(level, noise, x, y[1:], 60, 30, 1.5)
+    with pytest.raises(ValueError, match="as of level"):
+        near(level, noise[:, 1:].copy(), x, y, 60, 30, 1.5)
