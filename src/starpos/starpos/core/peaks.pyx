@@ -141,7 +141,8 @@ def peaks(
 ):
     """Peaks of a plane (h, w) smoothed as in `smoothed`: pixels above a limit, of which none within `flat` px is higher.
 
-    limit        (strips, w): of each strip of so many rows
+    limit        (strips, C): of each strip of so many rows, in cells that cover its width evenly, with one more beyond each
+                 end; linear between them
     first, last  the rows in which peaks are looked for
 
     Peaks side by side are one. Returns x, y (N,) px, their means, and the smoothed value (N,).
@@ -154,9 +155,12 @@ def peaks(
     _begin(&s, width, weight)
     cdef float *smooth = <float *>malloc(kept * width * sizeof(float))
     cdef int *marks = <int *>malloc(2 * (width + 2) * sizeof(int))
+    cdef float *wanted = <float *>malloc(width * sizeof(float))
     try:
-        if smooth == NULL or marks == NULL:
+        if smooth == NULL or marks == NULL or wanted == NULL:
             raise MemoryError
+        if limit.shape[1] < 3 or not 0 <= first <= last <= height or limit.shape[0] * strip < last:
+            raise ValueError(f"limits of {limit.shape[0]} strips of {strip} rows, in {limit.shape[1]} cells, for rows {first} to {last}")
         g.here, g.above = marks, marks + width + 2
         with nogil:
             memset(marks, 0xFF, 2 * (width + 2) * sizeof(int))
@@ -164,13 +168,26 @@ def peaks(
                 while done < min(row + flat + 1, <int>height):
                     _smooth_row(plane, &s, done, smooth + (done % kept) * width)
                     done += 1
-                _take_peaks(smooth, kept, width, height, row, flat, &limit[row // strip, 0], &g)
+                if row == first or row % strip == 0:
+                    _spread(&limit[row // strip, 0], limit.shape[1], width, wanted)
+                _take_peaks(smooth, kept, width, height, row, flat, wanted, &g)
         return _columns(&g)
     finally:
         free(smooth)
         free(marks)
+        free(wanted)
         free(s.margined)
         free(g.each)
+
+
+cdef void _spread(const float *cell, Py_ssize_t cells, Py_ssize_t width, float *out) noexcept nogil:
+    """Spread values in cells over a row of pixels."""
+    cdef Py_ssize_t x, left
+    cdef double place
+    for x in range(width):
+        place = (x + 0.5) * (cells - 2) / width + 0.5
+        left = <Py_ssize_t>place
+        out[x] = cell[left] + <float>(place - left) * (cell[left + 1] - cell[left])
 
 
 cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:

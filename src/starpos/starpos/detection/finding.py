@@ -168,7 +168,7 @@ def _peaks_of(
     (first, last), _ = background.cell(0, np.stack([strips, np.minimum(strips + STRIP, plane.shape[0]) - 1]))
     first, last = first.astype(int), last.astype(int) + 1
     rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
-    floor = _columns((level + threshold * noise).astype(np.float32)[rows].min(1), background)
+    floor = (level + threshold * noise).astype(np.float32)[rows].min(1)
     x, y, value = _in_parts(plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
     local, sigma = between(np.stack([level, noise]), *background.cell(x, y)).T
@@ -197,7 +197,7 @@ def _chunks(count: int) -> list[slice]:
 def _in_parts(
     plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, w), found by so many threads."""
+    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, cells), found by so many threads."""
     height, parts = plane.shape[0], min(threads, len(limit))
     ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
 
@@ -267,15 +267,6 @@ def _above_tail(height: np.ndarray, threshold: float) -> float:
             break
         threshold *= 1.1
     return threshold
-
-
-def _columns(mesh: np.ndarray, background: Background) -> np.ndarray:
-    """Spread a background's mesh (rows, columns) over the frame's width: (rows, width), linear between cells."""
-    _, place = background.cell(np.arange(background.width), 0)
-    left = place.astype(int)
-    share = (place - left).astype(np.float32)
-    here, after = (np.take(mesh, place, axis=1) for place in (left, left + 1))
-    return here + share * (after - here)
 
 
 def _join_plateaus(

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage, spatial
 
 from starpos.core.moments import own_shapes
-from starpos.core.noise import light_noise
+from starpos.core.noise import light_noise, strangeness
 from starpos.core.order import quantile
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars, gains_at
@@ -35,8 +35,8 @@ BRIGHT, TEACHERS = 20, 250
 # and of wide stars fewer: together they have so many pixels.
 TEACHING_PIXELS = 12000
 # A star does not teach if the residual's share of its squared light exceeds this, plus noise, plus three times that of
-# other stars.
-UNLIKE = 0.005
+# other stars; DN2 of light, so that darkness has a share too.
+UNLIKE, DARKEST = 0.005, 1e-9
 # Rounds in which each star's own shape is measured, and in each of them rounds of centring.
 OWN_ROUNDS, CENTRINGS = 3, 2
 # So many stars agree by more than chance if they differ by less than this (log of width, ellipticity); twigs do not.
@@ -97,9 +97,10 @@ def learn(
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
         if not sound.any():
             break
+        # two stars in one image would teach a wrong PSF and too much photon noise
+        strange, error = strangeness(stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, DARKEST)
         # compared with the best 30 %, because most of the brightest may be pairs
-        strange, error = _strangeness(stamps, fit)
-        sound &= strange < 3 * max(0, quantile(strange[sound].astype(float), 0.3)) + 3 * error + UNLIKE
+        sound &= strange < 3 * max(0, quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= rounds
@@ -242,17 +243,6 @@ def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndar
         alone[a[height[b] > 0.02 * height[a]]] = False
         high[a[height[b] > height[a]]] = False
     return alone, high
-
-
-def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of squared residuals beyond the sky's noise over that of the model (N,), for each star, and its error (N,).
-
-    It is large for two stars in one image, which would teach a wrong PSF and too much photon noise.
-    """
-    noise2 = fit.used * stamps.noise**2
-    light2 = np.maximum((fit.used * fit.model**2).sum((1, 2)), 1e-9)
-    left = (fit.used * fit.residual**2 - noise2 * (1 - fit.leverage)).sum((1, 2))
-    return left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
 
 
 def respond(

@@ -8,7 +8,7 @@ from scipy import ndimage
 from starpos.core.background import between, near
 from starpos.core.mesh import above, evened
 from starpos.core.order import median, quantile
-from starpos.core.peaks import smoothed
+from starpos.core.peaks import peaks, smoothed
 from starpos.core.sparse import any_flat, bright_squares, third_highest
 
 
@@ -126,3 +126,15 @@ def test_the_sky_near_a_pixel_lies_between_cells(phases, rng):
         near(level, noise, x, y[1:], 60, 30, 1.5)
     with pytest.raises(ValueError, match="as of level"):
         near(level, noise[:, 1:].copy(), x, y, 60, 30, 1.5)
+
+
+def test_the_limit_of_peaks_is_linear_between_cells_and_another_in_each_strip(rng):
+    plane, cells = np.zeros((20, 60), np.uint16), rng.uniform(100, 200, (2, 8)).astype(np.float32)
+    row, column = (v.ravel() for v in np.mgrid[1:20:3, 1:60:3])
+    plane[row, column] = height = rng.integers(50, 250, len(row))
+    place = (column + 0.5) * 6 / 60 + 0.5
+    limit = np.where(row < 10, *(np.interp(place, np.arange(8), strip) for strip in cells))
+    x, y, value = peaks(plane, np.array([1, 0], np.float32), 1, cells, 10, 0, 20)
+    np.testing.assert_array_equal((y, x, value), np.stack([row, column, height])[:, height > limit])
+    with pytest.raises(ValueError, match="2 strips"):
+        peaks(plane, np.array([1, 0], np.float32), 1, cells, 9, 0, 20)
