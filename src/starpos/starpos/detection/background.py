@@ -2,7 +2,7 @@
 """Background and noise of a frame: clipped means on a coarse mesh, from a sparse sample of the pixels."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -156,6 +156,8 @@ def _spread(count: int) -> np.ndarray:
     return np.arange(most) * (count - 1) // max(most - 1, 1)
 
 
+# the frames of a camera have one size
+@lru_cache(maxsize=16)
 def _sample(length: int, cell_px: int) -> np.ndarray:
     """Row numbers (cells, samples): each cell's samples are pairs of neighbours, and the first of a pair is even."""
     cells = max(1, round(length / cell_px))

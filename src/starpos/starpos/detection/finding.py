@@ -3,6 +3,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse, spatial
@@ -41,7 +42,7 @@ class Kernel:
     reach: int
     flat: int
 
-    @property
+    @cached_property
     def weight(self) -> np.ndarray:
         """Weights (reach + 1,) along one axis, from the middle outwards."""
         weight = np.exp(-0.5 * (np.arange(self.reach + 1) / self.sigma) ** 2)

@@ -80,6 +80,9 @@ class Fit:
     leverage: np.ndarray
 
 
+COLUMNS = tuple(f.name for f in fields(Fit))
+
+
 def fit_stars(
     stamps: Stamps,
     psf: Psf,
@@ -101,7 +104,7 @@ def fit_stars(
         stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, np.stack([x, y], 1), local.axes,
         local.series, response.rules, rounds, leverage,
     )  # fmt: skip
-    return Fit(**dict(zip((f.name for f in fields(Fit)), columns, strict=True)))
+    return Fit(**dict(zip(COLUMNS, columns, strict=True)))
 
 
 def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:
