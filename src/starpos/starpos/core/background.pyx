@@ -139,45 +139,77 @@ def sampled(
     found, tops = np.empty((2, 4, down, across)), np.empty((2, 4, down, across), np.int32)
     cdef double[:, :, :, ::1] sky = found
     cdef int[:, :, :, ::1] highest = tops
-    cdef unsigned short *value = <unsigned short *>malloc(2 * n * sizeof(unsigned short))
+    cdef unsigned short *value = <unsigned short *>malloc(5 * n * sizeof(unsigned short))
     if value == NULL:
         raise MemoryError
+    cdef unsigned short *own
     with nogil:
         for i in range(down):
             for j in range(across):
+                for y in range(tall):
+                    row, own = &plane[rows[i, y], 0], value + y % 2 * 2 * n + y // 2 * (wide // 2)
+                    for x in range(wide // 2):
+                        own[x], own[n + x] = row[columns[j, 2 * x]], row[columns[j, 2 * x + 1]]
                 for phase in range(4):
-                    k = top = 0
-                    for y in range(phase // 2, tall, 2):
-                        row = &plane[rows[i, y], 0]
-                        for x in range(phase % 2, wide, 2):
-                            value[k] = row[columns[j, x]]
-                            top = max(top, <int>value[k])
-                            k += 1
-                    _clipped(value, n, &clip, value + n, &sky[0, phase, i, j], &sky[1, phase, i, j])
+                    own, top = value + phase * n, 0
+                    for k in range(n):
+                        top = max(top, <int>own[k])
+                    _clipped(own, n, &clip, value + 4 * n, &sky[0, phase, i, j], &sky[1, phase, i, j])
                     highest[0, phase, i, j] = top
-                    highest[1, phase, i, j] = equal(value, n, top)
+                    highest[1, phase, i, j] = equal(own, n, top)
     free(value)
     return found[0], found[1], tops[0], tops[1]
 
 
+cdef inline double _between(const double[:, :, ::1] mesh, Py_ssize_t p, double row, double column) noexcept nogil:
+    """The value of mesh p at a place, bilinear; beyond the edges as on them."""
+    # what is not a number is 0
+    cdef double y = min(row if row > 0 else 0.0, mesh.shape[1] - 1.0), x = min(column if column > 0 else 0.0, mesh.shape[2] - 1.0)
+    cdef Py_ssize_t i = min(<Py_ssize_t>y, mesh.shape[1] - 2), j = min(<Py_ssize_t>x, mesh.shape[2] - 2)
+    y, x = y - i, x - j
+    return (
+        (1 - y) * ((1 - x) * mesh[p, i, j] + x * mesh[p, i, j + 1])
+        + y * ((1 - x) * mesh[p, i + 1, j] + x * mesh[p, i + 1, j + 1])
+    )
+
+
 def between(const double[:, :, ::1] mesh, const double[::1] row, const double[::1] column):
     """Values (N, P) of P meshes (P, rows, columns) at the places row, column (N,), bilinear; beyond the edges as on them."""
-    cdef Py_ssize_t n = row.shape[0], height = mesh.shape[1], width = mesh.shape[2], k, p, i, j
-    cdef double y, x
-    if column.shape[0] != n or height < 2 or width < 2:
-        raise ValueError(f"{n} rows and {column.shape[0]} columns in meshes of {height} x {width}: as many, in 2 x 2 or more")
+    cdef Py_ssize_t n = row.shape[0], k, p
+    if column.shape[0] != n or mesh.shape[1] < 2 or mesh.shape[2] < 2:
+        raise ValueError(
+            f"{n} rows and {column.shape[0]} columns in meshes of {mesh.shape[1]} x {mesh.shape[2]}: as many, in 2 x 2 or more"
+        )
     out = np.empty((n, mesh.shape[0]))
     cdef double[:, ::1] value = out
     with nogil:
         for k in range(n):
-            # what is not a number is 0
-            y, x = row[k] if row[k] > 0 else 0.0, column[k] if column[k] > 0 else 0.0
-            y, x = min(y, height - 1.0), min(x, width - 1.0)
-            i, j = min(<Py_ssize_t>y, height - 2), min(<Py_ssize_t>x, width - 2)
-            y, x = y - i, x - j
             for p in range(mesh.shape[0]):
-                value[k, p] = (
-                    (1 - y) * ((1 - x) * mesh[p, i, j] + x * mesh[p, i, j + 1])
-                    + y * ((1 - x) * mesh[p, i + 1, j] + x * mesh[p, i + 1, j + 1])
-                )
+                value[k, p] = _between(mesh, p, row[k], column[k])
     return out
+
+
+def near(
+    const double[:, :, ::1] level, const double[:, :, ::1] noise, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y,
+    int width, int height, float correlation,
+):
+    """Level and noise (N, P) float32 at the pixels x, y (N,) of a frame that meshes (P, rows + 2, columns + 2) cover.
+
+    correlation  factor of the noise
+    """
+    cdef Py_ssize_t n = x.shape[0], k, p
+    cdef double row, column
+    if y.shape[0] != n or level.shape[1] < 3 or level.shape[2] < 3 or width < 1 or height < 1:
+        raise ValueError(f"{n} columns, {y.shape[0]} rows, {width} x {height} px: as many are needed, on cells that cover them")
+    if not (level.shape[0] == noise.shape[0] and level.shape[1] == noise.shape[1] and level.shape[2] == noise.shape[2]):
+        raise ValueError("as many cells of noise as of level are needed")
+    out = np.empty((2, n, level.shape[0]), np.float32)
+    cdef float[:, :, ::1] sky = out
+    with nogil:
+        for k in range(n):
+            row = (y[k] + 0.5) * (level.shape[1] - 2) / height + 0.5
+            column = (x[k] + 0.5) * (level.shape[2] - 2) / width + 0.5
+            for p in range(level.shape[0]):
+                sky[0, k, p] = <float>_between(level, p, row, column)
+                sky[1, k, p] = <float>_between(noise, p, row, column) * correlation
+    return out[0], out[1]

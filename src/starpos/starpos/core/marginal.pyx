@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Normal equations of a PSF's terms, star by star, with the star's own place and gains eliminated."""
 
-from libc.math cimport isnan
+from libc.math cimport isnan, sqrt
 from libc.stdlib cimport free, malloc
 from libc.string cimport memset
 
@@ -176,3 +176,79 @@ def marginal(
     free(normal)
     free(block.design)
     return out, right_
+
+
+cdef bint _solve(double *upper, double *b, int n) noexcept nogil:
+    """Replace b (n,) by the solution of the symmetric equations whose upper half is given, and destroyed; False: there is none.
+
+    Cholesky's factor row by row: whole rows are added, in wide registers.
+    """
+    cdef double pivot, share
+    cdef int i, j, k
+    for k in range(n):
+        pivot = upper[k * n + k]
+        if not pivot > 0:
+            return False
+        pivot = 1 / sqrt(pivot)
+        for j in range(k, n):
+            upper[k * n + j] *= pivot
+        b[k] *= pivot
+        for i in range(k + 1, n):
+            share = upper[k * n + i]
+            for j in range(i, n):
+                upper[i * n + j] -= share * upper[k * n + j]
+            b[i] -= share * b[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            b[k] -= upper[k * n + j] * b[j]
+        b[k] /= upper[k * n + k]
+    return True
+
+
+def chosen(
+    const double[:, ::1] normal, const double[::1] right, const unsigned char[:, ::1] candidates, const double[::1] price
+):
+    """The coefficients (M,) that minimise chi-square plus their price; 0 for those not worth it.
+
+    normal, right  (M, M), (M,): of the normal equations
+    candidates     (C, M): sets of coefficients that are tried one after the other, beside those accepted before
+    price          (M,): what each coefficient must lower chi-square by
+    """
+    cdef int most = right.shape[0], c, j, i, n
+    cdef double best = 0.0, gain
+    if not (normal.shape[0] == normal.shape[1] == candidates.shape[1] == price.shape[0] == most):
+        raise ValueError(f"{normal.shape[0]} equations, {candidates.shape[1]} and {price.shape[0]} coefficients: {most} are needed")
+    out, taken_ = np.zeros(most), np.zeros(most, np.uint8)
+    cdef double[::1] found = out
+    cdef unsigned char[::1] taken = taken_
+    cdef double *upper = <double *>malloc(max(most * (most + 1), 1) * sizeof(double))
+    cdef int *index = <int *>malloc(max(most, 1) * sizeof(int))
+    if upper == NULL or index == NULL:
+        free(upper)
+        free(index)
+        raise MemoryError
+    cdef double *solution = upper + most * most
+    with nogil:
+        for c in range(candidates.shape[0]):
+            n = 0
+            for j in range(most):
+                if taken[j] or candidates[c, j]:
+                    index[n] = j
+                    n += 1
+            for i in range(n):
+                solution[i] = right[index[i]]
+                for j in range(i, n):
+                    upper[i * n + j] = normal[index[i], index[j]]
+            if not _solve(upper, solution, n):
+                continue
+            gain = 0.0
+            for i in range(n):
+                gain += right[index[i]] * solution[i] - price[index[i]]
+            if gain > best:
+                best = gain
+                found[:] = 0.0
+                for i in range(n):
+                    found[index[i]], taken[index[i]] = solution[i], True
+    free(upper)
+    free(index)
+    return out

@@ -2,12 +2,14 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Moments of images through elliptical Gaussian windows, and the places of images by them."""
 
-from libc.math cimport NAN, exp, rint
+from libc.math cimport INFINITY, NAN, exp, fabs, isnan, rint
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 cimport starpos.core.wide
+from starpos.core.algebra cimport middle
+from starpos.core.shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, sides, with_sides
 
 cdef extern from *:
     """
@@ -176,17 +178,14 @@ def centred(
     gain         as many: a step over the mean through the window; at most 1 px
     farthest     px from the beginning
     """
-    cdef int n = signal.shape[0], half = signal.shape[1] // 2, k, w, i, round_
+    cdef int n = signal.shape[0], k, w
     cdef Image image
-    cdef double[6] found
-    cdef double[2] place
     cdef double[2] begin
-    cdef double step
     _sound(signal, column.shape[0], row.shape[0], window)
     _sound(signal, column.shape[0], row.shape[0], gain)
     if gain.shape[0] != window.shape[0]:
         raise ValueError(f"{window.shape[0]} windows and {gain.shape[0]} gains: as many are needed")
-    out = np.empty((2, n))
+    out = np.empty((n, 2))
     cdef double[:, ::1] places = out
     _begin(&image, signal.shape[1])
     with nogil:
@@ -194,15 +193,156 @@ def centred(
             w = k if window.shape[0] > 1 else 0
             _take(&image, &signal[k, 0, 0])
             begin[0], begin[1] = column[k], row[k]
-            place[0], place[1] = begin[0], begin[1]
-            for round_ in range(rounds):
-                _moments(&image, &window[w, 0, 0], begin[0] - half - place[0], begin[1] - half - place[1], found)
-                # without light it stays where it is
-                if not found[0] > 0:
-                    break
-                for i in range(2):
-                    step = max(-1.0, min(gain[w, i, 0] * found[1] + gain[w, i, 1] * found[2], 1.0))
-                    place[i] = max(begin[i] - farthest, min(place[i] + step, begin[i] + farthest))
-            places[0, k], places[1, k] = place[0], place[1]
+            _centre(&image, &window[w, 0, 0], &gain[w, 0, 0], begin, rounds, farthest, &places[k, 0])
     free(image.light)
-    return out[0], out[1]
+    return np.ascontiguousarray(out.T)
+
+
+cdef void _centre(
+    const Image *image, const double *window, const double *gain, const double *begin, int rounds, double farthest,
+    double *place,
+) noexcept nogil:
+    """Set place (2,) px by the mean of an image's light, as `centred` explains."""
+    cdef double[6] found
+    cdef double half = image.size // 2, step
+    cdef int round_, i
+    place[0], place[1] = begin[0], begin[1]
+    for round_ in range(rounds):
+        _moments(image, window, begin[0] - half - place[0], begin[1] - half - place[1], found)
+        # without light it stays where it is
+        if not found[0] > 0:
+            break
+        for i in range(2):
+            step = max(-1.0, min(gain[2 * i] * found[1] + gain[2 * i + 1] * found[2], 1.0))
+            place[i] = max(begin[i] - farthest, min(place[i] + step, begin[i] + farthest))
+
+
+cdef inline void _set_gain(Shape own, Shape of_window, double *gain) noexcept nogil:
+    """Set gain (2, 2): a star's step over the mean through a window, of whose covariance the inverse is given."""
+    gain[0], gain[1] = 1 + own.xx * of_window.xx + own.xy * of_window.xy, own.xx * of_window.xy + own.xy * of_window.yy
+    gain[2], gain[3] = own.xy * of_window.xx + own.yy * of_window.xy, 1 + own.xy * of_window.xy + own.yy * of_window.yy
+
+
+cdef inline void _set_window(Shape s, double *window) noexcept nogil:
+    window[0], window[1], window[2], window[3] = s.xx, s.xy, s.xy, s.yy
+
+
+def own_shapes(
+    const float[:, :, ::1] signal, double first, double narrowest_window, double narrowest, double widest, int rounds,
+    int centring, double farthest,
+):
+    """Covariances (N, 2, 2) px2 of N images (N, S, S), each through a window of its own shape.
+
+    first                px2 along any axis, where it begins
+    narrowest_window     px2, of a window
+    narrowest, widest    px2: limits of the covariances; where nothing can be measured they are the widest
+    rounds               of windows; in each, so many rounds of centring, at most `farthest` px from the middle
+
+    Returns also their squared widths (N, 2) px2, the smaller first unless only that could not be measured.
+    """
+    cdef int n = signal.shape[0], k, round_
+    cdef double half = signal.shape[1] // 2, low, high
+    cdef Image image
+    cdef Shape own, through
+    cdef double[4] window
+    cdef double[4] gain
+    cdef double[2] begin
+    cdef double[2] place
+    cdef double[6] found
+    if signal.shape[1] != signal.shape[2]:
+        raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
+    out, widths = np.empty((n, 2, 2)), np.empty((n, 2))
+    cdef double[:, :, ::1] shape = out
+    cdef double[:, ::1] width = widths
+    low = high = first
+    begin[0] = begin[1] = half
+    _begin(&image, signal.shape[1])
+    with nogil:
+        for k in range(n):
+            _take(&image, &signal[k, 0, 0])
+            own = Shape(first, 0.0, first)
+            for round_ in range(rounds):
+                through = clipped_to(own, narrowest_window, INFINITY, 1.0)
+                _set_window(through, window)
+                _set_gain(own, inverse(through), gain)
+                _centre(&image, window, gain, begin, centring, farthest, place)
+                _moments(&image, window, -place[0], -place[1], found)
+                own = shape_before(Shape(found[3], found[4], found[5]), through)
+                if isnan(own.xx):
+                    own = Shape(widest, 0.0, widest)
+                low, high = sides(own)
+                low = max(narrowest, min(low, widest)) if low > 0 else widest
+                high = max(narrowest, min(high, widest)) if high > 0 else widest
+                own = with_sides(own, low, high)
+            width[k, 0], width[k, 1] = low, high
+            put_shape(shape, k, own)
+    free(image.light)
+    return out, widths
+
+
+def settled(
+    const float[:, :, ::1] signal, double first, double narrowest_window, double narrowest, double widest, int rounds,
+    double farthest, double thinnest, double enough,
+):
+    """The typical covariance (2, 2) px2 of N images (N, S, S), through a window of that shape; None if all fail.
+
+    first                px2 along any axis, of the first window
+    narrowest_window     px2, of the others
+    narrowest, widest    px2: limits of the covariance
+    farthest, thinnest   an image counts whose mean is nearer (px) than that, and whose image is wider (px2)
+    enough               relative change at which it is settled, before so many rounds
+    """
+    cdef int n = signal.shape[0], k, j, round_, count
+    cdef double half = signal.shape[1] // 2, change = INFINITY
+    cdef Image image
+    cdef Shape own = Shape(NAN, NAN, NAN), through = Shape(first, 0.0, first), of_seen, of_window, before
+    cdef double[4] window
+    cdef double[4] gain
+    cdef double *found
+    if signal.shape[1] != signal.shape[2]:
+        raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
+    _begin(&image, signal.shape[1])
+    # of each image its place and moments; of the images that count each of three moments
+    cdef double *room = <double *>malloc(max(11 * n, 1) * sizeof(double))
+    if room == NULL:
+        free(image.light)
+        raise MemoryError
+    cdef double *seen = room + 8 * n
+    with nogil:
+        for k in range(n):
+            room[8 * k] = room[8 * k + 1] = half
+        for round_ in range(rounds):
+            count = 0
+            _set_window(through, window)
+            for k in range(n):
+                found = room + 8 * k
+                _take(&image, &signal[k, 0, 0])
+                _moments(&image, window, -found[0], -found[1], found + 2)
+                if not (fabs(found[3]) < farthest and fabs(found[4]) < farthest):
+                    found[2] = 0.0
+                elif not sides(Shape(found[5], found[6], found[7]))[0] > thinnest:
+                    found[2] = 0.0
+                if found[2] > 0:
+                    for j in range(3):
+                        seen[j * n + count] = found[5 + j]
+                    count += 1
+            if not count:
+                break
+            of_seen = inverse(Shape(middle(seen, count), middle(seen + n, count), middle(seen + 2 * n, count)))
+            of_window, before = inverse(through), own
+            own = clipped_to(
+                Shape(of_seen.xx - of_window.xx, of_seen.xy - of_window.xy, of_seen.yy - of_window.yy), 1 / widest,
+                1 / narrowest, -1.0,
+            )
+            _set_gain(own, of_window, gain)
+            for k in range(n):
+                found = room + 8 * k
+                for j in range(2 if found[2] > 0 else 0):
+                    found[j] += max(-1.0, min(gain[2 * j] * found[3] + gain[2 * j + 1] * found[4], 1.0))
+            change = max(max(fabs(own.xx - before.xx), fabs(own.xy - before.xy)), fabs(own.yy - before.yy))
+            through = clipped_to(own, narrowest_window, INFINITY, 1.0)
+            if change < enough * max(own.xx, own.yy):
+                break
+    free(room)
+    free(image.light)
+    return None if isnan(own.xx) else np.array([[own.xx, own.xy], [own.xy, own.yy]])

@@ -62,6 +62,22 @@ cdef (double, double) _fitted(const Pixel *each, Py_ssize_t n, double photon, do
     return photon + sqrt(2 / max(information, 1e-12)), misfit2
 
 
+cdef int _alike(
+    const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
+    const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage,
+) except -1:
+    """Raise ValueError unless images of fits have the same shapes, and stamps the same size."""
+    for name, fits, height, width in (
+        ("model", model.shape[0], model.shape[1], model.shape[2]),
+        ("residual", residual.shape[0], residual.shape[1], residual.shape[2]),
+        ("used", used.shape[0], used.shape[1], used.shape[2]),
+        ("leverage", leverage.shape[0], leverage.shape[1], leverage.shape[2]),
+    ):
+        if (fits, height, width) != (model.shape[0], noise.shape[1], noise.shape[2]):
+            raise ValueError(f"{name} has the shape {(fits, height, width)}: as the model, and stamps as of the noise")
+    return 0
+
+
 def light_noise(
     const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
     const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage, const Py_ssize_t[::1] rows, double photon,
@@ -76,14 +92,7 @@ def light_noise(
     """
     cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], count = 0, k, j, row
     cdef double misfit2
-    for name, fits, height, width in (
-        ("model", model.shape[0], model.shape[1], model.shape[2]),
-        ("residual", residual.shape[0], residual.shape[1], residual.shape[2]),
-        ("used", used.shape[0], used.shape[1], used.shape[2]),
-        ("leverage", leverage.shape[0], leverage.shape[1], leverage.shape[2]),
-    ):
-        if (fits, height, width) != (model.shape[0], noise.shape[1], noise.shape[2]):
-            raise ValueError(f"{name} has the shape {(fits, height, width)}: as the model, and stamps as of the noise")
+    _alike(noise, model, residual, used, leverage)
     if noise.shape[0] != n or (n and not 0 <= np.min(rows) <= np.max(rows) < model.shape[0]):
         raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
     cdef Pixel *each = <Pixel *>malloc(max(n * area, 1) * sizeof(Pixel))
@@ -102,3 +111,32 @@ def light_noise(
         photon, misfit2 = _fitted(each, count, photon, misfit * misfit, outlier * outlier)
     free(each)
     return photon, sqrt(misfit2)
+
+
+def strangeness(
+    const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
+    const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage, double darkest,
+):
+    """Sum of squared residuals beyond the sky's noise over that of the model (N,), of fits (N, S, S), and its error (N,).
+
+    darkest  DN2: a model's sum of squares is at least so much
+    """
+    cdef Py_ssize_t n = model.shape[0], area = noise.shape[1] * noise.shape[2], k, j
+    cdef double light2, left, scatter, noise2
+    _alike(noise, model, residual, used, leverage)
+    if noise.shape[0] != n:
+        raise ValueError(f"{noise.shape[0]} stars and {n} fits: one each is needed")
+    out = np.empty((2, n))
+    cdef double[:, ::1] found = out
+    with nogil:
+        for k in range(n):
+            light2 = left = scatter = 0.0
+            for j in range(area):
+                if (&used[k, 0, 0])[j]:
+                    noise2 = <double>(&noise[k, 0, 0])[j] * (&noise[k, 0, 0])[j]
+                    light2 += <double>(&model[k, 0, 0])[j] * (&model[k, 0, 0])[j]
+                    left += <double>(&residual[k, 0, 0])[j] * (&residual[k, 0, 0])[j] - noise2 * (1 - (&leverage[k, 0, 0])[j])
+                    scatter += noise2 * noise2
+            light2 = max(light2, darkest)
+            found[0, k], found[1, k] = left / light2, sqrt(2 * scatter) / light2
+    return out[0], out[1]

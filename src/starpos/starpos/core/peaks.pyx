@@ -104,20 +104,34 @@ cdef void _smooth_row(const pixel_t[:, ::1] plane, const Smoother *s, Py_ssize_t
     _along_row(s, plane.shape[1], out)
 
 
-def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, int first, int last):
-    """Rows first .. last - 1 of a plane (h, w) smoothed along both axes by weights (reach + 1,) from the middle outwards.
+def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
+    """Some rows (R,) of a plane (h, w), and of these every so manieth pixel, smoothed along both axes.
+
+    weight  (reach + 1,): from the middle outwards
 
     Beyond its edges the plane continues as in a mirror.
     """
+    cdef Py_ssize_t width = plane.shape[1], k, x
     cdef Smoother s
-    cdef int row
-    out = np.empty((max(last - first, 0), plane.shape[1]), np.float32)
+    if step < 1 or not width or np.min(rows, initial=0) < 0 or np.max(rows, initial=-1) >= plane.shape[0]:
+        raise ValueError(f"rows and steps of {step} px beyond the {width} x {plane.shape[0]} px of the frame")
+    out = np.empty((rows.shape[0], (width + step - 1) // step), np.float32)
     cdef float[:, ::1] smooth = out
-    _begin(&s, plane.shape[1], weight)
+    cdef float *whole = <float *>malloc(width * sizeof(float))
+    if whole == NULL:
+        raise MemoryError
+    try:
+        _begin(&s, width, weight)
+    except MemoryError:
+        free(whole)
+        raise
     with nogil:
-        for row in range(first, last):
-            _smooth_row(plane, &s, row, &smooth[row - first, 0])
+        for k in range(rows.shape[0]):
+            _smooth_row(plane, &s, rows[k], whole)
+            for x in range(smooth.shape[1]):
+                smooth[k, x] = whole[x * step]
     free(s.margined)
+    free(whole)
     return out
 
 
@@ -127,7 +141,8 @@ def peaks(
 ):
     """Peaks of a plane (h, w) smoothed as in `smoothed`: pixels above a limit, of which none within `flat` px is higher.
 
-    limit        (strips, w): of each strip of so many rows
+    limit        (strips, C): of each strip of so many rows, in cells that cover its width evenly, with one more beyond each
+                 end; linear between them
     first, last  the rows in which peaks are looked for
 
     Peaks side by side are one. Returns x, y (N,) px, their means, and the smoothed value (N,).
@@ -140,9 +155,12 @@ def peaks(
     _begin(&s, width, weight)
     cdef float *smooth = <float *>malloc(kept * width * sizeof(float))
     cdef int *marks = <int *>malloc(2 * (width + 2) * sizeof(int))
+    cdef float *wanted = <float *>malloc(width * sizeof(float))
     try:
-        if smooth == NULL or marks == NULL:
+        if smooth == NULL or marks == NULL or wanted == NULL:
             raise MemoryError
+        if limit.shape[1] < 3 or not 0 <= first <= last <= height or limit.shape[0] * strip < last:
+            raise ValueError(f"limits of {limit.shape[0]} strips of {strip} rows, in {limit.shape[1]} cells, for rows {first} to {last}")
         g.here, g.above = marks, marks + width + 2
         with nogil:
             memset(marks, 0xFF, 2 * (width + 2) * sizeof(int))
@@ -150,13 +168,26 @@ def peaks(
                 while done < min(row + flat + 1, <int>height):
                     _smooth_row(plane, &s, done, smooth + (done % kept) * width)
                     done += 1
-                _take_peaks(smooth, kept, width, height, row, flat, &limit[row // strip, 0], &g)
+                if row == first or row % strip == 0:
+                    _spread(&limit[row // strip, 0], limit.shape[1], width, wanted)
+                _take_peaks(smooth, kept, width, height, row, flat, wanted, &g)
         return _columns(&g)
     finally:
         free(smooth)
         free(marks)
+        free(wanted)
         free(s.margined)
         free(g.each)
+
+
+cdef void _spread(const float *cell, Py_ssize_t cells, Py_ssize_t width, float *out) noexcept nogil:
+    """Spread values in cells over a row of pixels."""
+    cdef Py_ssize_t x, left
+    cdef double place
+    for x in range(width):
+        place = (x + 0.5) * (cells - 2) / width + 0.5
+        left = <Py_ssize_t>place
+        out[x] = cell[left] + <float>(place - left) * (cell[left + 1] - cell[left])
 
 
 cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:

@@ -2,15 +2,18 @@
 """Background and noise of a frame: clipped means on a coarse mesh, from a sparse sample of the pixels."""
 
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import ndimage
 
-from starpos.core.background import between, sampled
+from starpos.core.background import near, sampled
+from starpos.core.mesh import evened
+from starpos.core.order import median
+from starpos.core.sparse import any_flat
 from starpos.normal import SIGMA_PER_MAD
 
-# Neighbouring cells that differ by more than so many times their error lie at an edge, a roof's for example.
+# Sigmas of a cell by which cells beside each other differ no more where the sky goes on.
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
 QUANTISATION = 12**-0.5
@@ -46,10 +49,10 @@ class Background:
     def is_mosaic(self) -> bool:
         return len(self.level) > 1
 
-    def at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Level (N, P) and noise (N, P), DN, at the pixels x, y (N,), bilinear between the cells' centres."""
-        place = self.cell(x, y)
-        return between(self.level, *place), between(self.noise, *place)
+    @cached_property
+    def typical(self) -> tuple[float, float]:
+        """Level and noise, DN: medians over the cells."""
+        return median(self.level.ravel()), median(self.noise.ravel())
 
     def cell(self, x: np.ndarray | int, y: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
         """Row and column in the meshes, with fractions, of the pixels x, y."""
@@ -58,9 +61,9 @@ class Background:
         return row, column
 
     def near(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Level and noise (N, P) float32, DN, for sums over pixels around x, y (N,): with the correlation."""
-        level, noise = (v.astype(np.float32) for v in self.at(x, y))
-        return level, noise * np.float32(self.correlation)
+        """Level and noise (N, P) float32, DN, for sums over pixels around the pixels x, y (N,): with the correlation."""
+        x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
+        return near(self.level, self.noise, x, y, self.width, self.height, self.correlation)
 
     def of_pixels(
         self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray
@@ -104,11 +107,10 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     if not mosaic:
         level, noise = level.mean(0, keepdims=True), np.sqrt((noise**2).mean(0, keepdims=True))
     error = np.maximum(noise, QUANTISATION) * samples**-0.5
-    level, noise = (
-        np.stack([_smooth(m, e) for m, e in zip(mesh, error, strict=True)]) for mesh in (level, noise)
-    )
+    # cells that differ by more lie at an edge, of a roof for example
+    steep = STEEP * np.array([median(e) for e in error.reshape(len(error), -1)])
+    level, noise = evened(level, steep, False), evened(noise, steep, True)
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
-    level, noise = _beyond(level, 1, "reflect"), _beyond(noise, 1, "edge")
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
 
 
@@ -121,7 +123,8 @@ def _beside_lamps(white: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tu
     if white.mean() < WHITE or not (white < WHITE).any():
         return level, noise
     row, column = ndimage.distance_transform_edt(white >= WHITE, return_distances=False, return_indices=True)
-    return level[:, row, column], noise[:, row, column]
+    level, noise = (np.ascontiguousarray(mesh[:, row, column]) for mesh in (level, noise))
+    return level, noise
 
 
 def _lost_noise(plane: np.ndarray) -> float:
@@ -133,7 +136,9 @@ def _lost_noise(plane: np.ndarray) -> float:
     height, width = (n // 8 for n in plane.shape)
     if not (height and width):
         return 0.0
-    rows, columns = (np.unique(np.linspace(0, n - 1, MOST_BLOCKS).astype(int)) for n in (height, width))
+    rows, columns = (_spread(n) for n in (height, width))
+    if not any_flat(plane, rows, columns):
+        return 0.0
     blocks = plane[: 8 * height, : 8 * width].reshape(height, 8, width, 8)[rows[:, None], :, columns]
     blocks = blocks.reshape(-1, 64)
     low, high = blocks.min(1), blocks.max(1)
@@ -145,6 +150,14 @@ def _lost_noise(plane: np.ndarray) -> float:
     return BLOCK_NOISE * float(np.quantile(blocks[bumpy].astype(np.float32).std(1), FAINTEST))
 
 
+def _spread(count: int) -> np.ndarray:
+    """At most MOST_BLOCKS of the numbers 0 to count - 1, evenly."""
+    most = min(count, MOST_BLOCKS)
+    return np.arange(most) * (count - 1) // max(most - 1, 1)
+
+
+# the frames of a camera have one size
+@lru_cache(maxsize=16)
 def _sample(length: int, cell_px: int) -> np.ndarray:
     """Row numbers (cells, samples): each cell's samples are pairs of neighbours, and the first of a pair is even."""
     cells = max(1, round(length / cell_px))
@@ -160,24 +173,7 @@ def _phases_differ(level: np.ndarray, noise: np.ndarray, samples: int) -> bool:
 
     The two diagonals are compared, because a gradient of the sky leaves them equal.
     """
-    contrast = np.median(level[0] + level[3] - level[1] - level[2]) / 2
-    error = np.median(noise) / np.sqrt(samples * level[0].size)
-    return bool(abs(contrast) > max(0.03 * np.median(noise), 6 * error, 0.1))
-
-
-def _smooth(mesh: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Smooth a mesh: a median replaces cells that something bright covers, then a mean evens out their noise.
-
-    The mean is left out across an edge (of a roof), where cells differ by more than their errors explain.
-    """
-    typical = ndimage.median_filter(_beyond(mesh, 2, "reflect"), 3)
-    even, typical = ndimage.uniform_filter(typical, 3)[2:-2, 2:-2], typical[2:-2, 2:-2]
-    return np.where(np.abs(even - typical) < STEEP * np.median(error), even, typical)
-
-
-def _beyond(mesh: np.ndarray, cells: int, mode: Literal["reflect", "edge"]) -> np.ndarray:
-    """Continue a mesh (..., rows, columns) beyond its edges: a gradient goes on ("reflect") or ends ("edge")."""
-    around = [(0, 0)] * (mesh.ndim - 2) + [(cells, cells)] * 2
-    if mode == "reflect":
-        return np.pad(mesh, around, mode, reflect_type="odd")
-    return np.pad(mesh, around, mode)
+    contrast = median((level[0] + level[3] - level[1] - level[2]).ravel()) / 2
+    typical = median(noise.ravel())
+    error = typical / np.sqrt(samples * level[0].size)
+    return bool(abs(contrast) > max(0.03 * typical, 6 * error, 0.1))

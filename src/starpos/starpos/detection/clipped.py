@@ -42,9 +42,10 @@ def with_clipped(
     told = np.sqrt(np.maximum(stars["chi2"], 1.0)) < TOLD * stars["snr"]
     told |= ~saturated & (stars["chi2"] < STRANGE)
     level, top = background.near(x, y)[0].mean(1), _tops(plane, x, y)
-    sky = float(np.median(background.level))
+    sky = background.typical[0]
     peaks, places = np.stack([x, y], 1), np.stack([stars["x"], stars["y"]], 1)
-    lost = (top - sky > FLAT * (top.max() - sky)) & ~_near(places[told], peaks)
+    lost = top - sky > FLAT * (top.max() - sky)
+    lost[lost] = ~_near(places[told], peaks[lost])
     lost |= _near(places[saturated & ~told], peaks)
     # what stands on a roof is the roof's
     lost = np.flatnonzero(lost & (top - level > OWN * (top - sky)))[:MOST]

@@ -7,6 +7,7 @@ Their light is told by the area of the disc. Nothing else puts the brightest sta
 import cv2
 import numpy as np
 
+from starpos.core.sparse import bright_squares
 from starpos.detection.background import Background
 from starpos.frames.stars import SATURATED
 
@@ -30,26 +31,22 @@ GROWTH = 2.0
 
 def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dict[str, np.ndarray]:
     """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2."""
-    level, noise = float(np.median(background.level)), float(np.median(background.noise))
+    level, noise = background.typical
     least = max(WIDER * fwhm_px, LEAST_PX)
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
-    sample = plane[:-1:step, :-1:step]
-    # whole numbers, else pixels would become floating-point ones; flat, because two axes take longer
-    row, column = np.divmod(np.flatnonzero(sample > int(level + CLEAR * noise)), sample.shape[1])
-    y, x = step * row, step * column
     # no single hot pixel
-    height = np.minimum.reduce([plane[y + i, x + j] for i in (0, 1) for j in (0, 1)]).astype(float)
+    y, x, height = bright_squares(plane, step, int(level + CLEAR * noise))
     if height.max(initial=0) < level + CLEAR * noise:
         return columns_of([], fwhm_px, 0.0)
     top = float(height.max())
     limit = level + FLAT * (top - level)
     bright = height >= limit
-    boxes = _groups(row[bright], column[bright])
+    boxes = _groups(y[bright] // step, x[bright] // step)
     most = WIDEST * min(plane.shape)
     fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
-    discs = [_disc(plane, box[:4] * step, 2 * step, limit) for box in boxes[fits][:MOST]]
-    return columns_of([d for d in discs if d is not None and least < d[2] < most], fwhm_px, top - level)
+    discs = [_disc(plane, box[:4] * step, 2 * step, limit, least) for box in boxes[fits][:MOST]]
+    return columns_of([d for d in discs if d is not None and d[2] < most], fwhm_px, top - level)
 
 
 def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -67,10 +64,12 @@ def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
     return boxes
 
 
-def _disc(plane: np.ndarray, box: np.ndarray, around: int, limit: float) -> tuple[float, float, float] | None:
+def _disc(
+    plane: np.ndarray, box: np.ndarray, around: int, limit: float, least: float
+) -> tuple[float, float, float] | None:
     """Centre x, y and radius (px) of the disc of pixels above the limit in a box (left, top, width, height) px.
 
-    None if it is not round, or goes on beyond the box and `around` px more.
+    None if it is not round, not wider than the least radius, or goes on beyond the box and `around` px more.
     """
     left, top = (max(0, int(v) - around) for v in box[:2])
     right, bottom = (int(v + size) + around for v, size in zip(box[:2], box[2:], strict=True))
@@ -82,6 +81,8 @@ def _disc(plane: np.ndarray, box: np.ndarray, around: int, limit: float) -> tupl
     x0, y0, width, height, area = boxes[k]
     if x0 == 0 or y0 == 0 or x0 + width == window.shape[1] or y0 + height == window.shape[0]:
         return None
+    if width * height <= np.pi * least**2:
+        return None
     # holes, as some sensors have where they overflow, count
     outline, _ = cv2.findContours(
         window[y0 : y0 + height, x0 : x0 + width], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
@@ -89,7 +90,7 @@ def _disc(plane: np.ndarray, box: np.ndarray, around: int, limit: float) -> tupl
     filled = cv2.drawContours(np.zeros((height, width), np.uint8), [max(outline, key=len)], -1, 1, cv2.FILLED)
     rows, columns = np.nonzero(filled)
     area = len(rows)
-    if area < LEAST_PX**2:
+    if area <= np.pi * least**2:
         return None
     spread = np.linalg.eigvalsh(np.cov(columns, rows))
     if (

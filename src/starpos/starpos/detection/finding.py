@@ -3,11 +3,14 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse, spatial
 
 from starpos.core.background import between
+from starpos.core.mesh import above
+from starpos.core.order import median
 from starpos.core.peaks import peaks, smoothed
 from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
@@ -19,8 +22,8 @@ STRIP = 64
 CHUNK = 1024
 # Parts of a strip in which the sky is compared; the whole frame is at most so many times less even than the typical one.
 PARTS, UNEVENEST = 4, 1.4
-# With fewer values in a part its quantiles are chance.
-SAMPLES = 32
+# With fewer values in a part its quantiles are chance; a smaller factor may be chance too.
+SAMPLES, CORRELATED = 32, 1.1
 # Diameter of the widest defocused star, px.
 CROWD = 14
 # So many of the brightest peaks decide whether the frame's stars are rings,
@@ -39,7 +42,7 @@ class Kernel:
     reach: int
     flat: int
 
-    @property
+    @cached_property
     def weight(self) -> np.ndarray:
         """Weights (reach + 1,) along one axis, from the middle outwards."""
         weight = np.exp(-0.5 * (np.arange(self.reach + 1) / self.sigma) ** 2)
@@ -161,12 +164,12 @@ def _peaks_of(
     threshold = threshold * unevenness
     level, noise = background.level.mean(0), np.sqrt((background.noise**2).mean(0))
     noise = noise * kernel.norm * correlation
-    wanted = (level + threshold * noise).astype(np.float32)
-    lowest = _columns(wanted, background)
-    strips = np.arange(0, plane.shape[0], STRIP)
     # each strip against the lowest threshold of its mesh rows; the exact threshold follows below
+    strips = np.arange(0, plane.shape[0], STRIP)
     (first, last), _ = background.cell(0, np.stack([strips, np.minimum(strips + STRIP, plane.shape[0]) - 1]))
-    floor = np.stack([lowest[int(i) : int(j) + 2].min(0) for i, j in zip(first, last, strict=True)])
+    first, last = first.astype(int), last.astype(int) + 1
+    rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+    floor = (level + threshold * noise).astype(np.float32)[rows].min(1)
     x, y, value = _in_parts(plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
     local, sigma = between(np.stack([level, noise]), *background.cell(x, y)).T
@@ -195,7 +198,7 @@ def _chunks(count: int) -> list[slice]:
 def _in_parts(
     plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, w), found by so many threads."""
+    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, cells), found by so many threads."""
     height, parts = plane.shape[0], min(threads, len(limit))
     ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
 
@@ -216,38 +219,43 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     SNR of a star. The second is the sky's unevenness within the background's cells, from clouds: it raises the threshold.
     """
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
-    strips = [smoothed(plane, kernel.weight, top, min(top + 16, len(plane))) for top in tops.tolist()]
-    value = np.concatenate([smooth[::4, ::4] for smooth in strips])
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
-    x, y = np.meshgrid(np.arange(0, plane.shape[1], 4), rows)
-    level, noise = background.at(x.ravel(), y.ravel())
-    level, noise = level.mean(1).astype(np.float32), np.sqrt((noise**2).mean(1)).astype(np.float32)
-    score = (value - level.reshape(x.shape)) / noise.reshape(x.shape)
+    value = smoothed(plane, kernel.weight, rows, 4)
+    place = background.cell(np.arange(0, plane.shape[1], 4), rows)
+    score = above(value, background.level, background.noise, *place)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
-    low, sigma_below, median = _low_side(score)
+    low, sigma_below, usual = _low_side(score.ravel())
+    scatter = min(usual - sigma_below, sigma_below - low) / kernel.norm
+    if not scatter > 1:
+        return 1.0, 1.0
     # a roof or a tree that covers a part of the frame must not raise the threshold elsewhere
     columns = min(PARTS, score.shape[1])
-    parts = [part for row in np.split(score, len(tops)) for part in np.array_split(row, columns, axis=1)]
-    part_low, part_below, part_median = np.array([_low_side(part) for part in parts]).T
-    typical = np.median(np.minimum(part_median - part_below, part_below - part_low))
-    typical = typical if score.size > SAMPLES * len(parts) else np.inf
-    whole = tied = min(median - sigma_below, sigma_below - low, UNEVENEST * typical) / kernel.norm
+    parts = np.array_split(score.reshape(len(tops), -1, score.shape[1]), columns, axis=2)
+    sides = [_low_side(part.reshape(len(tops), -1)) for part in parts]
+    part_low, part_below, part_usual = np.concatenate(sides, axis=1)
+    typical = median(np.minimum(part_usual - part_below, part_below - part_low))
+    typical = typical if score.size > SAMPLES * part_low.size else np.inf
+    whole = tied = float(min(scatter, UNEVENEST * typical / kernel.norm))
     # clouds hardly change over `lag` px, but smoothed noise is independent there: differences show the noise alone
     lag = round(1.7 * kernel.sigma)
-    if score.shape[1] > 2 * lag:
+    if whole > CORRELATED and score.shape[1] > 2 * lag:
         steps = (score[:, lag:-lag] - 0.5 * (score[:, : -2 * lag] + score[:, 2 * lag :])) / 1.5**0.5
-        tied = min(whole, SIGMA_PER_MAD * np.median(np.abs(steps)) / kernel.norm)
-    tied = float(tied) if tied > 1.1 else 1.0
-    return tied, max(1.0, float(whole) / tied)
+        tied = min(whole, SIGMA_PER_MAD * float(np.median(np.abs(steps))) / kernel.norm)
+    tied = tied if tied > CORRELATED else 1.0
+    return tied, max(1.0, whole / tied)
 
 
 def _low_side(score: np.ndarray) -> np.ndarray:
-    """Quantiles (3,) of scores at -2, -1 and 0 sigma of a Gaussian, as np.quantile has them: it takes longer to begin."""
-    ordered = np.sort(score, axis=None)
-    place = np.array([0.0228, 0.1587, 0.5]) * (len(ordered) - 1)
+    """Quantiles (3, ...) of scores (..., N) at -2, -1 and 0 sigma of a Gaussian.
+
+    np.quantile has the same: it takes longer to begin.
+    """
+    ordered = np.sort(score, axis=-1)
+    place = np.array([0.0228, 0.1587, 0.5]) * (ordered.shape[-1] - 1)
     low = place.astype(int)
-    above = ordered[np.minimum(low + 1, len(ordered) - 1)]
-    return ordered[low] + (place - low) * (above - ordered[low])
+    above_it = ordered[..., np.minimum(low + 1, ordered.shape[-1] - 1)]
+    ordered = ordered[..., low]
+    return np.moveaxis(ordered + (place - low) * (above_it - ordered), -1, 0)
 
 
 def _above_tail(height: np.ndarray, threshold: float) -> float:
@@ -260,15 +268,6 @@ def _above_tail(height: np.ndarray, threshold: float) -> float:
             break
         threshold *= 1.1
     return threshold
-
-
-def _columns(mesh: np.ndarray, background: Background) -> np.ndarray:
-    """Spread a background's mesh (rows, columns) over the frame's width: (rows, width), linear between cells."""
-    _, place = background.cell(np.arange(background.width), 0)
-    left = place.astype(int)
-    share = (place - left).astype(np.float32)
-    here, after = (np.take(mesh, place, axis=1) for place in (left, left + 1))
-    return here + share * (after - here)
 
 
 def _join_plateaus(

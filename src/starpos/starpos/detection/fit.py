@@ -80,6 +80,9 @@ class Fit:
     leverage: np.ndarray
 
 
+COLUMNS = tuple(f.name for f in fields(Fit))
+
+
 def fit_stars(
     stamps: Stamps,
     psf: Psf,
@@ -101,9 +104,11 @@ def fit_stars(
         stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, np.stack([x, y], 1), local.axes,
         local.series, response.rules, rounds, leverage,
     )  # fmt: skip
-    return Fit(**dict(zip((f.name for f in fields(Fit)), columns, strict=True)))
+    return Fit(**dict(zip(COLUMNS, columns, strict=True)))
 
 
 def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """The gain (N, S, S) float32 of each pixel: stars' gains (N, P) taken at the pixels' phases (N, S, S)."""
+    """The gain float32 of each pixel: stars' gains (N, P) at the pixels' phases (N, S, S); (N, 1, 1) without a mosaic."""
+    if gains.shape[1] == 1:
+        return gains.astype(np.float32)[:, :, None]
     return gains.astype(np.float32)[np.arange(len(gains))[:, None, None], phase]

@@ -6,13 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.core.noise import light_noise
+from starpos.core.moments import own_shapes
+from starpos.core.noise import light_noise, strangeness
+from starpos.core.order import quantile
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
+    FARTHEST,
     NARROWEST,
+    NARROWEST_WINDOW,
     centroid,
     frame_shape,
     moments,
@@ -31,8 +35,10 @@ BRIGHT, TEACHERS = 20, 250
 # and of wide stars fewer: together they have so many pixels.
 TEACHING_PIXELS = 12000
 # A star does not teach if the residual's share of its squared light exceeds this, plus noise, plus three times that of
-# other stars.
-UNLIKE = 0.005
+# other stars; DN2 of light, so that darkness has a share too.
+UNLIKE, DARKEST = 0.005, 1e-9
+# Rounds in which each star's own shape is measured, and in each of them rounds of centring.
+OWN_ROUNDS, CENTRINGS = 3, 2
 # So many stars agree by more than chance if they differ by less than this (log of width, ellipticity); twigs do not.
 ALIKE, LIKENESS = 5, 0.6
 # Rounds of fitting and refining the PSF, and the order of its terms.
@@ -45,8 +51,8 @@ FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
 # Residuals of more sigma teach nothing of the noise.
 DEVIANT = 5.0
-# Largest distance from a star's centre to its stamp's edge, px.
-MAX_REACH = 20
+# Largest distance from a star's centre to its stamp's edge, px; where in the box that stars lie in its end is looked for.
+MAX_REACH, QUARTERS = 20, np.arange(5) / 4
 # Brighter stars than this SNR get no more weight when the widths over the field are fitted.
 LOUDEST = 100
 # A kernel whose response vanishes at the Nyquist frequency, so that it removes a mosaic; px2 it adds to a covariance.
@@ -91,9 +97,10 @@ def learn(
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 3
         if not sound.any():
             break
+        # two stars in one image would teach a wrong PSF and too much photon noise
+        strange, error = strangeness(stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, DARKEST)
         # compared with the best 30 %, because most of the brightest may be pairs
-        strange, error = _strangeness(stamps, fit)
-        sound &= strange < 3 * max(0, np.quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
+        sound &= strange < 3 * max(0, quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
         stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
         response = respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= rounds
@@ -189,13 +196,17 @@ def _most_alike(stamps: Stamps) -> np.ndarray:
 
     All of them if most lie near the median shape, else those near the shape at which they are densest.
     """
-    shape, widest = np.eye(2) * (stamps.reach / 4) ** 2, (stamps.reach / 2) ** 2
-    for _ in range(3):
-        window = window_for(shape)
-        own = own_shape(moments(stamps, *centroid(stamps, shape, rounds=2), window)[2], window)
-        values, vectors = np.linalg.eigh(np.nan_to_num(own))
-        values = np.where(values > 0, np.clip(values, NARROWEST, widest), widest)
-        shape = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
+    widest = (stamps.reach / 2) ** 2
+    shape, values = own_shapes(
+        stamps.signal,
+        (stamps.reach / 4) ** 2,
+        NARROWEST_WINDOW,
+        NARROWEST,
+        widest,
+        OWN_ROUNDS,
+        CENTRINGS,
+        FARTHEST,
+    )
     xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)], 1)
     alike = np.linalg.norm(look - np.median(look, axis=0), axis=1) < LIKENESS
@@ -209,9 +220,9 @@ def _most_alike(stamps: Stamps) -> np.ndarray:
 
 def reach_of(psf: Psf) -> int:
     """Distance from a star's centre, px, at which its stamp ends: 3.5 widths of the widest star in the field."""
-    low, high = psf.box
-    x, y = np.linspace(low, high, 5).T
-    widest = np.linalg.eigvalsh(psf.at(*(v.ravel() for v in np.meshgrid(x, y))).shape).max()
+    (left, top), (right, bottom) = psf.box
+    x, y = left + (right - left) * QUARTERS, top + (bottom - top) * QUARTERS
+    widest = np.linalg.eigvalsh(psf.at(np.tile(x, len(y)), np.repeat(y, len(x))).shape).max()
     return int(np.clip(np.ceil(3.5 * np.sqrt(widest)) + 1, 4, MAX_REACH))
 
 
@@ -232,17 +243,6 @@ def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndar
         alone[a[height[b] > 0.02 * height[a]]] = False
         high[a[height[b] > height[a]]] = False
     return alone, high
-
-
-def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of squared residuals beyond the sky's noise over that of the model (N,), for each star, and its error (N,).
-
-    It is large for two stars in one image, which would teach a wrong PSF and too much photon noise.
-    """
-    noise2 = fit.used * stamps.noise**2
-    light2 = np.maximum((fit.used * fit.model**2).sum((1, 2)), 1e-9)
-    left = (fit.used * fit.residual**2 - noise2 * (1 - fit.leverage)).sum((1, 2))
-    return left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
 
 
 def respond(

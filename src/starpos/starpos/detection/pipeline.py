@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from starpos.core.sparse import third_highest
 from starpos.detection.background import measure_background
 from starpos.detection.clipped import with_clipped
 from starpos.detection.discs import find_discs, with_discs
@@ -187,14 +188,16 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
     background = measure_background(plane, settings.mesh_px, picture.mosaic)
-    level, noise = float(np.median(background.level)), float(np.median(background.noise))
+    level, noise = background.typical
     limit = max(PEAKS, 2 * settings.max_stars)
     peaks = find_peaks(plane, background, settings.threshold, limit, settings.threads)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return _starless(about, level, noise)
     background = replace(background, correlation=peaks.correlation)
-    background = replace(background, streaks=find_streaks(plane, background, x, y))
+    streaks = find_streaks(plane, background, x, y)
+    if streaks:
+        background = replace(background, streaks=streaks)
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
     if picture.trail_px is not None:
@@ -241,12 +244,6 @@ def _starless(about: dict[str, Any], level: float, noise: float) -> Detection:
 def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: DetectionSettings) -> float:
     if settings.saturation_dn is not None:
         return settings.saturation_dn
-    near = np.arange(-2, 3)
-    rows, columns = y[:, None] + near, x[:, None] + near
-    height, width = plane.shape
-    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
-    patch = plane[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None, :]]
-    patch = np.where(inside, patch, 0).reshape(len(x), -1)
     # the third highest pixel of a star, because a hot pixel may exceed saturation; noise does not make three equal
-    highest = np.partition(patch, -3, axis=1)[:, -3].max()
-    return int(highest) if (patch == highest).sum(1).max() >= 3 else np.iinfo(plane.dtype).max
+    highest, count = third_highest(plane, x.astype(np.intp), y.astype(np.intp), 2)
+    return highest if count >= 3 else np.iinfo(plane.dtype).max

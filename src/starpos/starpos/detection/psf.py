@@ -14,8 +14,9 @@ import numpy as np
 from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike
 
+from starpos.core.field import local, monomials, shapes_of
 from starpos.core.psf import evaluated
-from starpos.core.shapes import clipped, inverted
+from starpos.core.shapes import clipped
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
@@ -39,7 +40,7 @@ class LocalPsf:
     @property
     def shape(self) -> np.ndarray:
         """Covariances (N, 2, 2) px2 of the Gaussians that the series multiply."""
-        return inverted(self.axes.transpose(0, 2, 1) @ self.axes)
+        return shapes_of(self.axes)
 
     def within(self, dx: np.ndarray, dy: np.ndarray, widths: float) -> np.ndarray:
         """Whether pixels at the offsets dx, dy px from the stars' centres lie within so many widths of them."""
@@ -86,25 +87,20 @@ class Psf:
 
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px."""
-        axes, series = self.axes[None], self.series[:1]
-        if len(self.widths) > 1:
-            axes = power(np.tensordot(self.monomials(x, y), self.widths, 1), -0.5) @ self.axes
-        if len(self.series) > 1:
-            series = np.tensordot(self.monomials(x, y), self.series, 1)
-        return LocalPsf(np.ascontiguousarray(axes), np.ascontiguousarray(series))
+        return LocalPsf(*local(*_points(x, y), self.box, self.axes, self.widths, self.series, NARROW, BROAD))
 
     def monomials(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Monomials (N, 6) of x, y scaled to -1..1 over the box; all but the first have zero mean over it."""
-        low, high = self.box
-        place = 2 * (np.stack([x, y], -1) - low) / np.maximum(high - low, 1) - 1
-        # a star whose fit failed has NaN as its place
-        p, q = np.nan_to_num(np.clip(place, -1, 1)).T
-        return np.stack([np.ones_like(p), p, q, p * p - 1 / 3, p * q, q * q - 1 / 3], -1)
+        return monomials(*_points(x, y), self.box)
 
     def with_widths(self, widths: np.ndarray) -> "Psf":
         """The Psf with the squared widths (6, 2, 2) along these axes; its axes become those of the new mean star."""
         root = power(widths[:1], -0.5)[0]
         return replace(self, axes=root @ self.axes, widths=root @ widths @ root)
+
+
+def _points(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
 
 
 def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) -> Psf:
@@ -113,8 +109,8 @@ def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) ->
     The first axis is the long one.
     """
     values, vectors = np.linalg.eigh(shape)
-    axes = (vectors / np.sqrt(values)).T[::-1]
-    box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]])
+    axes = np.ascontiguousarray((vectors / np.sqrt(values)).T[::-1])
+    box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]], float)
     return Psf(axes, np.eye(2)[None], np.ones((1, 1, 1)), box)
 
 

@@ -2,10 +2,12 @@
 """Refine a PSF by stars that were fitted with it, and find whether it varies over the field."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
-from starpos.core.marginal import marginal
+from starpos.core.marginal import chosen, marginal
+from starpos.core.order import median
 from starpos.detection.psf import MONOMIALS, Psf, power
 
 # A variation over the field needs at least so many stars,
@@ -39,9 +41,11 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
         fitted = np.linalg.lstsq(field * scale, own * scale, rcond=None)[0]
         off = np.sqrt(weight) * np.abs(own - field @ fitted).max(1)
         # pairs are wide but tell nothing of the optics
-        keep = off < 6 * np.median(off)
+        kept, keep = keep, off < 6 * median(off)
         if keep.sum() < PLACES:
             return psf
+        if np.array_equal(keep, kept):
+            break
     used = (weight * keep)[:, None]
     mean = (used * own).sum(0) / used.sum()
     before, after = ((used * (own - model) ** 2).sum() for model in (mean, field @ fitted))
@@ -67,14 +71,18 @@ class Terms:
 
 def even_terms(psf: Psf, highest: int) -> Terms:
     """Terms of even order, up to `highest` across the trail and, for a long star, up to twice that along it."""
-    grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
-    # without (0, 0)
-    orders = np.array(grid[1:])
-    orders = orders[_rank(psf, *orders.T) <= highest]
+    orders = _even_orders(highest)
+    rank = _rank(psf, *orders.T)
+    orders, rank = orders[rank <= highest], rank[rank <= highest]
     steps = np.arange(2, highest + 1, 2)
-    return Terms(
-        orders, (_rank(psf, *orders.T) <= steps[:, None])[..., None], np.full((len(orders), 1), WORTH)
-    )
+    return Terms(orders, (rank <= steps[:, None])[..., None], np.full((len(orders), 1), WORTH))
+
+
+@cache
+def _even_orders(highest: int) -> np.ndarray:
+    """All i, j (T, 2) of even terms that can be of use, without (0, 0)."""
+    grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
+    return np.array(grid[1:])
 
 
 def all_terms(psf: Psf, highest: int, count: int) -> Terms:
@@ -83,7 +91,7 @@ def all_terms(psf: Psf, highest: int, count: int) -> Terms:
     odd = np.array([(i, COMA - i) for i in range(COMA + 1)])
     orders = np.concatenate([even.orders, odd])
     first = np.arange(MONOMIALS if count >= PLACES else 1) == 0
-    steps = np.pad(even.candidates[..., 0], ((0, 0), (0, len(odd))))
+    steps = np.concatenate([even.candidates[..., 0], np.zeros((len(even.candidates), len(odd)), bool)], 1)
     width, coma = orders.sum(1) == 2, orders.sum(1) == COMA
     shape = (_rank(psf, *orders.T) <= FIELD_ORDER) & ~width & ~coma
     everywhere = [terms[:, None] & first for terms in (*steps, coma)]
@@ -127,8 +135,8 @@ def refine(
     each = (field[:, :, None] * field[:, None]).reshape(len(x), -1).T @ normal.reshape(len(x), -1)
     normal = each.reshape(places, places, count, count).transpose(2, 0, 3, 1).reshape(count * places, -1)
     right = (right.T @ field).ravel()
-    candidates = terms.candidates.reshape(-1, len(right))
-    found = _chosen(normal + np.eye(len(right)) / LIKELY**2, right, candidates, terms.price.ravel())
+    candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
+    found = chosen(normal + np.eye(len(right)) / LIKELY**2, right, candidates, terms.price.ravel())
     if not np.all(np.isfinite(found)):
         return psf
     found = found.reshape(count, places)
@@ -141,20 +149,6 @@ def refine(
     series[0, 0, 0] = 1
     series[:, i[1:], j[1:]] = found[used, : len(series)].T
     return replace(psf, series=series)
-
-
-def _chosen(normal: np.ndarray, right: np.ndarray, candidates: np.ndarray, price: np.ndarray) -> np.ndarray:
-    """The coefficients that minimise chi-square plus price; 0 for those not worth their price."""
-    found, taken, most = np.zeros(len(right)), np.zeros(len(right), bool), 0.0
-    for candidate in candidates:
-        index = np.flatnonzero(taken | candidate)
-        solution = np.linalg.solve(normal[np.ix_(index, index)], right[index])
-        gain = right[index] @ solution - price[index].sum()
-        if gain > most:
-            most, taken = gain, taken | candidate
-            found = np.zeros(len(right))
-            found[index] = solution
-    return found
 
 
 def _absorbed(psf: Psf, field: np.ndarray, orders: np.ndarray, found: np.ndarray) -> tuple[Psf, np.ndarray]:

@@ -7,7 +7,7 @@ a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 
 
 import numpy as np
 
-from starpos.core.moments import centred, windowed
+from starpos.core.moments import centred, settled, windowed
 from starpos.core.shapes import before, clipped, inverted, relative, through
 from starpos.detection.stamps import Stamps
 
@@ -15,6 +15,11 @@ from starpos.detection.stamps import Stamps
 NARROWEST = 0.2
 # px2. Through a narrower window a sum over pixels is too far from the integral.
 NARROWEST_WINDOW = 1.2
+# A star counts for the typical shape if its mean is so near the peak, px, and its windowed image wider than that, px2;
+# which is settled at a relative change of so little.
+NEAR, THINNEST, SETTLED = 1.5, 0.1, 1e-3
+# px. A centroid is not farther from the peak.
+FARTHEST = 2.0
 
 
 def at_least(shape: np.ndarray, floor: float) -> np.ndarray:
@@ -40,11 +45,11 @@ def moments(
 
 
 def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Windowed centroids x, y (N,) px of stars of covariance shape px2, at most 2 px from the peak."""
+    """Windowed centroids x, y (N,) px of stars of covariance shape px2, near the peak."""
     window = window_for(shape)
     # through the window an offset looks smaller than it is
     gain = np.eye(2) + shape @ inverted(_each(window)).reshape(window.shape)
-    return centred(stamps.signal, stamps.x, stamps.y, _each(window), _each(gain), rounds, 2.0)
+    return centred(stamps.signal, stamps.x, stamps.y, _each(window), _each(gain), rounds, FARTHEST)
 
 
 def window_for(shape: np.ndarray) -> np.ndarray:
@@ -59,42 +64,13 @@ def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarr
     """
     # a wide window suits all stars, but in the noise of a wide window faint sharp ones are lost
     for width in (max(1.5, stamps.reach / 4), 1.5):
-        shape = _settled_shape(stamps, np.eye(2) * width**2, rounds)
+        # a stamp does not hold a wider star than half its reach
+        shape = settled(
+            stamps.signal, width**2, NARROWEST_WINDOW, NARROWEST, (stamps.reach / 2) ** 2, rounds, NEAR, THINNEST, SETTLED
+        )  # fmt: skip
         if shape is not None:
             return at_least(shape - blur * np.eye(2), NARROWEST)
     return None
-
-
-def _settled_shape(stamps: Stamps, window: np.ndarray, rounds: int) -> np.ndarray | None:
-    """The typical covariance (2, 2) px2 of the stars in stamps, from a first window (2, 2) px2; None if all fail."""
-    x, y = stamps.x.astype(float), stamps.y.astype(float)
-    shape = None
-    for _ in range(rounds):
-        _, step, seen = moments(stamps, x, y, window)
-        with np.errstate(invalid="ignore"):
-            usable = (np.abs(step).max(1) < 1.5) & (_narrow_side(seen) > 0.1)
-        if not usable.any():
-            break
-        seen = np.median(seen[usable], axis=0)
-        of_seen, of_window = inverted(np.stack([seen, window]))
-        # a stamp does not hold a wider star
-        limit = (stamps.reach / 2.0) ** 2
-        own = clipped(_each(of_seen - of_window), 1 / limit, 1 / NARROWEST, -1.0)[0]
-        gain = np.eye(2) + own @ of_window
-        step = np.where(usable[:, None], step @ gain.T, 0)
-        x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
-        change = np.inf if shape is None else np.abs(own - shape).max() / own.max()
-        shape = own
-        window = window_for(own)
-        if change < 1e-3:
-            break
-    return shape
-
-
-def _narrow_side(seen: np.ndarray) -> np.ndarray:
-    """The smaller eigenvalues (N,) of moments (N, 2, 2); two negative ones would have a positive determinant."""
-    xx, xy, yy = seen[:, 0, 0], seen[:, 0, 1], seen[:, 1, 1]
-    return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
 
 
 def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ class Stamps:
         """The stamps that index selects; a mask (N,) that selects all copies nothing."""
         if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
             return self
-        return Stamps(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return Stamps(**{name: getattr(self, name)[index] for name in COLUMNS})
 
     @property
     def origin(self) -> np.ndarray:
@@ -70,6 +70,9 @@ class Stamps:
         dx = (grid + (self.x - x)[:, None]).astype(np.float32)
         dy = (grid + (self.y - y)[:, None]).astype(np.float32)
         return dx[:, None, :], dy[:, :, None]
+
+
+COLUMNS = tuple(f.name for f in fields(Stamps))
 
 
 def cut(

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.core.noise import light_noise
+from starpos.core.noise import light_noise, strangeness
 
 N, SIZE = 20, 9
 
@@ -68,3 +68,18 @@ def test_rows_that_are_not_there_are_refused(rng):
         light_noise(*given, np.arange(N) + 1, 0.0, 0.0, 5.0)
     with pytest.raises(ValueError, match="leverage"):
         light_noise(*given[:4], np.zeros((N, 0, 0), np.float32), np.arange(N), 0.0, 0.0, 5.0)
+
+
+def test_strangeness_is_that_of_plain_sums(rng):
+    """A star that was not fitted has none, whatever its pixels are."""
+    noise, model, residual, used, leverage = fits(rng, 0.4, 0.02, 1e3)
+    used[3], model[3] = False, np.nan
+    noise2, light = (np.where(used, v.astype(float), 0) ** 2 for v in (noise, model))
+    left = (np.where(used, residual.astype(float), 0) ** 2 - noise2 * (1 - leverage)).sum((1, 2))
+    light2 = np.maximum(light.sum((1, 2)), 1e-9)
+    found = strangeness(noise, model, residual, used, leverage, 1e-9)
+    np.testing.assert_allclose(
+        found, (left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2), rtol=1e-7
+    )
+    with pytest.raises(ValueError, match="one each"):
+        strangeness(noise[1:], model, residual, used, leverage, 1e-9)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Meshes of the sky, sparse looks at a frame, and medians, of the compiled core, beside their plain forms."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from starpos.core.background import between, near
+from starpos.core.mesh import above, evened
+from starpos.core.order import median, quantile
+from starpos.core.peaks import peaks, smoothed
+from starpos.core.sparse import any_flat, bright_squares, third_highest
+
+
+def plain_evened(mesh, steep, level):
+    """A mesh (rows, columns), evened out by scipy."""
+    around = np.pad(mesh, 2, "reflect", reflect_type="odd")
+    typical = ndimage.median_filter(around, 3)
+    even, typical = ndimage.uniform_filter(typical, 3)[2:-2, 2:-2], typical[2:-2, 2:-2]
+    mesh = np.where(np.abs(even - typical) < steep, even, typical)
+    return np.pad(mesh, 1, "edge") if level else np.pad(mesh, 1, "reflect", reflect_type="odd")
+
+
+@pytest.mark.parametrize("level", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (18, 27)])
+def test_a_mesh_is_evened_as_by_filters(size, level, rng):
+    mesh, steep = rng.normal(0, 1, (3, *size)), np.array([0.0, 0.3, 9.0])
+    plain = [plain_evened(m, s, level) for m, s in zip(mesh, steep, strict=True)]
+    np.testing.assert_allclose(evened(mesh, steep, level), plain, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("phases", [1, 4])
+def test_scores_are_those_of_single_places(phases, rng):
+    level, noise = rng.uniform(5, 9, (2, phases, 4, 6))
+    row, column = np.sort(rng.uniform(0, 2.99, 7)), np.sort(rng.uniform(0, 4.99, 11))
+    value = rng.normal(0, 100, (7, 11)).astype(np.float32)
+    places = [v.ravel() for v in np.meshgrid(row, column, indexing="ij")]
+    sky, sigma = between(level, *places).mean(1), np.sqrt((between(noise, *places) ** 2).mean(1))
+    plain = ((value.ravel() - sky) / sigma).reshape(value.shape)
+    np.testing.assert_allclose(above(value, level, noise, row, column), plain, rtol=1e-5)
+    with pytest.raises(ValueError, match="in a mesh of 4"):
+        above(value, level, noise, row + 1, column)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_some_rows_are_smoothed_as_by_convolution(kind, rng):
+    plane, weight = rng.integers(0, 255, (9, 30)).astype(kind), np.array([0.4, 0.2, 0.1], np.float32)
+    both = np.concatenate([weight[:0:-1], weight])
+    plain = plane.astype(float)
+    for axis in (0, 1):
+        plain = ndimage.convolve1d(plain, both, axis=axis, mode="mirror")
+    rows = np.array([0, 4, 8])
+    np.testing.assert_allclose(smoothed(plane, weight, rows, 4), plain[rows, ::4], rtol=1e-5)
+    with pytest.raises(ValueError, match="beyond"):
+        smoothed(plane, weight, rows + 1, 4)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("step", [1, 3, 4])
+def test_bright_squares_are_those_of_slices(kind, step, rng):
+    plane = rng.integers(0, 200, (41, 34)).astype(kind)
+    # most rows have nothing
+    plane[rng.random(41) < 0.7] = 3
+    row, column = np.nonzero(plane[:-1:step, :-1:step] > 120)
+    row, column = row * step, column * step
+    low = np.min([plane[row + i, column + j] for i in (0, 1) for j in (0, 1)], axis=0)
+    for found, plain in zip(bright_squares(plane, step, 120), (row, column, low), strict=True):
+        np.testing.assert_array_equal(found, plain)
+
+
+def test_a_frame_of_one_row_has_no_squares():
+    assert not any(len(column) for column in bright_squares(np.full((1, 9), 9, np.uint8), 2, 1))
+
+
+def test_flat_blocks_are_found_and_black_ones_are_not(rng):
+    plane, some = rng.integers(1, 9, (40, 64)).astype(np.uint8), (np.arange(0, 5, 2), np.arange(1, 8, 2))
+    plane[8:16, 24:32], plane[16:24, 24:32] = 7, 0
+    assert not any_flat(plane, *some)
+    plane[16:24, 24:32] = 7
+    assert any_flat(plane, *some)
+    plane[23, 31] = 8
+    assert not any_flat(plane, *some)
+    with pytest.raises(ValueError, match="beyond"):
+        any_flat(plane, some[0] + 1, some[1])
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 100])
+def test_medians_and_quantiles_are_those_of_numpy(n, rng):
+    values = rng.normal(0, 1, n)
+    assert median(values) == pytest.approx(np.median(values), abs=1e-15)
+    for share in (0, 0.3, 0.97, 1):
+        assert quantile(values, share) == pytest.approx(np.quantile(values, share), abs=1e-15)
+    assert np.isnan(median(np.append(values, np.nan)))
+
+
+def test_nothing_has_no_median_and_no_quantile():
+    assert np.isnan(median(np.zeros(0)))
+    with pytest.raises(ValueError, match="there is none"):
+        quantile(np.zeros(0), 0.5)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_the_third_highest_pixel_is_that_of_sorted_squares(kind, rng):
+    """Some squares lie partly beyond the frame."""
+    for most in (3, 9, 200):
+        plane = rng.integers(0, most, (20, 30)).astype(kind)
+        x, y = rng.integers(0, 30, 12), rng.integers(0, 20, 12)
+        around = np.pad(plane, 2)
+        squares = np.stack([around[j : j + 5, i : i + 5].ravel() for i, j in zip(x, y, strict=True)])
+        third = np.sort(squares, axis=1)[:, -3].max()
+        shared = (squares == third).sum(1)[np.sort(squares, axis=1)[:, -3] == third].max()
+        assert third_highest(plane, x, y, 2) == (third, shared)
+    with pytest.raises(ValueError, match="at least one"):
+        third_highest(plane, x[:0], y[:0], 2)
+
+
+@pytest.mark.parametrize("phases", [1, 4])
+def test_the_sky_near_a_pixel_lies_between_cells(phases, rng):
+    level, noise = rng.uniform(5, 9, (2, phases, 5, 8))
+    x, y = rng.integers(-3, 63, 40), rng.integers(-3, 33, 40)
+    place = (y + 0.5) * 3 / 30 + 0.5, (x + 0.5) * 6 / 60 + 0.5
+    plain = between(level, *place), between(noise, *place) * 1.5
+    for found, expected in zip(near(level, noise, x, y, 60, 30, 1.5), plain, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    with pytest.raises(ValueError, match="as many"):
+        near(level, noise, x, y[1:], 60, 30, 1.5)
+    with pytest.raises(ValueError, match="as of level"):
+        near(level, noise[:, 1:].copy(), x, y, 60, 30, 1.5)
+
+
+def test_the_limit_of_peaks_is_linear_between_cells_and_another_in_each_strip(rng):
+    plane, cells = np.zeros((20, 60), np.uint16), rng.uniform(100, 200, (2, 8)).astype(np.float32)
+    row, column = (v.ravel() for v in np.mgrid[1:20:3, 1:60:3])
+    plane[row, column] = height = rng.integers(50, 250, len(row))
+    place = (column + 0.5) * 6 / 60 + 0.5
+    limit = np.where(row < 10, *(np.interp(place, np.arange(8), strip) for strip in cells))
+    x, y, value = peaks(plane, np.array([1, 0], np.float32), 1, cells, 10, 0, 20)
+    np.testing.assert_array_equal((y, x, value), np.stack([row, column, height])[:, height > limit])
+    with pytest.raises(ValueError, match="2 strips"):
+        peaks(plane, np.array([1, 0], np.float32), 1, cells, 9, 0, 20)
