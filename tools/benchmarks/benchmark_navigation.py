@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of docs/navigation.md: how well place and heading are known under way, and whether their claims hold.
 
-`benchmark_navigation.py [--voyages N] [--seconds S]`.  Voyages of starpos_testing.voyages with odometry or a log (none
-for the drone), a frame every 2 s.  Means of the last quarter: error of the place, 1 sigma an axis as claimed, NEES of the
-place (2 where claims hold), error of the heading; CPU time of a voyage without identification.
+`benchmark_navigation.py [--voyages N] [--first SEED] [--seconds S] [--vehicles rover ...]`.  Voyages of
+starpos_testing.voyages with odometry or a log (none for the drone), a frame every 2 s.  Means of the last quarter: error
+of the place, 1 sigma an axis as claimed, NEES of the place (2 where claims hold), error of the heading; CPU time of a voyage without identification.
 """
 
 import argparse
@@ -22,6 +22,7 @@ from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL, TACTICAL, MadeVo
 
 EARTH_M = 6.37e6
 GRADES = {"industrial": INDUSTRIAL, "tactical": TACTICAL}
+VEHICLES = "rover", "ship", "drone", "parked"
 CADENCE_S, RATE_HZ = 2.0, 50.0
 # of a voyage in the table of bench.py
 VOYAGE_S = 300.0
@@ -67,7 +68,7 @@ def scored(vehicle: str, grade: str, seconds: float, seed: int) -> tuple[np.ndar
 
 def rows(options) -> Iterator[Row]:
     """The rows of bench.py: one voyage of each vehicle."""
-    for vehicle in ("rover",) if options.quick else ("rover", "ship", "drone", "parked"):
+    for vehicle in VEHICLES[:1] if options.quick else VEHICLES:
         _, spent_s = scored(vehicle, "industrial", VOYAGE_S, 0)
         what = f"a voyage of {VOYAGE_S:g} s, {vehicle}"
         yield Row(what, Cost(1000 * spent_s), "real time", Cost(1000 * VOYAGE_S))
@@ -78,16 +79,19 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--voyages", type=int, default=8, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="of the first voyage (0)")
     parser.add_argument("--seconds", type=float, default=1200.0)
+    parser.add_argument("--vehicles", nargs="+", choices=VEHICLES, default=VEHICLES)
     args = parser.parse_args()
     print(
         "| vehicle | IMU | error m | claimed m | NEES | heading arcsec | CPU s |",
         "| --- | --- | --- | --- | --- | --- | --- |",
         sep="\n",
     )
-    for vehicle in ("rover", "ship", "drone", "parked"):
+    seeds = range(args.first, args.first + args.voyages)
+    for vehicle in args.vehicles:
         for grade in GRADES:
-            voyages = [scored(vehicle, grade, args.seconds, seed) for seed in range(args.voyages)]
+            voyages = [scored(vehicle, grade, args.seconds, seed) for seed in seeds]
             error, claimed, nees, heading = np.mean([found for found, _ in voyages], axis=0)
             spent_s = np.mean([spent for _, spent in voyages])
             print(
