@@ -3,7 +3,8 @@
 
 `benchmark_navigation.py [--voyages N] [--first SEED] [--seconds S] [--vehicles rover ...]`.  Voyages of
 starpos_testing.voyages with odometry or a log (none for the drone), a frame every 2 s.  Means of the last quarter: error
-of the place, 1 sigma an axis as claimed, NEES of the place (2 where claims hold), error of the heading; CPU time of a voyage without identification.
+of the place, 1 sigma an axis as claimed, NEES of the place (2 where claims hold), error of the heading; CPU time of a
+voyage without identification.
 """
 
 import argparse
