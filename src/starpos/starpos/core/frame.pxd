@@ -11,22 +11,23 @@ cdef class Frame:
     cdef double radius
     cdef double area
     cdef int tested
-    cdef double[2] middle
+    cdef double[2][2] middle
     cdef double[2] half
 
 
-cdef inline bint on_frame(Frame frame, const double *pixel, double margin) noexcept nogil:
-    """Whether a pixel (2,) lies on a frame or within a margin (px) of it."""
-    return (fabs(pixel[0] - frame.middle[0]) < frame.half[0] + margin) & (
-        fabs(pixel[1] - frame.middle[1]) < frame.half[1] + margin
+cdef inline bint on_frame(Frame frame, bint mirrored, const double *pixel, double margin) noexcept nogil:
+    """Whether a pixel (2,) lies on a frame, flipped if mirrored, or within a margin (px) of it."""
+    return (fabs(pixel[0] - frame.middle[mirrored][0]) < frame.half[0] + margin) & (
+        fabs(pixel[1] - frame.middle[mirrored][1]) < frame.half[1] + margin
     )
 
 
-cdef inline void axis_of(Frame frame, const double *attitude, double *axis) noexcept nogil:
-    """Set axis (3,) to the direction, of any length, of a frame's centre in an attitude (3, 3)."""
+cdef inline void axis_of(Frame frame, bint mirrored, const double *attitude, double *axis) noexcept nogil:
+    """Set axis (3,) to the direction, of any length, of the middle of a frame, flipped if mirrored, in an attitude (3, 3)."""
+    cdef const double *middle = frame.middle[mirrored]
     cdef int i
     for i in range(3):
-        axis[i] = (frame.middle[0] * attitude[i] + frame.middle[1] * attitude[3 + i]) / frame.focal + attitude[6 + i]
+        axis[i] = (middle[0] * attitude[i] + middle[1] * attitude[3 + i]) / frame.focal + attitude[6 + i]
 
 
 cdef inline void direction_of(double x, double y, double focal, double *v) noexcept nogil:

@@ -12,16 +12,18 @@ cdef class Frame:
 
     xy            (2, N, 2) px, as they are and flipped
     sigma         (N,) px
-    middle, half  (2,) px: the frame's centre, and half its size
+    middle        (2, 2) px: of the part that shows something, as it is and flipped
+    half          (2,) px: half its size
     focal_px      approximate focal length
-    radius_rad    of a cone about the frame's centre that contains the frame
+    radius_rad    of a cone about that middle that contains this part
     area_px2      over which false detections are spread
     tested        so many of the brightest decide whether a pose is right
     """
 
     def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad, double area_px2, int tested):
         self.xy, self.sigma, self.area, self.tested = xy, sigma, area_px2, tested
-        self.middle[0], self.middle[1] = middle
+        self.middle[0][0], self.middle[0][1] = middle[0]
+        self.middle[1][0], self.middle[1][1] = middle[1]
         self.half[0], self.half[1] = half
         self.focal, self.radius = focal_px, radius_rad
 

@@ -25,6 +25,6 @@ cdef class BrightTable:
         const double *radius_px, int most_stars, double match_sigma, double log_false,
     ) except? -1
     cdef int _on_frame(
-        self, const int *runs, int count, Frame frame, const double *attitude, double focal_px, const Date *date,
+        self, const int *runs, int count, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
         Bright *bright,
     ) noexcept nogil

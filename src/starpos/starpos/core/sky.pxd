@@ -35,13 +35,13 @@ cdef class StarTable:
 
     cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil
     cdef int find(
-        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
-        double blend_px, Visible *out,
+        self, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date, double margin_px,
+        int most, double blend_px, Visible *out,
     ) except -1 nogil
     cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil
     cdef int _projected(
-        self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
-        const Date *date, int most, Visible *out, Point *pixel,
+        self, const int *near, int n, Frame frame, bint mirrored, const double *attitude, double focal_px,
+        double margin_px, const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil
     cdef int _unblended(
         self, Point *pixel, double blend_px, double focal_px, Visible *out, int *single

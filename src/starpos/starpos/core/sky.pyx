@@ -91,11 +91,12 @@ cdef class StarTable:
         return out
 
     def on_frame(
-        self, Frame frame, const double[:, ::1] attitude, double focal_px, double years, velocity, double margin_px,
-        int most, double blend_px,
+        self, Frame frame, bint mirrored, const double[:, ::1] attitude, double focal_px, double years, velocity,
+        double margin_px, int most, double blend_px,
     ):
         """The brightest stars on a frame: rows (S,), directions (S, 3), and how far (px) fainter ones move the image.
 
+        mirrored            whether the frame's rows are flipped
         attitude, focal_px  the pose
         margin_px           stars so far beyond the frame are on it
         most                so many stars are taken
@@ -109,7 +110,7 @@ cdef class StarTable:
         cdef int k, i
         found.memory = NULL
         try:
-            self.find(frame, &attitude[0, 0], focal_px, &date, margin_px, most, blend_px, &found)
+            self.find(frame, mirrored, &attitude[0, 0], focal_px, &date, margin_px, most, blend_px, &found)
             index, directions, drawn = np.empty(found.count, np.intp), np.empty((found.count, 3)), np.empty(found.count)
             row, w, moved = index, directions, drawn
             for k in range(found.count):
@@ -121,15 +122,15 @@ cdef class StarTable:
             free(found.memory)
 
     cdef int find(
-        self, Frame frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
-        double blend_px, Visible *out,
+        self, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date, double margin_px,
+        int most, double blend_px, Visible *out,
     ) except -1 nogil:
         """Set `out` to the stars of `on_frame`; its memory is the caller's to free, even after an error."""
         cdef int[2 * MOST_RUNS] runs
         cdef double[3] axis
         # the cells reach beyond the frame
         cdef int cut = 4 * most + 100, i, n = 0, count
-        axis_of(frame, attitude, axis)
+        axis_of(frame, mirrored, attitude, axis)
         count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
         for i in range(count):
             n += runs[2 * i + 1] - runs[2 * i]
@@ -148,7 +149,7 @@ cdef class StarTable:
         cdef Point *pixel = <Point *>(out.row + most)
         cdef int *near = <int *>(pixel + 2 * most)
         n = self._by_light(runs, count, cut, near)
-        self._projected(near, n, frame, attitude, focal_px, margin_px, date, most, out, pixel)
+        self._projected(near, n, frame, mirrored, attitude, focal_px, margin_px, date, most, out, pixel)
         return self._unblended(pixel, blend_px, frame.focal, out, near)
 
     cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil:
@@ -176,8 +177,8 @@ cdef class StarTable:
         return kept
 
     cdef int _projected(
-        self, const int *near, int n, Frame frame, const double *attitude, double focal_px, double margin_px,
-        const Date *date, int most, Visible *out, Point *pixel,
+        self, const int *near, int n, Frame frame, bint mirrored, const double *attitude, double focal_px,
+        double margin_px, const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil:
         """Keep of the rows `near` (n,) those on the frame, with their directions and pixels, at most so many."""
         cdef int k, soon, kept = 0
@@ -196,7 +197,7 @@ cdef class StarTable:
             pixel_of(u, focal_px, u)
             out.row[kept] = near[k]
             pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
-            kept += on_frame(frame, u, margin_px)
+            kept += on_frame(frame, mirrored, u, margin_px)
         out.count = kept
         return kept
 

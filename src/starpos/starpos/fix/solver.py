@@ -77,7 +77,7 @@ class Solver:
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
-            field = field_of(directions_of(camera, stars), mean_sigma(stars.covariance), camera)
+            field = field_of(directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window)
             found = identify_frame(field, sky, predicted)
         except StarposError as e:
             return _failure(stars, e)
@@ -126,7 +126,7 @@ class Solver:
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
-            field = field_of(directions, mean_sigma(stars.covariance), camera)
+            field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
         except StarposError as e:
             return _failure(stars, e)

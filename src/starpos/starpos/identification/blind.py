@@ -14,10 +14,12 @@ from itertools import combinations, product
 import numpy as np
 
 from starpos import rotation
+from starpos.frames.stars import Window
 from starpos.identification.evidence import any_scale
 from starpos.identification.full import FEWEST_STARS, Identification, identified
 from starpos.identification.pose import MATCH_SIGMA, FrameStars, Pose, Poses, directions
 from starpos.identification.quads import SHORTEST, SIDES, QuadCatalogue, shapes
+from starpos.identification.search import through
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
 
@@ -61,10 +63,12 @@ def identify_blind(
     quads: QuadCatalogue,
     stages: Sequence[tuple[int, float]] = STAGES,
     near_px: float | None = None,
+    window: Window | None = None,
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, of a pinhole camera of unknown focal length.
 
     near_px: a focal length that it may have, with which the search begins; half of the probability is for it.
+    window: the part of the frame that shows something, as `Stars` has it; None: all of it.
 
     Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None if there is
     none beyond doubt.
@@ -82,7 +86,8 @@ def identify_blind(
         prior = any_scale(low, high, -math.log(len(spans)))
         for pose, radius_px in _poses(field, sky, quads, (low, high), stars, error_px):
             camera = Camera.from_focal(width, height, pose.focal_px)
-            found = identified(FrameStars.of(xy, sigma_px, camera), sky, pose, radius_px, prior)
+            seen = through(FrameStars.of(xy, sigma_px, camera), camera, window)
+            found = identified(seen, sky, pose, radius_px, prior)
             if found:
                 return camera, found
     return None

@@ -28,8 +28,8 @@ class FrameStars:
 
     xy        (2, N, 2) px from the principal point, as they are and with the frame's rows flipped
     sigma     (N,) px, their errors along one axis
-    middle    (2,) px, the frame's centre
-    half      (2,) px, half its size
+    middle    (2, 2) px, the centre of the part of the frame that shows something, as it is and with its rows flipped
+    half      (2,) px, half the size of that part
     focal_px  approximate focal length
     area_px2  area over which false detections are spread; never more than the true one
     tested    so many of the brightest decide whether a pose is right
@@ -56,7 +56,7 @@ class FrameStars:
         return cls(
             xy=np.stack([xy, flipped]) - principal,
             sigma=np.maximum(sigma, LEAST_SIGMA_PX),
-            middle=np.array(camera.centre_px) - principal,
+            middle=np.tile(np.array(camera.centre_px) - principal, (2, 1)),
             half=np.array([camera.width, camera.height]) / 2,
             focal_px=camera.fx,
             area_px2=float((camera.width - 2 * margin_px) * (camera.height - 2 * margin_px)),
@@ -69,9 +69,28 @@ class FrameStars:
         """The stars of these rows, in the same order."""
         return replace(self, xy=np.ascontiguousarray(self.xy[:, row]), sigma=self.sigma[row])
 
+    def within(self, low: np.ndarray, high: np.ndarray, share: float) -> "FrameStars":
+        """The stars of a frame of which only a share of the area, from low (2,) to high (2,) px, shows something.
+
+        What is hidden counts neither against a pose whose stars would be there, nor as area for false detections.
+        """
+        first, last = (
+            np.maximum(low, self.middle[0] - self.half),
+            np.minimum(high, self.middle[0] + self.half),
+        )
+        middle = (first + last) / 2
+        # of rows that are flipped, the sum of the two stays
+        flipped = np.array([middle[0], self.middle[:, 1].sum() - middle[1]])
+        return replace(
+            self,
+            middle=np.stack([middle, flipped]),
+            half=(last - first) / 2,
+            area_px2=self.area_px2 * share,
+        )
+
     @cached_property
     def compiled(self) -> Frame:
-        """The stars, for the compiled core; the cone about the frame's centre has some margin."""
+        """The stars, for the compiled core; the cone about the middle has some margin."""
         radius_rad = math.atan(math.hypot(*self.half.tolist()) / self.focal_px) * 1.05 + 2e-4
         return Frame(
             self.xy,

@@ -9,6 +9,7 @@ import numpy as np
 
 from starpos.core.frame import projected
 from starpos.core.search import Limits, Lost
+from starpos.frames.stars import Window
 from starpos.identification import wide
 from starpos.identification.evidence import anywhere
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified, judge
@@ -73,11 +74,33 @@ def identify_directions(
     return identify_frame(field_of(directions, sigma_px, camera), sky, priors)
 
 
-def field_of(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars | wide.WideField:
-    """The stars in directions (N, 3) in C, errors (N,) px, as `identify_frame` takes them from this camera."""
+def field_of(
+    directions: np.ndarray, sigma_px: np.ndarray, camera: Camera, window: Window | None = None
+) -> FrameStars | wide.WideField:
+    """The stars in directions (N, 3) in C, errors (N,) px, as `identify_frame` takes them from this camera.
+
+    window: the part of the frame that shows something, as `Stars` has it.
+    """
     if wide.is_wide(camera):
         return wide.WideField(directions, sigma_px, camera)
-    return frame_stars(directions, sigma_px, camera)
+    return through(frame_stars(directions, sigma_px, camera), camera, window)
+
+
+def through(field: FrameStars, camera: Camera, window: Window | None) -> FrameStars:
+    """The field of a camera's frame of which only a window shows something, if it has one."""
+    if window is None:
+        return field
+    left, top, right, bottom = window
+    # a lens bends the sides
+    x, y = np.meshgrid(np.linspace(left, right, 3) - 0.5, np.linspace(top, bottom, 3) - 0.5)
+    v = camera.directions(x.ravel(), y.ravel())
+    xy = v[:, :2] / v[:, 2:] * camera.fx
+    low, high = xy.min(0), xy.max(0)
+    # where the window ends with the frame, the field ends where it did
+    low[[left <= 0, top <= 0]] = -np.inf
+    high[[right >= camera.width, bottom >= camera.height]] = np.inf
+    share = (right - left) * (bottom - top) / (camera.width * camera.height)
+    return field.within(low, high, share)
 
 
 def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars:
@@ -92,7 +115,7 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
     return FrameStars(
         xy=xy,
         sigma=sigma,
-        middle=np.array([(width - 1) / 2 - cx, (height - 1) / 2 - cy]),
+        middle=np.tile([(width - 1) / 2 - cx, (height - 1) / 2 - cy], (2, 1)),
         half=np.array([width / 2 + margin, height / 2 + margin]),
         focal_px=camera.fx,
         area_px2=float(width * height),
@@ -143,7 +166,7 @@ def evenly_spread(field: FrameStars) -> np.ndarray:
 
     The lights of a town, a trail or a line of text lie in few cells.
     """
-    place = 0.5 + 0.5 * (field.xy[0] - field.middle) / field.half
+    place = 0.5 + 0.5 * (field.xy[0] - field.middle[0]) / field.half
     column, row = np.clip((CELLS * place).astype(int), 0, CELLS - 1).T
     return np.sort(np.unique(CELLS * row + column, return_index=True)[1])
 

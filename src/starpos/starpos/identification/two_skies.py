@@ -87,7 +87,7 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
     residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
-    u, v = ((xy - field.middle) / field.half.max()).T
+    u, v = ((xy - field.middle[int(found.mirrored)]) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
     residual, kept = residual - terms @ np.linalg.lstsq(terms, residual, rcond=None)[0], np.arange(stars)

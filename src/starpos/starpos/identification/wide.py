@@ -153,7 +153,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
     stars = best.field
     pose = Pose(flip @ best.turn @ flip @ found.attitude, stars.focal_px * found.focal_scale, found.mirrored)
     residual = stars.xy[int(found.mirrored)][star] - pose.project(sky.directions(catalogue))
-    from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle)
+    from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle[int(found.mirrored)])
     return best, replace(
         found,
         star=star,
