@@ -29,6 +29,7 @@ from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
 from starpos.identification.pose import FrameStars
 from starpos.identification.search import Priors, field_of, identify_frame
+from starpos.identification.second_look import Look, second_look
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
@@ -69,16 +70,21 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, predicted: Priors = ()) -> Solution:
-        """Names of the stars and pointing of the camera, predicted or anywhere.  Stars without a time: J2000 places."""
+    def identify(self, stars: Stars, predicted: Priors = (), look: Look | None = None) -> Solution:
+        """Names of the stars and pointing of the camera, predicted or anywhere.  Stars without a time: J2000 places.
+
+        look: what their frame shows where stars should be, asked if the stars alone are too few.
+        """
         if (rows := self._inside(stars)) is not None:
-            return _for_all(stars, rows, self.identify(stars.take(rows), predicted))
+            return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look))
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field = field_of(directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window)
             found = identify_frame(field, sky, predicted)
+            if found is None and look is not None and isinstance(field, FrameStars):
+                found = second_look(field, sky, predicted, camera, look)
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
