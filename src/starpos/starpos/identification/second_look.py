@@ -20,8 +20,8 @@ from starpos.instrument.camera import Camera
 
 # What a frame shows at pixels x, y (N,), in sigma of a normal distribution by rank, and the SNR; NaN where it cannot say.
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-# Log-odds of a pose that is looked at, and those that accept it. The largest evidence of the detections, at whichever they
-# stop, exceeds y in 1 of y frames; so its product with what a look finds exceeds x in (1 + log(x / worth)) / x of them:
+# Log-odds of a pose that is looked at, and those that accept it. The largest evidence of the detections, at whichever one
+# stops, exceeds y in 1 of y frames; so its product with what a look finds exceeds x in (1 + log(x / worth)) / x of them:
 # once in 1e10 frames. So all tries together fail at most 1.2 times in 1e9.
 WORTH, ENOUGH = 5.0, 26.2
 MOST_LOOKS = 20
