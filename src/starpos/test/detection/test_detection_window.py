@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of which whole sides are white: the window between them is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from starpos.detection import detect
+from starpos.errors import FrameError
 from starpos.frames.frame import Frame
 from starpos_testing.skies.rendered import field, grid, noisy
 
@@ -53,3 +56,10 @@ def test_a_sky_cut_off_at_zero_is_not_white(plane):
 def test_a_lamp_inside_the_frame_is_no_side(plane):
     plane[100:300, 200:400] = WHITE
     assert window_of(plane) is None
+
+
+@pytest.mark.parametrize("window", [(0, 0, 601, 400), (-1, 0, 10, 10), (300, 0, 300, 400), (0, 20, 600, 10)])
+def test_a_window_beyond_the_frame_is_refused(window, plane):
+    stars = detect(Frame(plane)).stars
+    with pytest.raises(FrameError, match="window"):
+        replace(stars, window=window)
