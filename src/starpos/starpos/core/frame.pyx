@@ -2,30 +2,125 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The stars of a frame in pixels from the principal point, as the other modules here take them."""
 
-from libc.math cimport atan2, hypot, isfinite, sqrt
+from libc.math cimport M_PI, atan, atan2, hypot, isfinite, rint, sqrt
 
 import numpy as np
 
 
-cdef class Frame:
-    """Stars of a frame: as `pose.FrameStars` has them.
+cdef class FrameStars:
+    """N stars of a frame, brightest first.
 
-    xy            (2, N, 2) px, as they are and flipped
-    sigma         (N,) px
-    middle        (2, 2) px: of the part that shows something, as it is and flipped
-    half          (2,) px: half its size
-    focal_px      approximate focal length
-    radius_rad    of a cone about that middle that contains this part
-    area_px2      over which false detections are spread
-    tested        so many of the brightest decide whether a pose is right
+    xy        (2, N, 2) px from the principal point, as they are and with the frame's rows flipped
+    sigma     (N,) px, their errors along one axis
+    middle    (2,) px, the centre of the part of the frame that shows something
+    half      (2,) px, half the size of that part
+    focal_px  approximate focal length
+    area_px2  area over which false detections are spread; never more than the true one
+    tested    so many of the brightest decide whether a pose is right
     """
 
-    def __init__(self, xy, sigma, middle, half, double focal_px, double radius_rad, double area_px2, int tested):
-        self.xy, self.sigma, self.area, self.tested = xy, sigma, area_px2, tested
-        self.middle[0][0], self.middle[0][1] = middle[0]
-        self.middle[1][0], self.middle[1][1] = middle[1]
-        self.half[0], self.half[1] = half
-        self.focal, self.radius = focal_px, radius_rad
+    def __init__(self, *, xy, sigma, middle, half, double focal_px, double area_px2, int tested):
+        _centre(self, middle[0], middle[1], middle[1])
+        self.reach[0], self.reach[1] = half
+        self.focal_px, self.area_px2, self.tested = focal_px, area_px2, tested
+        _hold(self, xy, sigma)
+
+    def __len__(self):
+        return self.error.shape[0]
+
+    @property
+    def middle(self):
+        return np.array([self.centre[0][0], self.centre[0][1]])
+
+    @property
+    def half(self):
+        return np.array([self.reach[0], self.reach[1]])
+
+    def take(self, row):
+        """The stars of these rows, in the same order."""
+        return _changed(self, np.ascontiguousarray(self.xy[:, row]), self.sigma[row])
+
+    def but(self, *, focal_px=None, area_px2=None, tested=None):
+        """Stars as they are, with another focal length, area or number of those that decide."""
+        cdef FrameStars out = _changed(self, self.xy, self.sigma)
+        out.focal_px = self.focal_px if focal_px is None else focal_px
+        out.area_px2 = self.area_px2 if area_px2 is None else area_px2
+        out.tested = self.tested if tested is None else tested
+        _hold(out, self.xy, self.sigma)
+        return out
+
+
+    def within(self, low, high, double share):
+        """The stars of a frame of which only a share of the area, from low (2,) to high (2,) px, shows something.
+
+        What is hidden counts neither against a pose whose stars would be there, nor as area for false detections.
+        """
+        cdef FrameStars out = _changed(self, self.xy, self.sigma)
+        cdef double both = self.centre[0][1] + self.centre[1][1]
+        first, last = np.maximum(low, self.middle - self.half), np.minimum(high, self.middle + self.half)
+        x, y = (first + last) / 2
+        _centre(out, x, y, both - y)
+        out.reach[0], out.reach[1] = (last - first) / 2
+        out.area_px2 = self.area_px2 * share
+        _hold(out, self.xy, self.sigma)
+        return out
+
+
+cdef void _centre(FrameStars f, double x, double y, double flipped) noexcept:
+    """Set the middle of what a frame shows, whose row is another one if the rows are flipped."""
+    f.centre[0][0], f.centre[0][1], f.centre[1][0], f.centre[1][1] = x, y, x, flipped
+
+
+cdef int _hold(FrameStars f, xy, sigma) except -1:
+    """Take the stars' pixels and errors; the frame's size and focal length are there."""
+    f.xy, f.sigma = xy, sigma
+    f.pixel, f.error = xy, sigma
+    # some margin
+    f.radius = atan(hypot(f.reach[0], f.reach[1]) / f.focal_px) * 1.05 + 2e-4
+    return 0
+
+
+cdef FrameStars _changed(FrameStars f, xy, sigma):
+    """Other stars of the same frame."""
+    cdef FrameStars out = FrameStars.__new__(FrameStars)
+    cdef int i
+    for i in range(2):
+        out.centre[i][0], out.centre[i][1], out.reach[i] = f.centre[i][0], f.centre[i][1], f.reach[i]
+    out.focal_px, out.area_px2, out.tested = f.focal_px, f.area_px2, f.tested
+    _hold(out, xy, sigma)
+    return out
+
+
+def ideal_frame(
+    const double[::1] x, const double[::1] y, const double[:, :, ::1] covariance, camera, double edge_px, double least_sigma,
+    int tested,
+):
+    """FrameStars of the pixels x, y (N,), with covariances (N, 2, 2), of a pinhole camera without distortion.
+
+    edge_px      so far beyond the frame they may be: None if one is farther
+    least_sigma  px; smaller errors become it
+    """
+    cdef double fx = camera.fx, squeeze = fx / <double>camera.fy, cx = camera.cx, cy = camera.cy
+    cdef double width = camera.width, height = camera.height, across, down
+    cdef Py_ssize_t n = x.shape[0], k
+    cdef FrameStars out = FrameStars.__new__(FrameStars)
+    pixels, errors = np.empty((2, n, 2)), np.empty(n)
+    cdef double[:, :, ::1] xy = pixels
+    cdef double[::1] error = errors
+    # as a camera with square pixels sees them
+    cdef double rows = max(1.0, rint(height * squeeze))
+    for k in range(n):
+        if not (-edge_px < x[k] < width - 1 + edge_px and -edge_px < y[k] < height - 1 + edge_px):
+            return None
+        across, down = x[k] - cx, (y[k] - cy) * squeeze
+        xy[0, k, 0] = xy[1, k, 0] = across
+        xy[0, k, 1], xy[1, k, 1] = down, rows - 1 - 2 * cy * squeeze - down
+        error[k] = max(sqrt((covariance[k, 0, 0] + covariance[k, 1, 1]) / 2), least_sigma)
+    _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
+    out.reach[0], out.reach[1] = width / 2, rows / 2
+    out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
+    _hold(out, pixels, errors)
+    return out
 
 
 def projected(
@@ -115,6 +210,8 @@ def explained(const Py_ssize_t[::1] star, const Py_ssize_t[::1] index, const Py_
 def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
     """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
 
+    Right ascension and position angle are in [0, 2 pi).
+
     centre    vector in C, three numbers of any length, of the frame's centre
     above     the same of a pixel above it
     attitude  (3, 3): ICRS into C
@@ -142,4 +239,11 @@ def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mir
     else:
         # at a pole, on the meridian of right ascension 0
         east, north = up[1], -up[0] * seen[0][2]
-    return atan2(seen[0][1], seen[0][0]), atan2(seen[0][2], flat), atan2(east, north)
+    return _full_turn(atan2(seen[0][1], seen[0][0])), atan2(seen[0][2], flat), _full_turn(atan2(east, north))
+
+
+cdef inline double _full_turn(double angle) noexcept:
+    """The angle from -pi to pi, brought to [0, 2 pi)."""
+    cdef double turned = angle + 2 * M_PI if angle < 0 else angle
+    # the smallest negative angles are rounded to 2 pi
+    return turned if turned < 2 * M_PI else 0.0

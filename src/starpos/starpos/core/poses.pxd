@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from starpos.core.frame cimport Frame
+from starpos.core.frame cimport FrameStars
 from starpos.core.matching cimport Matching
 from starpos.core.sky cimport Visible
 
@@ -33,12 +33,12 @@ cdef struct Settled:
 
 
 cdef void settle(
-    Frame frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
+    FrameStars frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
     double *work, Settled *out,
 ) noexcept nogil
-cdef void gates(Frame frame, Rules rules, double spread, int n, double *radius) noexcept nogil
+cdef void gates(FrameStars frame, Rules rules, double spread, int n, double *radius) noexcept nogil
 cdef void count_alike(
-    Frame frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
+    FrameStars frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
 ) noexcept nogil
 cdef double weighed(
     const double[:, ::1] xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,

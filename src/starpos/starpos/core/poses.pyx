@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos.core.algebra cimport best_rotation, factored, median, solved, turn_by, turned
-from starpos.core.frame cimport Frame, direction_of, pixel_of
+from starpos.core.frame cimport FrameStars, direction_of, pixel_of
 from starpos.core.matching cimport Matching, match, order
 from starpos.core.sky cimport Visible
 
@@ -158,7 +158,7 @@ cdef class Rules:
 
 
 cdef void settle(
-    Frame frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
+    FrameStars frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
     double *work, Settled *out,
 ) noexcept nogil:
     """Match a frame's n brightest stars with the catalogue's, fit the pose, and match again until no pair changes.
@@ -168,7 +168,7 @@ cdef void settle(
     work    room for 3 numbers a pair
     out     holds the pose to begin with; the fit begins with the frame's focal length
     """
-    cdef const double[:, ::1] xy = frame.xy[mirrored]
+    cdef const double[:, ::1] xy = frame.pixel[mirrored]
     cdef double *sigma = work + 2 * min(n, stars.count)
     cdef int turn, i, k
     cdef bint same
@@ -182,7 +182,7 @@ cdef void settle(
             if m.near[i] < 0:
                 continue
             same = same and k < out.count and out.star[k] == i and out.near[k] == m.near[i]
-            out.star[k], out.near[k], sigma[k] = i, m.near[i], hypot(frame.sigma[i], rules.floor_px)
+            out.star[k], out.near[k], sigma[k] = i, m.near[i], hypot(frame.error[i], rules.floor_px)
             k += 1
         if same and k == out.count:
             break
@@ -195,13 +195,13 @@ cdef void settle(
 
 
 cdef void _refit(
-    Frame frame, const double[:, ::1] xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
+    FrameStars frame, const double[:, ::1] xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
     double *pixel, double *off, Settled *out,
 ) noexcept nogil:
     """Fit the pose to the pairs with errors sigma (M,); set pixels, offsets (M, 2) and residuals, with errors floored (M,)."""
     cdef double square, weight, whole = 0.0, weighted = 0.0, weights = 0.0
     cdef int k, i
-    out.focal = frame.focal
+    out.focal = frame.focal_px
     _fit_alone(
         xy, stars.w, sigma, out.star, out.near, out.count, rules.steps, rules.small_step, out.attitude, &out.focal
     )
@@ -217,24 +217,24 @@ cdef void _refit(
     out.rms, out.mean_square = sqrt(weighted / weights), whole / (2 * out.count)
 
 
-cdef void gates(Frame frame, Rules rules, double spread, int n, double *radius) noexcept nogil:
+cdef void gates(FrameStars frame, Rules rules, double spread, int n, double *radius) noexcept nogil:
     """Set how far (n,) px the n brightest stars may be from their places, where the residuals have a spread."""
     cdef int i
     for i in range(n):
-        radius[i] = rules.gate_sigma * hypot(max(spread, rules.least), frame.sigma[i]) + rules.gate_px
+        radius[i] = rules.gate_sigma * hypot(max(spread, rules.least), frame.error[i]) + rules.gate_px
 
 
 cdef void count_alike(
-    Frame frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
+    FrameStars frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
 ) noexcept nogil:
     """Fit the pose of pairs again, to all alike; the arguments are those of `settle`, and work for 4 numbers a pair."""
     cdef double *sigma = work + 2 * out.count
     cdef double *floored = sigma + out.count
     cdef int k
     for k in range(out.count):
-        sigma[k] = hypot(frame.sigma[out.star[k]], out.spread)
-        floored[k] = hypot(frame.sigma[out.star[k]], rules.floor_px)
-    _refit(frame, frame.xy[mirrored], stars, rules, sigma, floored, pixel, work, out)
+        sigma[k] = hypot(frame.error[out.star[k]], out.spread)
+        floored[k] = hypot(frame.error[out.star[k]], rules.floor_px)
+    _refit(frame, frame.pixel[mirrored], stars, rules, sigma, floored, pixel, work, out)
 
 
 def log_ratio(

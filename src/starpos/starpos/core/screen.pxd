@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from starpos.core.frame cimport Frame
+from starpos.core.frame cimport FrameStars
 from starpos.core.sky cimport Date, StarTable
 from starpos.core.triangles cimport Candidate
 
@@ -17,14 +17,14 @@ cdef class BrightTable:
     cdef const int[::1] cell_start
 
     cdef void pose(
-        self, Frame frame, const Candidate *c, const Date *date, double error_px, double match_sigma, int n,
+        self, FrameStars frame, const Candidate *c, const Date *date, double error_px, double match_sigma, int n,
         double *attitude, double *focal, double *radius,
     ) noexcept nogil
     cdef double worth(
-        self, Frame frame, const Candidate *c, const Date *date, const double *attitude, double focal_px, int n,
+        self, FrameStars frame, const Candidate *c, const Date *date, const double *attitude, double focal_px, int n,
         const double *radius_px, int most_stars, double match_sigma, double log_false,
     ) except? -1
     cdef int _on_frame(
-        self, const int *runs, int count, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
-        Bright *bright,
+        self, const int *runs, int count, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
+        const Date *date, Bright *bright,
     ) noexcept nogil

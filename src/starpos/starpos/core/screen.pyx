@@ -7,10 +7,10 @@ from libc.stdlib cimport free, malloc, qsort
 
 import numpy as np
 
-from starpos.core.algebra cimport best_rotation, turned
-from starpos.core.frame cimport Frame, axis_of, direction_of, on_frame, pixel_of
+from starpos.core.algebra cimport best_rotation, fetch, turned
+from starpos.core.frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of
 from starpos.core.matching cimport Matching, begin, match, order
-from starpos.core.sky cimport MOST_RUNS, Date, StarTable, runs_near
+from starpos.core.sky cimport MOST_RUNS, Date, Span, StarTable, runs_near
 from starpos.core.triangles cimport Candidate
 
 # Stars so far beyond a frame are on it.
@@ -31,7 +31,7 @@ cdef class BrightTable:
         self.cell_start = np.ascontiguousarray(cell_start, np.int32)
 
     cdef void pose(
-        self, Frame frame, const Candidate *c, const Date *date, double error_px, double match_sigma, int n,
+        self, FrameStars frame, const Candidate *c, const Date *date, double error_px, double match_sigma, int n,
         double *attitude, double *focal, double *radius,
     ) noexcept nogil:
         """Set the pose that brings a candidate's catalogue triangle to that of the frame.
@@ -49,15 +49,19 @@ cdef class BrightTable:
         cdef const double *pixel
         cdef int i, j, k, turn
         for k in range(3):
+            fetch(&self.row[c.corner[k]])
+        for k in range(3):
+            self.stars.ask(self.row[c.corner[k]], self.row[c.corner[k]], date)
+        for k in range(3):
             self.stars.direction(self.row[c.corner[k]], date, &w[3 * k])
-            pixel = &frame.xy[c.mirrored, c.star[k], 0]
+            pixel = &frame.pixel[c.mirrored, c.star[k], 0]
             x += pixel[0] / 3
             y += pixel[1] / 3
         wanted = _perimeter(w)
-        focal[0] = frame.focal
+        focal[0] = frame.focal_px
         for turn in range(3):
             for k in range(3):
-                pixel = &frame.xy[c.mirrored, c.star[k], 0]
+                pixel = &frame.pixel[c.mirrored, c.star[k], 0]
                 direction_of(pixel[0], pixel[1], focal[0], &seen[3 * k])
             if turn < 2:
                 focal[0] *= _perimeter(seen) / wanted
@@ -69,15 +73,15 @@ cdef class BrightTable:
         best_rotation(b, attitude)
         # a triangle's error grows with the distance from it
         for k in range(3):
-            pixel = &frame.xy[c.mirrored, c.star[k], 0]
+            pixel = &frame.pixel[c.mirrored, c.star[k], 0]
             size2 += ((pixel[0] - x) ** 2 + (pixel[1] - y) ** 2) / 3
         for i in range(n):
-            pixel = &frame.xy[c.mirrored, i, 0]
+            pixel = &frame.pixel[c.mirrored, i, 0]
             away2 = (pixel[0] - x) ** 2 + (pixel[1] - y) ** 2
-            radius[i] = match_sigma * hypot(frame.sigma[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
+            radius[i] = match_sigma * hypot(frame.error[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
 
     cdef double worth(
-        self, Frame frame, const Candidate *c, const Date *date, const double *attitude, double focal_px, int n,
+        self, FrameStars frame, const Candidate *c, const Date *date, const double *attitude, double focal_px, int n,
         const double *radius_px, int most_stars, double match_sigma, double log_false,
     ) except? -1:
         """The log-odds of a pose against chance, by stars that coincide with the n brightest of a frame.
@@ -88,14 +92,15 @@ cdef class BrightTable:
         log_false   logarithm of the share of detections that may be false
         """
         cdef int[2 * MOST_RUNS] runs
+        cdef Span span
         cdef double[3] axis
-        cdef double total = 0.0, best = -1e300, variance, area_px2 = 4 * frame.half[0] * frame.half[1]
+        cdef double total = 0.0, best = -1e300, variance, area_px2 = 4 * frame.reach[0] * frame.reach[1]
         cdef Matching m
         cdef Bright *bright = NULL
         cdef double *pixel
         cdef int i, count, room = 0
         axis_of(frame, c.mirrored, attitude, axis)
-        count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
+        count = runs_near(&self.cell_start[0], axis, frame.radius, runs, &span)
         for i in range(count):
             room += runs[2 * i + 1] - runs[2 * i]
         m.memory = NULL
@@ -111,7 +116,7 @@ cdef class BrightTable:
             for i in range(count):
                 pixel[2 * i], pixel[2 * i + 1] = bright[i].x, bright[i].y
             begin(&m, n, count)
-            order(&m, frame.xy[c.mirrored], n)
+            order(&m, frame.pixel[c.mirrored], n)
             match(&m, n, pixel, count, radius_px)
             # the sum from the brightest star down to the one where it is largest
             for i in range(n):
@@ -129,8 +134,8 @@ cdef class BrightTable:
         return best
 
     cdef int _on_frame(
-        self, const int *runs, int count, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
-        Bright *bright,
+        self, const int *runs, int count, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
+        const Date *date, Bright *bright,
     ) noexcept nogil:
         """The stars of runs of rows that lie on a frame: their pixels; how many."""
         cdef int i, k, kept = 0

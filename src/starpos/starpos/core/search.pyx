@@ -2,12 +2,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The search for a frame's place in the sky: poses of triangles, stage by stage, and the judgement of each pose."""
 
+from libc.math cimport INFINITY, M_PI, fabs, log
 from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy
 
 import numpy as np
 
-from starpos.core.frame cimport Frame, on_frame
+from starpos.core.frame cimport FrameStars, on_frame
 from starpos.core.matching cimport Matching, begin
 from starpos.core.poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
 from starpos.core.screen cimport BrightTable
@@ -23,32 +24,69 @@ cdef struct Work:
     double *memory
 
 
+cdef class Anywhere:
+    """The logarithm of the density of poses of a frame lost in space, as `evidence.Prior` has it.
+
+    focal_px   about the focal length
+    scales     ((limit, probability), (limit, probability)): on the error of its logarithm
+    mirrored   probability that a frame is
+    log_share  of the probability of all poses
+    """
+
+    cdef double focal, mirrored, log_share
+    cdef double[2] limit
+    cdef double[2] share
+
+    def __init__(self, double focal_px, scales, double mirrored, double log_share):
+        self.focal, self.mirrored, self.log_share = focal_px, mirrored, log_share
+        (self.limit[0], self.share[0]), (self.limit[1], self.share[1]) = scales
+
+    def __call__(self, pose):
+        return self.at(pose.focal_px, pose.mirrored)
+
+    cdef double at(self, double focal, bint mirrored) noexcept:
+        """The logarithm at a focal length; rotations have a volume of 8 pi2."""
+        cdef double off = fabs(log(focal / self.focal)), density = 0.0
+        cdef int k
+        for k in range(2):
+            if off < self.limit[k]:
+                density += self.share[k] / (2 * self.limit[k])
+        if density == 0:
+            return -INFINITY
+        return self.log_share + log((self.mirrored if mirrored else 1 - self.mirrored) * density / (8 * M_PI * M_PI))
+
+
 cdef class Judge:
     """Judges poses of a frame by the evidence of its stars.
 
     years, velocity  of the date: Julian years after J2000, and (3,) in units of c
-    width            (4,): of the prior, as `evidence.Prior` has it
-    log_density      of the prior: of an attitude (3, 3), a focal length (px) and whether the frame is mirrored
+    prior            as `evidence.Prior` has it
     enough           log-odds of an identification
     """
 
-    cdef Frame frame
+    cdef FrameStars frame
     cdef StarTable table
     cdef Date date
     cdef Rules rules
     cdef Chances chances
     cdef double[4] width
+    # one of them is None
+    cdef Anywhere anywhere
     cdef object log_density
     cdef double enough
 
     def __init__(
-        self, Frame frame, StarTable table, double years, velocity, width, log_density, double enough, Rules rules,
-        Chances chances,
+        self, FrameStars frame, StarTable table, double years, velocity, prior, double enough, Rules rules, Chances chances
     ):
         cdef int k
         self.frame, self.table, self.date, self.rules = frame, table, date_of(years, velocity), rules
         self.chances = chances
-        self.log_density, self.enough = log_density, enough
+        self.enough = enough
+        if isinstance(prior.log_density, Anywhere):
+            self.anywhere = prior.log_density
+        else:
+            self.log_density = prior.log_density_at
+        width = prior.width
         for k in range(4):
             self.width[k] = width[k]
 
@@ -69,12 +107,12 @@ cdef class Judge:
 
     cdef int _deciding(self):
         """How many of the frame's stars decide."""
-        return min(<int>self.frame.sigma.shape[0], self.frame.tested)
+        return min(<int>self.frame.error.shape[0], self.frame.tested)
 
     cdef judged(self, const double *attitude, double focal, bint mirrored, const double *radius):
         """What `identified` returns."""
         cdef Work work
-        cdef int n = self._deciding(), most = min(<int>self.frame.sigma.shape[0], self.rules.most_stars)
+        cdef int n = self._deciding(), most = min(<int>self.frame.error.shape[0], self.rules.most_stars)
         cdef double log_odds
         memcpy(work.end.attitude, attitude, 9 * sizeof(double))
         work.end.focal, work.stars.memory, work.m.memory, work.memory = focal, NULL, NULL, NULL
@@ -82,14 +120,17 @@ cdef class Judge:
             if not self._settled(mirrored, n, radius, &work):
                 return None
             log_odds = weighed(
-                self.frame.xy[mirrored], &self.frame.sigma[0], n, self.frame.area, work.end.attitude, work.end.focal,
+                self.frame.pixel[mirrored], &self.frame.error[0], n, self.frame.area_px2, work.end.attitude, work.end.focal,
                 self.width, work.end.star, work.end.near, work.stars.w, work.end.near, work.end.count, self.chances,
             )
-            log_odds += self.log_density(_attitude(&work.end), work.end.focal, mirrored)
+            if self.anywhere is not None:
+                log_odds += self.anywhere.at(work.end.focal, mirrored)
+            else:
+                log_odds += self.log_density(_attitude(&work.end), work.end.focal, mirrored)
             # true for NaN too
             if not log_odds >= self.enough:
                 return None
-            if self.frame.sigma.shape[0] > n and not self._settled(mirrored, most, NULL, &work):
+            if self.frame.error.shape[0] > n and not self._settled(mirrored, most, NULL, &work):
                 return None
             if work.end.spread > self.rules.bent_px:
                 count_alike(
@@ -134,20 +175,21 @@ cdef class Judge:
     cdef _columns(self, bint mirrored, const Work *work, double log_odds):
         """What `identified` returns."""
         cdef const Settled *end = &work.end
-        cdef int k, inside = 0
-        rows, blends, due = np.empty((2, end.count), np.intp), np.empty(end.count), np.empty(work.stars.count, np.intp)
-        cdef Py_ssize_t[:, ::1] row = rows
-        cdef double[::1] blend = blends
-        cdef Py_ssize_t[::1] expected = due
-        for k in range(end.count):
-            row[0, k], row[1, k] = end.star[k], work.stars.row[end.near[k]]
+        cdef int k, n = end.count, last = 2 * n
+        # one block of memory each is quicker than four
+        rows, moved = np.empty(2 * n + work.stars.count, np.intp), np.empty(n)
+        cdef Py_ssize_t[::1] row = rows
+        cdef double[::1] blend = moved
+        for k in range(n):
+            row[k], row[n + k] = end.star[k], work.stars.row[end.near[k]]
             blend[k] = work.stars.moved[end.near[k]]
         for k in range(work.stars.count):
             if on_frame(self.frame, mirrored, &work.memory[2 * k], -self.rules.inside_px):
-                expected[inside] = work.stars.row[k]
-                inside += 1
+                row[last] = work.stars.row[k]
+                last += 1
         return (
-            rows[0], rows[1], blends, _attitude(end), end.focal, end.rms, end.mean_square, log_odds, due[:inside], mirrored
+            rows[:n], rows[n:2 * n], moved, _attitude(end), end.focal, end.rms, end.mean_square, log_odds, rows[2 * n:last],
+            mirrored,
         )
 
 
@@ -251,10 +293,10 @@ cdef class Lost:
 
     cdef int _look_up(self, int stars, double error_px) except -1:
         """Take the candidates of a stage."""
-        cdef Frame frame = self.judge.frame
+        cdef FrameStars frame = self.judge.frame
         cdef Limits limits = self.limits
         cdef int k, done
-        stars = min(stars, <int>frame.sigma.shape[0])
+        stars = min(stars, <int>frame.error.shape[0])
         if self.crowded:
             self.count = self.table.supported(
                 frame, stars, error_px, limits.most_in_crowd, limits.most_supported, self.found

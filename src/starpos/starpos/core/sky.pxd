@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from starpos.core.algebra cimport Point
-from starpos.core.frame cimport Frame
+from starpos.core.frame cimport FrameStars
 
 
 cdef enum:
@@ -25,6 +25,14 @@ cdef struct Visible:
     void *memory
 
 
+cdef struct Span:
+    # Mas: least and largest declination, least right ascension, and how far it goes on from there.
+    long long south
+    long long north
+    long long west
+    long long width
+
+
 cdef class StarTable:
     cdef const unsigned int[::1] ra
     cdef const int[::1] dec
@@ -35,12 +43,14 @@ cdef class StarTable:
 
     cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil
     cdef int find(
-        self, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date, double margin_px,
-        int most, double blend_px, Visible *out,
+        self, FrameStars frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
+        double margin_px, int most, double blend_px, Visible *out,
     ) except -1 nogil
-    cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil
+    cdef void ask(self, int first, int end, const Date *date) noexcept nogil
+    cdef int _inside(self, const int *runs, int count, const Span *span, int *near) noexcept nogil
+    cdef int _by_light(self, const int *rows, int n, int cut, int *near) noexcept nogil
     cdef int _projected(
-        self, const int *near, int n, Frame frame, bint mirrored, const double *attitude, double focal_px,
+        self, const int *near, int n, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
         double margin_px, const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil
     cdef int _unblended(
@@ -49,4 +59,4 @@ cdef class StarTable:
 
 
 cdef Date date_of(double years, velocity) except *
-cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil
+cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs, Span *span) noexcept nogil

@@ -4,11 +4,12 @@
 
 from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, hypot, pow, rint, sin, sqrt
 from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
 
 import numpy as np
 
 from starpos.core.algebra cimport Point, Strips, fetch, sort_by_x, turned
-from starpos.core.frame cimport Frame, axis_of, on_frame, pixel_of
+from starpos.core.frame cimport FrameStars, axis_of, pixel_of, seen_on
 
 cdef enum:
     # In mas.
@@ -16,8 +17,13 @@ cdef enum:
     # Of brightness: V from -10.24 to 30.71 in steps of 0.01.
     BINS = 4096
     BRIGHTEST = -1024
-    # Memory is asked for so many stars ahead.
-    SOON = 12
+    # Numbers of 32 bits in a piece of memory that comes at once.
+    LINE = 16
+    # Mas: a circle, and how far beyond a cone stars may be that have moved, or whose light is bent.
+    CIRCLE = 1296000000
+    MOVED = 360000
+    # Letters of a designation, at most.
+    LETTERS = 40
 
 cdef double MAS = M_PI / 180 / DEGREE
 
@@ -91,7 +97,7 @@ cdef class StarTable:
         return out
 
     def on_frame(
-        self, Frame frame, bint mirrored, const double[:, ::1] attitude, double focal_px, double years, velocity,
+        self, FrameStars frame, bint mirrored, const double[:, ::1] attitude, double focal_px, double years, velocity,
         double margin_px, int most, double blend_px,
     ):
         """The brightest stars on a frame: rows (S,), directions (S, 3), and how far (px) fainter ones move the image.
@@ -122,23 +128,22 @@ cdef class StarTable:
             free(found.memory)
 
     cdef int find(
-        self, Frame frame, bint mirrored, const double *attitude, double focal_px, const Date *date, double margin_px,
-        int most, double blend_px, Visible *out,
+        self, FrameStars frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
+        double margin_px, int most, double blend_px, Visible *out,
     ) except -1 nogil:
         """Set `out` to the stars of `on_frame`; its memory is the caller's to free, even after an error."""
         cdef int[2 * MOST_RUNS] runs
         cdef double[3] axis
         # the cells reach beyond the frame
         cdef int cut = 4 * most + 100, i, n = 0, count
+        cdef Span span
         axis_of(frame, mirrored, attitude, axis)
-        count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
+        count = runs_near(&self.cell_start[0], axis, frame.radius, runs, &span)
         for i in range(count):
             n += runs[2 * i + 1] - runs[2 * i]
-            fetch(&self.vmag[runs[2 * i]])
-            fetch(&self.ra[runs[2 * i]])
-            fetch(&self.dec[runs[2 * i]])
+            self.ask(runs[2 * i], runs[2 * i + 1], date)
         most = min(most, n)
-        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + (n + 1) * sizeof(int))
+        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + 2 * (n + 1) * sizeof(int))
         if out.memory == NULL:
             with gil:
                 raise MemoryError
@@ -148,56 +153,75 @@ cdef class StarTable:
         # half of it to sort in
         cdef Point *pixel = <Point *>(out.row + most)
         cdef int *near = <int *>(pixel + 2 * most)
-        n = self._by_light(runs, count, cut, near)
+        cdef int *rows = near + n + 1
+        n = self._inside(runs, count, &span, rows)
+        n = self._by_light(rows, n, cut, near)
         self._projected(near, n, frame, mirrored, attitude, focal_px, margin_px, date, most, out, pixel)
-        return self._unblended(pixel, blend_px, frame.focal, out, near)
+        return self._unblended(pixel, blend_px, frame.focal_px, out, near)
 
-    cdef int _by_light(self, const int *runs, int count, int cut, int *near) noexcept nogil:
-        """Write the rows of runs to `near`, brightest first, about `cut` of them; how many."""
-        cdef int[BINS] first
-        cdef int i, k, bin, total = 0, kept = 0, low = BINS - 1, high = 0
+    cdef void ask(self, int first, int end, const Date *date) noexcept nogil:
+        """Ask for the memory of rows that are needed soon."""
+        cdef int k, row
+        for k in range((end - first) // LINE + 2):
+            row = min(first + k * LINE, end)
+            fetch(&self.ra[row])
+            fetch(&self.dec[row])
+            fetch(&self.vmag[row])
+            if date.moved:
+                fetch(&self.pm_ra[row])
+                fetch(&self.pm_dec[row])
+
+    cdef int _inside(self, const int *runs, int count, const Span *span, int *near) noexcept nogil:
+        """Write the rows of runs that lie in a span to `near`; how many: cells reach beyond it."""
+        cdef long long east
+        cdef int i, k, kept = 0
         for i in range(count):
             for k in range(runs[2 * i], runs[2 * i + 1]):
-                bin = _light(self.vmag[k])
-                low, high = min(low, bin), max(high, bin)
+                east = self.ra[k] - span.west
+                east += CIRCLE if east < 0 else 0
+                near[kept] = k
+                kept += (span.south <= self.dec[k]) & (self.dec[k] <= span.north) & (east <= span.width)
+        return kept
+
+    cdef int _by_light(self, const int *rows, int n, int cut, int *near) noexcept nogil:
+        """Write rows (n,) to `near`, brightest first, about `cut` of them; how many."""
+        cdef int[BINS] first
+        cdef int k, bin, total = 0, kept = 0, low = BINS - 1, high = 0
+        for k in range(n):
+            bin = _light(self.vmag[rows[k]])
+            low, high = min(low, bin), max(high, bin)
         for bin in range(low, high + 1):
             first[bin] = 0
-        for i in range(count):
-            for k in range(runs[2 * i], runs[2 * i + 1]):
-                first[_light(self.vmag[k])] += 1
+        for k in range(n):
+            first[_light(self.vmag[rows[k]])] += 1
         # how many are brighter; stars that come after `cut` others do not count
         for bin in range(low, high + 1):
             kept = kept if total >= cut else total + first[bin]
             first[bin], total = total, total + first[bin]
-        for i in range(count):
-            for k in range(runs[2 * i], runs[2 * i + 1]):
-                bin = _light(self.vmag[k])
-                near[first[bin]] = k
-                first[bin] += 1
+        for k in range(n):
+            bin = _light(self.vmag[rows[k]])
+            near[first[bin]] = rows[k]
+            first[bin] += 1
         return kept
 
     cdef int _projected(
-        self, const int *near, int n, Frame frame, bint mirrored, const double *attitude, double focal_px,
+        self, const int *near, int n, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
         double margin_px, const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil:
         """Keep of the rows `near` (n,) those on the frame, with their directions and pixels, at most so many."""
-        cdef int k, soon, kept = 0
+        cdef int k, kept = 0
         cdef double[3] u
+        cdef double[2] at
         for k in range(n):
             if kept == most:
                 break
-            soon = near[min(k + SOON, n - 1)]
-            fetch(&self.ra[soon])
-            fetch(&self.dec[soon])
-            if date.moved:
-                fetch(&self.pm_ra[soon])
-                fetch(&self.pm_dec[soon])
             self.direction(near[k], date, &out.w[3 * kept])
             turned(attitude, &out.w[3 * kept], u)
-            pixel_of(u, focal_px, u)
             out.row[kept] = near[k]
-            pixel[kept].x, pixel[kept].y, pixel[kept].row = u[0], u[1], kept
-            kept += on_frame(frame, mirrored, u, margin_px)
+            pixel_of(u, focal_px, at)
+            pixel[kept].x, pixel[kept].y, pixel[kept].row = at[0], at[1], kept
+            # no jump, which no processor could guess: it works on the next stars meanwhile
+            kept += seen_on(frame, mirrored, u, focal_px, margin_px)
         out.count = kept
         return kept
 
@@ -237,16 +261,57 @@ cdef class StarTable:
         return kept
 
 
-def designations(const int[::1] hip, const short[:, ::1] tyc, const Py_ssize_t[::1] index):
-    """Names of rows (n,) of columns (N,), (N, 3): by Hipparcos number, by Tycho's three where that is 0."""
-    cdef Py_ssize_t k, row
-    out = []
-    for k in range(index.shape[0]):
-        row = index[k]
-        if not 0 <= row < hip.shape[0]:
-            raise IndexError(f"the star catalogue has no row {row}")
-        out.append(f"HIP {hip[row]}" if hip[row] else f"TYC {tyc[row, 0]}-{tyc[row, 1]}-{tyc[row, 2]}")
-    return out
+cdef class Designations:
+    """Names of a catalogue's rows: by Hipparcos number hip (N,), by Tycho's three tyc (N, 3) where that is 0."""
+
+    cdef const int[::1] hip
+    cdef const short[:, ::1] tyc
+
+    def __init__(self, hip, tyc):
+        self.hip, self.tyc = np.ascontiguousarray(hip, np.int32), np.ascontiguousarray(tyc, np.int16)
+
+    def of(self, const Py_ssize_t[::1] index):
+        """The names of rows (n,) as a list."""
+        cdef Py_ssize_t k, row
+        cdef char[LETTERS] text
+        cdef char *end = &text[LETTERS]
+        cdef char *at
+        out = []
+        for k in range(index.shape[0]):
+            if not 0 <= index[k] < self.hip.shape[0]:
+                raise IndexError(f"the star catalogue has no row {index[k]}")
+            fetch(&self.hip[index[k]])
+            fetch(&self.tyc[index[k], 0])
+        for k in range(index.shape[0]):
+            row = index[k]
+            if self.hip[row]:
+                at = _before(_written(self.hip[row], end), b"HIP ", 4)
+            else:
+                at = _before(_written(self.tyc[row, 2], end), b"-", 1)
+                at = _before(_written(self.tyc[row, 1], at), b"-", 1)
+                at = _before(_written(self.tyc[row, 0], at), b"TYC ", 4)
+            out.append(at[:end - at].decode("ascii"))
+        return out
+
+
+cdef inline char *_written(int number, char *end) noexcept nogil:
+    """Write the digits of a number before `end`; where they begin."""
+    cdef unsigned int left = number if number >= 0 else -number
+    while True:
+        end -= 1
+        end[0] = 48 + left % 10
+        left //= 10
+        if left == 0:
+            break
+    if number < 0:
+        end -= 1
+        end[0] = 45
+    return end
+
+
+cdef inline char *_before(char *end, const char *letters, int n) noexcept nogil:
+    """Write n letters before `end`; where they begin."""
+    return <char *>memcpy(end - n, letters, n)
 
 
 cdef inline int _light(short vmag) noexcept nogil:
@@ -263,16 +328,21 @@ cdef Date date_of(double years, velocity) except *:
     return date
 
 
-cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil:
+cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs, Span *span) noexcept nogil:
     """Write the first rows and the ends of all runs of cells that a cone about a vector (3,) touches; how many.
 
-    As `starpos.sky.zones.rows_near` does.
+    As `starpos.sky.zones.rows_near` does.  span: what the cone covers, and some margin.
     """
     cdef double flat = hypot(axis[0], axis[1]), ra = atan2(axis[1], axis[0]) * 180 / M_PI, dec = atan2(axis[2], flat)
     cdef double wide = 180.0
     cdef int low, high, first, width, zone, count = 0
     if fabs(dec) + radius < M_PI / 2 - 1e-9:
         wide = asin(min(sin(radius) / cos(dec), 1.0)) * 180 / M_PI
+    span.south = <long long>((dec - radius) / MAS) - MOVED
+    span.north = <long long>((dec + radius) / MAS) + MOVED
+    # the margin is one along the sky
+    span.width = <long long>min(2 * wide * DEGREE + 2 * MOVED / max(cos(dec) - radius, 1e-3), CIRCLE)
+    span.west = (<long long>(ra * DEGREE) - span.width // 2 + 2 * <long long>CIRCLE) % CIRCLE
     low = max(<int>((dec - radius) * 180 / M_PI + 90), 0)
     high = min(<int>((dec + radius) * 180 / M_PI + 90), ZONES - 1)
     first = <int>floor(ra - wide)

@@ -4,7 +4,7 @@
 
 from libc.math cimport M_PI, atan2, sin, sqrt
 
-from starpos.core.frame cimport Frame
+from starpos.core.frame cimport FrameStars
 
 cdef enum:
     # Shapes are kept to 1/65536 of their ranges; the highest bits of the three are a triangle's bin.
@@ -71,10 +71,10 @@ cdef class TriangleTable:
     cdef double[3] codes
 
     cdef int best(
-        self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
+        self, FrameStars frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
     ) except -1
     cdef int supported(
-        self, Frame frame, int stars, double error_px, double most_expected, int most, Candidate *out
+        self, FrameStars frame, int stars, double error_px, double most_expected, int most, Candidate *out
     ) except -1
     cdef double _rarest(self, const Search *s, double most_expected) except? -1
     cdef void _measure(self, const Search *s, int a, int b, int c, Shape *out) noexcept nogil

@@ -8,11 +8,13 @@ from libc.stdlib cimport calloc, free, malloc, realloc
 import numpy as np
 
 from starpos.core.algebra cimport fetch
-from starpos.core.frame cimport Frame, direction_of
+from starpos.core.frame cimport FrameStars, direction_of
 
 cdef enum:
     # Of the number of candidates that chance makes: 64 for each power of two.
     STEPS = 4096
+    # Shapes in a piece of memory that comes at once.
+    LINE = 10
     # Logarithm of the size of a table that fits into a processor's cache.
     LOG_MARKS = 18
 
@@ -41,7 +43,7 @@ cdef class TriangleTable:
         self.codes[2] = CODES / table.longest_allowed[0]
 
     def candidates(
-        self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose
+        self, FrameStars frame, int first, int last, double error_px, double most_expected, int most, bint loose
     ):
         """The candidates of `best` as arrays: star (K, 3), corner (K, 3) and mirrored (K,)."""
         cdef int k, count
@@ -57,7 +59,7 @@ cdef class TriangleTable:
         return np.array(star, int).reshape(-1, 3), np.array(corner, int).reshape(-1, 3), np.array(mirrored, bool)
 
     cdef int best(
-        self, Frame frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
+        self, FrameStars frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
     ) except -1:
         """Write candidates for triangles of a frame's stars whose faintest is first .. last - 1, brightest first.
 
@@ -90,7 +92,7 @@ cdef class TriangleTable:
             free(s.v)
 
     cdef int supported(
-        self, Frame frame, int stars, double error_px, double most_expected, int most, Candidate *out
+        self, FrameStars frame, int stars, double error_px, double most_expected, int most, Candidate *out
     ) except -1:
         """Write candidates as `best` does, those that at least two others support, in a crowd of false stars.
 
@@ -173,7 +175,7 @@ cdef class TriangleTable:
         cdef double[3] angle
         cdef double[3] middle
         cdef double[3] least
-        cdef int i, swap, row, column
+        cdef int i, swap, row, column, run
         cdef Query *q
         least[0], least[1], least[2] = M_PI / 3, 0.0, 0.0
         angles_of(shape.side, angle)
@@ -193,7 +195,9 @@ cdef class TriangleTable:
             q.turn = is_counter_clockwise(&s.v[3 * q.star[0]], &s.v[3 * q.star[1]], &s.v[3 * q.star[2]])
             for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
                 for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
-                    fetch(&self.bin_start[(row << BITS_1 | column) << BITS_2 | q.low[2] >> SHIFT_2])
+                    run = (row << BITS_1 | column) << BITS_2
+                    fetch(&self.bin_start[run + (q.low[2] >> SHIFT_2)])
+                    fetch(&self.bin_start[run + (q.high[2] >> SHIFT_2) + 1])
         if s.queries >= AHEAD:
             self._answer(s)
         return 0
@@ -202,13 +206,17 @@ cdef class TriangleTable:
         """Add the candidates of all queries that wait."""
         cdef const Query *q
         cdef Candidate *c
-        cdef int k, row, column, run, t, end, stop, before = s.count, last = <int>self.shape.shape[0] - 1
-        for k in range(s.queries if last >= 0 else 0):
+        cdef int k, row, column, run, t, end, stop, before = s.count
+        for k in range(s.queries):
             q = &s.waiting[k]
             for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
                 for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
-                    t = min(self.bin_start[(row << BITS_1 | column) << BITS_2 | q.low[2] >> SHIFT_2], last)
-                    fetch(&self.shape[t, 0])
+                    run = (row << BITS_1 | column) << BITS_2
+                    t, end = self.bin_start[run + (q.low[2] >> SHIFT_2)], self.bin_start[run + (q.high[2] >> SHIFT_2) + 1]
+                    while t < end:
+                        fetch(&self.shape[t, 0])
+                        t += LINE
+                    fetch(&self.shape[end, 0])
         for k in range(s.queries):
             q = &s.waiting[k]
             for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
@@ -260,20 +268,20 @@ cdef class TriangleTable:
         return 0
 
 
-cdef int _begin(Search *s, Frame frame, int stars, double error_px) except -1:
+cdef int _begin(Search *s, FrameStars frame, int stars, double error_px) except -1:
     """Take directions, errors and distances of a frame's brightest stars."""
     cdef int a, b
     cdef double x, y, z
     s.found, s.count, s.room, s.queries = NULL, 0, 0, 0
-    s.stars = stars = min(stars, <int>frame.sigma.shape[0])
+    s.stars = stars = min(stars, <int>frame.error.shape[0])
     s.v = <double *>malloc((4 * stars + stars * stars + 1) * sizeof(double))
     if s.v == NULL:
         raise MemoryError
     s.error = s.v + 3 * stars
     s.side = s.error + stars
     for b in range(stars):
-        direction_of(frame.xy[0, b, 0], frame.xy[0, b, 1], frame.focal, &s.v[3 * b])
-        s.error[b] = hypot(error_px, frame.sigma[b]) / frame.focal
+        direction_of(frame.pixel[0, b, 0], frame.pixel[0, b, 1], frame.focal_px, &s.v[3 * b])
+        s.error[b] = hypot(error_px, frame.error[b]) / frame.focal_px
         for a in range(b):
             x, y, z = s.v[3 * a] - s.v[3 * b], s.v[3 * a + 1] - s.v[3 * b + 1], s.v[3 * a + 2] - s.v[3 * b + 2]
             s.side[a * stars + b] = 2 * asin(min(1.0, 0.5 * sqrt(x * x + y * y + z * z)))

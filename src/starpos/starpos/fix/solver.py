@@ -9,14 +9,14 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.frame import mean_sigma, pointing_of
+from starpos.core.frame import FrameStars, mean_sigma, pointing_of
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.fix.horizon import check_above_horizon
 from starpos.fix.pointing import IDEAL, pointing_fix
-from starpos.fix.seen import directions_of, high_enough, inside
+from starpos.fix.seen import as_seen, directions_of, high_enough, inside
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Attitude, Solution, Status, status_of
 from starpos.fix.unidentified import why_unidentified
 from starpos.fix.unmoved import check_unmoved
@@ -27,7 +27,6 @@ from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache, wide
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
-from starpos.identification.pose import FrameStars
 from starpos.identification.search import Priors, field_of, identify_frame
 from starpos.identification.second_look import Look, second_look
 from starpos.identification.triangles import TriangleCatalogue
@@ -37,7 +36,6 @@ from starpos.instrument.camera_vertical import own_level
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
-from starpos.rotation import full_turn
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
@@ -75,13 +73,17 @@ class Solver:
 
         look: what their frame shows where stars should be, asked if the stars alone are too few.
         """
-        if (rows := self._inside(stars)) is not None:
-            return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look))
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
-            field = field_of(directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window)
+            field: FrameStars | wide.WideField | None = as_seen(camera, stars)
+            if field is None:
+                if (rows := inside(stars, camera)) is not None:
+                    return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look))
+                field = field_of(
+                    directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
+                )
             found = identify_frame(field, sky, predicted)
             if found is None and look is not None and isinstance(field, FrameStars):
                 found = second_look(field, sky, predicted, camera, look)
@@ -344,16 +346,16 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
     fx, fy = camera.fx * found.focal_scale, camera.fy * found.focal_scale
     x, y = camera.centre_px
-    if not camera.is_ideal:
-        centre, above = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
-    else:
+    if camera.is_ideal:
         across, down = (x - camera.cx) / fx, (y - camera.cy) / fy
         centre, above = (across, down, 1.0), (across, down - 1 / fy, 1.0)
+    else:
+        centre, above = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
     ra, dec, roll = pointing_of(centre, above, found.attitude, sky.velocity, found.mirrored)
     return Attitude(
-        ra=full_turn(ra),
+        ra=ra,
         dec=dec,
-        roll=full_turn(roll),
+        roll=roll,
         focal_px=fx,
         residual_arcsec=found.residual_px / math.sqrt(fx * fy) / ARCSEC,
         log_odds=found.log_odds,

@@ -14,10 +14,11 @@ from itertools import combinations, product
 import numpy as np
 
 from starpos import rotation
+from starpos.core.frame import FrameStars
 from starpos.frames.stars import Window
 from starpos.identification.evidence import any_scale
 from starpos.identification.full import FEWEST_STARS, Identification, identified
-from starpos.identification.pose import MATCH_SIGMA, FrameStars, Pose, Poses, directions
+from starpos.identification.pose import MATCH_SIGMA, Pose, Poses, directions, stars_at
 from starpos.identification.quads import SHORTEST, SIDES, QuadCatalogue, shapes
 from starpos.identification.search import through
 from starpos.identification.sky import Sky
@@ -80,13 +81,13 @@ def identify_blind(
     spans = [(shortest, longest)]
     if near_px is not None and shortest < near_px < longest:
         spans.insert(0, (max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
-    field = FrameStars.of(xy, sigma_px, Camera.from_focal(width, height, shortest))
+    field = stars_at(Camera.from_focal(width, height, shortest), xy, sigma_px)
     different = dict.fromkeys((min(stars, len(field)), error_px) for stars, error_px in stages)
     for (stars, error_px), (low, high) in product(different, spans):
         prior = any_scale(low, high, -math.log(len(spans)))
         for pose, radius_px in _poses(field, sky, quads, (low, high), stars, error_px):
             camera = Camera.from_focal(width, height, pose.focal_px)
-            seen = through(FrameStars.of(xy, sigma_px, camera), camera, window)
+            seen = through(stars_at(camera, xy, sigma_px), camera, window)
             found = identified(seen, sky, pose, radius_px, prior)
             if found:
                 return camera, found

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.core.poses import Chances
+from starpos.core.search import Anywhere
 from starpos.identification.pose import Pose
 from starpos.identification.triangles import SCALE_TOLERANCE
 
@@ -54,15 +55,8 @@ class Prior:
 
 
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
-    """The Prior of a frame lost in space, with a focal length of about focal_px; rotations have a volume of 8 pi2."""
-
-    def log_density(pose: Pose) -> float:
-        scale = abs(math.log(pose.focal_px / focal_px))
-        density = sum(share / (2 * within) for within, share in SCALES if scale < within)
-        parity = MIRRORED if pose.mirrored else 1 - MIRRORED
-        return log_share + math.log(parity * density / (8 * math.pi**2)) if density else -math.inf
-
-    return Prior(log_density, WIDTH)
+    """The Prior of a frame lost in space, with a focal length of about focal_px."""
+    return Prior(Anywhere(focal_px, SCALES, MIRRORED, log_share), WIDTH)
 
 
 def any_scale(shortest_px: float, longest_px: float, log_share: float = 0.0) -> Prior:

@@ -3,9 +3,9 @@
 
 from dataclasses import dataclass
 
-from starpos.core.frame import explained
+from starpos.core.frame import FrameStars, explained
 from starpos.identification.full import Identification
-from starpos.identification.pose import TEST_STARS, FrameStars
+from starpos.identification.pose import TEST_STARS
 
 # At least so many catalogue stars are asked for, where the frame has as many.
 LEAST_DUE = 8

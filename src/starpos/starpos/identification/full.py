@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.core.frame import FrameStars
 from starpos.core.poses import Rules
 from starpos.core.search import Judge
 from starpos.identification.evidence import CHANCES, Prior
-from starpos.identification.pose import SMALL_STEP, STEPS, FrameStars, Pose
+from starpos.identification.pose import SMALL_STEP, STEPS, Pose
 from starpos.identification.sky import Sky
 from starpos.normal import SIGMA_PER_MAD
 
@@ -117,7 +118,7 @@ class OnFrame:
     def of(cls, field: FrameStars, sky: Sky, pose: Pose, most_detections: int) -> "OnFrame":
         """The stars that the field's brightest detections may be, at most `most_detections` of them."""
         found = sky.stars.on_frame(
-            field.compiled,
+            field,
             pose.mirrored,
             pose.attitude,
             pose.focal_px,
@@ -133,12 +134,11 @@ class OnFrame:
 def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> Judge:
     """What judges poses of a frame by a prior, for the compiled core; enough: log-odds of an identification."""
     return Judge(
-        field.compiled,
+        field,
         sky.stars,
         sky.years,
         sky.velocity,
-        prior.width,
-        prior.log_density_at,
+        prior,
         enough,
         RULES,
         CHANCES,

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose of a pinhole camera among the stars, and a frame's stars in pixels from the principal point."""
 
-import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
 from starpos import rotation
-from starpos.core.frame import Frame
+from starpos.core.frame import FrameStars
 from starpos.core.poses import fitted
 from starpos.instrument.camera import Camera
 
@@ -22,86 +20,24 @@ LEAST_SIGMA_PX = 1e-3
 MATCH_SIGMA = 3.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameStars:
-    """N stars of a frame, brightest first.
+def stars_at(camera: Camera, xy: np.ndarray, sigma: np.ndarray) -> FrameStars:
+    """FrameStars at pixels xy (N, 2) of an ideal camera with square pixels, with errors (N,) px, brightest first.
 
-    xy        (2, N, 2) px from the principal point, as they are and with the frame's rows flipped
-    sigma     (N,) px, their errors along one axis
-    middle    (2, 2) px, the centre of the part of the frame that shows something, as it is and with its rows flipped
-    half      (2,) px, half the size of that part
-    focal_px  approximate focal length
-    area_px2  area over which false detections are spread; never more than the true one
-    tested    so many of the brightest decide whether a pose is right
+    ValueError if a pixel or an error is not a finite number.
     """
-
-    xy: np.ndarray
-    sigma: np.ndarray
-    middle: np.ndarray
-    half: np.ndarray
-    focal_px: float
-    area_px2: float
-    tested: int = TEST_STARS
-
-    @classmethod
-    def of(cls, xy: np.ndarray, sigma: np.ndarray, camera: Camera, margin_px: int = 0) -> "FrameStars":
-        """Make FrameStars from pixels xy (N, 2) of an ideal camera whose frame has margins with few detections.
-
-        ValueError if a pixel or an error is not a finite number.
-        """
-        if not (np.isfinite(xy).all() and np.isfinite(sigma).all()):
-            raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
-        principal = np.array([camera.cx, camera.cy])
-        flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
-        return cls(
-            xy=np.stack([xy, flipped]) - principal,
-            sigma=np.maximum(sigma, LEAST_SIGMA_PX),
-            middle=np.tile(np.array(camera.centre_px) - principal, (2, 1)),
-            half=np.array([camera.width, camera.height]) / 2,
-            focal_px=camera.fx,
-            area_px2=float((camera.width - 2 * margin_px) * (camera.height - 2 * margin_px)),
-        )
-
-    def __len__(self) -> int:
-        return len(self.sigma)
-
-    def take(self, row: np.ndarray) -> "FrameStars":
-        """The stars of these rows, in the same order."""
-        return replace(self, xy=np.ascontiguousarray(self.xy[:, row]), sigma=self.sigma[row])
-
-    def within(self, low: np.ndarray, high: np.ndarray, share: float) -> "FrameStars":
-        """The stars of a frame of which only a share of the area, from low (2,) to high (2,) px, shows something.
-
-        What is hidden counts neither against a pose whose stars would be there, nor as area for false detections.
-        """
-        first, last = (
-            np.maximum(low, self.middle[0] - self.half),
-            np.minimum(high, self.middle[0] + self.half),
-        )
-        middle = (first + last) / 2
-        # of rows that are flipped, the sum of the two stays
-        flipped = np.array([middle[0], self.middle[:, 1].sum() - middle[1]])
-        return replace(
-            self,
-            middle=np.stack([middle, flipped]),
-            half=(last - first) / 2,
-            area_px2=self.area_px2 * share,
-        )
-
-    @cached_property
-    def compiled(self) -> Frame:
-        """The stars, for the compiled core; the cone about the middle has some margin."""
-        radius_rad = math.atan(math.hypot(*self.half.tolist()) / self.focal_px) * 1.05 + 2e-4
-        return Frame(
-            self.xy,
-            self.sigma,
-            self.middle,
-            self.half,
-            self.focal_px,
-            radius_rad,
-            self.area_px2,
-            self.tested,
-        )
+    if not (np.isfinite(xy).all() and np.isfinite(sigma).all()):
+        raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
+    principal = np.array([camera.cx, camera.cy])
+    flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
+    return FrameStars(
+        xy=np.stack([xy, flipped]) - principal,
+        sigma=np.maximum(sigma, LEAST_SIGMA_PX),
+        middle=np.array(camera.centre_px) - principal,
+        half=np.array([camera.width, camera.height]) / 2,
+        focal_px=camera.fx,
+        area_px2=float(camera.width * camera.height),
+        tested=TEST_STARS,
+    )
 
 
 @dataclass(frozen=True)

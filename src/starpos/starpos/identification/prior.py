@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.core.frame import FrameStars
 from starpos.identification.evidence import SCALE_TOLERANCE, Prior
 from starpos.identification.full import OnFrame
-from starpos.identification.pose import MATCH_SIGMA, FrameStars, Pose, directions
+from starpos.identification.pose import MATCH_SIGMA, Pose, directions
 from starpos.identification.sky import Sky
 
 # The stars may be off by this where the prior is right.

@@ -4,16 +4,17 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain, repeat
 
 import numpy as np
 
-from starpos.core.frame import projected
+from starpos.core.frame import FrameStars, projected
 from starpos.core.search import Limits, Lost
 from starpos.frames.stars import Window
 from starpos.identification import wide
 from starpos.identification.evidence import anywhere
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified, judge
-from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, TEST_STARS, FrameStars
+from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, TEST_STARS, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
@@ -60,7 +61,7 @@ def identify(
 
     None if no part of the sky fits beyond doubt. ValueError if a pixel or an error is not a finite number.
     """
-    return identify_frame(FrameStars.of(xy, sigma_px, camera), sky, priors)
+    return identify_frame(stars_at(camera, xy, sigma_px), sky, priors)
 
 
 def identify_directions(
@@ -115,10 +116,11 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
     return FrameStars(
         xy=xy,
         sigma=sigma,
-        middle=np.tile([(width - 1) / 2 - cx, (height - 1) / 2 - cy], (2, 1)),
+        middle=np.array([(width - 1) / 2 - cx, (height - 1) / 2 - cy]),
         half=np.array([width / 2 + margin, height / 2 + margin]),
         focal_px=camera.fx,
         area_px2=float(width * height),
+        tested=TEST_STARS,
     )
 
 
@@ -140,24 +142,26 @@ def identifications(
     """
     if len(field) < FEWEST_STARS:
         return
-    yield from _first_or_crowded(field, sky, priors, enough)
+    yield from near_or_lost(field, sky, priors, STAGES, enough)
+    yield from _crowded(field, sky, priors, enough, CROWD_STARS)
     rows = evenly_spread(field)
     # each star found keeps those of its cell away: that leaves less area for the others
     left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
     uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
     if uneven and len(rows) >= FEWEST_STARS and left_px2 > 0:
-        even = replace(field.take(rows), area_px2=left_px2)
-        for found in _first_or_crowded(even, sky, (), enough + SECOND_TRY, CELLS**2 // 2):
+        even, enough = field.take(rows).but(area_px2=left_px2), enough + SECOND_TRY
+        for found in chain(
+            near_or_lost(even, sky, (), STAGES, enough), _crowded(even, sky, (), enough, CELLS**2 // 2)
+        ):
             yield replace(found, star=rows[found.star])
 
 
-def _first_or_crowded(
-    field: FrameStars, sky: Sky, priors: Priors, enough: float, crowd: int = CROWD_STARS
+def _crowded(
+    field: FrameStars, sky: Sky, priors: Priors, enough: float, crowd: int
 ) -> Iterator[Identification]:
-    """Yield what the brightest stars of a field show, then what shows if nearly all of them are false."""
-    yield from near_or_lost(field, sky, priors, STAGES, enough)
+    """Yield what the `crowd` brightest stars of a field show if nearly all of them are false."""
     stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
-    crowded = replace(field, tested=crowd)
+    crowded = field.but(tested=crowd)
     yield from near_or_lost(crowded, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
 
 
@@ -166,7 +170,7 @@ def evenly_spread(field: FrameStars) -> np.ndarray:
 
     The lights of a town, a trail or a line of text lie in few cells.
     """
-    place = 0.5 + 0.5 * (field.xy[0] - field.middle[0]) / field.half
+    place = 0.5 + 0.5 * (field.xy[0] - field.middle) / field.half
     column, row = np.clip((CELLS * place).astype(int), 0, CELLS - 1).T
     return np.sort(np.unique(CELLS * row + column, return_index=True)[1])
 
@@ -179,18 +183,34 @@ def near_or_lost(
     enough: float = ENOUGH,
     crowded: bool = False,
 ) -> Iterator[Identification]:
-    """Yield what is identified with log-odds of `enough`: by the priors, then lost in space by `stages`.
+    """What is identified with log-odds of `enough`: by the priors, then lost in space by `stages`.
 
     Half of the probability is that of the priors, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
+    if priors:
+        return _near_or_lost(field, sky, priors, stages, enough, crowded)
+    return _lost(field, sky, stages, 0.0, enough, crowded)
+
+
+def _near_or_lost(
+    field: FrameStars, sky: Sky, priors: Priors, stages: Stages, enough: float, crowded: bool
+) -> Iterator[Identification]:
+    """Yield what is identified by the priors, which have half of the probability, then what is without them."""
     for prior in priors:
         for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
             if found := identified(field, sky, pose, radius_px, known, enough):
                 yield found
-    lost = judge(field, sky, anywhere(field.focal_px, LOG_HALF if priors else 0.0), enough)
-    for found in Lost(lost, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS):
-        yield Identification.of(found, field)
+    yield from _lost(field, sky, stages, LOG_HALF, enough, crowded)
+
+
+def _lost(
+    field: FrameStars, sky: Sky, stages: Stages, log_share: float, enough: float, crowded: bool
+) -> Iterator[Identification]:
+    """What is identified lost in space, which has that share of the probability."""
+    judged = judge(field, sky, anywhere(field.focal_px, log_share), enough)
+    found = Lost(judged, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS)
+    return map(Identification.of, found, repeat(field))
 
 
 def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification | None:

@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from starpos.core.frame import FrameStars
 from starpos.identification.full import Identification, OnFrame
-from starpos.identification.pose import TEST_STARS, FrameStars, Pose
+from starpos.identification.pose import TEST_STARS, Pose
 from starpos.identification.search import STAGES, Priors, near_or_lost
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera

@@ -11,14 +11,14 @@ much more than their errors, and as much as those of distant stars, which no len
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
+from starpos.core.frame import FrameStars
 from starpos.identification.evidence import DOUBLE_PX
 from starpos.identification.full import ENOUGH, Identification
 from starpos.identification.pairs import close_pairs
-from starpos.identification.pose import TEST_STARS, FrameStars, Pose
+from starpos.identification.pose import TEST_STARS, Pose
 from starpos.identification.prior import PointingPrior
 from starpos.identification.search import STAGES, near_or_lost
 from starpos.identification.sky import Sky
@@ -70,7 +70,8 @@ def two_skies(field: FrameStars, flux: np.ndarray, sky: Sky, found: Identificati
     if _between_two(field, sky, found):
         return True
     bright = min(len(field), TEST_STARS)
-    if bright - np.count_nonzero(found.star < bright) < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
+    # the rows are in ascending order
+    if bright - found.star.searchsorted(bright) < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
         return False
     left = np.ones(len(flux), bool)
     left[found.star] = False
@@ -87,7 +88,7 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
     residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
-    u, v = ((xy - field.middle[int(found.mirrored)]) / field.half.max()).T
+    u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
     residual, kept = residual - terms @ np.linalg.lstsq(terms, residual, rcond=None)[0], np.arange(stars)
@@ -183,7 +184,7 @@ def _another_pose(
     """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
     row, first = np.flatnonzero(left)[:MOST_STARS], _pose(field, found)
     while len(row) >= LEAST_LEFT:
-        rest = replace(field.take(row), focal_px=first.focal_px)
+        rest = field.take(row).but(focal_px=first.focal_px)
         second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
         if second is None:
             return False

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.core.frame import FrameStars
 from starpos.identification.full import (
     BENT_PX,
     BLEND_PX,
@@ -28,7 +29,7 @@ from starpos.identification.full import (
     OnFrame,
 )
 from starpos.identification.pairs import close_pairs, mutual_nearest
-from starpos.identification.pose import FrameStars, Pose
+from starpos.identification.pose import Pose, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import EQUIDISTANT, Camera
@@ -90,7 +91,7 @@ class Part:
     @property
     def field(self) -> FrameStars:
         """The stars on the frame of the part's camera."""
-        return FrameStars.of(self.camera.project(self.directions), self.sigma_px, self.camera)
+        return stars_at(self.camera, self.camera.project(self.directions), self.sigma_px)
 
     def turned(self, priors: Sequence[PointingPrior | PlumbPrior]) -> tuple[PointingPrior | PlumbPrior, ...]:
         """Priors of the frame as those of this part."""
@@ -153,7 +154,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
     stars = best.field
     pose = Pose(flip @ best.turn @ flip @ found.attitude, stars.focal_px * found.focal_scale, found.mirrored)
     residual = stars.xy[int(found.mirrored)][star] - pose.project(sky.directions(catalogue))
-    from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle[int(found.mirrored)])
+    from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle)
     return best, replace(
         found,
         star=star,

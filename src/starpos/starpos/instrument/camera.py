@@ -6,6 +6,7 @@ Pixel (0, 0) is the centre of the top-left pixel; C has x right, y down, z out a
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,7 +68,7 @@ class Camera:
         cx, cy = (width - 1) / 2, (height - 1) / 2
         return cls(width=width, height=height, fx=focal_px, fy=focal_px, cx=cx, cy=cy, model=model)
 
-    @property
+    @cached_property
     def is_ideal(self) -> bool:
         """Whether the camera is a pinhole without distortion."""
         return self.model == PLUMB_BOB and not any(self.distortion)

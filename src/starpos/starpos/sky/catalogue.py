@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.sky import designations
+from starpos.core.sky import Designations
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
@@ -104,6 +104,10 @@ class Catalogue:
         """First row of each cell, as `zones.cell_starts` returns it."""
         return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
 
+    @cached_property
+    def _designations(self) -> Designations:
+        return Designations(self.hip, self.tyc)
+
     def vmag(self, index: Rows = slice(None)) -> np.ndarray:
         """Johnson V magnitudes (n,) of the rows `index`."""
         return self.vmag_centi[index] * 0.01
@@ -134,7 +138,7 @@ class Catalogue:
 
     def names(self, index: np.ndarray) -> list[str]:
         """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""
-        return designations(self.hip, self.tyc, np.asarray(index, np.intp))
+        return self._designations.of(np.asarray(index, np.intp))
 
     def cone(self, centre: np.ndarray, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Rows of the stars within radius_rad of the unit vector `centre` (3,) at J2000, brightest first."""

@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos.core.poses import log_ratio
 from starpos.identification import PlumbPrior, PointingPrior, full, identify, search
 from starpos.identification.evidence import CHANCES, DOUBLE_PX, LOG_SHARES, WIDTH, Prior, anywhere
-from starpos.identification.pose import FrameStars, Pose, directions
+from starpos.identification.pose import Pose, directions, stars_at
 from starpos.instrument.camera import Camera
 from starpos.simulation.montecarlo_fields import Conditions, draw
 from starpos_testing.skies.scenes import random_attitude
@@ -26,7 +26,7 @@ def largest(fields, rng, catalogue, priors=tuple):
     sky, best = sky_for(catalogue, SMALL), []
     for _ in range(fields):
         n = int(rng.integers(5, 10))
-        field = FrameStars.of(rng.uniform(0, [299, 224], (n, 2)), np.full(n, SIGMA_PX), SMALL)
+        field = stars_at(SMALL, rng.uniform(0, [299, 224], (n, 2)), np.full(n, SIGMA_PX))
         tried = search.identifications(field, sky, priors(), enough=-np.inf)
         best.append(max((found.log_odds for found in tried), default=-np.inf))
     return np.array(best)
@@ -134,7 +134,7 @@ def test_a_detection_upon_another_says_nothing(rng):
 
 def test_the_priors_share_half_of_the_probability(catalogue, rng, monkeypatch):
     sky, attitude = sky_for(catalogue, SMALL), random_attitude(rng)
-    field = FrameStars.of(rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX), SMALL)
+    field = stars_at(SMALL, rng.uniform(0, [299, 224], (20, 2)), np.full(20, SIGMA_PX))
     priors = PointingPrior(attitude, SMALL.fx), PlumbPrior(attitude[2], np.eye(3)[2], 1e-3)
     expected = Pose(attitude, SMALL.fx, False)
     tried = {}
@@ -178,7 +178,7 @@ def integral(prior, made, zenith, reach_rad, rng):
 
 def test_a_prior_is_a_probability(rng):
     """The density of each over all poses makes its share, and its widths leave room for no more."""
-    field = FrameStars.of(np.zeros((0, 2)), np.zeros(0), SMALL)
+    field = stars_at(SMALL, np.zeros((0, 2)), np.zeros(0))
     made = Pose(random_attitude(rng), SMALL.fx, False)
     zenith = random_attitude(rng)[2]
     plumb = PlumbPrior(zenith, made.attitude @ zenith, 0.01)._known(field, 0.0)

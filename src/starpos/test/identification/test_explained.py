@@ -12,7 +12,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification import identify
 from starpos.identification.explained import Explained, explained_by
-from starpos.identification.pose import FrameStars
+from starpos.identification.pose import stars_at
 from starpos.instrument.instrument import Instrument
 from starpos_testing.skies.scenes import random_attitude, solver_of, stars_of, tilt_of, wide_scene
 
@@ -27,7 +27,7 @@ def field(sky, rng):
 
 def explained(xy, sky):
     sigma = np.full(len(xy), SIGMA_PX)
-    return explained_by(identify(xy, sigma, CAMERA, sky), FrameStars.of(xy, sigma, CAMERA))
+    return explained_by(identify(xy, sigma, CAMERA, sky), stars_at(CAMERA, xy, sigma))
 
 
 def test_a_clear_frame_is_explained_and_all_its_stars_are_there(field, sky):

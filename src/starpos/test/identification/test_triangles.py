@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starpos.identification import triangle_cache, triangles
-from starpos.identification.pose import FrameStars, directions
+from starpos.identification.pose import directions, stars_at
 from starpos.instrument.camera import Camera
 from starpos.rotation import shortest_turn
 from starpos_testing.patience import WAIT_S
@@ -115,12 +115,12 @@ def test_what_is_looked_up_is_what_brute_force_finds(table, places, rng):
     for triangle in rng.integers(0, len(known), 60):
         v = places[table.corners[triangle]]
         xy = camera.project(v @ shortest_turn(unit_sum(v), np.array([0.0, 0.0, 1.0])).T)
-        frame = FrameStars.of(xy + rng.normal(0, 0.3, (3, 2)), np.full(3, 0.3), camera)
+        frame = stars_at(camera, xy + rng.normal(0, 0.3, (3, 2)), np.full(3, 0.3))
         seen = directions(frame.xy[:1], np.array([camera.fx]))[0]
         if rng.random() < 0.3:
-            frame = FrameStars.of(xy, np.full(3, 1.5), camera)
+            frame = stars_at(camera, xy, np.full(3, 1.5))
             seen = directions(frame.xy[:1], np.array([camera.fx]))[0]
-        star, corner, mirrored = table.compiled.candidates(frame.compiled, 0, 3, 0.2, 1e9, 100_000, False)
+        star, corner, mirrored = table.compiled.candidates(frame, 0, 3, 0.2, 1e9, 100_000, False)
         found = {(*s, *c) for s, c in zip(star.tolist(), corner.tolist(), strict=True)}
         orders, shape, tolerance = queries(seen, np.hypot(0.2, frame.sigma[0]) / camera.fx)
         apart = np.abs(known - shape)
