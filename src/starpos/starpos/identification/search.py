@@ -144,11 +144,10 @@ def identifications(
         return
     yield from near_or_lost(field, sky, priors, STAGES, enough)
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
-    rows = evenly_spread(field)
+    rows = second_try(field)
     # each star found keeps those of its cell away: that leaves less area for the others
     left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
-    uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
-    if uneven and len(rows) >= FEWEST_STARS and left_px2 > 0:
+    if rows is not None and left_px2 > 0:
         even, enough = field.take(rows).but(area_px2=left_px2), enough + SECOND_TRY
         for found in chain(
             near_or_lost(even, sky, (), STAGES, enough), _crowded(even, sky, (), enough, CELLS**2 // 2)
@@ -163,6 +162,13 @@ def _crowded(
     stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
     crowded = field.but(tested=crowd)
     yield from near_or_lost(crowded, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
+
+
+def second_try(field: FrameStars) -> np.ndarray | None:
+    """Rows of the stars that are tried where the brightest crowd in few cells; None where they are spread already."""
+    rows = evenly_spread(field)
+    uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
+    return rows if uneven and len(rows) >= FEWEST_STARS else None
 
 
 def evenly_spread(field: FrameStars) -> np.ndarray:
