@@ -32,6 +32,7 @@ from starpos.sky import catalogue
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
+    from starpos.detection.second_look import SecondLook
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,15 @@ def stars_of(item: Frame | Stars) -> Stars:
     return detect(item).stars
 
 
+def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
+    """A second look at the frame of the stars; None for a list."""
+    if isinstance(item, Stars):
+        return None
+    from starpos.detection.second_look import SecondLook
+
+    return SecondLook.of(item, stars)
+
+
 @dataclass(frozen=True)
 class Listing:
     """Gives the stars of a frame."""
@@ -145,7 +155,8 @@ class Identifying:
         with suppress(StarposError):
             solver.prepare(item.width, item.height)
         begin = time.process_time()
-        answer = solver.identify(stars_of(item))
+        stars = stars_of(item)
+        answer = solver.identify(stars, look=look_at(item, stars))
         return answer, 1000 * (time.process_time() - begin)
 
 

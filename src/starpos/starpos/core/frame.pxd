@@ -10,33 +10,36 @@ cdef class FrameStars:
     cdef readonly double focal_px
     cdef readonly double area_px2
     cdef readonly int tested
-    # the same in C, and the radius (rad) of a cone about the frame's centre that contains the frame
+    # the same in C, the middle also with the rows flipped; the radius (rad) of a cone about it that contains the frame
     cdef const double[:, :, ::1] pixel
     cdef const double[::1] error
-    cdef double[2] centre
+    cdef double[2][2] centre
     cdef double[2] reach
     cdef double radius
 
 
-cdef inline bint on_frame(FrameStars frame, const double *pixel, double margin) noexcept nogil:
-    """Whether a pixel (2,) lies on a frame or within a margin (px) of it."""
-    return (fabs(pixel[0] - frame.centre[0]) < frame.reach[0] + margin) & (
-        fabs(pixel[1] - frame.centre[1]) < frame.reach[1] + margin
+cdef inline bint on_frame(FrameStars frame, bint mirrored, const double *pixel, double margin) noexcept nogil:
+    """Whether a pixel (2,) lies on a frame, with its rows flipped if mirrored, or within a margin (px) of it."""
+    cdef const double *centre = frame.centre[mirrored]
+    return (fabs(pixel[0] - centre[0]) < frame.reach[0] + margin) & (
+        fabs(pixel[1] - centre[1]) < frame.reach[1] + margin
     )
 
 
-cdef inline bint seen_on(FrameStars frame, const double *u, double focal, double margin) noexcept nogil:
-    """Whether the pixel of a direction (3,) in C lies on a frame or within a margin (px) of it; nothing behind the camera."""
-    return (fabs(u[0] * focal - frame.centre[0] * u[2]) < (frame.reach[0] + margin) * u[2]) & (
-        fabs(u[1] * focal - frame.centre[1] * u[2]) < (frame.reach[1] + margin) * u[2]
+cdef inline bint seen_on(FrameStars frame, bint mirrored, const double *u, double focal, double margin) noexcept nogil:
+    """Whether `on_frame` holds for the pixel of a direction (3,) in C; nothing behind the camera is on a frame."""
+    cdef const double *centre = frame.centre[mirrored]
+    return (fabs(u[0] * focal - centre[0] * u[2]) < (frame.reach[0] + margin) * u[2]) & (
+        fabs(u[1] * focal - centre[1] * u[2]) < (frame.reach[1] + margin) * u[2]
     )
 
 
-cdef inline void axis_of(FrameStars frame, const double *attitude, double *axis) noexcept nogil:
-    """Set axis (3,) to the direction, of any length, of a frame's centre in an attitude (3, 3)."""
+cdef inline void axis_of(FrameStars frame, bint mirrored, const double *attitude, double *axis) noexcept nogil:
+    """Set axis (3,) to the direction, of any length, of a frame's middle, flipped if mirrored, in an attitude (3, 3)."""
+    cdef const double *centre = frame.centre[mirrored]
     cdef int i
     for i in range(3):
-        axis[i] = (frame.centre[0] * attitude[i] + frame.centre[1] * attitude[3 + i]) / frame.focal_px + attitude[6 + i]
+        axis[i] = (centre[0] * attitude[i] + centre[1] * attitude[3 + i]) / frame.focal_px + attitude[6 + i]
 
 
 cdef inline void direction_of(double x, double y, double focal, double *v) noexcept nogil:

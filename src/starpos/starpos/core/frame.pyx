@@ -12,15 +12,15 @@ cdef class FrameStars:
 
     xy        (2, N, 2) px from the principal point, as they are and with the frame's rows flipped
     sigma     (N,) px, their errors along one axis
-    middle    (2,) px, the frame's centre
-    half      (2,) px, half its size
+    middle    (2,) px, the centre of the part of the frame that shows something
+    half      (2,) px, half the size of that part
     focal_px  approximate focal length
     area_px2  area over which false detections are spread; never more than the true one
     tested    so many of the brightest decide whether a pose is right
     """
 
     def __init__(self, *, xy, sigma, middle, half, double focal_px, double area_px2, int tested):
-        self.centre[0], self.centre[1] = middle
+        _centre(self, middle[0], middle[1], middle[1])
         self.reach[0], self.reach[1] = half
         self.focal_px, self.area_px2, self.tested = focal_px, area_px2, tested
         _hold(self, xy, sigma)
@@ -30,7 +30,7 @@ cdef class FrameStars:
 
     @property
     def middle(self):
-        return np.array([self.centre[0], self.centre[1]])
+        return np.array([self.centre[0][0], self.centre[0][1]])
 
     @property
     def half(self):
@@ -50,6 +50,27 @@ cdef class FrameStars:
         return out
 
 
+    def within(self, low, high, double share):
+        """The stars of a frame of which only a share of the area, from low (2,) to high (2,) px, shows something.
+
+        What is hidden counts neither against a pose whose stars would be there, nor as area for false detections.
+        """
+        cdef FrameStars out = _changed(self, self.xy, self.sigma)
+        cdef double both = self.centre[0][1] + self.centre[1][1]
+        first, last = np.maximum(low, self.middle - self.half), np.minimum(high, self.middle + self.half)
+        x, y = (first + last) / 2
+        _centre(out, x, y, both - y)
+        out.reach[0], out.reach[1] = (last - first) / 2
+        out.area_px2 = self.area_px2 * share
+        _hold(out, self.xy, self.sigma)
+        return out
+
+
+cdef void _centre(FrameStars f, double x, double y, double flipped) noexcept:
+    """Set the middle of what a frame shows, whose row is another one if the rows are flipped."""
+    f.centre[0][0], f.centre[0][1], f.centre[1][0], f.centre[1][1] = x, y, x, flipped
+
+
 cdef int _hold(FrameStars f, xy, sigma) except -1:
     """Take the stars' pixels and errors; the frame's size and focal length are there."""
     f.xy, f.sigma = xy, sigma
@@ -64,7 +85,7 @@ cdef FrameStars _changed(FrameStars f, xy, sigma):
     cdef FrameStars out = FrameStars.__new__(FrameStars)
     cdef int i
     for i in range(2):
-        out.centre[i], out.reach[i] = f.centre[i], f.reach[i]
+        out.centre[i][0], out.centre[i][1], out.reach[i] = f.centre[i][0], f.centre[i][1], f.reach[i]
     out.focal_px, out.area_px2, out.tested = f.focal_px, f.area_px2, f.tested
     _hold(out, xy, sigma)
     return out
@@ -95,7 +116,7 @@ def ideal_frame(
         xy[0, k, 0] = xy[1, k, 0] = across
         xy[0, k, 1], xy[1, k, 1] = down, rows - 1 - 2 * cy * squeeze - down
         error[k] = max(sqrt((covariance[k, 0, 0] + covariance[k, 1, 1]) / 2), least_sigma)
-    out.centre[0], out.centre[1] = (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze
+    _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
     out.reach[0], out.reach[1] = width / 2, rows / 2
     out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
     _hold(out, pixels, errors)

@@ -25,6 +25,6 @@ cdef class BrightTable:
         const double *radius_px, int most_stars, double match_sigma, double log_false,
     ) except? -1
     cdef int _on_frame(
-        self, const int *runs, int count, FrameStars frame, const double *attitude, double focal_px, const Date *date,
-        Bright *bright,
+        self, const int *runs, int count, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
+        const Date *date, Bright *bright,
     ) noexcept nogil

@@ -99,7 +99,7 @@ cdef class BrightTable:
         cdef Bright *bright = NULL
         cdef double *pixel
         cdef int i, count, room = 0
-        axis_of(frame, attitude, axis)
+        axis_of(frame, c.mirrored, attitude, axis)
         count = runs_near(&self.cell_start[0], axis, frame.radius, runs, &span)
         for i in range(count):
             room += runs[2 * i + 1] - runs[2 * i]
@@ -109,7 +109,7 @@ cdef class BrightTable:
             if bright == NULL:
                 raise MemoryError
             pixel = <double *>(bright + room + 1)
-            count = self._on_frame(runs, count, frame, attitude, focal_px, date, bright)
+            count = self._on_frame(runs, count, frame, c.mirrored, attitude, focal_px, date, bright)
             if count > most_stars:
                 qsort(bright, count, sizeof(Bright), _by_rank)
                 count = most_stars
@@ -134,8 +134,8 @@ cdef class BrightTable:
         return best
 
     cdef int _on_frame(
-        self, const int *runs, int count, FrameStars frame, const double *attitude, double focal_px, const Date *date,
-        Bright *bright,
+        self, const int *runs, int count, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
+        const Date *date, Bright *bright,
     ) noexcept nogil:
         """The stars of runs of rows that lie on a frame: their pixels; how many."""
         cdef int i, k, kept = 0
@@ -147,7 +147,7 @@ cdef class BrightTable:
                 turned(attitude, w, u)
                 pixel_of(u, focal_px, u)
                 bright[kept].x, bright[kept].y, bright[kept].rank = u[0], u[1], self.rank[k]
-                kept += on_frame(frame, u, EDGE_PX)
+                kept += on_frame(frame, mirrored, u, EDGE_PX)
         return kept
 
 

@@ -149,8 +149,8 @@ cdef class Judge:
         cdef double *room
         _release(work)
         self.table.find(
-            self.frame, work.end.attitude, work.end.focal, &self.date, self.rules.edge_px, most, self.rules.blend_px,
-            &work.stars,
+            self.frame, mirrored, work.end.attitude, work.end.focal, &self.date, self.rules.edge_px, most,
+            self.rules.blend_px, &work.stars,
         )
         pairs = min(n, work.stars.count)
         if pairs < self.rules.fewest:
@@ -184,7 +184,7 @@ cdef class Judge:
             row[k], row[n + k] = end.star[k], work.stars.row[end.near[k]]
             blend[k] = work.stars.moved[end.near[k]]
         for k in range(work.stars.count):
-            if on_frame(self.frame, &work.memory[2 * k], -self.rules.inside_px):
+            if on_frame(self.frame, mirrored, &work.memory[2 * k], -self.rules.inside_px):
                 row[last] = work.stars.row[k]
                 last += 1
         return (

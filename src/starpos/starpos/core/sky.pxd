@@ -43,15 +43,15 @@ cdef class StarTable:
 
     cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil
     cdef int find(
-        self, FrameStars frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
-        double blend_px, Visible *out,
+        self, FrameStars frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
+        double margin_px, int most, double blend_px, Visible *out,
     ) except -1 nogil
     cdef void ask(self, int first, int end, const Date *date) noexcept nogil
     cdef int _inside(self, const int *runs, int count, const Span *span, int *near) noexcept nogil
     cdef int _by_light(self, const int *rows, int n, int cut, int *near) noexcept nogil
     cdef int _projected(
-        self, const int *near, int n, FrameStars frame, const double *attitude, double focal_px, double margin_px,
-        const Date *date, int most, Visible *out, Point *pixel,
+        self, const int *near, int n, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
+        double margin_px, const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil
     cdef int _unblended(
         self, Point *pixel, double blend_px, double focal_px, Visible *out, int *single

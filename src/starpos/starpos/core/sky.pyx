@@ -97,11 +97,12 @@ cdef class StarTable:
         return out
 
     def on_frame(
-        self, FrameStars frame, const double[:, ::1] attitude, double focal_px, double years, velocity, double margin_px,
-        int most, double blend_px,
+        self, FrameStars frame, bint mirrored, const double[:, ::1] attitude, double focal_px, double years, velocity,
+        double margin_px, int most, double blend_px,
     ):
         """The brightest stars on a frame: rows (S,), directions (S, 3), and how far (px) fainter ones move the image.
 
+        mirrored            whether the frame's rows are flipped
         attitude, focal_px  the pose
         margin_px           stars so far beyond the frame are on it
         most                so many stars are taken
@@ -115,7 +116,7 @@ cdef class StarTable:
         cdef int k, i
         found.memory = NULL
         try:
-            self.find(frame, &attitude[0, 0], focal_px, &date, margin_px, most, blend_px, &found)
+            self.find(frame, mirrored, &attitude[0, 0], focal_px, &date, margin_px, most, blend_px, &found)
             index, directions, drawn = np.empty(found.count, np.intp), np.empty((found.count, 3)), np.empty(found.count)
             row, w, moved = index, directions, drawn
             for k in range(found.count):
@@ -127,8 +128,8 @@ cdef class StarTable:
             free(found.memory)
 
     cdef int find(
-        self, FrameStars frame, const double *attitude, double focal_px, const Date *date, double margin_px, int most,
-        double blend_px, Visible *out,
+        self, FrameStars frame, bint mirrored, const double *attitude, double focal_px, const Date *date,
+        double margin_px, int most, double blend_px, Visible *out,
     ) except -1 nogil:
         """Set `out` to the stars of `on_frame`; its memory is the caller's to free, even after an error."""
         cdef int[2 * MOST_RUNS] runs
@@ -136,7 +137,7 @@ cdef class StarTable:
         # the cells reach beyond the frame
         cdef int cut = 4 * most + 100, i, n = 0, count
         cdef Span span
-        axis_of(frame, attitude, axis)
+        axis_of(frame, mirrored, attitude, axis)
         count = runs_near(&self.cell_start[0], axis, frame.radius, runs, &span)
         for i in range(count):
             n += runs[2 * i + 1] - runs[2 * i]
@@ -155,7 +156,7 @@ cdef class StarTable:
         cdef int *rows = near + n + 1
         n = self._inside(runs, count, &span, rows)
         n = self._by_light(rows, n, cut, near)
-        self._projected(near, n, frame, attitude, focal_px, margin_px, date, most, out, pixel)
+        self._projected(near, n, frame, mirrored, attitude, focal_px, margin_px, date, most, out, pixel)
         return self._unblended(pixel, blend_px, frame.focal_px, out, near)
 
     cdef void ask(self, int first, int end, const Date *date) noexcept nogil:
@@ -204,8 +205,8 @@ cdef class StarTable:
         return kept
 
     cdef int _projected(
-        self, const int *near, int n, FrameStars frame, const double *attitude, double focal_px, double margin_px,
-        const Date *date, int most, Visible *out, Point *pixel,
+        self, const int *near, int n, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
+        double margin_px, const Date *date, int most, Visible *out, Point *pixel,
     ) noexcept nogil:
         """Keep of the rows `near` (n,) those on the frame, with their directions and pixels, at most so many."""
         cdef int k, kept = 0
@@ -220,7 +221,7 @@ cdef class StarTable:
             pixel_of(u, focal_px, at)
             pixel[kept].x, pixel[kept].y, pixel[kept].row = at[0], at[1], kept
             # no jump, which no processor could guess: it works on the next stars meanwhile
-            kept += seen_on(frame, u, focal_px, margin_px)
+            kept += seen_on(frame, mirrored, u, focal_px, margin_px)
         out.count = kept
         return kept
 

@@ -20,6 +20,7 @@ from starpos.detection.plane import halved, plane_of
 from starpos.detection.streak import find_streaks
 from starpos.detection.trail import with_trail
 from starpos.detection.vet import measure, resolve
+from starpos.detection.window import window_of
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, Stars, no_stars
@@ -172,6 +173,7 @@ def _detect(picture: _Picture) -> Detection:
         fwhm_px=2 * reduced.fwhm_px,
         width=picture.about["width"],
         height=picture.about["height"],
+        window=found.stars.window,
     )
     return replace(
         found, stars=stars, fwhm_px=2 * reduced.fwhm_px, chi2=reduced.chi2, left_out=reduced.left_out
@@ -222,6 +224,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         covariance=columns["covariance"],
         flags=columns["flags"],
         fwhm_px=fwhm_px,
+        window=window_of(plane, level),
         **about,
     )
     return Detection(

@@ -12,7 +12,7 @@ from starpos.fix.solver import attitude_of, suspicions
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Sky, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
-from starpos.identification.search import frame_stars
+from starpos.identification.search import frame_stars, through
 from starpos.identification.triangles import no_triangles
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -47,8 +47,8 @@ class BlindSolver:
             return Solution.failed(stars, status_of(stars, e), str(e))
         quads = quad_cache.cached(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
-        near_px = stars.rough_focal_px
-        answer = identify_blind(xy, seen.sigma, stars.width, stars.height, sky, quads, self.stages, near_px)
+        size, near_px, window = (stars.width, stars.height), stars.rough_focal_px, stars.window
+        answer = identify_blind(xy, seen.sigma, *size, sky, quads, self.stages, near_px, window)
         if answer is None:
             message = (
                 f"{stars.place}: none of the sky fits its {len(seen)} stars at any scale (fields of {SMALLEST_DEG:g} to "
@@ -59,9 +59,8 @@ class BlindSolver:
                 Solution.failed(stars, Status.NOT_IDENTIFIED, message), identify_s=time.perf_counter() - begin
             )
         camera, found = answer
-        warnings, explained = suspicions(
-            seen, frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera), sky, found
-        )
+        field = frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera)
+        warnings, explained = suspicions(seen, through(field, camera, window), sky, found)
         return replace(
             Solution.failed(stars, Status.OK, "identified"),
             names=tuple(self.catalogue.names(found.catalogue)),

@@ -8,6 +8,7 @@ import numpy as np
 from starpos.core.frame import FrameStars, all_within, ideal_frame, unit_vectors
 from starpos.frames.stars import EDGE_PX, Stars
 from starpos.identification.pose import LEAST_SIGMA_PX, TEST_STARS
+from starpos.identification.search import through
 from starpos.instrument.camera import PLUMB_BOB, Camera
 
 # Lower stars of a fisheye make no fix: what refraction does near the horizon no model tells.
@@ -36,7 +37,8 @@ def as_seen(camera: Camera, stars: Stars) -> FrameStars | None:
     """
     if not camera.is_ideal:
         return None
-    return ideal_frame(stars.x, stars.y, stars.covariance, camera, EDGE_PX, LEAST_SIGMA_PX, TEST_STARS)
+    field = ideal_frame(stars.x, stars.y, stars.covariance, camera, EDGE_PX, LEAST_SIGMA_PX, TEST_STARS)
+    return None if field is None else through(field, camera, stars.window)
 
 
 def high_enough(sines: np.ndarray) -> np.ndarray:

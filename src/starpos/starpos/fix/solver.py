@@ -28,6 +28,7 @@ from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_c
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors, field_of, identify_frame
+from starpos.identification.second_look import Look, second_look
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
@@ -67,18 +68,25 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, predicted: Priors = ()) -> Solution:
-        """Names of the stars and pointing of the camera, predicted or anywhere.  Stars without a time: J2000 places."""
+    def identify(self, stars: Stars, predicted: Priors = (), look: Look | None = None) -> Solution:
+        """Names of the stars and pointing of the camera, predicted or anywhere.  Stars without a time: J2000 places.
+
+        look: what their frame shows where stars should be, asked if the stars alone are too few.
+        """
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
-            field = as_seen(camera, stars)
+            field: FrameStars | wide.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return _for_all(stars, rows, self.identify(stars.take(rows), predicted))
-                field = field_of(directions_of(camera, stars), mean_sigma(stars.covariance), camera)
+                    return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look))
+                field = field_of(
+                    directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
+                )
             found = identify_frame(field, sky, predicted)
+            if found is None and look is not None and isinstance(field, FrameStars):
+                found = second_look(field, sky, predicted, camera, look)
         except StarposError as e:
             return _failure(stars, e)
         if found is None:
@@ -126,7 +134,7 @@ class Solver:
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
-            field = field_of(directions, mean_sigma(stars.covariance), camera)
+            field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
         except StarposError as e:
             return _failure(stars, e)

@@ -14,6 +14,8 @@ EDGE = 2
 ELONGATED = 4
 BLENDED = 8
 UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED
+# Left, top, right, bottom: the first column and row, and the first beyond.
+Window = tuple[int, int, int, int]
 COLUMNS = ("x", "y", "flux", "snr", "covariance", "flags")
 # A centroid farther outside the frame than this is not a star's.
 EDGE_PX = 2.0
@@ -34,6 +36,7 @@ class Stars(Exposure):
     flags           (N,) uint8, a sum of SATURATED, EDGE, ELONGATED, BLENDED
     width, height   px, of the frame
     fwhm_px         width of the star images, px; None: unknown
+    window          px, the part of the frame that shows something, where the rest is white; None: all of it
 
     Sequences are converted to arrays. FrameError if the columns do not fit together or hold impossible values.
     """
@@ -47,12 +50,17 @@ class Stars(Exposure):
     width: int
     height: int
     fwhm_px: float | None = None
+    window: Window | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         place = self.place
         check_size(self.width, self.height, place)
         n = np.size(self.x)
+        if self.window is not None:
+            left, top, right, bottom = self.window
+            if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
+                raise FrameError(f"{place}: the window {self.window} is no part of the frame; leave it out.")
         for name in ("x", "y", "flux", "snr"):
             self._set(name, np.float64, (n,), place)
         self._set("covariance", np.float64, (n, 2, 2), place)

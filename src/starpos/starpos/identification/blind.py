@@ -8,17 +8,19 @@ possible before. Where the focal length is roughly known, scales near it come fi
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
 
 from starpos import rotation
 from starpos.core.frame import FrameStars
+from starpos.frames.stars import Window
 from starpos.identification.evidence import any_scale
-from starpos.identification.full import FEWEST_STARS, Identification, identified
+from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified
 from starpos.identification.pose import MATCH_SIGMA, Pose, Poses, directions, stars_at
 from starpos.identification.quads import SHORTEST, SIDES, QuadCatalogue, shapes
+from starpos.identification.search import SECOND_TRY, second_try, through
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
 
@@ -62,10 +64,12 @@ def identify_blind(
     quads: QuadCatalogue,
     stages: Sequence[tuple[int, float]] = STAGES,
     near_px: float | None = None,
+    window: Window | None = None,
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, of a pinhole camera of unknown focal length.
 
     near_px: a focal length that it may have, with which the search begins; half of the probability is for it.
+    window: the part of the frame that shows something, as `Stars` has it; None: all of it.
 
     Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None if there is
     none beyond doubt.
@@ -77,15 +81,24 @@ def identify_blind(
     spans = [(shortest, longest)]
     if near_px is not None and shortest < near_px < longest:
         spans.insert(0, (max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
-    field = stars_at(Camera.from_focal(width, height, shortest), xy, sigma_px)
-    different = dict.fromkeys((min(stars, len(field)), error_px) for stars, error_px in stages)
-    for (stars, error_px), (low, high) in product(different, spans):
-        prior = any_scale(low, high, -math.log(len(spans)))
-        for pose, radius_px in _poses(field, sky, quads, (low, high), stars, error_px):
-            camera = Camera.from_focal(width, height, pose.focal_px)
-            found = identified(stars_at(camera, xy, sigma_px), sky, pose, radius_px, prior)
-            if found:
-                return camera, found
+    camera = Camera.from_focal(width, height, shortest)
+    frame = stars_at(camera, xy, sigma_px)
+    tries = [(np.arange(len(xy)), 1.0, ENOUGH)]
+    if (even := second_try(through(frame, camera, window))) is not None:
+        # each star found keeps those of its cell away: that leaves less area for the others
+        tries.append((even, 0.5, ENOUGH + SECOND_TRY))
+    for rows, share, enough in tries:
+        field = frame.take(rows)
+        different = dict.fromkeys((min(stars, len(field)), error_px) for stars, error_px in stages)
+        for (stars, error_px), (low, high) in product(different, spans):
+            prior = any_scale(low, high, -math.log(len(spans)))
+            for pose, radius_px in _poses(field, sky, quads, (low, high), stars, error_px):
+                camera = Camera.from_focal(width, height, pose.focal_px)
+                seen = through(stars_at(camera, xy[rows], sigma_px[rows]), camera, window)
+                seen = seen.but(area_px2=share * seen.area_px2)
+                found = identified(seen, sky, pose, radius_px, prior, enough)
+                if found:
+                    return camera, replace(found, star=rows[found.star])
     return None
 
 

@@ -119,6 +119,7 @@ class OnFrame:
         """The stars that the field's brightest detections may be, at most `most_detections` of them."""
         found = sky.stars.on_frame(
             field,
+            pose.mirrored,
             pose.attitude,
             pose.focal_px,
             sky.years,

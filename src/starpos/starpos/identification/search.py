@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.core.frame import FrameStars, projected
 from starpos.core.search import Limits, Lost
+from starpos.frames.stars import Window
 from starpos.identification import wide
 from starpos.identification.evidence import anywhere
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified, judge
@@ -74,11 +75,33 @@ def identify_directions(
     return identify_frame(field_of(directions, sigma_px, camera), sky, priors)
 
 
-def field_of(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars | wide.WideField:
-    """The stars in directions (N, 3) in C, errors (N,) px, as `identify_frame` takes them from this camera."""
+def field_of(
+    directions: np.ndarray, sigma_px: np.ndarray, camera: Camera, window: Window | None = None
+) -> FrameStars | wide.WideField:
+    """The stars in directions (N, 3) in C, errors (N,) px, as `identify_frame` takes them from this camera.
+
+    window: the part of the frame that shows something, as `Stars` has it.
+    """
     if wide.is_wide(camera):
         return wide.WideField(directions, sigma_px, camera)
-    return frame_stars(directions, sigma_px, camera)
+    return through(frame_stars(directions, sigma_px, camera), camera, window)
+
+
+def through(field: FrameStars, camera: Camera, window: Window | None) -> FrameStars:
+    """The field of a camera's frame of which only a window shows something, if it has one."""
+    if window is None:
+        return field
+    left, top, right, bottom = window
+    # a lens bends the sides
+    x, y = np.meshgrid(np.linspace(left, right, 3) - 0.5, np.linspace(top, bottom, 3) - 0.5)
+    v = camera.directions(x.ravel(), y.ravel())
+    xy = v[:, :2] / v[:, 2:] * camera.fx
+    low, high = xy.min(0), xy.max(0)
+    # where the window ends with the frame, the field ends where it did
+    low[[left <= 0, top <= 0]] = -np.inf
+    high[[right >= camera.width, bottom >= camera.height]] = np.inf
+    share = (right - left) * (bottom - top) / (camera.width * camera.height)
+    return field.within(low, high, share)
 
 
 def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars:
@@ -121,11 +144,10 @@ def identifications(
         return
     yield from near_or_lost(field, sky, priors, STAGES, enough)
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
-    rows = evenly_spread(field)
+    rows = second_try(field)
     # each star found keeps those of its cell away: that leaves less area for the others
     left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
-    uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
-    if uneven and len(rows) >= FEWEST_STARS and left_px2 > 0:
+    if rows is not None and left_px2 > 0:
         even, enough = field.take(rows).but(area_px2=left_px2), enough + SECOND_TRY
         for found in chain(
             near_or_lost(even, sky, (), STAGES, enough), _crowded(even, sky, (), enough, CELLS**2 // 2)
@@ -140,6 +162,13 @@ def _crowded(
     stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
     crowded = field.but(tested=crowd)
     yield from near_or_lost(crowded, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
+
+
+def second_try(field: FrameStars) -> np.ndarray | None:
+    """Rows of the stars that are tried where the brightest crowd in few cells; None where they are spread already."""
+    rows = evenly_spread(field)
+    uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
+    return rows if uneven and len(rows) >= FEWEST_STARS else None
 
 
 def evenly_spread(field: FrameStars) -> np.ndarray:

@@ -53,7 +53,7 @@ LEAST_SHARE_SECOND = 0.5
 STEEPEST_BEND = 0.2
 # Between two skies the residuals of neighbours differ by so many px, by their errors times the first number plus the
 # second over the square root of the number of stars, and by this share of what those of distant stars do.
-MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.35
+MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.3
 # Errors of centroids (px) that nobody states.
 LEAST_ERROR_PX = 0.1
 # Of so many stars or more only this share, those that fit best, are compared.

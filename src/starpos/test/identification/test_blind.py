@@ -112,6 +112,14 @@ def test_a_few_false_stars_brighter_than_all_others_do_not_matter(solver, catalo
     assert s.ok and looks(s, axis) > 1 - 1e-6
 
 
+def test_lights_that_crowd_in_one_corner_hide_no_sky(solver, catalogue, rng):
+    xy, axis, _ = seen(catalogue, 13.0, 7.5, rng)
+    town = rng.uniform([0, 0.85 * HEIGHT], [0.3 * WIDTH, HEIGHT - 1], (120, 2))
+    s = solver.identify(listed(np.concatenate([town, xy])))
+    assert s.ok and looks(s, axis) > 1 - 1e-6
+    assert s.star.min() >= len(town)
+
+
 def test_random_points_are_refused_in_bounded_time(solver, rng):
     begin = time.process_time()
     for n in (0, 3, 4, 14):

@@ -224,3 +224,35 @@ def test_coarse_centroids_are_searched_with_their_own_error(catalogue, rng):
             assert np.arccos(np.clip(answer.attitude[2] @ attitude[2], -1, 1)) < 2 / camera.fx
             found += 1
     assert found >= 7
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(
+    "window", [(0, 0, 500, 700), (500, 0, 1000, 700), (0, 0, 1000, 300), (0, 350, 1000, 700)]
+)
+def test_stars_of_a_hidden_part_are_not_missed(window, mirrored, catalogue, rng):
+    camera, limit = FIELDS["15 deg"]
+    sky = sky_for(catalogue, camera)
+    attitude = random_attitude(rng)
+    xy, index = seen(sky, camera, attitude, limit, rng)
+    if mirrored:
+        xy[:, 1] = camera.height - 1 - xy[:, 1]
+    shown = ((xy >= window[:2]) & (xy < window[2:])).all(1)
+    v, sigma = camera.directions(*xy[shown].T), np.full(shown.sum(), 0.05)
+    part = search.identify_frame(search.field_of(v, sigma, camera, window), sky)
+    whole = search.identify_frame(search.field_of(v, sigma, camera), sky)
+    check(part, attitude, index[shown], camera, sky)
+    assert part.mirrored == mirrored
+    # of the brightest stars that should be there, nearly all are
+    of_part, of_whole = (np.isin(a.expected[: len(part.star)], part.catalogue).mean() for a in (part, whole))
+    assert of_part > 0.75
+    assert of_whole < of_part - 0.15
+    assert part.log_odds > whole.log_odds + 3
+
+
+def test_the_area_of_chance_is_that_of_the_window(catalogue, rng):
+    camera, _ = FIELDS["15 deg"]
+    v = camera.directions(*rng.uniform(100, 300, (2, 8)))
+    field = search.field_of(v, np.full(8, 0.05), camera, (0, 0, camera.width // 4, camera.height))
+    assert field.area_px2 == pytest.approx(camera.width // 4 * camera.height)
+    assert 4 * field.half.prod() == pytest.approx(field.area_px2)

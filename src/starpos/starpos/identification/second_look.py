@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the stars detected are too few to decide, the frame itself tells: is there light where fainter stars should be?
+
+A pose that its stars make likely, but not likely enough, says where the catalogue's other stars are. Each of these places
+is compared with those around it, where a star is as likely to be if the pose is wrong. The evidence is the ratio of the
+probabilities of that comparison, so its mean is at most 1 if the pose is wrong, whatever noise the frame has; and as it
+looks only where nothing was detected, it multiplies with the evidence of the detections.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from starpos.core.frame import FrameStars
+from starpos.identification.full import Identification, OnFrame
+from starpos.identification.pose import TEST_STARS, Pose
+from starpos.identification.search import STAGES, Priors, near_or_lost
+from starpos.identification.sky import Sky
+from starpos.instrument.camera import Camera
+
+# What a frame shows at pixels x, y (N,), in sigma of a normal distribution by rank, and the SNR; NaN where it cannot say.
+Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+# Log-odds of a pose that is looked at, and those that accept it. The largest evidence of the detections, at whichever one
+# stops, exceeds y in 1 of y frames; so its product with what a look finds exceeds x in (1 + log(x / worth)) / x of them:
+# once in 1e10 frames. So all tries together fail at most 1.2 times in 1e9.
+WORTH, ENOUGH = 5.0, 26.2
+MOST_LOOKS = 20
+# Nearer to a detection a place tells what is known already; nearer to a brighter star of the catalogue, of that one.
+DETECTED_PX, NEAR_PX = 8.0, 6.0
+# A star may be so much fainter than the stars identified say (all alike), or missing (each); it is expected at most so
+# high, in sigma: a light that is higher tells no more. Fainter stars than the last are not looked for.
+BRIGHTNESS, MISSING, HIGHEST, LOWEST = np.array([0.25, 0.5, 0.8, 1.2]), 0.25, 2.5, 0.5
+
+
+def second_look(
+    field: FrameStars, sky: Sky, priors: Priors, camera: Camera, look: Look
+) -> Identification | None:
+    """Identify a frame whose stars are too few, by the light at the places of others.
+
+    field, priors  as `identify_frame` takes them; the field is that of the camera's pixels, without refraction
+    """
+    seen: set[tuple[bytes, bytes]] = set()
+    for found in near_or_lost(field, sky, priors, STAGES, WORTH):
+        pairs = found.star.tobytes(), found.catalogue.tobytes()
+        if pairs in seen:
+            continue
+        seen.add(pairs)
+        log_odds = found.log_odds + _log_ratio(field, sky, camera, found, look)
+        if log_odds >= ENOUGH:
+            return replace(found, log_odds=log_odds)
+        if len(seen) == MOST_LOOKS:
+            break
+    return None
+
+
+def _log_ratio(field: FrameStars, sky: Sky, camera: Camera, found: Identification, look: Look) -> float:
+    """The logarithm of the evidence for an identification by what was not detected."""
+    pose = Pose(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
+    due = OnFrame.of(field, sky, pose, TEST_STARS)
+    xy, detected = pose.project(due.directions), field.xy[int(found.mirrored)]
+    alone = np.linalg.norm(xy[:, None] - detected, axis=2).min(1) > DETECTED_PX
+    apart = np.linalg.norm(xy[:, None] - xy, axis=2)
+    # rows are sorted: the brighter ones come first
+    alone &= ~np.tril(apart < NEAR_PX, -1).any(1)
+    _, snr = look(*_pixels(sky.directions(found.catalogue), camera, found))
+    lights = (snr * 10 ** (0.4 * sky.catalogue.vmag(found.catalogue)))[~np.isnan(snr)]
+    light = np.median(lights) if len(lights) else 0.0
+    expected = light * 10 ** (-0.4 * sky.catalogue.vmag(due.index))
+    rows = np.flatnonzero(alone & (expected * BRIGHTNESS.max() > LOWEST))
+    height, _ = look(*_pixels(due.directions[rows], camera, found))
+    said = ~np.isnan(height)
+    return log_ratio(height[said], expected[rows[said]])
+
+
+def log_ratio(height: np.ndarray, expected: np.ndarray) -> float:
+    """The logarithm of how much likelier heights (N,), in sigma, are with stars of the expected heights than without."""
+    high = np.minimum(BRIGHTNESS[:, None] * expected, HIGHEST)
+    ratio = MISSING + (1 - MISSING) * np.exp(high * height - high**2 / 2)
+    return float(np.logaddexp.reduce(np.log(ratio).sum(1)) - np.log(len(BRIGHTNESS)))
+
+
+def _pixels(w: np.ndarray, camera: Camera, found: Identification) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels x, y (N,) on the camera's frame of `Sky`'s directions w (N, 3)."""
+    x, y = camera.scaled(found.focal_scale).project(w @ found.attitude.T).T
+    return x, camera.height - 1 - y if found.mirrored else y
