@@ -46,7 +46,7 @@ class SecondLook:
     @cached_property
     def _smooth(self) -> np.ndarray:
         plane, _ = plane_of(self.frame)
-        return np.asarray(smoothed(plane, self._kernel.weight, 0, len(plane)), np.float32)
+        return smoothed(plane, self._kernel.weight, np.arange(len(plane)), 1)
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How bright the places x, y (N,) px are: in sigma of a normal distribution, by rank; and the SNR.
