@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # of --csv; the stars of --json have the same, without the file
 COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
-JSON_HELP = "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], and cpu_ms"
+JSON_HELP = "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], cpu_ms and negative"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -42,13 +42,14 @@ def run(args: argparse.Namespace) -> int:
 def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", output: Output) -> None:
     if isinstance(answer, FrameError):
         console.complain("detect", answer)
-        output.put({"file": path, "stars": [], "cpu_ms": 0.0, "status": "bad input"}, "", ())
+        output.put({"file": path, "stars": [], "cpu_ms": 0.0, "negative": False, "status": "bad input"}, "", ())
         return
     found, cpu_ms = answer
     stars = found if isinstance(found, Stars) else found.stars
     left_out = 0 if isinstance(found, Stars) else found.left_out
     rows = _rows(stars)
-    value = {"file": path, "stars": rows, "cpu_ms": cpu_ms} | ({"left_out": left_out} if left_out else {})
+    value = {"file": path, "stars": rows, "cpu_ms": cpu_ms, "negative": stars.negative}
+    value |= {"left_out": left_out} if left_out else {}
     output.put(
         value, _line(path, found, cpu_ms), [dict(zip(COLUMNS, (path, *row), strict=True)) for row in rows]
     )
@@ -58,6 +59,7 @@ def _line(path: str, found: "Detection | Stars", cpu_ms: float) -> str:
     if isinstance(found, Stars):
         return f"{path}: a list of {len(found)} stars"
     cut = f"; {found.left_out} fainter peaks were too many and are left out" if found.left_out else ""
+    cut += "; a negative: its stars are dark" if found.stars.negative else ""
     return (
         f"{path}: {len(found.stars)} stars, background {found.background:.1f} DN, noise {found.noise:.2f} DN, "
         f"FWHM {found.fwhm_px:.2f} px, chi2 {found.typical_chi2:.2f}, {cpu_ms:.0f} ms{cut}"

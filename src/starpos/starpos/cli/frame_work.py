@@ -102,18 +102,19 @@ def stars_of(item: Frame | Stars) -> Stars:
     """The stars of a list, or those detected on a frame."""
     if isinstance(item, Stars):
         return item
-    from starpos.detection import detect
+    from starpos.detection.negative import detect_dark_too
 
-    return detect(item).stars
+    return detect_dark_too(item).stars
 
 
 def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
     """A second look at the frame of the stars; None for a list."""
     if isinstance(item, Stars):
         return None
+    from starpos.detection.negative import negative_of
     from starpos.detection.second_look import SecondLook
 
-    return SecondLook.of(item, stars)
+    return SecondLook.of(negative_of(item) if stars.negative else item, stars)
 
 
 @dataclass(frozen=True)
@@ -133,11 +134,11 @@ class Detecting:
     read: Reader
 
     def __call__(self, path: str) -> tuple["Detection | Stars", float]:
-        from starpos.detection import detect
+        from starpos.detection.negative import detect_dark_too
 
         item = self.read(path)
         begin = time.process_time()
-        found = item if isinstance(item, Stars) else detect(item)
+        found = item if isinstance(item, Stars) else detect_dark_too(item)
         return found, 1000 * (time.process_time() - begin)
 
 

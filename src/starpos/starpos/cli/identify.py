@@ -18,7 +18,7 @@ from starpos.sky.catalogue import load_catalogue
 
 # of --csv
 COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-           "log_odds", "mirrored", "warnings", "cpu_ms")  # fmt: skip
+           "log_odds", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
 JSON_HELP = (
     "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
     "focal_px, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
@@ -94,6 +94,7 @@ def as_json(path: str, s: Solution) -> dict:
         "residual_arcsec": a.residual_arcsec if a else None,
         "log_odds": a.log_odds if a else None,
         "mirrored": a.mirrored if a else None,
+        "negative": s.negative,
         "status": s.status.value,
         "warnings": list(s.warnings),
         "bright_explained": [s.explained.explained, s.explained.bright] if s.explained else None,
@@ -110,5 +111,6 @@ def _line(path: str, s: Solution) -> str:
         f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
         f"focal length {a.focal_px:.1f} px, log-odds {a.log_odds:.0f}"
         + (", mirrored" if a.mirrored else "")
+        + (", a negative" if s.negative else "")
         + "".join(f", {name}" for name in s.warnings)
     )

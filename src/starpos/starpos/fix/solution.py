@@ -61,6 +61,7 @@ class Solution:
     warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
     explained: how much of the frame the identification explains.
     found: the identification itself, whose rows are those of the input's stars.
+    negative: whether the stars are dark on a bright sky.
     hint: helps to identify the next frame.
     """
 
@@ -83,12 +84,20 @@ class Solution:
     warnings: tuple[str, ...] = ()
     explained: Explained | None = None
     found: Identification | None = None
+    negative: bool = False
 
     @classmethod
     def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
         """A solution that has nothing but its status and message."""
-        number = len(stars) if isinstance(stars, Stars) else 0
-        return cls(status, message, source=stars.source, utc_unix_s=stars.mid_unix_s, stars_detected=number)
+        number, negative = (len(stars), stars.negative) if isinstance(stars, Stars) else (0, False)
+        return cls(
+            status,
+            message,
+            source=stars.source,
+            utc_unix_s=stars.mid_unix_s,
+            stars_detected=number,
+            negative=negative,
+        )
 
     def __repr__(self) -> str:
         found = self.fix.in_degrees if self.fix else self.message

@@ -98,6 +98,7 @@ class Solver:
             source=stars.source,
             utc_unix_s=stars.mid_unix_s,
             stars_detected=len(stars),
+            negative=stars.negative,
             names=tuple(catalogue.names(found.catalogue)),
             star=found.star,
             magnitudes=catalogue.vmag(found.catalogue),

@@ -37,6 +37,7 @@ class Stars(Exposure):
     width, height   px, of the frame
     fwhm_px         width of the star images, px; None: unknown
     window          px, the part of the frame that shows something, where the rest is white; None: all of it
+    negative        whether they are dark on a bright sky, as on a plate
 
     Sequences are converted to arrays. FrameError if the columns do not fit together or hold impossible values.
     """
@@ -51,6 +52,7 @@ class Stars(Exposure):
     height: int
     fwhm_px: float | None = None
     window: Window | None = None
+    negative: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,7 +21,7 @@ SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "l
               "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched",
               "residual_arcsec", "log_odds", "status", "warnings"}  # fmt: skip
 IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-                 "log_odds", "status", "warnings", "bright_explained", "bright_seen", "cpu_ms"}  # fmt: skip
+                 "log_odds", "negative", "status", "warnings", "bright_explained", "bright_seen", "cpu_ms"}  # fmt: skip
 
 
 def objects(out):
