@@ -7,6 +7,8 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from starpos.core.limits cimport within
+
 cimport starpos.core.wide
 
 cdef extern from *:
@@ -132,9 +134,12 @@ def sampled(
     cdef int n = tall // 2 * (wide // 2), i, j, phase, k, y, x, top
     cdef const pixel_t *row
     cdef Clip clip = Clip(per_mad, per_tail, sigmas, share)
-    if not n or tall % 2 or wide % 2 or np.min(rows) < 0 or np.min(columns) < 0:
+    if not n or tall % 2 or wide % 2:
         raise ValueError("a cell's rows and columns must be pairs")
-    if np.max(rows) >= plane.shape[0] or np.max(columns) >= plane.shape[1]:
+    if not (
+        within[int](&rows[0, 0], down * tall, 0, <int>plane.shape[0] - 1)
+        and within[int](&columns[0, 0], across * wide, 0, <int>plane.shape[1] - 1)
+    ):
         raise ValueError(f"a cell lies beyond the {plane.shape[1]} x {plane.shape[0]} px of the frame")
     found, tops = np.empty((2, 4, down, across)), np.empty((2, 4, down, across), np.int32)
     cdef double[:, :, :, ::1] sky = found

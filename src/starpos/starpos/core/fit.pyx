@@ -9,6 +9,7 @@ from libc.string cimport memset
 import numpy as np
 
 from starpos.core.algebra cimport factored, solved
+from starpos.core.limits cimport unsigned_char, within
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
 from starpos.core.sums cimport products, weigh
 
@@ -387,14 +388,13 @@ cdef int sound_stamps(
 ) except -1:
     """Raise ValueError unless shapes and phases of stamps are what a fit reads."""
     cdef Py_ssize_t n = signal.shape[0], size = signal.shape[1]
-    for name, height, width, depth in (
-        ("signal", n, size, signal.shape[2]),
-        ("noise", noise.shape[0], noise.shape[1], noise.shape[2]),
-        ("good", good.shape[0], good.shape[1], good.shape[2]),
-        ("phase", phase.shape[0], phase.shape[1], phase.shape[2]),
+    for name, shape in (
+        ("signal", (n, size, signal.shape[2])),
+        ("noise", (noise.shape[0], noise.shape[1], noise.shape[2])),
+        ("good", (good.shape[0], good.shape[1], good.shape[2])),
+        ("phase", (phase.shape[0], phase.shape[1], phase.shape[2])),
     ):
-        if (height, width, depth) != (n, size, size):
-            raise ValueError(f"{name} has the shape {(height, width, depth)}; {(n, size, size)} is needed")
-    if n and size and np.max(phase) >= rules.phases:
+        if shape != (n, size, size):
+            raise ValueError(f"{name} has the shape {shape}; {(n, size, size)} is needed")
+    if not within[unsigned_char](&phase[0, 0, 0], n * size * size, 0, rules.phases - 1):
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {rules.phases}")
-    return 0

@@ -10,6 +10,7 @@ import numpy as np
 
 cimport starpos.core.wide
 from starpos.core.algebra cimport factored, solved
+from starpos.core.limits cimport unsigned_char, within
 from starpos.core.psf cimport BLOCK, ORDERS, Local, evaluate, local_of, scaled, sound, terms_at
 
 cdef extern from *:
@@ -140,11 +141,14 @@ def marginal(
     ):
         if (images, rows, columns) != (n, size, size):
             raise ValueError(f"pixels {(images, rows, columns)}: {(n, size, size)} are needed")
-    if top.shape[0] != n or orders.shape[1] != 2 or phases not in (1, 4) or (n and np.max(phase) >= phases):
+    if top.shape[0] != n or orders.shape[1] != 2 or phases not in (1, 4):
         raise ValueError(f"{top.shape[0]} rows, {phases} phases, orders of {orders.shape[1]} numbers: {n} rows, 1 or 4, 2")
-    if count and not 0 <= np.min(orders) <= np.max(orders) <= ORDERS:
+    if not within[unsigned_char](&phase[0, 0, 0], n * size * size, 0, phases - 1):
+        raise ValueError(f"a pixel of phase {np.max(phase)}: there are {phases}")
+    if not within[int](&orders[0, 0], 2 * count, 0, ORDERS):
         raise ValueError(f"terms of orders to {np.max(orders)}: they must be 0 to {ORDERS}")
-    highest = max(1, np.max(orders, initial=1))
+    for k in range(count):
+        highest = max(highest, max(orders[k, 0], orders[k, 1]))
     out, right_ = np.empty((n, count, count)), np.empty((n, count))
     cdef double[:, :, ::1] normals = out
     cdef double[:, ::1] rights = right_

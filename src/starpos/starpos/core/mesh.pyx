@@ -2,10 +2,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Meshes of the sky: evened out, and how far a smoothed frame is above them."""
 
-from libc.math cimport fabs, sqrt
+from libc.math cimport fabs, nextafter, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
+
+from starpos.core.limits cimport within
 
 cdef enum:
     # Cells that a mesh is continued by before it is evened out.
@@ -99,6 +101,11 @@ cdef inline double _down(const double *m, Py_ssize_t stride) noexcept nogil:
     return (m[-stride] + m[0] + m[stride]) / 3
 
 
+cdef bint _inside(const double[::1] place, Py_ssize_t cells) noexcept nogil:
+    """Whether all places are between the first and the last of so many cells."""
+    return within[double](&place[0], place.shape[0], 0, nextafter(cells - 1, 0))
+
+
 def above(
     const float[:, ::1] value, const double[:, :, ::1] level, const double[:, :, ::1] noise, const double[::1] row,
     const double[::1] column,
@@ -111,12 +118,8 @@ def above(
     cdef double sky, noise2, one, share, down
     if row.shape[0] != tall or column.shape[0] != wide:
         raise ValueError(f"{row.shape[0]} rows and {column.shape[0]} columns of {tall} x {wide} values: as many are needed")
-    for name, least, most, size in (
-        ("rows", np.min(row, initial=0), np.max(row, initial=0), level.shape[1]),
-        ("columns", np.min(column, initial=0), np.max(column, initial=0), level.shape[2]),
-    ):
-        if not 0 <= least <= most < size - 1:
-            raise ValueError(f"{name} {least} to {most} in a mesh of {size}")
+    if not (_inside(row, level.shape[1]) and _inside(column, level.shape[2])):
+        raise ValueError(f"a row or a column beyond a mesh of {level.shape[1]} x {level.shape[2]} cells")
     if level.shape[0] != noise.shape[0] or level.shape[1] != noise.shape[1] or level.shape[2] != noise.shape[2]:
         raise ValueError("as many cells of noise as of level are needed")
     cdef Py_ssize_t cells = level.shape[2], phases = level.shape[0]

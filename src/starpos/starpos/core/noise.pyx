@@ -7,6 +7,8 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from starpos.core.limits cimport within
+
 cdef enum:
     ROUNDS = 4
 
@@ -93,7 +95,7 @@ def light_noise(
     cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], count = 0, k, j, row
     cdef double misfit2
     _alike(noise, model, residual, used, leverage)
-    if noise.shape[0] != n or (n and not 0 <= np.min(rows) <= np.max(rows) < model.shape[0]):
+    if noise.shape[0] != n or not within[Py_ssize_t](&rows[0], n, 0, model.shape[0] - 1):
         raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
     cdef Pixel *each = <Pixel *>malloc(max(n * area, 1) * sizeof(Pixel))
     if each == NULL:

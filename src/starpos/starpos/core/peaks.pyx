@@ -2,6 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Peaks of a smoothed frame, in one pass over its 8- or 16-bit pixels: a few rows at a time, which stay in the cache."""
 
+from libc.math cimport INFINITY, fabs
 from libc.stdlib cimport free, malloc, realloc
 from libc.string cimport memset
 
@@ -11,25 +12,37 @@ cimport starpos.core.wide
 
 cdef extern from *:
     """
-    /* Set `out` to a row times its weight and three pairs of others, each times its weight; or add three pairs. */
-    #define STARPOS_SMOOTH(kind, pixel, sum) \\
-        STARPOS_WIDE static void starpos_begin_##kind( \\
-                float *restrict out, const float *w, Py_ssize_t n, const pixel *m, const pixel *const *p) { \\
-            const float s = w[0], t = w[1], u = w[2], v = w[3]; \\
-            const pixel *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5]; \\
-            for (Py_ssize_t i = 0; i < n; i++) \\
-                out[i] = s * m[i] + (t * ((sum)a[i] + b[i]) + u * ((sum)c[i] + d[i]) + v * ((sum)e[i] + f[i])); \\
-        } \\
-        STARPOS_WIDE static void starpos_add_##kind( \\
-                float *restrict out, const float *w, Py_ssize_t n, const pixel *const *p) { \\
-            const float t = w[0], u = w[1], v = w[2]; \\
-            const pixel *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5]; \\
-            for (Py_ssize_t i = 0; i < n; i++) \\
-                out[i] += t * ((sum)a[i] + b[i]) + u * ((sum)c[i] + d[i]) + v * ((sum)e[i] + f[i]); \\
+    /* Take a row of n pixels; the highest. */
+    #define STARPOS_WIDEN(kind, pixel) \
+        STARPOS_WIDE static int starpos_widen_##kind(float *restrict out, const pixel *restrict row, Py_ssize_t n) { \
+            pixel highest = 0; \
+            for (Py_ssize_t i = 0; i < n; i++) \
+                highest = row[i] > highest ? row[i] : highest; \
+            for (Py_ssize_t i = 0; i < n; i++) \
+                out[i] = row[i]; \
+            return highest; \
         }
-    STARPOS_SMOOTH(8, unsigned char, int)
-    STARPOS_SMOOTH(16, unsigned short, int)
-    STARPOS_SMOOTH(float, float, float)
+    STARPOS_WIDEN(8, unsigned char) STARPOS_WIDEN(16, unsigned short)
+    /* Set `out` to a row times its weight and three pairs of others, each times its weight; or add three pairs. */
+    STARPOS_WIDE static void starpos_begin(float *restrict out, const float *w, Py_ssize_t n, const float *m, const float *const *p) {
+        const float s = w[0], t = w[1], u = w[2], v = w[3];
+        const float *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5];
+        for (Py_ssize_t i = 0; i < n; i++)
+            out[i] = s * m[i] + (t * (a[i] + b[i]) + u * (c[i] + d[i]) + v * (e[i] + f[i]));
+    }
+    STARPOS_WIDE static void starpos_add(float *restrict out, const float *w, Py_ssize_t n, const float *const *p) {
+        const float t = w[0], u = w[1], v = w[2];
+        const float *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5];
+        for (Py_ssize_t i = 0; i < n; i++)
+            out[i] += t * (a[i] + b[i]) + u * (c[i] + d[i]) + v * (e[i] + f[i]);
+    }
+    /* Whether the sum of a pixel and the next one is above the limit. */
+    STARPOS_WIDE static int starpos_any_pair(const float *restrict row, float limit, Py_ssize_t n) {
+        int any = 0;
+        for (Py_ssize_t i = 0; i < n; i++)
+            any |= row[i] + row[i + 1] > limit;
+        return any;
+    }
     /* Whether a pixel of the row is above its limit. */
     STARPOS_WIDE static int starpos_any_above(const float *restrict row, const float *restrict limit, Py_ssize_t n) {
         int any = 0;
@@ -38,12 +51,11 @@ cdef extern from *:
         return any;
     }
     """
-    void begin_8 "starpos_begin_8"(float *out, const float *w, Py_ssize_t n, const unsigned char *middle, const unsigned char **p) noexcept nogil
-    void add_8 "starpos_add_8"(float *out, const float *w, Py_ssize_t n, const unsigned char **p) noexcept nogil
-    void begin_16 "starpos_begin_16"(float *out, const float *w, Py_ssize_t n, const unsigned short *middle, const unsigned short **p) noexcept nogil
-    void add_16 "starpos_add_16"(float *out, const float *w, Py_ssize_t n, const unsigned short **p) noexcept nogil
-    void begin_float "starpos_begin_float"(float *out, const float *w, Py_ssize_t n, const float *middle, const float **p) noexcept nogil
-    void add_float "starpos_add_float"(float *out, const float *w, Py_ssize_t n, const float **p) noexcept nogil
+    int widen_8 "starpos_widen_8"(float *out, const unsigned char *row, Py_ssize_t n) noexcept nogil
+    int widen_16 "starpos_widen_16"(float *out, const unsigned short *row, Py_ssize_t n) noexcept nogil
+    void begin "starpos_begin"(float *out, const float *w, Py_ssize_t n, const float *middle, const float **p) noexcept nogil
+    void add "starpos_add"(float *out, const float *w, Py_ssize_t n, const float **p) noexcept nogil
+    bint any_pair "starpos_any_pair"(const float *row, float limit, Py_ssize_t n) noexcept nogil
     bint any_above "starpos_any_above"(const float *row, const float *limit, Py_ssize_t n) noexcept nogil
 
 ctypedef unsigned char unsigned_char
@@ -53,9 +65,13 @@ ctypedef fused pixel_t:
     unsigned short
 
 cdef enum:
-    # Pairs of rows that are added at once, and pixels of a row that are compared at once.
+    # Pairs of rows that are added at once, and pixels of a row that are compared, and smoothed along it, at once.
     TOGETHER = 3
-    BLOCK = 256
+    BLOCK = 128
+
+
+# Of the single precision in which rows are smoothed, with a margin.
+cdef float ROUNDING = 1e-5
 
 
 cdef struct Group:
@@ -71,37 +87,64 @@ cdef struct Groups:
     Group *each
     int count
     int room
-    # Of each pixel of this row and of the one above, its group, or -1.
+    # Of each pixel of this row and of the one above, its group, or -1; the last row that has any.
     int *here
     int *above
+    Py_ssize_t last
 
 
 cdef struct Smoother:
-    # Weights from the middle outwards, with 0 up to whole triples; a row with margins.
+    # Weights from the middle outwards, with 0 up to whole triples.
     float *weight
     int reach
     int padded
-    float *margined
+    # A row with its margins.
+    Py_ssize_t stride
+    # Rows of the plane around the last one that was smoothed, row % slots at its place; `end` is the row after these.
+    float *plain
+    int slots
+    Py_ssize_t last
+    Py_ssize_t end
+    # Of each row of the plane that has been taken the highest pixel; NULL if nobody asked.
+    int *highest
+    # No smoothed pixel is above half so many times the highest sum of two neighbours among those it is made of.
+    float over
+
+
+cdef struct Window:
+    # Rows, row % kept at its place: smoothed across, with margins, and of these the blocks that are smoothed along too.
+    int kept
+    Py_ssize_t width
+    Py_ssize_t blocks
+    float *across
+    float *smooth
+    unsigned char *known
+    # Of a strip the limit of each pixel, and of each block what a sum of two neighbours must exceed.
+    float *limit
+    float *least
 
 
 cdef int _begin(Smoother *s, Py_ssize_t width, const float[::1] weight) except -1:
     """Take memory for smoothing rows."""
     cdef int k
+    cdef double share = 0.0
     s.reach = weight.shape[0] - 1
+    if s.reach < 1:
+        raise ValueError("a kernel of a single pixel smooths nothing")
     s.padded = max(3, (s.reach + 2) // 3 * 3)
-    s.margined = <float *>malloc((width + 3 * s.padded + 1) * sizeof(float))
-    if s.margined == NULL:
+    s.stride, s.slots, s.last, s.end = width + 2 * s.padded, 2 * s.reach + 1, 0, 0
+    s.highest = NULL
+    s.plain = <float *>malloc((s.slots * width + s.padded + 1) * sizeof(float))
+    if s.plain == NULL:
         raise MemoryError
-    s.weight = s.margined + width + 2 * s.padded
-    for k in range(s.padded + 1):
+    s.weight, s.over = s.plain + s.slots * width, 1.0
+    for k in range(s.padded, -1, -1):
         s.weight[k] = weight[k] if k <= s.reach else 0.0
+        # the kernel is a sum of pairs of neighbours, each with a share of the weight, and a rest in the middle
+        share = 2 * s.weight[k] - share if k else share
+        s.over = s.over if share >= 0 else INFINITY
+    s.over = s.over * (1 + fabs(s.weight[0] - share)) * (1 + ROUNDING)
     return 0
-
-
-cdef void _smooth_row(const pixel_t[:, ::1] plane, const Smoother *s, Py_ssize_t row, float *out) noexcept nogil:
-    """Set `out` (w,) to a row of the smoothed plane."""
-    _across_rows(plane, s, row, s.margined + s.padded)
-    _along_row(s, plane.shape[1], out)
 
 
 def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
@@ -117,21 +160,20 @@ def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssiz
         raise ValueError(f"rows and steps of {step} px beyond the {width} x {plane.shape[0]} px of the frame")
     out = np.empty((rows.shape[0], (width + step - 1) // step), np.float32)
     cdef float[:, ::1] smooth = out
-    cdef float *whole = <float *>malloc(width * sizeof(float))
-    if whole == NULL:
+    _begin(&s, width, weight)
+    cdef float *across = <float *>malloc((s.stride + width) * sizeof(float))
+    if across == NULL:
+        free(s.plain)
         raise MemoryError
-    try:
-        _begin(&s, width, weight)
-    except MemoryError:
-        free(whole)
-        raise
+    cdef float *whole = across + s.stride
     with nogil:
         for k in range(rows.shape[0]):
-            _smooth_row(plane, &s, rows[k], whole)
+            _smooth_across(plane, &s, rows[k], across)
+            _smooth_along(&s, across + s.padded, width, whole)
             for x in range(smooth.shape[1]):
                 smooth[k, x] = whole[x * step]
-    free(s.margined)
-    free(whole)
+    free(s.plain)
+    free(across)
     return out
 
 
@@ -145,49 +187,63 @@ def peaks(
                  end; linear between them
     first, last  the rows in which peaks are looked for
 
-    Peaks side by side are one. Returns x, y (N,) px, their means, and the smoothed value (N,).
+    Peaks side by side are one. Returns x, y (N,) px, their means, the smoothed value (N,), and the highest pixel of each row.
     """
     cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1]
-    cdef int kept = 2 * flat + 1, row, done = max(first - flat, 0)
+    cdef int row, done = max(first - flat, 0)
     cdef Groups g
     cdef Smoother s
-    g.each, g.count, g.room = NULL, 0, 0
+    cdef Window w
+    highest_ = np.zeros(height, np.int32)
+    cdef int[::1] highest = highest_
+    if limit.shape[1] < 3 or not 0 <= first <= last <= height or limit.shape[0] * strip < last:
+        raise ValueError(f"limits of {limit.shape[0]} strips of {strip} rows, in {limit.shape[1]} cells, for rows {first} to {last}")
+    w.kept, w.width, w.blocks = 2 * flat + 1, width, (width + BLOCK - 1) // BLOCK
+    g.each, g.count, g.room, g.last = NULL, 0, 0, -3
     _begin(&s, width, weight)
-    cdef float *smooth = <float *>malloc(kept * width * sizeof(float))
+    s.highest = &highest[0]
+    w.across = <float *>malloc((w.kept * (s.stride + width) + width + w.blocks) * sizeof(float))
+    w.known = <unsigned char *>malloc(w.kept * w.blocks)
     cdef int *marks = <int *>malloc(2 * (width + 2) * sizeof(int))
-    cdef float *wanted = <float *>malloc(width * sizeof(float))
     try:
-        if smooth == NULL or marks == NULL or wanted == NULL:
+        if w.across == NULL or w.known == NULL or marks == NULL:
             raise MemoryError
-        if limit.shape[1] < 3 or not 0 <= first <= last <= height or limit.shape[0] * strip < last:
-            raise ValueError(f"limits of {limit.shape[0]} strips of {strip} rows, in {limit.shape[1]} cells, for rows {first} to {last}")
+        w.smooth = w.across + w.kept * s.stride
+        w.limit = w.smooth + w.kept * width
+        w.least = w.limit + width
         g.here, g.above = marks, marks + width + 2
         with nogil:
             memset(marks, 0xFF, 2 * (width + 2) * sizeof(int))
             for row in range(first, last):
                 while done < min(row + flat + 1, <int>height):
-                    _smooth_row(plane, &s, done, smooth + (done % kept) * width)
+                    _smooth_across(plane, &s, done, w.across + (done % w.kept) * s.stride)
+                    memset(w.known + (done % w.kept) * w.blocks, 0, w.blocks)
                     done += 1
                 if row == first or row % strip == 0:
-                    _spread(&limit[row // strip, 0], limit.shape[1], width, wanted)
-                _take_peaks(smooth, kept, width, height, row, flat, wanted, &g)
-        return _columns(&g)
+                    _spread(&limit[row // strip, 0], limit.shape[1], &s, &w)
+                _take_peaks(&s, &w, height, row, flat, &g)
+        return *_columns(&g), highest_[first:last]
     finally:
-        free(smooth)
+        free(w.across)
+        free(w.known)
         free(marks)
-        free(wanted)
-        free(s.margined)
+        free(s.plain)
         free(g.each)
 
 
-cdef void _spread(const float *cell, Py_ssize_t cells, Py_ssize_t width, float *out) noexcept nogil:
-    """Spread values in cells over a row of pixels."""
-    cdef Py_ssize_t x, left
-    cdef double place
-    for x in range(width):
-        place = (x + 0.5) * (cells - 2) / width + 0.5
-        left = <Py_ssize_t>place
-        out[x] = cell[left] + <float>(place - left) * (cell[left + 1] - cell[left])
+cdef void _spread(const float *cell, Py_ssize_t cells, const Smoother *s, Window *w) noexcept nogil:
+    """Spread limits in cells over the pixels of a row."""
+    cdef Py_ssize_t x, left, block
+    cdef double place, step = (cells - 2) / <double>w.width
+    cdef float least
+    for block in range(w.blocks):
+        least = INFINITY
+        for x in range(block * BLOCK, min((block + 1) * BLOCK, w.width)):
+            place = (x + 0.5) * step + 0.5
+            left = <int>place
+            w.limit[x] = cell[left] + <float>(place - left) * (cell[left + 1] - cell[left])
+            least = min(least, w.limit[x])
+        w.least[block] = 2 * least / s.over
 
 
 cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
@@ -197,77 +253,97 @@ cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
     return k if n > 1 else 0
 
 
-cdef void _across_rows(const pixel_t[:, ::1] plane, const Smoother *s, Py_ssize_t row, float *out) noexcept nogil:
-    """Smooth a row with those above and below it."""
-    cdef const pixel_t *pair[2 * TOGETHER]
+cdef void _smooth_across(const pixel_t[:, ::1] plane, Smoother *s, Py_ssize_t row, float *out) noexcept nogil:
+    """Set `out` (stride,) to a row smoothed with those above and below it, and its margins."""
+    cdef const float *pair[2 * TOGETHER]
     cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1]
-    cdef int k, j, near
+    cdef float *smooth = out + s.padded
+    cdef int k, j, near, highest
+    # no row of use is there before a row above the last one, or far below it
+    if row < s.last or row - s.reach > s.end:
+        s.end = max(row - s.reach, 0)
+    s.last = row
+    while s.end < min(row + s.reach + 1, height):
+        if pixel_t is unsigned_char:
+            highest = widen_8(s.plain + (s.end % s.slots) * width, &plane[s.end, 0], width)
+        else:
+            highest = widen_16(s.plain + (s.end % s.slots) * width, &plane[s.end, 0], width)
+        if s.highest != NULL:
+            s.highest[s.end] = highest
+        s.end += 1
     for k in range(1, s.padded + 1, 3):
         for j in range(TOGETHER):
             # a weight of 0 takes any row
             near = k + j if k + j <= s.reach else 0
-            pair[2 * j] = &plane[_mirrored(row - near, height), 0]
-            pair[2 * j + 1] = &plane[_mirrored(row + near, height), 0]
-        if pixel_t is unsigned_char:
-            if k == 1:
-                begin_8(out, s.weight, width, &plane[row, 0], pair)
-            else:
-                add_8(out, &s.weight[k], width, pair)
+            pair[2 * j] = s.plain + (_mirrored(row - near, height) % s.slots) * width
+            pair[2 * j + 1] = s.plain + (_mirrored(row + near, height) % s.slots) * width
+        if k == 1:
+            begin(smooth, s.weight, width, s.plain + (row % s.slots) * width, pair)
         else:
-            if k == 1:
-                begin_16(out, s.weight, width, &plane[row, 0], pair)
-            else:
-                add_16(out, &s.weight[k], width, pair)
-
-
-cdef void _along_row(const Smoother *s, Py_ssize_t width, float *out) noexcept nogil:
-    """Smooth along itself the row in s.margined."""
-    cdef const float *pair[2 * TOGETHER]
-    cdef float *row = s.margined + s.padded
-    cdef int k, j
+            add(smooth, &s.weight[k], width, pair)
     for k in range(1, s.padded + 1):
-        row[-k], row[width - 1 + k] = row[_mirrored(-k, width)], row[_mirrored(width - 1 + k, width)]
+        smooth[-k], smooth[width - 1 + k] = smooth[_mirrored(-k, width)], smooth[_mirrored(width - 1 + k, width)]
+
+
+cdef void _smooth_along(const Smoother *s, const float *row, Py_ssize_t n, float *out) noexcept nogil:
+    """Smooth n pixels of a row, which has margins, along it."""
+    cdef const float *pair[2 * TOGETHER]
+    cdef int k, j
     for k in range(1, s.padded + 1, 3):
         for j in range(TOGETHER):
             pair[2 * j], pair[2 * j + 1] = row - (k + j), row + (k + j)
         if k == 1:
-            begin_float(out, s.weight, width, row, pair)
+            begin(out, s.weight, n, row, pair)
         else:
-            add_float(out, &s.weight[k], width, pair)
+            add(out, &s.weight[k], n, pair)
 
 
-cdef int _take_peaks(
-    const float *smooth, int kept, Py_ssize_t width, Py_ssize_t height, Py_ssize_t row, int flat, const float *limit,
-    Groups *g,
-) except -1 nogil:
-    """Add the peaks of a row to their groups."""
-    cdef const float *own = smooth + (row % kept) * width
-    cdef const float *other
-    cdef Py_ssize_t block, first, x, i, y
-    cdef float value
-    cdef bint highest
+cdef void _finish(const Smoother *s, Window *w, Py_ssize_t row, Py_ssize_t block) noexcept nogil:
+    """Smooth a block of a row along the row too, unless it has been."""
+    cdef Py_ssize_t place = row % w.kept, first = block * BLOCK
+    if not w.known[place * w.blocks + block]:
+        w.known[place * w.blocks + block] = True
+        _smooth_along(
+            s, w.across + place * s.stride + s.padded + first, min(BLOCK, w.width - first), w.smooth + place * w.width + first
+        )
+
+
+cdef int _take_peaks(const Smoother *s, Window *w, Py_ssize_t height, Py_ssize_t row, int flat, Groups *g) except -1 nogil:
+    """Add the peaks of a row to their groups. Most blocks are too dark for a peak: they are not smoothed along the row."""
+    cdef const float *own = w.smooth + (row % w.kept) * w.width
+    # the first pixel that the row's first one is made of
+    cdef const float *across = w.across + (row % w.kept) * s.stride + s.padded - s.reach
+    cdef Py_ssize_t top = max(row - flat, 0), bottom = min(row + flat + 1, height), block, first, count, x, y, k
     g.here, g.above = g.above, g.here
-    memset(g.here, 0xFF, (width + 2) * sizeof(int))
-    for block in range((width + BLOCK - 1) // BLOCK):
+    if g.last >= row - 2:
+        memset(g.here, 0xFF, (w.width + 2) * sizeof(int))
+    for block in range(w.blocks):
         first = block * BLOCK
-        if not any_above(own + first, limit + first, min(BLOCK, width - first)):
+        count = min(BLOCK, w.width - first)
+        if not any_pair(across + first, w.least[block], count + 2 * s.reach - 1):
             continue
-        for x in range(first, min(first + BLOCK, width)):
-            value = own[x]
-            if not value > limit[x]:
-                continue
-            highest = True
-            for y in range(max(row - flat, 0), min(row + flat + 1, height)):
-                other = smooth + (y % kept) * width
-                for i in range(max(x - flat, 0), min(x + flat + 1, width)):
-                    if other[i] > value:
-                        highest = False
-                        break
-                if not highest:
-                    break
-            if highest:
-                _join(g, x, row, value)
+        _finish(s, w, row, block)
+        if not any_above(own + first, w.limit + first, count):
+            continue
+        for y in range(top, bottom):
+            for k in range(max(first - flat, 0) // BLOCK, (min(first + count + flat, w.width) - 1) // BLOCK + 1):
+                _finish(s, w, y, k)
+        for x in range(first, first + count):
+            if own[x] > w.limit[x] and _is_highest(w, top, bottom, max(x - flat, 0), min(x + flat + 1, w.width), own[x]):
+                _join(g, x, row, own[x])
     return 0
+
+
+cdef bint _is_highest(const Window *w, Py_ssize_t top, Py_ssize_t bottom, Py_ssize_t left, Py_ssize_t right, float value) noexcept nogil:
+    """Whether no pixel in a box is above the value."""
+    cdef const float *other
+    cdef Py_ssize_t y, x
+    for y in range(top, bottom):
+        other = w.smooth + (y % w.kept) * w.width
+        for x in range(left, right):
+            if other[x] > value:
+                return False
+    return True
 
 
 cdef int _join(Groups *g, Py_ssize_t x, Py_ssize_t y, float value) except -1 nogil:
@@ -305,7 +381,7 @@ cdef int _join(Groups *g, Py_ssize_t x, Py_ssize_t y, float value) except -1 nog
     g.each[group].y += y
     g.each[group].value += value
     g.each[group].count += 1
-    g.here[x + 1] = group
+    g.here[x + 1], g.last = group, y
     return 0
 
 

@@ -2,27 +2,9 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """What a sparse look at the 8- or 16-bit pixels of a frame shows: flat blocks, and bright squares."""
 
-from libc.stdlib cimport free, malloc
-
 import numpy as np
 
-cimport starpos.core.wide
-
-cdef extern from *:
-    """
-    /* Whether one of n pixels is above a limit. */
-    #define STARPOS_ANY(kind, pixel) \\
-        STARPOS_WIDE static int starpos_any_##kind(const pixel *v, Py_ssize_t n, int limit) { \\
-            int most = -1; \\
-            for (Py_ssize_t i = 0; i < n; i++) \\
-                most = v[i] > most ? v[i] : most; \\
-            return most > limit; \\
-        }
-    STARPOS_ANY(8, unsigned char)
-    STARPOS_ANY(16, unsigned short)
-    """
-    bint any_8 "starpos_any_8"(const unsigned char *v, Py_ssize_t n, int limit) noexcept nogil
-    bint any_16 "starpos_any_16"(const unsigned short *v, Py_ssize_t n, int limit) noexcept nogil
+from starpos.core.limits cimport within
 
 ctypedef unsigned char unsigned_char
 
@@ -34,9 +16,10 @@ ctypedef fused pixel_t:
 def any_flat(const pixel_t[:, ::1] plane, const Py_ssize_t[::1] rows, const Py_ssize_t[::1] columns):
     """Whether a block of 8 x 8 equal pixels above 0 is among some of a plane's blocks: those in these rows and columns of them."""
     cdef Py_ssize_t i, j
-    if np.min(rows, initial=0) < 0 or np.min(columns, initial=0) < 0:
-        raise ValueError("blocks are numbered from 0")
-    if 8 * np.max(rows, initial=-1) + 8 > plane.shape[0] or 8 * np.max(columns, initial=-1) + 8 > plane.shape[1]:
+    if not (
+        within[Py_ssize_t](&rows[0], rows.shape[0], 0, plane.shape[0] // 8 - 1)
+        and within[Py_ssize_t](&columns[0], columns.shape[0], 0, plane.shape[1] // 8 - 1)
+    ):
         raise ValueError(f"a block lies beyond the {plane.shape[1]} x {plane.shape[0]} px of the frame")
     for i in range(rows.shape[0]):
         for j in range(columns.shape[0]):
@@ -56,26 +39,24 @@ cdef bint _is_flat(const pixel_t *block, Py_ssize_t width) noexcept nogil:
     return True
 
 
-def bright_squares(const pixel_t[:, ::1] plane, int step, int limit):
+def bright_squares(const pixel_t[:, ::1] plane, const int[::1] highest, int step, int limit):
     """Pixels of every so manieth row and column of a plane that are above a limit, with one more to the right and below.
+
+    highest (h,): of each row the highest pixel
 
     Returns their rows and columns (N,), px, and the lowest of the 2 x 2 pixels of which each is the first, (N,).
     """
     cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1], count = 0, i, j, x
     cdef Py_ssize_t down, across
     cdef const pixel_t *line
-    if step < 1 or not (height and width):
-        raise ValueError(f"steps of {step} px in a frame of {width} x {height} px: there is nothing to see")
+    if step < 1 or not (height and width) or highest.shape[0] != height:
+        raise ValueError(f"steps of {step} px, {highest.shape[0]} rows in a frame of {width} x {height} px: there is nothing to see")
     down, across = (height + step - 2) // step, (width + step - 2) // step
-    cdef unsigned char *bright = <unsigned char *>malloc(max(down, 1))
-    if bright == NULL:
-        raise MemoryError
     with nogil:
         for i in range(down):
             line = &plane[i * step, 0]
-            # a whole row takes less time than every so manieth of its pixels, and most rows hold nothing bright
-            bright[i] = any_8(line, width, limit) if pixel_t is unsigned_char else any_16(line, width, limit)
-            for j in range(across if bright[i] else 0):
+            # most rows hold nothing bright
+            for j in range(across if highest[i * step] > limit else 0):
                 count += line[j * step] > limit
     places_, lowest_ = np.empty((2, count), np.intp), np.empty(count)
     cdef Py_ssize_t[:, ::1] place = places_
@@ -84,13 +65,12 @@ def bright_squares(const pixel_t[:, ::1] plane, int step, int limit):
     with nogil:
         for i in range(down):
             line = &plane[i * step, 0]
-            for j in range(across if bright[i] else 0):
+            for j in range(across if highest[i * step] > limit else 0):
                 x = j * step
                 if line[x] > limit:
                     place[0, count], place[1, count] = i * step, x
                     lowest[count] = min(min(line[x], line[x + 1]), min(line[width + x], line[width + x + 1]))
                     count += 1
-    free(bright)
     return places_[0], places_[1], lowest_
 
 

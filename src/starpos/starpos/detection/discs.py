@@ -29,14 +29,19 @@ OFF_CENTRE = 0.04
 GROWTH = 2.0
 
 
-def find_discs(plane: np.ndarray, background: Background, fwhm_px: float) -> dict[str, np.ndarray]:
-    """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2."""
+def find_discs(
+    plane: np.ndarray, background: Background, fwhm_px: float, highest: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2.
+
+    highest (h,) int32: the brightest pixel of each row.
+    """
     level, noise = background.typical
     least = max(WIDER * fwhm_px, LEAST_PX)
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
     # no single hot pixel
-    y, x, height = bright_squares(plane, step, int(level + CLEAR * noise))
+    y, x, height = bright_squares(plane, highest, step, int(level + CLEAR * noise))
     if height.max(initial=0) < level + CLEAR * noise:
         return columns_of([], fwhm_px, 0.0)
     top = float(height.max())

@@ -60,11 +60,12 @@ SHARP = Kernel(1.2, 3, 2)
 WIDE = Kernel(4.0, 10, 7)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Peaks:
     """Peaks of the smoothed frame, highest first: x, y (N,) int px and height (N,) in sigma of the smoothed noise.
 
     correlation  noise of the smoothed frame, over what independent pixels would give; 1 or more
+    highest      (h,) int32: the frame's brightest pixel in each row
     left_out     how many lower peaks there were besides
     """
 
@@ -72,6 +73,7 @@ class Peaks:
     y: np.ndarray
     height: np.ndarray
     correlation: float
+    highest: np.ndarray
     left_out: int = 0
 
 
@@ -108,8 +110,8 @@ def _crowded(peaks: Peaks) -> bool:
         return False
     leaders = points[:LEADERS]
     alike = points[peaks.height > 0.5 * peaks.height[len(leaders) - 1]]
-    nearest = spatial.cKDTree(alike).query(leaders, 2)[0][:, 1]
-    return bool(np.median(nearest) < CROWD)
+    nearest = spatial.cKDTree(alike).query(leaders, [2])[0].ravel()
+    return median(nearest) < CROWD
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
@@ -170,7 +172,7 @@ def _peaks_of(
     first, last = first.astype(int), last.astype(int) + 1
     rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
     floor = (level + threshold * noise).astype(np.float32)[rows].min(1)
-    x, y, value = _in_parts(plane, kernel, floor, threads)
+    x, y, value, highest = _in_parts(plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
     local, sigma = between(np.stack([level, noise]), *background.cell(x, y)).T
     height = (value - local) / sigma
@@ -187,7 +189,14 @@ def _peaks_of(
     keep = keep[np.argsort(-height[keep], kind="stable")]
     x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
     left_out += max(0, len(x) - limit)
-    return Peaks(x[:limit], y[:limit], height[:limit], correlation, left_out)
+    return Peaks(
+        x=x[:limit],
+        y=y[:limit],
+        height=height[:limit],
+        correlation=correlation,
+        highest=highest,
+        left_out=left_out,
+    )
 
 
 def _chunks(count: int) -> list[slice]:
@@ -195,21 +204,21 @@ def _chunks(count: int) -> list[slice]:
     return [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
 
 
-def _in_parts(
-    plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, cells), found by so many threads."""
+def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int) -> tuple[np.ndarray, ...]:
+    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, cells), and each row's highest pixel (h,).
+
+    So many threads look for them.
+    """
     height, parts = plane.shape[0], min(threads, len(limit))
     ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
 
-    def found(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def found(k: int) -> tuple[np.ndarray, ...]:
         return peaks(plane, kernel.weight, kernel.flat, limit, STRIP, ends[k], ends[k + 1])
 
     if parts == 1:
         return found(0)
     with ThreadPoolExecutor(parts) as pool:
-        x, y, value = (np.concatenate(column) for column in zip(*pool.map(found, range(parts)), strict=True))
-    return x, y, value
+        return tuple(np.concatenate(column) for column in zip(*pool.map(found, range(parts)), strict=True))
 
 
 def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) -> tuple[float, float]:

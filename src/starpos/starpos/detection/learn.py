@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learn a frame's PSF, colour gains and photon noise from its own bright stars."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -221,9 +222,11 @@ def _most_alike(stamps: Stamps) -> np.ndarray:
 def reach_of(psf: Psf) -> int:
     """Distance from a star's centre, px, at which its stamp ends: 3.5 widths of the widest star in the field."""
     (left, top), (right, bottom) = psf.box
-    x, y = left + (right - left) * QUARTERS, top + (bottom - top) * QUARTERS
+    # where the widths are the same everywhere, one place tells them
+    quarters = QUARTERS if len(psf.widths) > 1 else QUARTERS[:1]
+    x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
     widest = np.linalg.eigvalsh(psf.at(np.tile(x, len(y)), np.repeat(y, len(x))).shape).max()
-    return int(np.clip(np.ceil(3.5 * np.sqrt(widest)) + 1, 4, MAX_REACH))
+    return min(max(math.ceil(3.5 * math.sqrt(widest)) + 1, 4), MAX_REACH)
 
 
 def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
@@ -288,7 +291,7 @@ def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Re
     x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
     scale = gains_at(fit.gains[sound], stamps.phase) * flux[:, None, None]
     left, top = stamps.corner(x, y)
-    light = scale * psf.at(x, y).evaluate(left, top, stamps.size)[0]
+    light = fit.model[sound]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
     variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
     weight = fit.used[sound] * scale**2 / variance

@@ -212,7 +212,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     columns = resolve(columns, lesson.psf)
     fwhm_px = lesson.psf.fwhm_px
-    columns = with_discs(columns, find_discs(plane, background, fwhm_px), fwhm_px)
+    columns = with_discs(columns, find_discs(plane, background, fwhm_px, peaks.highest), fwhm_px)
     if fwhm_px < WIDE_FWHM:
         columns = with_clipped(columns, plane, background, x, y, fwhm_px)
     columns = {name: column[: settings.max_stars] for name, column in columns.items()}

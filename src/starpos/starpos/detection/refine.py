@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine a PSF by stars that were fitted with it, and find whether it varies over the field."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -21,6 +22,7 @@ LIKELY = 0.3
 WORTH, DEAR = 2.0, 4.0
 # Order of the odd terms.
 COMA = 3
+COMA_ORDERS = np.array([(i, COMA - i) for i in range(COMA + 1)])
 # Highest order of the even terms that may vary over the field.
 FIELD_ORDER = 4
 
@@ -88,10 +90,11 @@ def _even_orders(highest: int) -> np.ndarray:
 def all_terms(psf: Psf, highest: int, count: int) -> Terms:
     """The even terms, then coma, then variations over the field if there are enough stars, `count`."""
     even = even_terms(psf, highest)
-    odd = np.array([(i, COMA - i) for i in range(COMA + 1)])
-    orders = np.concatenate([even.orders, odd])
+    orders = np.concatenate([even.orders, COMA_ORDERS])
     first = np.arange(MONOMIALS if count >= PLACES else 1) == 0
-    steps = np.concatenate([even.candidates[..., 0], np.zeros((len(even.candidates), len(odd)), bool)], 1)
+    steps = np.concatenate(
+        [even.candidates[..., 0], np.zeros((len(even.candidates), len(COMA_ORDERS)), bool)], 1
+    )
     width, coma = orders.sum(1) == 2, orders.sum(1) == COMA
     shape = (_rank(psf, *orders.T) <= FIELD_ORDER) & ~width & ~coma
     everywhere = [terms[:, None] & first for terms in (*steps, coma)]
@@ -101,8 +104,8 @@ def all_terms(psf: Psf, highest: int, count: int) -> Terms:
 
 def _rank(psf: Psf, i: np.ndarray, j: np.ndarray) -> np.ndarray:
     """The order that terms i, j (T,) count as: along the trail of a long star orders count less, down to half."""
-    long, short = 1 / np.linalg.norm(psf.axes, axis=1)
-    return i / float(np.clip(long / short, 1, 2)) + j
+    across, along = (math.hypot(*axis) for axis in psf.axes[::-1].tolist())
+    return i / min(max(across / along, 1), 2) + j
 
 
 def refine(

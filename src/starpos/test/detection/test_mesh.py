@@ -10,6 +10,7 @@ from starpos.core.mesh import above, evened
 from starpos.core.order import median, quantile
 from starpos.core.peaks import peaks, smoothed
 from starpos.core.sparse import any_flat, bright_squares, third_highest
+from starpos.detection.finding import SHARP, WIDE
 
 
 def plain_evened(mesh, steep, level):
@@ -38,7 +39,7 @@ def test_scores_are_those_of_single_places(phases, rng):
     sky, sigma = between(level, *places).mean(1), np.sqrt((between(noise, *places) ** 2).mean(1))
     plain = ((value.ravel() - sky) / sigma).reshape(value.shape)
     np.testing.assert_allclose(above(value, level, noise, row, column), plain, rtol=1e-5)
-    with pytest.raises(ValueError, match="in a mesh of 4"):
+    with pytest.raises(ValueError, match="a mesh of 4"):
         above(value, level, noise, row + 1, column)
 
 
@@ -64,12 +65,15 @@ def test_bright_squares_are_those_of_slices(kind, step, rng):
     row, column = np.nonzero(plane[:-1:step, :-1:step] > 120)
     row, column = row * step, column * step
     low = np.min([plane[row + i, column + j] for i in (0, 1) for j in (0, 1)], axis=0)
-    for found, plain in zip(bright_squares(plane, step, 120), (row, column, low), strict=True):
+    squares = bright_squares(plane, plane.max(1).astype(np.int32), step, 120)
+    for found, plain in zip(squares, (row, column, low), strict=True):
         np.testing.assert_array_equal(found, plain)
 
 
 def test_a_frame_of_one_row_has_no_squares():
-    assert not any(len(column) for column in bright_squares(np.full((1, 9), 9, np.uint8), 2, 1))
+    assert not any(
+        len(column) for column in bright_squares(np.full((1, 9), 9, np.uint8), np.full(1, 9, np.int32), 2, 1)
+    )
 
 
 def test_flat_blocks_are_found_and_black_ones_are_not(rng):
@@ -128,13 +132,30 @@ def test_the_sky_near_a_pixel_lies_between_cells(phases, rng):
         near(level, noise[:, 1:].copy(), x, y, 60, 30, 1.5)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("kernel", [SHARP, WIDE])
+def test_peaks_in_blocks_that_are_left_out_or_not_are_those_of_the_whole_smoothed_plane(kind, kernel, rng):
+    plane = rng.integers(0, 60, (70, 300)).astype(kind)
+    plane[rng.random(plane.shape) < 0.01] += 190
+    # a flat half, whose blocks are dark
+    plane[:, :150] //= 8
+    smooth = smoothed(plane, kernel.weight, np.arange(70), 1)
+    highest = ndimage.maximum_filter(smooth, 2 * kernel.flat + 1, mode="nearest")
+    limit = np.quantile(smooth, 0.9)
+    row, column = np.nonzero((smooth == highest) & (smooth > limit))
+    cells = np.full((2, 4), limit, np.float32)
+    x, y, value, _ = peaks(plane, kernel.weight, kernel.flat, cells, 40, 0, 70)
+    np.testing.assert_array_equal((y, x, value), (row, column, smooth[row, column]))
+
+
 def test_the_limit_of_peaks_is_linear_between_cells_and_another_in_each_strip(rng):
     plane, cells = np.zeros((20, 60), np.uint16), rng.uniform(100, 200, (2, 8)).astype(np.float32)
     row, column = (v.ravel() for v in np.mgrid[1:20:3, 1:60:3])
     plane[row, column] = height = rng.integers(50, 250, len(row))
     place = (column + 0.5) * 6 / 60 + 0.5
     limit = np.where(row < 10, *(np.interp(place, np.arange(8), strip) for strip in cells))
-    x, y, value = peaks(plane, np.array([1, 0], np.float32), 1, cells, 10, 0, 20)
+    x, y, value, highest = peaks(plane, np.array([1, 0], np.float32), 1, cells, 10, 0, 20)
     np.testing.assert_array_equal((y, x, value), np.stack([row, column, height])[:, height > limit])
+    np.testing.assert_array_equal(highest, plane.max(1))
     with pytest.raises(ValueError, match="2 strips"):
         peaks(plane, np.array([1, 0], np.float32), 1, cells, 9, 0, 20)
