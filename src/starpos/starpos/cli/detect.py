@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 # of --csv; the stars of --json have the same, without the file
 COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
-JSON_HELP = "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], cpu_ms and negative"
+JSON_HELP = (
+    "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], cpu_ms and negative"
+)
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +44,9 @@ def run(args: argparse.Namespace) -> int:
 def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", output: Output) -> None:
     if isinstance(answer, FrameError):
         console.complain("detect", answer)
-        output.put({"file": path, "stars": [], "cpu_ms": 0.0, "negative": False, "status": "bad input"}, "", ())
+        output.put(
+            {"file": path, "stars": [], "cpu_ms": 0.0, "negative": False, "status": "bad input"}, "", ()
+        )
         return
     found, cpu_ms = answer
     stars = found if isinstance(found, Stars) else found.stars

@@ -303,7 +303,7 @@ def test_detect(night, capsys):
     status, out, errors = run(capsys, "detect", night / "frame_0000.fits", "--json")
     (answer,) = objects(out)
     assert (status, errors) == (0, [])
-    assert set(answer) == {"file", "stars", "cpu_ms"}
+    assert (set(answer), answer["negative"]) == ({"file", "stars", "cpu_ms", "negative"}, False)
     assert len(answer["stars"]) > 50
     x, y, flux, snr, sigma_x, sigma_y, flags = np.array(answer["stars"]).T
     assert np.all(np.diff(flux) <= 0)

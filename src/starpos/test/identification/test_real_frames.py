@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
+from starpos.detection.negative import detect_dark_too, negative_of
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
@@ -16,15 +17,22 @@ from starpos.instrument.instrument import Instrument
 YEAR = {"openstartracker": 2017.4, "tetra3": 2019.6, "panoptes": 2016.7}
 
 
-@pytest.fixture(scope="module", params=["openstartracker", "tetra3", "panoptes"])
+@pytest.fixture(
+    scope="module", params=["openstartracker", "tetra3", "panoptes", "tetra3 negative", "panoptes negative"]
+)
 def answers(request, shared, catalogue):
-    """What one camera saw: rows of the truth, the stars of each frame and what became of them, arcsec a pixel."""
+    """What one camera saw: rows of the truth, the stars of each frame and what became of them, arcsec a pixel.
+
+    With a word behind the camera's name the frames are negatives.
+    """
+    name, _, negative = request.param.partition(" ")
     with (shared / "real" / "truth.csv").open() as f:
-        rows = [row for row in csv.DictReader(f) if row["set"] == request.param]
+        rows = [row for row in csv.DictReader(f) if row["set"] == name]
     scale = float(np.mean([float(row["scale_x"]) for row in rows if row["solved"] == "1"]))
     solver = Solver(Instrument(np.degrees(3600) / scale), catalogue)
-    folder = shared / "real" / request.param
-    stars = [detect(read_frame(folder / row["file"])).stars for row in rows]
+    frames = [read_frame(shared / "real" / name / row["file"]) for row in rows]
+    found = [detect_dark_too(negative_of(f)) if negative else detect(f) for f in frames]
+    stars = [f.stars for f in found]
     return rows, stars, [solver.identify(s) for s in stars], scale
 
 
