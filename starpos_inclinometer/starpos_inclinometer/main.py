@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executables. Their imports are heavy, so they come after the signal handlers (see starpos_common)."""
 
-import signal
 import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -31,12 +30,9 @@ def inclinometer() -> int:
 
 def emulator() -> int:
     """Run the emulated microcontroller until SIGINT or SIGTERM."""
-    stopped: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda signum, frame: stopped.append(signum))
-    from starpos_inclinometer.emulator import main
+    from starpos_common.stop_signals import stop_signals
 
-    status = main(sys.argv[1:], stopped)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    return status
+    with stop_signals() as stopped:
+        from starpos_inclinometer.emulator import main
+
+        return main(sys.argv[1:], stopped)

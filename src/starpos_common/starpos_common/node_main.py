@@ -6,17 +6,17 @@ clean exit. The module of an executable therefore imports its node inside `make_
 """
 
 import os
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from starpos_common.stop_signals import stop_signals
+
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # rclpy's signal handler wakes the executor at once, but rarely misses it when two signals come together (rclpy 7.1).
 # So the main loop looks itself that often.
 NOTICE_S = 0.5
@@ -37,18 +37,11 @@ def run(
     The status is 0 after SIGINT (once or twice) or SIGTERM, and 1 with one line on standard error when the start is
     refused. Any other exception of a callback is a defect: it ends the process with its traceback.
     """
-    stopped: list[int] = []
-    for number in SIGNALS:
-        signal.signal(number, lambda signum, frame: stopped.append(signum))
-    try:
+    with stop_signals() as stopped:
         if help_text is not None and _asks_for_help(sys.argv[1:] if args is None else args):
             _show(help_text())
             return 0
         return _run(make_nodes, args, stopped)
-    finally:
-        # launch sends a second SIGINT: the default handler must not get it while the interpreter ends.
-        for number in SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
 
 
 def _show(text: str) -> None:

@@ -6,7 +6,6 @@ For machines without `ros2 bag play`, and to play as fast as the solver answers,
 
 import argparse
 import math
-import signal
 import sys
 import time
 from pathlib import Path
@@ -14,11 +13,11 @@ from typing import TYPE_CHECKING
 
 from starpos.errors import BagError, StarposError
 from starpos_bringup.recording.bag import Bag, Topic
+from starpos_common.stop_signals import stop_signals
 
 if TYPE_CHECKING:
     from starpos_bringup.recording.player import Player
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # Exit statuses.
 PLAYED, CUT_SHORT, REFUSED = 0, 1, 2
 # The topic that must be there, and others.
@@ -31,14 +30,8 @@ WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 
 def replay() -> int:
     """Run the executable."""
-    stopped: list[int] = []
-    for number in SIGNALS:
-        signal.signal(number, lambda signum, frame: stopped.append(signum))
-    try:
+    with stop_signals() as stopped:
         return main(sys.argv[1:], stopped)
-    finally:
-        for number in SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
 
 
 def main(arguments: list[str], stopped: list[int]) -> int:
