@@ -155,6 +155,7 @@ def test_every_module_and_source_file_that_a_document_names_is_there(document):
 @pytest.mark.parametrize(
     "said",
     [
+        # a document that is not in the repository
         "see DESIGN section 2",
         "as ARCHITECTURE.md says",
         "docs/nowhere.md",

@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The stars of a frame in pixels from the principal point, as the other modules here take them."""
 
-from libc.math cimport M_PI, atan, atan2, hypot, isfinite, rint, sqrt
+from libc.math cimport atan, atan2, hypot, isfinite, rint, sqrt
 
 import numpy as np
 
@@ -38,32 +38,30 @@ cdef class FrameStars:
 
     def take(self, row):
         """The stars of these rows, in the same order."""
-        return _changed(self, np.ascontiguousarray(self.xy[:, row]), self.sigma[row])
+        return _hold(_shape_of(self), np.ascontiguousarray(self.xy[:, row]), self.sigma[row])
 
     def but(self, *, focal_px=None, area_px2=None, tested=None):
         """Stars as they are, with another focal length, area or number of those that decide."""
-        cdef FrameStars out = _changed(self, self.xy, self.sigma)
+        cdef FrameStars out = _shape_of(self)
         out.focal_px = self.focal_px if focal_px is None else focal_px
         out.area_px2 = self.area_px2 if area_px2 is None else area_px2
         out.tested = self.tested if tested is None else tested
-        _hold(out, self.xy, self.sigma)
-        return out
-
+        return _hold(out, self.xy, self.sigma)
 
     def within(self, low, high, double share):
         """The stars of a frame of which only a share of the area, from low (2,) to high (2,) px, shows something.
 
         What is hidden counts neither against a pose whose stars would be there, nor as area for false detections.
         """
-        cdef FrameStars out = _changed(self, self.xy, self.sigma)
+        cdef FrameStars out = _shape_of(self)
+        # a row and the same row of flipped ones have this sum
         cdef double both = self.centre[0][1] + self.centre[1][1]
         first, last = np.maximum(low, self.middle - self.half), np.minimum(high, self.middle + self.half)
         x, y = (first + last) / 2
         _centre(out, x, y, both - y)
         out.reach[0], out.reach[1] = (last - first) / 2
         out.area_px2 = self.area_px2 * share
-        _hold(out, self.xy, self.sigma)
-        return out
+        return _hold(out, self.xy, self.sigma)
 
 
 cdef void _centre(FrameStars f, double x, double y, double flipped) noexcept:
@@ -71,23 +69,22 @@ cdef void _centre(FrameStars f, double x, double y, double flipped) noexcept:
     f.centre[0][0], f.centre[0][1], f.centre[1][0], f.centre[1][1] = x, y, x, flipped
 
 
-cdef int _hold(FrameStars f, xy, sigma) except -1:
-    """Take the stars' pixels and errors; the frame's size and focal length are there."""
+cdef FrameStars _hold(FrameStars f, xy, sigma):
+    """Give f these stars' pixels and errors; its size and focal length are there."""
     f.xy, f.sigma = xy, sigma
     f.pixel, f.error = xy, sigma
     # some margin
     f.radius = atan(hypot(f.reach[0], f.reach[1]) / f.focal_px) * 1.05 + 2e-4
-    return 0
+    return f
 
 
-cdef FrameStars _changed(FrameStars f, xy, sigma):
-    """Other stars of the same frame."""
+cdef FrameStars _shape_of(FrameStars f):
+    """A frame of the same shape, as yet without stars."""
     cdef FrameStars out = FrameStars.__new__(FrameStars)
     cdef int i
     for i in range(2):
         out.centre[i][0], out.centre[i][1], out.reach[i] = f.centre[i][0], f.centre[i][1], f.reach[i]
     out.focal_px, out.area_px2, out.tested = f.focal_px, f.area_px2, f.tested
-    _hold(out, xy, sigma)
     return out
 
 
@@ -119,8 +116,7 @@ def ideal_frame(
     _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
     out.reach[0], out.reach[1] = width / 2, rows / 2
     out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
-    _hold(out, pixels, errors)
-    return out
+    return _hold(out, pixels, errors)
 
 
 def projected(
@@ -210,7 +206,7 @@ def explained(const Py_ssize_t[::1] star, const Py_ssize_t[::1] index, const Py_
 def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
     """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
 
-    Right ascension and position angle are in [0, 2 pi).
+    All are in [-pi, pi].
 
     centre    vector in C, three numbers of any length, of the frame's centre
     above     the same of a pixel above it
@@ -239,11 +235,4 @@ def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mir
     else:
         # at a pole, on the meridian of right ascension 0
         east, north = up[1], -up[0] * seen[0][2]
-    return _full_turn(atan2(seen[0][1], seen[0][0])), atan2(seen[0][2], flat), _full_turn(atan2(east, north))
-
-
-cdef inline double _full_turn(double angle) noexcept:
-    """The angle from -pi to pi, brought to [0, 2 pi)."""
-    cdef double turned = angle + 2 * M_PI if angle < 0 else angle
-    # the smallest negative angles are rounded to 2 pi
-    return turned if turned < 2 * M_PI else 0.0
+    return atan2(seen[0][1], seen[0][0]), atan2(seen[0][2], flat), atan2(east, north)

@@ -37,10 +37,6 @@ class Response:
             self.gain, self.colour_spread, self.dn_per_photon, self.misfit, FIT_WIDTHS, OUTLIER, FAINT
         )
 
-    def of_phase(self, phase: np.ndarray) -> np.ndarray:
-        """The frame's gain (float32) of pixels of these phases; 1 without a mosaic."""
-        return self.gain.astype(np.float32)[phase] if len(self.gain) > 1 else np.ones(1, np.float32)
-
     def variance(self, noise: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Variance, DN2, of pixels with the sky's noise (DN) and a star's light (DN) on them."""
         light = np.maximum(light, 0)

@@ -36,6 +36,7 @@ from starpos.instrument.camera_vertical import own_level
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
+from starpos.rotation import full_turn
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
@@ -354,9 +355,9 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
         centre, above = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
     ra, dec, roll = pointing_of(centre, above, found.attitude, sky.velocity, found.mirrored)
     return Attitude(
-        ra=ra,
+        ra=full_turn(ra),
         dec=dec,
-        roll=roll,
+        roll=full_turn(roll),
         focal_px=fx,
         residual_arcsec=found.residual_px / math.sqrt(fx * fy) / ARCSEC,
         log_odds=found.log_odds,

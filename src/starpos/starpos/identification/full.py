@@ -58,7 +58,7 @@ RULES = Rules(
 class Identification:
     """M matched stars and the attitude they give.
 
-    star             (M,): rows of the input
+    star             (M,): rows of the input, in ascending order
     catalogue        (M,): rows of the star catalogue
     blend_px         (M,): how far unresolved neighbours may move each star's image
     attitude         (3, 3): `Sky`'s directions into C

@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.core.frame import FrameStars, projected
 from starpos.core.search import Limits, Lost
+from starpos.errors import InstrumentError
 from starpos.frames.stars import Window
 from starpos.identification import wide
 from starpos.identification.evidence import anywhere
@@ -94,7 +95,11 @@ def through(field: FrameStars, camera: Camera, window: Window | None) -> FrameSt
     left, top, right, bottom = window
     # a lens bends the sides
     x, y = np.meshgrid(np.linspace(left, right, 3) - 0.5, np.linspace(top, bottom, 3) - 0.5)
-    v = camera.directions(x.ravel(), y.ravel())
+    try:
+        v = camera.directions(x.ravel(), y.ravel())
+    except InstrumentError:
+        # the lens is known where stars are, not at every side: as if all of the frame showed something
+        return field
     xy = v[:, :2] / v[:, 2:] * camera.fx
     low, high = xy.min(0), xy.max(0)
     # where the window ends with the frame, the field ends where it did

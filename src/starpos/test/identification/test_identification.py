@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lost in space: simulated fields whose stars and pointing are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from starpos.errors import InstrumentError
 from starpos.identification import Sky, identify, identify_directions, search, triangle_cache
 from starpos.instrument.camera import Camera
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_attitude, random_stars
@@ -256,3 +259,17 @@ def test_the_area_of_chance_is_that_of_the_window(catalogue, rng):
     field = search.field_of(v, np.full(8, 0.05), camera, (0, 0, camera.width // 4, camera.height))
     assert field.area_px2 == pytest.approx(camera.width // 4 * camera.height)
     assert 4 * field.half.prod() == pytest.approx(field.area_px2)
+
+
+def test_a_window_whose_corners_the_lens_does_not_know_is_left_aside(catalogue, rng):
+    ideal, _ = FIELDS["15 deg"]
+    # a barrel distortion that folds at nine tenths of the way to a corner
+    k1 = -((2 / 3 / (0.9 * ideal.half_diagonal_rad)) ** 2) / 3
+    camera = replace(ideal, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    window = 0, 0, camera.width // 2, camera.height
+    with pytest.raises(InstrumentError):
+        camera.directions([0.0], [0.0])
+    middle = np.array([[camera.cx], [camera.cy]])
+    v = camera.directions(*(middle + rng.uniform(-100, 100, (2, 8))))
+    field = search.field_of(v, np.full(8, 0.05), camera, window)
+    assert field.area_px2 == camera.width * camera.height
