@@ -25,6 +25,7 @@ from starpos_testing.skies.scenes import (
     FOCAL_PX,
     SIZE,
     START,
+    random_attitude,
     random_stars,
     solver_of,
     stars_of,
@@ -133,6 +134,29 @@ def test_identify_gives_the_pointing_of_the_frames_centre(night, catalogue):
     d_dec = abs(state_free.attitude.dec - a.dec) / ARCSEC
     d_ra = abs(state_free.attitude.ra - a.ra) * np.cos(a.dec) / ARCSEC
     assert 0.1 < np.hypot(d_ra, d_dec) < 23
+
+
+def test_the_window_of_a_frame_counts_with_and_without_its_directions(night):
+    _, stars, tilt, solver = night
+    width = stars.width // 3
+    shown = stars.take(np.flatnonzero(stars.x < width))
+    windowed = replace(shown, window=(0, 0, width, stars.height))
+    for ask in (solver.identify, lambda s: solver.solve(s, tilt)):
+        assert ask(windowed).attitude.log_odds > ask(shown).attitude.log_odds + 10
+
+
+def test_right_ascension_and_roll_are_in_a_full_turn(catalogue, rng):
+    camera = Camera.from_focal(*SIZE, FOCAL_PX)
+    solver = Solver(Instrument(FOCAL_PX), catalogue)
+    for _ in range(8):
+        attitude = random_attitude(rng)
+        index = catalogue.cone(attitude[2], camera.half_diagonal_rad, 7.0)
+        x, y = camera.project(catalogue.directions(index, 2000.0) @ attitude.T).T
+        on = (x > 0) & (x < camera.width - 1) & (y > 0) & (y < camera.height - 1)
+        listed = replace(random_stars(on.sum(), rng, mid_unix_s=None), x=x[on], y=y[on])
+        found = solver.identify(listed).attitude
+        assert found.ra == pytest.approx(np.arctan2(attitude[2, 1], attitude[2, 0]) % (2 * np.pi), abs=1e-4)
+        assert 0 <= found.roll < 2 * np.pi
 
 
 def test_a_mirrored_frame_has_a_pointing_but_no_fix(night):
