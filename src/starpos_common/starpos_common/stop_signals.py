@@ -2,9 +2,10 @@
 """SIGINT and SIGTERM as wishes that a process looks at when it can, until its interpreter has ended."""
 
 import contextlib
-import ctypes
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -21,15 +22,23 @@ def stop_signals() -> Iterator[list[int]]:
     try:
         yield stopped
     finally:
+        if not isinstance(sys.unraisablehook, _UnlessLate):
+            sys.unraisablehook = _UnlessLate(sys.unraisablehook)
         for number in SIGNALS:
-            ignore(number)
+            signal.signal(number, signal.SIG_IGN)
 
 
-def ignore(number: int) -> None:
-    """Ignore a signal from now on, without a word of one that comes meanwhile.
+class _UnlessLate:
+    """A hook for errors that nobody catches, without those of signals that came while they were made to be ignored.
 
-    Of a signal between its look for earlier ones and the change, `signal.signal` prints "ignored due to race
-    condition". So the process ignores it first; then Python is told, which would else set the default as it ends.
+    Another thread may take a signal before the change and note it after; Python then prints "ignored due to race
+    condition". No order of calls prevents it.
     """
-    ctypes.pythonapi.PyOS_setsig(number, ctypes.c_void_p(signal.SIG_IGN))
-    signal.signal(number, signal.SIG_IGN)
+
+    def __init__(self, told: Callable[[Any], Any]) -> None:
+        self._told = told
+
+    def __call__(self, unraisable: Any) -> None:
+        error = unraisable.exc_value
+        if not (isinstance(error, OSError) and "ignored due to race condition" in str(error)):
+            self._told(unraisable)
