@@ -37,7 +37,7 @@ FOREIGN = {
     "yaml",
 }
 # What the compiled core may import.
-CORE = {"libc", "numpy", "starpos.core"}
+CORE = {"cpython", "libc", "numpy", "starpos.core"}
 IMPORTED = re.compile(r"\bfrom\s+([\w.]+)\s+c?import\b|\bc?import\s+(.+)")
 # What asks the package itself, for its file and its version.
 AT_THE_DOOR = {"starpos.parallel.same"}

@@ -30,6 +30,11 @@ cdef struct Strips:
     int[STRIPS + 1] first
 
 
+cdef inline double length(double x, double y) noexcept nogil:
+    """The length of a vector of neither tiny nor huge numbers; the library's `hypot` takes care of those, and longer."""
+    return sqrt(x * x + y * y)
+
+
 cdef inline void turned(const double *rotation, const double *v, double *out) noexcept nogil:
     """Set `out` (3,) to rotation (3, 3) times v (3,)."""
     cdef int i

@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The stars of a frame in pixels from the principal point, as the other modules here take them."""
 
-from libc.math cimport atan, atan2, hypot, isfinite, rint, sqrt
+from libc.math cimport M_PI, atan, atan2, hypot, isfinite, rint, sqrt
 
 import numpy as np
 
@@ -73,7 +73,11 @@ cdef FrameStars _hold(FrameStars f, xy, sigma):
     """Give f these stars' pixels and errors; its size and focal length are there."""
     f.xy, f.sigma = xy, sigma
     f.pixel, f.error = xy, sigma
-    # some margin
+    return _measured(f)
+
+
+cdef FrameStars _measured(FrameStars f):
+    """Set the radius of f, some more than that of its corners."""
     f.radius = atan(hypot(f.reach[0], f.reach[1]) / f.focal_px) * 1.05 + 2e-4
     return f
 
@@ -116,7 +120,8 @@ def ideal_frame(
     _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
     out.reach[0], out.reach[1] = width / 2, rows / 2
     out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
-    return _hold(out, pixels, errors)
+    out.xy, out.sigma, out.pixel, out.error = pixels, errors, xy, error
+    return _measured(out)
 
 
 def projected(
@@ -206,7 +211,7 @@ def explained(const Py_ssize_t[::1] star, const Py_ssize_t[::1] index, const Py_
 def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
     """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
 
-    All are in [-pi, pi].
+    The first and the last are in [0, 2 pi).
 
     centre    vector in C, three numbers of any length, of the frame's centre
     above     the same of a pixel above it
@@ -235,4 +240,11 @@ def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mir
     else:
         # at a pole, on the meridian of right ascension 0
         east, north = up[1], -up[0] * seen[0][2]
-    return atan2(seen[0][1], seen[0][0]), atan2(seen[0][2], flat), atan2(east, north)
+    return _full_turn(atan2(seen[0][1], seen[0][0])), atan2(seen[0][2], flat), _full_turn(atan2(east, north))
+
+
+cdef double _full_turn(double angle) noexcept:
+    """An angle in [-pi, pi], brought to [0, 2 pi), as `rotation.full_turn` does."""
+    angle += 2 * M_PI if angle < 0 else 0.0
+    # the smallest negative angle becomes 2 pi
+    return 0.0 if angle >= 2 * M_PI else angle

@@ -47,24 +47,33 @@ cdef inline void match(Matching *m, int n, const double *star, int stars, const 
 
     m.near of the others becomes -1.
     """
-    cdef double widest = 0.0, x, y, apart2
-    cdef int i, j, s, low
+    cdef double widest = 0.0, x, y, apart2, nearest2
+    cdef int i, j, s, low, nearest
+    # what is written below might be these, for all that a compiler knows
+    cdef const Point *at = m.sorted
+    cdef const Point *end = at + n
+    cdef const Point *point
+    cdef const Strips *strips = &m.strips
+    cdef int *near = m.near
+    cdef int *back = m.back
+    cdef double *near2 = m.near2
     for i in range(n):
         widest = max(widest, radius[i])
-        m.near[i], m.near2[i] = -1, 1e300
+        near[i], near2[i] = -1, 1e300
     for s in range(stars):
         x, y = star[2 * s], star[2 * s + 1]
-        m.back[s], m.back2[s] = -1, 1e300
-        low = m.strips.first[strip_of(x - widest, &m.strips)]
-        while low < n and m.sorted[low].x <= x + widest:
-            i = m.sorted[low].row
-            apart2 = (m.sorted[low].x - x) ** 2 + (m.sorted[low].y - y) ** 2
-            if apart2 < m.near2[i]:
-                m.near[i], m.near2[i] = s, apart2
-            if apart2 < m.back2[s] or apart2 == m.back2[s] and i < m.back[s]:
-                m.back[s], m.back2[s] = i, apart2
-            low += 1
+        nearest, nearest2 = -1, 1e300
+        point = at + strips.first[strip_of(x - widest, strips)]
+        while point < end and point.x <= x + widest:
+            i = point.row
+            apart2 = (point.x - x) ** 2 + (point.y - y) ** 2
+            if apart2 < near2[i]:
+                near[i], near2[i] = s, apart2
+            if apart2 < nearest2 or apart2 == nearest2 and i < nearest:
+                nearest, nearest2 = i, apart2
+            point += 1
+        back[s] = nearest
     for i in range(n):
-        j = m.near[i]
-        if j >= 0 and not (m.near2[i] < radius[i] * radius[i] and m.back[j] == i):
-            m.near[i] = -1
+        j = near[i]
+        if j >= 0 and not (near2[i] < radius[i] * radius[i] and back[j] == i):
+            near[i] = -1

@@ -2,12 +2,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Poses of a camera among the stars: fitted to stars that are matched meanwhile, and weighed against chance."""
 
-from libc.math cimport M_PI, exp, fabs, hypot, log, sqrt
+from libc.math cimport M_PI, exp, fabs, log, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport best_rotation, factored, median, solved, turn_by, turned
+from starpos.core.algebra cimport best_rotation, factored, length, median, solved, turn_by, turned
 from starpos.core.frame cimport FrameStars, direction_of, pixel_of
 from starpos.core.matching cimport Matching, match, order
 from starpos.core.sky cimport Visible
@@ -182,7 +182,7 @@ cdef void settle(
             if m.near[i] < 0:
                 continue
             same = same and k < out.count and out.star[k] == i and out.near[k] == m.near[i]
-            out.star[k], out.near[k], sigma[k] = i, m.near[i], hypot(frame.error[i], rules.floor_px)
+            out.star[k], out.near[k], sigma[k] = i, m.near[i], length(frame.error[i], rules.floor_px)
             k += 1
         if same and k == out.count:
             break
@@ -221,7 +221,7 @@ cdef void gates(FrameStars frame, Rules rules, double spread, int n, double *rad
     """Set how far (n,) px the n brightest stars may be from their places, where the residuals have a spread."""
     cdef int i
     for i in range(n):
-        radius[i] = rules.gate_sigma * hypot(max(spread, rules.least), frame.error[i]) + rules.gate_px
+        radius[i] = rules.gate_sigma * length(max(spread, rules.least), frame.error[i]) + rules.gate_px
 
 
 cdef void count_alike(
@@ -232,8 +232,8 @@ cdef void count_alike(
     cdef double *floored = sigma + out.count
     cdef int k
     for k in range(out.count):
-        sigma[k] = hypot(frame.error[out.star[k]], out.spread)
-        floored[k] = hypot(frame.error[out.star[k]], rules.floor_px)
+        sigma[k] = length(frame.error[out.star[k]], out.spread)
+        floored[k] = length(frame.error[out.star[k]], rules.floor_px)
     _refit(frame, frame.pixel[mirrored], stars, rules, sigma, floored, pixel, work, out)
 
 
@@ -267,7 +267,7 @@ cdef double weighed(
 ) except? -1:
     """What `log_ratio` returns, of the n brightest detections; w[row[k]] is the direction of the star matched with star[k]."""
     cdef int e, i, j, k, passed, hits = 0
-    cdef double best = -1e300, total, most, odds, least = 1e300, variance, volume
+    cdef double best = -1e300, total, most, product, largest, odds, least = 1e300, variance, volume
     cdef double[16] information
     cdef double[16] normal
     cdef double[8] slope
@@ -309,14 +309,19 @@ cdef double weighed(
                 if (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2 < chances.double_px * chances.double_px:
                     hit[i] = DOUBLED
         for e in range(ERRORS):
-            total, most = 0.0, -1e300
+            # the logarithm of the largest product of the first odds; a product that gets too large or small goes into `total`
+            total, most, product, largest = 0.0, -1e300, 1.0, 0.0
             for i in range(n):
                 odds = 1.0 if hit[i] == DOUBLED else chance[i]
                 if hit[i] >= 0:
                     variance = sigma_px[i] * sigma_px[i] + chances.errors_px[e] * chances.errors_px[e]
                     odds += gain[hit[i]] * exp(-0.5 * apart2[hit[i]] / variance) / variance
-                total += log(odds)
-                most = max(most, total)
+                product *= odds
+                largest = max(largest, product)
+                if i == n - 1 or not 1e-150 < product < 1e150:
+                    most = max(most, total + log(largest))
+                    total += log(product)
+                    product, largest = 1.0, 0.0
             for i in range(16):
                 information[i] = normal[i] / (least + chances.errors_px[e] * chances.errors_px[e])
             for i in range(4):

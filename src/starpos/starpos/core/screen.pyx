@@ -2,15 +2,15 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Poses of triangles, and their worth by the bright catalogue stars that a frame's bright stars coincide with."""
 
-from libc.math cimport M_PI, hypot, log, sqrt
+from libc.math cimport M_PI, log, sqrt
 from libc.stdlib cimport free, malloc, qsort
 
 import numpy as np
 
-from starpos.core.algebra cimport best_rotation, fetch, turned
+from starpos.core.algebra cimport best_rotation, fetch, length, turned
 from starpos.core.frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of
 from starpos.core.matching cimport Matching, begin, match, order
-from starpos.core.sky cimport MOST_RUNS, Date, Span, StarTable, runs_near
+from starpos.core.sky cimport MOST_RUNS, Date, StarTable, runs_near
 from starpos.core.triangles cimport Candidate
 
 # Stars so far beyond a frame are on it.
@@ -78,7 +78,7 @@ cdef class BrightTable:
         for i in range(n):
             pixel = &frame.pixel[c.mirrored, i, 0]
             away2 = (pixel[0] - x) ** 2 + (pixel[1] - y) ** 2
-            radius[i] = match_sigma * hypot(frame.error[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
+            radius[i] = match_sigma * length(frame.error[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
 
     cdef double worth(
         self, FrameStars frame, const Candidate *c, const Date *date, const double *attitude, double focal_px, int n,
@@ -92,7 +92,6 @@ cdef class BrightTable:
         log_false   logarithm of the share of detections that may be false
         """
         cdef int[2 * MOST_RUNS] runs
-        cdef Span span
         cdef double[3] axis
         cdef double total = 0.0, best = -1e300, variance, area_px2 = 4 * frame.reach[0] * frame.reach[1]
         cdef Matching m
@@ -100,7 +99,7 @@ cdef class BrightTable:
         cdef double *pixel
         cdef int i, count, room = 0
         axis_of(frame, c.mirrored, attitude, axis)
-        count = runs_near(&self.cell_start[0], axis, frame.radius, runs, &span)
+        count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
         for i in range(count):
             room += runs[2 * i + 1] - runs[2 * i]
         m.memory = NULL

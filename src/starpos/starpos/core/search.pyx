@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.core.frame cimport FrameStars, on_frame
 from starpos.core.matching cimport Matching, begin
+from starpos.core.memory cimport numbers_of
 from starpos.core.poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
 from starpos.core.screen cimport BrightTable
 from starpos.core.sky cimport Date, StarTable, Visible, date_of
@@ -22,6 +23,42 @@ cdef struct Work:
     Matching m
     Settled end
     double *memory
+
+
+cdef class Identification:
+    """M matched stars and the attitude they give.
+
+    star             (M,): rows of the frame's stars, in ascending order
+    catalogue        (M,): rows of the star catalogue
+    blend_px         (M,): how far unresolved neighbours may move each star's image
+    attitude         (3, 3): directions of the sky into C
+    focal_scale      factor on the camera's focal length
+    residual_px      rms along one axis, with the weights of the fit
+    mean_square_px2  of the residuals along one axis, all alike
+    log_odds         of the identification: its evidence, as `evidence` defines it, with the prior
+    expected         (E,): rows of the catalogue's stars well inside the frame, brightest first
+    mirrored         whether the frame's rows run bottom-up; the attitude is that of the flipped frame
+    """
+
+    cdef readonly object star, catalogue, blend_px, attitude, expected
+    cdef readonly double focal_scale, residual_px, mean_square_px2, log_odds
+    cdef readonly bint mirrored
+
+    def __init__(
+        self, *, star, catalogue, blend_px, attitude, double focal_scale, double residual_px, double mean_square_px2,
+        double log_odds, expected, bint mirrored,
+    ):
+        self.star, self.catalogue, self.blend_px, self.attitude = star, catalogue, blend_px, attitude
+        self.focal_scale, self.residual_px, self.mean_square_px2 = focal_scale, residual_px, mean_square_px2
+        self.log_odds, self.expected, self.mirrored = log_odds, expected, mirrored
+
+    def but(self, **changes):
+        """The identification with some of its values changed."""
+        names = (
+            "star", "catalogue", "blend_px", "attitude", "focal_scale", "residual_px", "mean_square_px2", "log_odds",
+            "expected", "mirrored",
+        )
+        return Identification(**({name: getattr(self, name) for name in names} | changes))
 
 
 cdef class Anywhere:
@@ -96,10 +133,7 @@ cdef class Judge:
         mirrored   whether the frame's rows are flipped
         radius_px  (n,): how far from their places those of the frame's stars may be that decide
 
-        Returns None where the evidence is not enough, else: of the stars matched, the rows in the frame (M,), the rows in
-        the catalogue (M,), and how far (px) fainter stars move them (M,); attitude (3, 3) and focal length; the rms of the
-        residuals (px) along one axis with the weights of the fit, and their mean square (px2); the log-odds; the catalogue's
-        rows of all stars well inside the frame (E,), brightest first; and whether the frame is mirrored.
+        None where the evidence is not enough.
         """
         if radius_px.shape[0] < self._deciding():
             raise ValueError(f"{radius_px.shape[0]} radii for {self._deciding()} stars: each one that decides needs its own")
@@ -136,7 +170,7 @@ cdef class Judge:
                 count_alike(
                     self.frame, mirrored, &work.stars, self.rules, work.memory, work.memory + 2 * work.stars.count, &work.end
                 )
-            return self._columns(mirrored, &work, log_odds)
+            return self._found(mirrored, &work, log_odds)
         finally:
             _release(&work)
 
@@ -172,14 +206,16 @@ cdef class Judge:
         )
         return work.end.count >= self.rules.fewest
 
-    cdef _columns(self, bint mirrored, const Work *work, double log_odds):
+    cdef Identification _found(self, bint mirrored, const Work *work, double log_odds):
         """What `identified` returns."""
+        cdef Identification out = Identification.__new__(Identification)
         cdef const Settled *end = &work.end
         cdef int k, n = end.count, last = 2 * n
-        # one block of memory each is quicker than four
-        rows, moved = np.empty(2 * n + work.stars.count, np.intp), np.empty(n)
-        cdef Py_ssize_t[::1] row = rows
-        cdef double[::1] blend = moved
+        # one block of memory is quicker than three
+        rows, out.blend_px, out.attitude = np.empty(2 * n + work.stars.count, np.intp), np.empty(n), np.empty((3, 3))
+        cdef Py_ssize_t *row = <Py_ssize_t *>numbers_of(rows)
+        cdef double *blend = <double *>numbers_of(out.blend_px)
+        memcpy(numbers_of(out.attitude), end.attitude, 9 * sizeof(double))
         for k in range(n):
             row[k], row[n + k] = end.star[k], work.stars.row[end.near[k]]
             blend[k] = work.stars.moved[end.near[k]]
@@ -187,10 +223,10 @@ cdef class Judge:
             if on_frame(self.frame, mirrored, &work.memory[2 * k], -self.rules.inside_px):
                 row[last] = work.stars.row[k]
                 last += 1
-        return (
-            rows[:n], rows[n:2 * n], moved, _attitude(end), end.focal, end.rms, end.mean_square, log_odds, rows[2 * n:last],
-            mirrored,
-        )
+        out.star, out.catalogue, out.expected = rows[:n], rows[n:2 * n], rows[2 * n:last]
+        out.focal_scale, out.log_odds, out.mirrored = end.focal / self.frame.focal_px, log_odds, mirrored
+        out.residual_px, out.mean_square_px2 = end.rms, end.mean_square
+        return out
 
 
 cdef _attitude(const Settled *end):

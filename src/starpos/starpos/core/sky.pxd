@@ -25,12 +25,14 @@ cdef struct Visible:
     void *memory
 
 
-cdef struct Span:
-    # Mas: least and largest declination, least right ascension, and how far it goes on from there.
-    long long south
-    long long north
-    long long west
-    long long width
+cdef struct Patch:
+    # A frame on the sky as a plane. Mas: its middle. Across and down: px a mas of right ascension and of declination, and
+    # how far (px) stars may be from the middle.
+    int ra
+    int dec
+    float[2] by_ra
+    float[2] by_dec
+    float[2] reach
 
 
 cdef class StarTable:
@@ -47,8 +49,8 @@ cdef class StarTable:
         double margin_px, int most, double blend_px, Visible *out,
     ) except -1 nogil
     cdef void ask(self, int first, int end, const Date *date) noexcept nogil
-    cdef int _inside(self, const int *runs, int count, const Span *span, int *near) noexcept nogil
-    cdef int _by_light(self, const int *rows, int n, int cut, int *near) noexcept nogil
+    cdef int _inside(self, const int *runs, int count, const Patch *patch, int *flags, int *near) noexcept nogil
+    cdef int _by_light(self, const int *rows, int n, int cut, int *bins, int *near) noexcept nogil
     cdef int _projected(
         self, const int *near, int n, FrameStars frame, bint mirrored, const double *attitude, double focal_px,
         double margin_px, const Date *date, int most, Visible *out, Point *pixel,
@@ -59,4 +61,4 @@ cdef class StarTable:
 
 
 cdef Date date_of(double years, velocity) except *
-cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs, Span *span) noexcept nogil
+cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil

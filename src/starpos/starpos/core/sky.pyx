@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Catalogue stars in the directions in which they are seen at a date, and those of them that lie on a frame."""
 
-from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, hypot, pow, rint, sin, sqrt
+from libc.math cimport M_PI, asin, atan2, cos, fabs, fabsf, floor, hypot, pow, rint, sin, sqrt, tan
 from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.core.algebra cimport Point, Strips, fetch, sort_by_x, turned
 from starpos.core.frame cimport FrameStars, axis_of, pixel_of, seen_on
+from starpos.core.memory cimport numbers_of
 
 cdef enum:
     # In mas.
@@ -19,13 +20,15 @@ cdef enum:
     BRIGHTEST = -1024
     # Numbers of 32 bits in a piece of memory that comes at once.
     LINE = 16
-    # Mas: a circle, and how far beyond a cone stars may be that have moved, or whose light is bent.
+    # Mas: a circle, and how far beyond a frame stars may be that have moved, or whose light is bent.
     CIRCLE = 1296000000
     MOVED = 360000
     # Letters of a designation, at most.
     LETTERS = 40
 
 cdef double MAS = M_PI / 180 / DEGREE
+# Where the plane is as far (rad) from the sphere as this share of a frame's radius, it is no plane.
+cdef double MOST_CURVED = 0.5
 
 # Sine and cosine of the middle of each degree of right ascension, and of declination from -90.
 cdef double[CELLS] sin_ra, cos_ra
@@ -46,8 +49,8 @@ _fill_tables()
 cdef inline void _of_small(double x, double *sine, double *cosine) noexcept nogil:
     """Sine and cosine of at most half a degree: the next terms of the series are below 1e-18."""
     cdef double x2 = x * x
-    sine[0] = x * (1 - x2 / 6 * (1 - x2 / 20 * (1 - x2 / 42)))
-    cosine[0] = 1 - x2 / 2 * (1 - x2 / 12 * (1 - x2 / 30))
+    sine[0] = x * (1 - x2 * (1.0 / 6) * (1 - x2 * (1.0 / 20) * (1 - x2 * (1.0 / 42))))
+    cosine[0] = 1 - x2 * 0.5 * (1 - x2 * (1.0 / 12) * (1 - x2 * (1.0 / 30)))
 
 
 cdef class StarTable:
@@ -63,12 +66,12 @@ cdef class StarTable:
 
     cdef void direction(self, Py_ssize_t row, const Date *date, double *w) noexcept nogil:
         """Set w (3,) to the unit vector of a row at a date."""
-        cdef long long ra = self.ra[row], dec = self.dec[row] + 90 * <long long>DEGREE
-        cdef long long i = ra // DEGREE, j = dec // DEGREE
+        cdef unsigned int ra = self.ra[row], dec = <unsigned int>(self.dec[row] + 90 * DEGREE)
+        cdef unsigned int i = ra // DEGREE, j = dec // DEGREE
         cdef double s, c, sr, cr, sd, cd, east, north, norm
-        _of_small((ra - i * DEGREE - DEGREE // 2) * MAS, &s, &c)
+        _of_small(<int>(ra - i * DEGREE - DEGREE // 2) * MAS, &s, &c)
         sr, cr = sin_ra[i] * c + cos_ra[i] * s, cos_ra[i] * c - sin_ra[i] * s
-        _of_small((dec - j * DEGREE - DEGREE // 2) * MAS, &s, &c)
+        _of_small(<int>(dec - j * DEGREE - DEGREE // 2) * MAS, &s, &c)
         sd, cd = sin_dec[j] * c + cos_dec[j] * s, cos_dec[j] * c - sin_dec[j] * s
         w[0], w[1], w[2] = cd * cr, cd * sr, sd
         if not date.moved:
@@ -136,14 +139,14 @@ cdef class StarTable:
         cdef double[3] axis
         # the cells reach beyond the frame
         cdef int cut = 4 * most + 100, i, n = 0, count
-        cdef Span span
+        cdef Patch patch
         axis_of(frame, mirrored, attitude, axis)
-        count = runs_near(&self.cell_start[0], axis, frame.radius, runs, &span)
+        count = runs_near(&self.cell_start[0], axis, frame.radius, runs)
         for i in range(count):
             n += runs[2 * i + 1] - runs[2 * i]
             self.ask(runs[2 * i], runs[2 * i + 1], date)
         most = min(most, n)
-        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + 2 * (n + 1) * sizeof(int))
+        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + 3 * (n + 1) * sizeof(int))
         if out.memory == NULL:
             with gil:
                 raise MemoryError
@@ -154,8 +157,10 @@ cdef class StarTable:
         cdef Point *pixel = <Point *>(out.row + most)
         cdef int *near = <int *>(pixel + 2 * most)
         cdef int *rows = near + n + 1
-        n = self._inside(runs, count, &span, rows)
-        n = self._by_light(rows, n, cut, near)
+        cdef int *bins = rows + n + 1
+        _flatten(frame, mirrored, attitude, focal_px, axis, margin_px, &patch)
+        n = self._inside(runs, count, &patch, near, rows)
+        n = self._by_light(rows, n, cut, bins, near)
         self._projected(near, n, frame, mirrored, attitude, focal_px, margin_px, date, most, out, pixel)
         return self._unblended(pixel, blend_px, frame.focal_px, out, near)
 
@@ -171,37 +176,35 @@ cdef class StarTable:
                 fetch(&self.pm_ra[row])
                 fetch(&self.pm_dec[row])
 
-    cdef int _inside(self, const int *runs, int count, const Span *span, int *near) noexcept nogil:
-        """Write the rows of runs that lie in a span to `near`; how many: cells reach beyond it."""
-        cdef long long east
-        cdef int i, k, kept = 0
+    cdef int _inside(self, const int *runs, int count, const Patch *patch, int *flags, int *near) noexcept nogil:
+        """Write the rows of runs that lie in a patch to `near`; how many: cells reach beyond it.  flags: to work in."""
+        cdef int i, k, first, n, kept = 0
         for i in range(count):
-            for k in range(runs[2 * i], runs[2 * i + 1]):
-                east = self.ra[k] - span.west
-                east += CIRCLE if east < 0 else 0
-                near[kept] = k
-                kept += (span.south <= self.dec[k]) & (self.dec[k] <= span.north) & (east <= span.width)
+            first, n = runs[2 * i], runs[2 * i + 1] - runs[2 * i]
+            _marked(&self.ra[first], &self.dec[first], n, patch, flags)
+            for k in range(n):
+                near[kept] = first + k
+                kept += flags[k]
         return kept
 
-    cdef int _by_light(self, const int *rows, int n, int cut, int *near) noexcept nogil:
-        """Write rows (n,) to `near`, brightest first, about `cut` of them; how many."""
+    cdef int _by_light(self, const int *rows, int n, int cut, int *bins, int *near) noexcept nogil:
+        """Write rows (n,) to `near`, brightest first, about `cut` of them; how many.  bins (n,): to work in."""
         cdef int[BINS] first
         cdef int k, bin, total = 0, kept = 0, low = BINS - 1, high = 0
         for k in range(n):
-            bin = _light(self.vmag[rows[k]])
-            low, high = min(low, bin), max(high, bin)
+            bins[k] = _light(self.vmag[rows[k]])
+            low, high = min(low, bins[k]), max(high, bins[k])
         for bin in range(low, high + 1):
             first[bin] = 0
         for k in range(n):
-            first[_light(self.vmag[rows[k]])] += 1
+            first[bins[k]] += 1
         # how many are brighter; stars that come after `cut` others do not count
         for bin in range(low, high + 1):
             kept = kept if total >= cut else total + first[bin]
             first[bin], total = total, total + first[bin]
         for k in range(n):
-            bin = _light(self.vmag[rows[k]])
-            near[first[bin]] = rows[k]
-            first[bin] += 1
+            near[first[bins[k]]] = rows[k]
+            first[bins[k]] += 1
         return kept
 
     cdef int _projected(
@@ -252,46 +255,55 @@ cdef class StarTable:
                 out.moved[a] += apart * ratio / (1 + ratio)
                 single[b] = 0
         for i in range(n):
-            if single[i]:
+            if kept < i and single[i]:
                 out.row[kept], out.moved[kept] = out.row[i], out.moved[i]
                 for j in range(3):
                     out.w[3 * kept + j] = out.w[3 * i + j]
-                kept += 1
+            kept += single[i]
         out.count = kept
         return kept
 
 
-cdef class Designations:
-    """Names of a catalogue's rows: by Hipparcos number hip (N,), by Tycho's three tyc (N, 3) where that is 0."""
+cdef class Labels:
+    """Names and brightnesses of a catalogue's rows.
+
+    hip, tyc  (N,), (N, 3): the Hipparcos number, and Tycho's three where that is 0
+    vmag      (N,): V in 0.01 mag
+    """
 
     cdef const int[::1] hip
     cdef const short[:, ::1] tyc
+    cdef const short[::1] vmag
 
-    def __init__(self, hip, tyc):
+    def __init__(self, hip, tyc, vmag):
         self.hip, self.tyc = np.ascontiguousarray(hip, np.int32), np.ascontiguousarray(tyc, np.int16)
+        self.vmag = np.ascontiguousarray(vmag, np.int16)
 
     def of(self, const Py_ssize_t[::1] index):
-        """The names of rows (n,) as a list."""
-        cdef Py_ssize_t k, row
+        """The names of rows (n,) as a tuple, and their V (n,) in mag."""
+        cdef Py_ssize_t k, row, n = index.shape[0]
         cdef char[LETTERS] text
         cdef char *end = &text[LETTERS]
         cdef char *at
-        out = []
-        for k in range(index.shape[0]):
+        names, magnitudes = [], np.empty(n)
+        cdef double *mag = <double *>numbers_of(magnitudes)
+        for k in range(n):
             if not 0 <= index[k] < self.hip.shape[0]:
                 raise IndexError(f"the star catalogue has no row {index[k]}")
+            fetch(&self.vmag[index[k]])
             fetch(&self.hip[index[k]])
             fetch(&self.tyc[index[k], 0])
-        for k in range(index.shape[0]):
+        for k in range(n):
             row = index[k]
+            mag[k] = self.vmag[row] * 0.01
             if self.hip[row]:
                 at = _before(_written(self.hip[row], end), b"HIP ", 4)
             else:
                 at = _before(_written(self.tyc[row, 2], end), b"-", 1)
                 at = _before(_written(self.tyc[row, 1], at), b"-", 1)
                 at = _before(_written(self.tyc[row, 0], at), b"TYC ", 4)
-            out.append(at[:end - at].decode("ascii"))
-        return out
+            names.append(at[:end - at].decode("ascii"))
+        return tuple(names), magnitudes
 
 
 cdef inline char *_written(int number, char *end) noexcept nogil:
@@ -328,21 +340,69 @@ cdef Date date_of(double years, velocity) except *:
     return date
 
 
-cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs, Span *span) noexcept nogil:
+cdef void _flatten(
+    FrameStars frame, bint mirrored, const double *attitude, double focal, const double *axis, double margin_px, Patch *out
+) noexcept nogil:
+    """Set the patch of a frame in a pose about the direction `axis` (3,), of any length, of its middle.
+
+    Lines of right ascension and declination are taken to be straight there. How much they bend is a margin, which grows
+    with the square of the frame's radius; where it is a large share of that, near a pole or in a wide field, all is in.
+    """
+    cdef double flat = hypot(axis[0], axis[1]), norm = hypot(flat, axis[2]), radius = frame.radius
+    cdef double ra = atan2(axis[1], axis[0]), dec = atan2(axis[2], flat), steep, slant, bend, ahead, off
+    cdef double[3] east
+    cdef double[3] north
+    cdef double[3] slope
+    cdef int i, k
+    out.ra, out.dec = <int>(ra / MAS), <int>(dec / MAS)
+    out.ra += CIRCLE if out.ra < 0 else 0
+    for i in range(2):
+        out.by_ra[i], out.by_dec[i], out.reach[i] = 0.0, 0.0, 1.0
+    # of the frame's middle and C's axis z
+    ahead = (attitude[6] * axis[0] + attitude[7] * axis[1] + attitude[8] * axis[2]) / norm
+    if fabs(dec) + radius > M_PI / 2 - 0.01 or ahead < 0.1:
+        return
+    steep, slant = tan(fabs(dec) + radius), sqrt(max(1 - ahead * ahead, 0.0)) / ahead
+    bend = radius * radius * (steep + 2 * slant + 2 * radius * (1 + steep * steep))
+    if bend > MOST_CURVED * radius:
+        return
+    bend += MOVED * MAS
+    east[0], east[1], east[2] = -axis[1] / norm, axis[0] / norm, 0.0
+    north[0], north[1], north[2] = -axis[2] * axis[0] / (flat * norm), -axis[2] * axis[1] / (flat * norm), flat / norm
+    for i in range(2):
+        for k in range(3):
+            slope[k] = (attitude[3 * i + k] * focal - frame.centre[mirrored][i] * attitude[6 + k]) / ahead * MAS
+        # `east` is as long as a parallel is, for a unit of right ascension
+        out.by_ra[i] = <float>(slope[0] * east[0] + slope[1] * east[1] + slope[2] * east[2])
+        out.by_dec[i] = <float>(slope[0] * north[0] + slope[1] * north[1] + slope[2] * north[2])
+        # the middle is that of the frame's own focal length
+        off = fabs(frame.centre[mirrored][i] * (focal / frame.focal_px - 1))
+        out.reach[i] = <float>(frame.reach[i] + margin_px + off + bend * focal / (ahead * ahead))
+
+
+cdef void _marked(const unsigned int *ra, const int *dec, int n, const Patch *patch, int *flags) noexcept nogil:
+    """Set flags (n,) to 1 for places (mas) in a patch, to 0 for others: several at once, where the processor can."""
+    cdef int k, east
+    cdef float x, y
+    for k in range(n):
+        east = <int>ra[k] - patch.ra
+        east -= CIRCLE if east > CIRCLE // 2 else 0
+        east += CIRCLE if east < -(CIRCLE // 2) else 0
+        x = patch.by_ra[0] * east + patch.by_dec[0] * (dec[k] - patch.dec)
+        y = patch.by_ra[1] * east + patch.by_dec[1] * (dec[k] - patch.dec)
+        flags[k] = (fabsf(x) < patch.reach[0]) & (fabsf(y) < patch.reach[1])
+
+
+cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil:
     """Write the first rows and the ends of all runs of cells that a cone about a vector (3,) touches; how many.
 
-    As `starpos.sky.zones.rows_near` does.  span: what the cone covers, and some margin.
+    As `starpos.sky.zones.rows_near` does.
     """
     cdef double flat = hypot(axis[0], axis[1]), ra = atan2(axis[1], axis[0]) * 180 / M_PI, dec = atan2(axis[2], flat)
     cdef double wide = 180.0
     cdef int low, high, first, width, zone, count = 0
     if fabs(dec) + radius < M_PI / 2 - 1e-9:
         wide = asin(min(sin(radius) / cos(dec), 1.0)) * 180 / M_PI
-    span.south = <long long>((dec - radius) / MAS) - MOVED
-    span.north = <long long>((dec + radius) / MAS) + MOVED
-    # the margin is one along the sky
-    span.width = <long long>min(2 * wide * DEGREE + 2 * MOVED / max(cos(dec) - radius, 1e-3), CIRCLE)
-    span.west = (<long long>(ra * DEGREE) - span.width // 2 + 2 * <long long>CIRCLE) % CIRCLE
     low = max(<int>((dec - radius) * 180 / M_PI + 90), 0)
     high = min(<int>((dec + radius) * 180 / M_PI + 90), ZONES - 1)
     first = <int>floor(ra - wide)

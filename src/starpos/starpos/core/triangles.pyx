@@ -2,12 +2,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Look up a frame's triangles of bright stars among those of the sky, by their shape."""
 
-from libc.math cimport M_PI, asin, fabs, hypot, log, sqrt
+from libc.math cimport M_PI, asin, log, sqrt
 from libc.stdlib cimport calloc, free, malloc, realloc
 
 import numpy as np
 
-from starpos.core.algebra cimport fetch
+from starpos.core.algebra cimport fetch, length
 from starpos.core.frame cimport FrameStars, direction_of
 
 cdef enum:
@@ -281,7 +281,7 @@ cdef int _begin(Search *s, FrameStars frame, int stars, double error_px) except 
     s.side = s.error + stars
     for b in range(stars):
         direction_of(frame.pixel[0, b, 0], frame.pixel[0, b, 1], frame.focal_px, &s.v[3 * b])
-        s.error[b] = hypot(error_px, frame.error[b]) / frame.focal_px
+        s.error[b] = length(error_px, frame.error[b]) / frame.focal_px
         for a in range(b):
             x, y, z = s.v[3 * a] - s.v[3 * b], s.v[3 * a + 1] - s.v[3 * b + 1], s.v[3 * a + 2] - s.v[3 * b + 2]
             s.side[a * stars + b] = 2 * asin(min(1.0, 0.5 * sqrt(x * x + y * y + z * z)))
@@ -404,4 +404,4 @@ cdef int _best(Search *s, int most, int least_support, bint by_size, Candidate *
 cdef inline bint _precedes(const Candidate *one, const Candidate *other, bint by_size) noexcept nogil:
     if one.support != other.support:
         return one.support > other.support
-    return by_size and fabs(log(one.size)) < fabs(log(other.size))
+    return by_size and max(one.size, 1 / one.size) < max(other.size, 1 / other.size)

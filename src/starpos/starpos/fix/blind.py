@@ -61,11 +61,12 @@ class BlindSolver:
         camera, found = answer
         field = frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera)
         warnings, explained = suspicions(seen, through(field, camera, window), sky, found)
+        names, magnitudes = self.catalogue.labels(found.catalogue)
         return replace(
             Solution.failed(stars, Status.OK, "identified"),
-            names=tuple(self.catalogue.names(found.catalogue)),
+            names=names,
             star=inside[found.star],
-            magnitudes=self.catalogue.vmag(found.catalogue),
+            magnitudes=magnitudes,
             attitude=attitude_of(found, sky, camera),
             identify_s=time.perf_counter() - begin,
             warnings=warnings,

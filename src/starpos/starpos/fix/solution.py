@@ -10,6 +10,7 @@ from starpos.errors import FixError, StarposError, TiltError, TiltRangeError, Ti
 from starpos.fix.fix import Fix
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
+from starpos.frozen import at_once
 from starpos.identification import Identification
 from starpos.identification.explained import Explained
 from starpos.identification.hint import Hint
@@ -34,6 +35,7 @@ class Status(str, Enum):
     POOR_FIT = "poor fit"
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Attitude:
     """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
@@ -51,6 +53,7 @@ class Attitude:
     model: str = PLUMB_BOB
 
 
+@at_once
 @dataclass(frozen=True)
 class Solution:
     """Solution of one frame: a status, a sentence, and as much of the answer as there is.

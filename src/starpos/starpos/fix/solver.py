@@ -36,7 +36,6 @@ from starpos.instrument.camera_vertical import own_level
 from starpos.instrument.inclinometer import Tilt, level_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
-from starpos.rotation import full_turn
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
@@ -93,6 +92,7 @@ class Solver:
         if found is None:
             return replace(_unidentified(stars, camera, sky), identify_s=time.perf_counter() - begin)
         warnings, explained = suspicions(stars, field, sky, found)
+        names, magnitudes = catalogue.labels(found.catalogue)
         return Solution(
             Status.OK,
             "identified",
@@ -100,9 +100,9 @@ class Solver:
             utc_unix_s=stars.mid_unix_s,
             stars_detected=len(stars),
             negative=stars.negative,
-            names=tuple(catalogue.names(found.catalogue)),
+            names=names,
             star=found.star,
-            magnitudes=catalogue.vmag(found.catalogue),
+            magnitudes=magnitudes,
             attitude=attitude_of(found, sky, camera),
             identify_s=time.perf_counter() - begin,
             warnings=warnings,
@@ -146,13 +146,13 @@ class Solver:
             )
         warnings, explained = suspicions(stars, field, sky, found)
         identified = time.perf_counter()
-        names, magnitudes = catalogue.names(found.catalogue), catalogue.vmag(found.catalogue)
+        names, magnitudes = catalogue.labels(found.catalogue)
         solution = replace(
             Solution.failed(stars, Status.OK, "fix"),
             attitude=attitude_of(found, sky, camera),
             tilt=tilt,
             identify_s=identified - begin,
-            names=tuple(names),
+            names=names,
             star=found.star,
             magnitudes=magnitudes,
             warnings=warnings,
@@ -320,7 +320,7 @@ def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
 def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
     """Solution for all stars from that for the rows `inside` of them."""
     star = None if s.star is None else inside[s.star]
-    found = s.found and replace(s.found, star=inside[s.found.star])
+    found = s.found and s.found.but(star=inside[s.found.star])
     return replace(s, star=star, found=found, stars_detected=len(stars))
 
 
@@ -340,7 +340,9 @@ def suspicions(
         part, found = wide.part_of(field, sky, found)
         field, flux = part.field, flux[part.row]
     explained = explained_by(found, field)
-    names = (TWO_SKIES,) * two_skies(field, flux, sky, found) + (UNEXPLAINED,) * (not explained.enough)
+    names = (TWO_SKIES,) * two_skies(field, flux, sky, found, explained) + (UNEXPLAINED,) * (
+        not explained.enough
+    )
     return names, explained
 
 
@@ -355,9 +357,9 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
         centre, above = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
     ra, dec, roll = pointing_of(centre, above, found.attitude, sky.velocity, found.mirrored)
     return Attitude(
-        ra=full_turn(ra),
+        ra=ra,
         dec=dec,
-        roll=full_turn(roll),
+        roll=roll,
         focal_px=fx,
         residual_arcsec=found.residual_px / math.sqrt(fx * fy) / ARCSEC,
         log_odds=found.log_odds,

@@ -8,7 +8,7 @@ possible before. Where the focal length is roughly known, scales near it come fi
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
@@ -98,7 +98,7 @@ def identify_blind(
                 seen = seen.but(area_px2=share * seen.area_px2)
                 found = identified(seen, sky, pose, radius_px, prior, enough)
                 if found:
-                    return camera, replace(found, star=rows[found.star])
+                    return camera, found.but(star=rows[found.star])
     return None
 
 

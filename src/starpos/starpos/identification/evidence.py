@@ -16,6 +16,7 @@ of a hundred.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -54,6 +55,7 @@ class Prior:
         return self.log_density(Pose(attitude, focal_px, mirrored))
 
 
+@lru_cache(maxsize=16)
 def anywhere(focal_px: float, log_share: float = 0.0) -> Prior:
     """The Prior of a frame lost in space, with a focal length of about focal_px."""
     return Prior(Anywhere(focal_px, SCALES, MIRRORED, log_share), WIDTH)

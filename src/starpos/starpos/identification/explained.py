@@ -4,6 +4,7 @@
 from dataclasses import dataclass
 
 from starpos.core.frame import FrameStars, explained
+from starpos.frozen import at_once
 from starpos.identification.full import Identification
 from starpos.identification.pose import TEST_STARS
 
@@ -14,6 +15,7 @@ LEAST_DUE = 8
 ENOUGH_EXPLAINED, ENOUGH_SEEN = 0.5, 0.6
 
 
+@at_once
 @dataclass(frozen=True)
 class Explained:
     """Counts of what an identification explains.

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.core.frame import FrameStars
 from starpos.core.poses import Rules
-from starpos.core.search import Judge
+from starpos.core.search import Identification, Judge
 from starpos.identification.evidence import CHANCES, Prior
 from starpos.identification.pose import SMALL_STEP, STEPS, Pose
 from starpos.identification.sky import Sky
@@ -52,53 +52,6 @@ RULES = Rules(
     most_stars=FAINTEST_FIT,
     bent_px=BENT_PX,
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Identification:
-    """M matched stars and the attitude they give.
-
-    star             (M,): rows of the input, in ascending order
-    catalogue        (M,): rows of the star catalogue
-    blend_px         (M,): how far unresolved neighbours may move each star's image
-    attitude         (3, 3): `Sky`'s directions into C
-    focal_scale      factor on the camera's focal length
-    residual_px      rms along one axis, with the weights of the fit
-    mean_square_px2  of the residuals along one axis, all alike
-    log_odds         of the identification: its evidence, as `evidence` defines it, with the prior
-    expected         (E,): rows of the catalogue's stars well inside the frame, brightest first
-    mirrored         whether the frame's rows run bottom-up; the attitude is that of the flipped frame
-    """
-
-    star: np.ndarray
-    catalogue: np.ndarray
-    blend_px: np.ndarray
-    attitude: np.ndarray
-    focal_scale: float
-    residual_px: float
-    mean_square_px2: float
-    log_odds: float
-    expected: np.ndarray
-    mirrored: bool
-
-    @classmethod
-    def of(cls, found: tuple, field: FrameStars) -> "Identification":
-        """The identification of a field that the compiled core has found."""
-        star, catalogue, blend_px, attitude, focal_px, rms_px, square_px2, log_odds, expected, mirrored = (
-            found
-        )
-        return cls(
-            star=star,
-            catalogue=catalogue,
-            blend_px=blend_px,
-            attitude=attitude,
-            focal_scale=focal_px / field.focal_px,
-            residual_px=rms_px,
-            mean_square_px2=square_px2,
-            log_odds=log_odds,
-            expected=expected,
-            mirrored=mirrored,
-        )
 
 
 @dataclass(frozen=True)
@@ -153,5 +106,4 @@ def identified(
     None unless the evidence is beyond doubt: log-odds of `enough`.
     """
     judged = judge(field, sky, prior, enough)
-    found = judged.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)
-    return None if found is None else Identification.of(found, field)
+    return judged.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)

@@ -3,8 +3,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from itertools import chain, repeat
+from itertools import chain
 
 import numpy as np
 
@@ -157,7 +156,7 @@ def identifications(
         for found in chain(
             near_or_lost(even, sky, (), STAGES, enough), _crowded(even, sky, (), enough, CELLS**2 // 2)
         ):
-            yield replace(found, star=rows[found.star])
+            yield found.but(star=rows[found.star])
 
 
 def _crowded(
@@ -220,8 +219,7 @@ def _lost(
 ) -> Iterator[Identification]:
     """What is identified lost in space, which has that share of the probability."""
     judged = judge(field, sky, anywhere(field.focal_px, log_share), enough)
-    found = Lost(judged, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS)
-    return map(Identification.of, found, repeat(field))
+    return Lost(judged, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS)
 
 
 def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification | None:

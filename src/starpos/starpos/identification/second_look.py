@@ -8,7 +8,6 @@ looks only where nothing was detected, it multiplies with the evidence of the de
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -48,7 +47,7 @@ def second_look(
         seen.add(pairs)
         log_odds = found.log_odds + _log_ratio(field, sky, camera, found, look)
         if log_odds >= ENOUGH:
-            return replace(found, log_odds=log_odds)
+            return found.but(log_odds=log_odds)
         if len(seen) == MOST_LOOKS:
             break
     return None

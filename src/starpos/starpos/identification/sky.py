@@ -9,10 +9,12 @@ import numpy as np
 from starpos.core.screen import BrightTable
 from starpos.core.sky import StarTable
 from starpos.earth.orientation import earth_motion
+from starpos.frozen import at_once
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.sky.catalogue import EPOCH, Catalogue
 
 
+@at_once
 @dataclass(frozen=True)
 class Sky:
     """The catalogue at a date: with proper motion to `year` and aberration by `velocity` (3,) in units of c."""

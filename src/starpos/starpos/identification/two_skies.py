@@ -16,6 +16,7 @@ import numpy as np
 
 from starpos.core.frame import FrameStars
 from starpos.identification.evidence import DOUBLE_PX
+from starpos.identification.explained import Explained
 from starpos.identification.full import ENOUGH, Identification
 from starpos.identification.pairs import close_pairs
 from starpos.identification.pose import TEST_STARS, Pose
@@ -62,16 +63,18 @@ FEW_WRONG, ROBUST = 32, 0.9
 BENDS = (12, 3), (20, 6), (32, 10)
 
 
-def two_skies(field: FrameStars, flux: np.ndarray, sky: Sky, found: Identification) -> bool:
+def two_skies(
+    field: FrameStars, flux: np.ndarray, sky: Sky, found: Identification, explained: Explained
+) -> bool:
     """Whether the stars that an identification has left over are a sky of their own.
 
     flux (N,): of the field's stars, in any unit, brightest first.
+    explained: how much of the field it explains.
     """
     if _between_two(field, sky, found):
         return True
-    bright = min(len(field), TEST_STARS)
-    # the rows are in ascending order
-    if bright - found.star.searchsorted(bright) < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
+    bright = explained.bright
+    if bright - explained.explained < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
         return False
     left = np.ones(len(flux), bool)
     left[found.star] = False

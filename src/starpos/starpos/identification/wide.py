@@ -155,8 +155,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
     pose = Pose(flip @ best.turn @ flip @ found.attitude, stars.focal_px * found.focal_scale, found.mirrored)
     residual = stars.xy[int(found.mirrored)][star] - pose.project(sky.directions(catalogue))
     from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle)
-    return best, replace(
-        found,
+    return best, found.but(
         star=star,
         catalogue=catalogue,
         blend_px=found.blend_px[inside],

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.sky import Designations
+from starpos.core.sky import Labels
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
@@ -105,8 +105,8 @@ class Catalogue:
         return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
 
     @cached_property
-    def _designations(self) -> Designations:
-        return Designations(self.hip, self.tyc)
+    def _labels(self) -> Labels:
+        return Labels(self.hip, self.tyc, self.vmag_centi)
 
     def vmag(self, index: Rows = slice(None)) -> np.ndarray:
         """Johnson V magnitudes (n,) of the rows `index`."""
@@ -136,9 +136,13 @@ class Catalogue:
         motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
         return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
-    def names(self, index: np.ndarray) -> list[str]:
+    def labels(self, index: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
+        """Names and V magnitudes (n,) of the rows `index` (n,)."""
+        return self._labels.of(np.asarray(index, np.intp))
+
+    def names(self, index: np.ndarray) -> tuple[str, ...]:
         """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""
-        return self._designations.of(np.asarray(index, np.intp))
+        return self.labels(index)[0]
 
     def cone(self, centre: np.ndarray, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Rows of the stars within radius_rad of the unit vector `centre` (3,) at J2000, brightest first."""

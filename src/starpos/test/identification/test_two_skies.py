@@ -13,6 +13,7 @@ from starpos.fix.solution import TWO_SKIES, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
+from starpos.identification.explained import explained_by
 from starpos.identification.search import frame_stars, identify_frame
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
@@ -70,7 +71,7 @@ def warns(light: Light, catalogue, rng) -> bool:
     seen = frame_stars(v, sigma, CAMERA)
     found = identify_frame(seen, sky)
     assert found is not None
-    return two_skies(seen, flux, sky, found)
+    return two_skies(seen, flux, sky, found, explained_by(found, seen))
 
 
 def turned(attitude, shift_px, rng, roll=0.0):

@@ -172,7 +172,7 @@ def test_an_old_attitude_is_of_no_use_until_the_bias_is_known(gyro, first, solve
     tell(gyro, MID_S, MID_S + 2.0, RATE + bias)
     later = frame_at(stars, 1.0)
     assert not gyro.predicted(later, solver)
-    seen = replace(found, attitude=turned(found.attitude, solver, RATE, 1.0))
+    seen = found.but(attitude=turned(found.attitude, solver, RATE, 1.0))
     gyro.saw(later, seen, solver)
     (prior,) = gyro.predicted(frame_at(stars, 2.0), solver)
     assert off_rad(prior, turned(found.attitude, solver, RATE, 2.0)) < 3e-3 and not said
@@ -193,7 +193,7 @@ def test_a_gyro_that_contradicts_the_stars_is_told(said, first, solver, kind):
     gyro = Gyro(said)
     tell(gyro, MID_S - 0.1, MID_S + 1.0, WRONG[kind](RATE))
     gyro.saw(stars, found, solver)
-    later = replace(found, attitude=turned(found.attitude, solver, RATE, 1.0))
+    later = found.but(attitude=turned(found.attitude, solver, RATE, 1.0))
     gyro.saw(frame_at(stars, 1.0), later, solver)
     assert ["off the stars" in sentence for sentence in said] == [True]
 

@@ -182,7 +182,7 @@ def test_bright_stars_come_from_the_supplement(catalogue):
 def test_names(catalogue):
     sirius = np.flatnonzero(catalogue.hip == 32349)
     unnamed = np.flatnonzero(catalogue.hip == 0)[:1]
-    assert catalogue.names(sirius) == ["HIP 32349"]
+    assert catalogue.names(sirius) == ("HIP 32349",)
     assert catalogue.names(unnamed)[0] == "TYC {}-{}-{}".format(*catalogue.tyc[unnamed[0]])
 
 
