@@ -2,9 +2,11 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The stars of a frame in pixels from the principal point, as the other modules here take them."""
 
-from libc.math cimport M_PI, atan, atan2, hypot, isfinite, rint, sqrt
+from libc.math cimport atan, hypot, isfinite, rint, sqrt
 
 import numpy as np
+
+from starpos.core.memory cimport numbers_of
 
 
 cdef class FrameStars:
@@ -92,18 +94,18 @@ cdef FrameStars _shape_of(FrameStars f):
     return out
 
 
-def ideal_frame(
-    const double[::1] x, const double[::1] y, const double[:, :, ::1] covariance, camera, double edge_px, double least_sigma,
-    int tested,
-):
-    """FrameStars of the pixels x, y (N,), with covariances (N, 2, 2), of a pinhole camera without distortion.
+def ideal_frame(across_px, down_px, covariance, camera, double edge_px, double least_sigma, int tested):
+    """FrameStars of pixels (N,), (N,), with covariances (N, 2, 2), of a pinhole camera without distortion.
 
     edge_px      so far beyond the frame they may be: None if one is farther
     least_sigma  px; smaller errors become it
     """
     cdef double fx = camera.fx, squeeze = fx / <double>camera.fy, cx = camera.cx, cy = camera.cy
     cdef double width = camera.width, height = camera.height, across, down
-    cdef Py_ssize_t n = x.shape[0], k
+    cdef Py_ssize_t n = len(across_px), k
+    cdef const double *x = <const double *>numbers_of(across_px, n * sizeof(double))
+    cdef const double *y = <const double *>numbers_of(down_px, n * sizeof(double))
+    cdef const double *variance = <const double *>numbers_of(covariance, 4 * n * sizeof(double))
     cdef FrameStars out = FrameStars.__new__(FrameStars)
     pixels, errors = np.empty((2, n, 2)), np.empty(n)
     cdef double[:, :, ::1] xy = pixels
@@ -116,7 +118,7 @@ def ideal_frame(
         across, down = x[k] - cx, (y[k] - cy) * squeeze
         xy[0, k, 0] = xy[1, k, 0] = across
         xy[0, k, 1], xy[1, k, 1] = down, rows - 1 - 2 * cy * squeeze - down
-        error[k] = max(sqrt((covariance[k, 0, 0] + covariance[k, 1, 1]) / 2), least_sigma)
+        error[k] = max(sqrt((variance[4 * k] + variance[4 * k + 3]) / 2), least_sigma)
     _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
     out.reach[0], out.reach[1] = width / 2, rows / 2
     out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
@@ -187,64 +189,3 @@ def mean_sigma(const double[:, :, ::1] covariance):
     for k in range(covariance.shape[0]):
         sigma[k] = sqrt((covariance[k, 0, 0] + covariance[k, 1, 1]) / 2)
     return out
-
-
-def explained(const Py_ssize_t[::1] star, const Py_ssize_t[::1] index, const Py_ssize_t[::1] expected, int bright, int least):
-    """How much stars (M,), rows of a frame, that are catalogue rows `index` (M,) explain, of the expected ones (E,).
-
-    Returns how many of the frame's `bright` brightest they are; how many of the brightest expected stars are among them,
-    of as many and at least `least`; and how many these are.
-    """
-    cdef Py_ssize_t k, j, due
-    cdef int found = 0, seen = 0
-    for k in range(star.shape[0]):
-        found += star[k] < bright
-    due = min(max(found, least), <int>expected.shape[0])
-    for k in range(due):
-        for j in range(index.shape[0]):
-            if index[j] == expected[k]:
-                seen += 1
-                break
-    return found, seen, due
-
-
-def pointing_of(centre, above, const double[:, ::1] attitude, velocity, bint mirrored):
-    """Right ascension, declination and position angle of the top (rad) of a frame, ICRS without aberration.
-
-    The first and the last are in [0, 2 pi).
-
-    centre    vector in C, three numbers of any length, of the frame's centre
-    above     the same of a pixel above it
-    attitude  (3, 3): ICRS into C
-    velocity  (3,): of the Earth, in units of c
-    mirrored  whether the frame's rows run bottom-up
-    """
-    cdef double[2][3] seen
-    cdef double[3] up
-    cdef double norm, flat, east, north, x, y, z
-    cdef int k, i
-    for k in range(2):
-        x, y, z = above if k else centre
-        norm = sqrt(x * x + y * y + z * z)
-        for i in range(3):
-            seen[k][i] = (x * attitude[0, i] + y * attitude[1, i] + z * attitude[2, i]) / norm - <double>velocity[i]
-        norm = sqrt(seen[k][0] ** 2 + seen[k][1] ** 2 + seen[k][2] ** 2)
-        for i in range(3):
-            seen[k][i] /= norm
-    flat = hypot(seen[0][0], seen[0][1])
-    for i in range(3):
-        up[i] = (seen[1][i] - seen[0][i]) * (-1 if mirrored else 1)
-    if flat > 0:
-        east = (up[1] * seen[0][0] - up[0] * seen[0][1]) / flat
-        north = up[2] * flat - (up[0] * seen[0][0] + up[1] * seen[0][1]) * seen[0][2] / flat
-    else:
-        # at a pole, on the meridian of right ascension 0
-        east, north = up[1], -up[0] * seen[0][2]
-    return _full_turn(atan2(seen[0][1], seen[0][0])), atan2(seen[0][2], flat), _full_turn(atan2(east, north))
-
-
-cdef double _full_turn(double angle) noexcept:
-    """An angle in [-pi, pi], brought to [0, 2 pi), as `rotation.full_turn` does."""
-    angle += 2 * M_PI if angle < 0 else 0.0
-    # the smallest negative angle becomes 2 pi
-    return 0.0 if angle >= 2 * M_PI else angle

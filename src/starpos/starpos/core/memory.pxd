@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-# Where arrays that a module has just made keep their numbers, for the other modules here.
+# Where arrays keep their numbers, for the other modules here.
 
-from cpython.buffer cimport PyBUF_WRITABLE, PyBuffer_Release, PyObject_GetBuffer
+from cpython.buffer cimport PyBUF_SIMPLE, PyBuffer_Release, PyObject_GetBuffer
 
 
-cdef inline void *numbers_of(array) except NULL:
-    """The first number of an array that `numpy.empty` has made, for as long as somebody holds the array.
+cdef inline void *numbers_of(array, Py_ssize_t size) except NULL:
+    """The first number of a contiguous array of so many bytes, for as long as somebody holds the array.
 
-    Its type is known, so it is not looked at: a typed view of a small array takes longer than the work on it.
+    Its type must be known: it is not looked at, because a typed view of a small array takes longer than the work on it.
     """
     cdef Py_buffer held
-    PyObject_GetBuffer(array, &held, PyBUF_WRITABLE)
+    PyObject_GetBuffer(array, &held, PyBUF_SIMPLE)
     PyBuffer_Release(&held)
+    if held.len != size:
+        raise ValueError(f"an array of {held.len} bytes where {size} were expected")
     return held.buf

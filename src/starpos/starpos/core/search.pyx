@@ -8,6 +8,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from starpos.core.found cimport Identification
 from starpos.core.frame cimport FrameStars, on_frame
 from starpos.core.matching cimport Matching, begin
 from starpos.core.memory cimport numbers_of
@@ -23,42 +24,6 @@ cdef struct Work:
     Matching m
     Settled end
     double *memory
-
-
-cdef class Identification:
-    """M matched stars and the attitude they give.
-
-    star             (M,): rows of the frame's stars, in ascending order
-    catalogue        (M,): rows of the star catalogue
-    blend_px         (M,): how far unresolved neighbours may move each star's image
-    attitude         (3, 3): directions of the sky into C
-    focal_scale      factor on the camera's focal length
-    residual_px      rms along one axis, with the weights of the fit
-    mean_square_px2  of the residuals along one axis, all alike
-    log_odds         of the identification: its evidence, as `evidence` defines it, with the prior
-    expected         (E,): rows of the catalogue's stars well inside the frame, brightest first
-    mirrored         whether the frame's rows run bottom-up; the attitude is that of the flipped frame
-    """
-
-    cdef readonly object star, catalogue, blend_px, attitude, expected
-    cdef readonly double focal_scale, residual_px, mean_square_px2, log_odds
-    cdef readonly bint mirrored
-
-    def __init__(
-        self, *, star, catalogue, blend_px, attitude, double focal_scale, double residual_px, double mean_square_px2,
-        double log_odds, expected, bint mirrored,
-    ):
-        self.star, self.catalogue, self.blend_px, self.attitude = star, catalogue, blend_px, attitude
-        self.focal_scale, self.residual_px, self.mean_square_px2 = focal_scale, residual_px, mean_square_px2
-        self.log_odds, self.expected, self.mirrored = log_odds, expected, mirrored
-
-    def but(self, **changes):
-        """The identification with some of its values changed."""
-        names = (
-            "star", "catalogue", "blend_px", "attitude", "focal_scale", "residual_px", "mean_square_px2", "log_odds",
-            "expected", "mirrored",
-        )
-        return Identification(**({name: getattr(self, name) for name in names} | changes))
 
 
 cdef class Anywhere:
@@ -115,17 +80,22 @@ cdef class Judge:
     def __init__(
         self, FrameStars frame, StarTable table, double years, velocity, prior, double enough, Rules rules, Chances chances
     ):
-        cdef int k
+        self._take(frame, table, years, velocity, prior, enough, rules, chances)
+
+    cdef int _take(
+        self, FrameStars frame, StarTable table, double years, velocity, prior, double enough, Rules rules, Chances chances
+    ) except -1:
+        """Take the arguments of a new one."""
         self.frame, self.table, self.date, self.rules = frame, table, date_of(years, velocity), rules
         self.chances = chances
         self.enough = enough
-        if isinstance(prior.log_density, Anywhere):
-            self.anywhere = prior.log_density
+        log_density = prior.log_density
+        if isinstance(log_density, Anywhere):
+            self.anywhere = log_density
         else:
             self.log_density = prior.log_density_at
-        width = prior.width
-        for k in range(4):
-            self.width[k] = width[k]
+        memcpy(self.width, numbers_of(prior.width, 4 * sizeof(double)), 4 * sizeof(double))
+        return 0
 
     def identified(self, const double[:, ::1] attitude, double focal_px, bint mirrored, const double[::1] radius_px):
         """What is identified by a pose near the right one.
@@ -213,9 +183,9 @@ cdef class Judge:
         cdef int k, n = end.count, last = 2 * n
         # one block of memory is quicker than three
         rows, out.blend_px, out.attitude = np.empty(2 * n + work.stars.count, np.intp), np.empty(n), np.empty((3, 3))
-        cdef Py_ssize_t *row = <Py_ssize_t *>numbers_of(rows)
-        cdef double *blend = <double *>numbers_of(out.blend_px)
-        memcpy(numbers_of(out.attitude), end.attitude, 9 * sizeof(double))
+        cdef Py_ssize_t *row = <Py_ssize_t *>numbers_of(rows, (2 * n + work.stars.count) * sizeof(Py_ssize_t))
+        cdef double *blend = <double *>numbers_of(out.blend_px, n * sizeof(double))
+        memcpy(numbers_of(out.attitude, 9 * sizeof(double)), end.attitude, 9 * sizeof(double))
         for k in range(n):
             row[k], row[n + k] = end.star[k], work.stars.row[end.near[k]]
             blend[k] = work.stars.moved[end.near[k]]
@@ -248,6 +218,7 @@ cdef void _release(Work *work) noexcept:
 cdef class Limits:
     """Limits of the search.
 
+    first_stars              the first look is at triangles of so many of the brightest stars
     match_sigma              stars lie within so many sigma of their places
     log_false                logarithm of the share of detections that may be false
     worth_a_fit, most_stars  log-odds of a pose that is judged, by so many of the brightest catalogue stars on the frame
@@ -258,21 +229,23 @@ cdef class Limits:
     """
 
     cdef double match_sigma, log_false, worth_a_fit, loose_px, most_candidates, most_in_crowd
-    cdef int most_stars, most_looked_at, most_supported
+    cdef int first_stars, most_stars, most_looked_at, most_supported
 
     def __init__(
-        self, *, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
+        self, *, int first_stars, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
         double most_candidates, int most_looked_at, double most_in_crowd, int most_supported,
     ):
+        self.first_stars = first_stars
         self.match_sigma, self.log_false, self.worth_a_fit, self.most_stars = match_sigma, log_false, worth_a_fit, most_stars
         self.loose_px, self.most_candidates, self.most_looked_at = loose_px, most_candidates, most_looked_at
         self.most_in_crowd, self.most_supported = most_in_crowd, most_supported
 
 
 cdef class Lost:
-    """An iterator over what is identified, as `Judge.identified` returns it, of a frame lost in space.
+    """An iterator over what is identified of a frame lost in space, as `Finder.lost` makes it.
 
-    stages   (number of brightest stars, their error in px): triangles of these are looked up, none twice with one error
+    stages   (number of brightest stars, their error in px): triangles of these are looked up, none twice with one error.
+             Before the first stage the best candidate that others support is judged, of fewer stars: it mostly is right
     crowded  most of the brightest stars may be false: only candidates that two others support are judged, all of them;
              else the best candidate is judged, and of the others those that are worth a fit
     """
@@ -283,7 +256,7 @@ cdef class Lost:
     cdef Limits limits
     cdef object stages
     cdef dict looked_up
-    cdef bint crowded, ranked
+    cdef bint crowded, ranked, begun
     cdef double error_px
     # Candidates of a stage; their order, where in it the search is, and its end; radii (px) of the stars that decide.
     cdef Candidate *found
@@ -291,15 +264,18 @@ cdef class Lost:
     cdef double *radius
     cdef int count, at
 
-    def __init__(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits):
+    cdef int _take(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits) except -1:
+        """Take what a new one searches by."""
         cdef int most = max(limits.most_looked_at, limits.most_supported) + 1
         self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
-        self.stages, self.looked_up, self.crowded = iter(stages), {}, crowded
+        self.stages, self.looked_up, self.crowded, self.begun = iter(stages), {}, crowded, crowded
+        self.error_px = stages[0][1]
         self.found = <Candidate *>malloc(most * (sizeof(Candidate) + sizeof(int)))
         self.radius = <double *>malloc((judge._deciding() + 1) * sizeof(double))
         if self.found == NULL or self.radius == NULL:
             raise MemoryError
         self.order = <int *>(self.found + most)
+        return 0
 
     def __dealloc__(self):
         free(self.found)
@@ -315,6 +291,10 @@ cdef class Lost:
         while True:
             if self.at == 1 and not self.ranked:
                 self._rank()
+            if self.at == self.count and not self.begun:
+                self.begun = True
+                self._look_first()
+                continue
             if self.at == self.count:
                 # at the end of the stages the search ends
                 stars, error_px = next(self.stages)
@@ -326,6 +306,15 @@ cdef class Lost:
             identified = self.judge.judged(attitude, focal, c.mirrored, self.radius)
             if identified is not None:
                 return identified
+
+    cdef int _look_first(self) except -1:
+        """Take the best candidate of the first few stars, if others support it."""
+        cdef int stars = min(self.limits.first_stars, <int>self.judge.frame.error.shape[0])
+        self.count = self.table.best(
+            self.judge.frame, 0, stars, self.error_px, self.limits.most_candidates, 1, True, self.found
+        )
+        self.at, self.ranked, self.order[0] = 0, True, 0
+        return 0
 
     cdef int _look_up(self, int stars, double error_px) except -1:
         """Take the candidates of a stage."""
@@ -384,3 +373,28 @@ cdef class Lost:
         finally:
             free(kept)
         return 0
+
+
+cdef class Finder:
+    """Tables and rules by which frames lost in space are found."""
+
+    cdef StarTable stars
+    cdef TriangleTable triangles
+    cdef BrightTable bright
+    cdef Rules rules
+    cdef Chances chances
+    cdef Limits limits
+
+    def __init__(
+        self, StarTable stars, TriangleTable triangles, BrightTable bright, Rules rules, Chances chances, Limits limits
+    ):
+        self.stars, self.triangles, self.bright = stars, triangles, bright
+        self.rules, self.chances, self.limits = rules, chances, limits
+
+    def lost(self, FrameStars frame, double years, velocity, prior, double enough, stages, bint crowded):
+        """An iterator over what is identified, as `Judge` has it with the same arguments; stages, crowded: see `Lost`."""
+        cdef Judge judge = Judge.__new__(Judge)
+        cdef Lost out = Lost.__new__(Lost)
+        judge._take(frame, self.stars, years, velocity, prior, enough, self.rules, self.chances)
+        out._take(judge, self.triangles, self.bright, stages, crowded, self.limits)
+        return out

@@ -4,13 +4,11 @@
 
 from libc.math cimport M_PI, asin, atan2, cos, fabs, fabsf, floor, hypot, pow, rint, sin, sqrt, tan
 from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy
 
 import numpy as np
 
 from starpos.core.algebra cimport Point, Strips, fetch, sort_by_x, turned
 from starpos.core.frame cimport FrameStars, axis_of, pixel_of, seen_on
-from starpos.core.memory cimport numbers_of
 
 cdef enum:
     # In mas.
@@ -23,8 +21,6 @@ cdef enum:
     # Mas: a circle, and how far beyond a frame stars may be that have moved, or whose light is bent.
     CIRCLE = 1296000000
     MOVED = 360000
-    # Letters of a designation, at most.
-    LETTERS = 40
 
 cdef double MAS = M_PI / 180 / DEGREE
 # Where the plane is as far (rad) from the sphere as this share of a frame's radius, it is no plane.
@@ -262,68 +258,6 @@ cdef class StarTable:
             kept += single[i]
         out.count = kept
         return kept
-
-
-cdef class Labels:
-    """Names and brightnesses of a catalogue's rows.
-
-    hip, tyc  (N,), (N, 3): the Hipparcos number, and Tycho's three where that is 0
-    vmag      (N,): V in 0.01 mag
-    """
-
-    cdef const int[::1] hip
-    cdef const short[:, ::1] tyc
-    cdef const short[::1] vmag
-
-    def __init__(self, hip, tyc, vmag):
-        self.hip, self.tyc = np.ascontiguousarray(hip, np.int32), np.ascontiguousarray(tyc, np.int16)
-        self.vmag = np.ascontiguousarray(vmag, np.int16)
-
-    def of(self, const Py_ssize_t[::1] index):
-        """The names of rows (n,) as a tuple, and their V (n,) in mag."""
-        cdef Py_ssize_t k, row, n = index.shape[0]
-        cdef char[LETTERS] text
-        cdef char *end = &text[LETTERS]
-        cdef char *at
-        names, magnitudes = [], np.empty(n)
-        cdef double *mag = <double *>numbers_of(magnitudes)
-        for k in range(n):
-            if not 0 <= index[k] < self.hip.shape[0]:
-                raise IndexError(f"the star catalogue has no row {index[k]}")
-            fetch(&self.vmag[index[k]])
-            fetch(&self.hip[index[k]])
-            fetch(&self.tyc[index[k], 0])
-        for k in range(n):
-            row = index[k]
-            mag[k] = self.vmag[row] * 0.01
-            if self.hip[row]:
-                at = _before(_written(self.hip[row], end), b"HIP ", 4)
-            else:
-                at = _before(_written(self.tyc[row, 2], end), b"-", 1)
-                at = _before(_written(self.tyc[row, 1], at), b"-", 1)
-                at = _before(_written(self.tyc[row, 0], at), b"TYC ", 4)
-            names.append(at[:end - at].decode("ascii"))
-        return tuple(names), magnitudes
-
-
-cdef inline char *_written(int number, char *end) noexcept nogil:
-    """Write the digits of a number before `end`; where they begin."""
-    cdef unsigned int left = number if number >= 0 else -number
-    while True:
-        end -= 1
-        end[0] = 48 + left % 10
-        left //= 10
-        if left == 0:
-            break
-    if number < 0:
-        end -= 1
-        end[0] = 45
-    return end
-
-
-cdef inline char *_before(char *end, const char *letters, int n) noexcept nogil:
-    """Write n letters before `end`; where they begin."""
-    return <char *>memcpy(end - n, letters, n)
 
 
 cdef inline int _light(short vmag) noexcept nogil:

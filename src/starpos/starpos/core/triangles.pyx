@@ -17,6 +17,8 @@ cdef enum:
     LINE = 10
     # Logarithm of the size of a table that fits into a processor's cache.
     LOG_MARKS = 18
+    # Of fewer candidates each one's support is counted at once.
+    MANY = 2000
 
 # Tolerances of smallest and largest angles that are too wide to tell anything, rad.
 cdef double WORST_SMALLEST = 0.1, WORST_LARGEST = 0.2
@@ -375,11 +377,14 @@ cdef int _best(Search *s, int most, int least_support, bint by_size, Candidate *
     cdef int k, j, kept = 0
     cdef Candidate *c
     cdef int *order = <int *>malloc((most + 1) * sizeof(int))
-    cdef unsigned char *marks = <unsigned char *>calloc(1 << LOG_MARKS, 1) if least_support > 0 else NULL
+    cdef unsigned char *marks = NULL
     try:
-        if order == NULL or (marks == NULL and least_support > 0):
+        if order == NULL:
             raise MemoryError
-        if least_support > 0:
+        if least_support > 0 and s.count > MANY:
+            marks = <unsigned char *>calloc(1 << LOG_MARKS, 1)
+            if marks == NULL:
+                raise MemoryError
             _drop_lonely(s, marks)
         _support(s)
         for k in range(s.count):

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.frame import FrameStars, mean_sigma, pointing_of
+from starpos.core.frame import FrameStars, mean_sigma
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TimeError
@@ -348,20 +348,20 @@ def suspicions(
 
 def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
-    fx, fy = camera.fx * found.focal_scale, camera.fy * found.focal_scale
-    x, y = camera.centre_px
+    scale = found.focal_scale
     if camera.is_ideal:
-        across, down = (x - camera.cx) / fx, (y - camera.cy) / fy
-        centre, above = (across, down, 1.0), (across, down - 1 / fy, 1.0)
+        across, down, row = camera.centre_from_axis
+        centre, above = (across, down, scale), (across, down - row, scale)
     else:
-        centre, above = camera.scaled(found.focal_scale).directions([x, x], [y, y - 1.0])
-    ra, dec, roll = pointing_of(centre, above, found.attitude, sky.velocity, found.mirrored)
+        x, y = camera.centre_px
+        centre, above = camera.scaled(scale).directions([x, x], [y, y - 1.0])
+    ra, dec, roll = found.pointing(centre, above, sky.velocity)
     return Attitude(
         ra=ra,
         dec=dec,
         roll=roll,
-        focal_px=fx,
-        residual_arcsec=found.residual_px / math.sqrt(fx * fy) / ARCSEC,
+        focal_px=camera.fx * scale,
+        residual_arcsec=found.residual_px / (scale * math.sqrt(camera.fx * camera.fy)) / ARCSEC,
         log_odds=found.log_odds,
         mirrored=found.mirrored,
         model=camera.model,

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 
-from starpos.core.frame import FrameStars, explained
+from starpos.core.frame import FrameStars
 from starpos.frozen import at_once
 from starpos.identification.full import Identification
 from starpos.identification.pose import TEST_STARS
@@ -42,5 +42,5 @@ def explained_by(found: Identification, field: FrameStars) -> Explained:
     stars of the sky, nearly all are seen, however faint the frame goes; where they are chance, few are.
     """
     bright = min(len(field), TEST_STARS)
-    number, seen, due = explained(found.star, found.catalogue, found.expected, bright, LEAST_DUE)
+    number, seen, due = found.explains(bright, LEAST_DUE)
     return Explained(number, bright, seen, due)

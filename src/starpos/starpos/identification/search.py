@@ -3,21 +3,24 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from itertools import chain
 
 import numpy as np
 
 from starpos.core.frame import FrameStars, projected
-from starpos.core.search import Limits, Lost
+from starpos.core.search import Finder, Limits
 from starpos.errors import InstrumentError
 from starpos.frames.stars import Window
 from starpos.identification import wide
-from starpos.identification.evidence import anywhere
-from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified, judge
+from starpos.identification.evidence import CHANCES, anywhere
+from starpos.identification.full import ENOUGH, FEWEST_STARS, RULES, Identification, identified
 from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, TEST_STARS, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
+from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
+from starpos.sky.catalogue import Catalogue
 
 # (number of brightest stars, their error in px); the last stages are for lenses with distortion.
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
@@ -31,6 +34,7 @@ CROWD_STAGES = (60, 0.3), (140, 0.1)
 # the brightest: else these are spread evenly already. Half of the cells decide. Such a second try needs more evidence.
 CELLS, MOST_EVEN, SECOND_TRY = 10, 0.65, math.log(10)
 LIMITS = Limits(
+    first_stars=4,
     match_sigma=MATCH_SIGMA,
     log_false=math.log(0.35),
     worth_a_fit=4.0,
@@ -218,8 +222,16 @@ def _lost(
     field: FrameStars, sky: Sky, stages: Stages, log_share: float, enough: float, crowded: bool
 ) -> Iterator[Identification]:
     """What is identified lost in space, which has that share of the probability."""
-    judged = judge(field, sky, anywhere(field.focal_px, log_share), enough)
-    return Lost(judged, sky.triangles.compiled, sky.brightest, stages, crowded, LIMITS)
+    prior = anywhere(field.focal_px, log_share)
+    return _finder(sky.catalogue, sky.triangles).lost(
+        field, sky.years, sky.velocity, prior, enough, stages, crowded
+    )
+
+
+@lru_cache(maxsize=4)
+def _finder(catalogue: Catalogue, triangles: TriangleCatalogue) -> Finder:
+    sky = Sky(catalogue, triangles)
+    return Finder(sky.stars, triangles.compiled, sky.brightest, RULES, CHANCES, LIMITS)
 
 
 def _by_parts(field: wide.WideField, sky: Sky, priors: Priors) -> Identification | None:

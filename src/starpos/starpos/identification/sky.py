@@ -13,6 +13,8 @@ from starpos.frozen import at_once
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.sky.catalogue import EPOCH, Catalogue
 
+PAGE_BYTES = 4096
+
 
 @at_once
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Sky:
     def at(cls, catalogue: Catalogue, triangles: TriangleCatalogue, utc_unix_s: float | None) -> "Sky":
         """The sky at a time; if it is unknown (None), at J2000 without aberration."""
         if utc_unix_s is None:
-            return cls(catalogue, triangles)
+            return _undated(catalogue, triangles)
         year, velocity = earth_motion(utc_unix_s)
         return cls(catalogue, triangles, year, tuple(velocity))
 
@@ -45,7 +47,7 @@ class Sky:
     def load(self) -> None:
         """Make what the first identification would have to wait for."""
         _brightest(self.catalogue, self.triangles)
-        _ = self.triangles.compiled
+        _touch(self.triangles)
 
     @property
     def years(self) -> float:
@@ -61,6 +63,11 @@ class Sky:
         return self.directions(self.triangles.star[row])
 
 
+@lru_cache(maxsize=4)
+def _undated(catalogue: Catalogue, triangles: TriangleCatalogue) -> Sky:
+    return Sky(catalogue, triangles)
+
+
 @lru_cache(maxsize=2)
 def _stars(catalogue: Catalogue) -> StarTable:
     return StarTable(catalogue)
@@ -69,3 +76,11 @@ def _stars(catalogue: Catalogue) -> StarTable:
 @lru_cache(maxsize=4)
 def _brightest(catalogue: Catalogue, triangles: TriangleCatalogue) -> BrightTable:
     return BrightTable(_stars(catalogue), triangles.star, triangles.rank, triangles.cell_start)
+
+
+@lru_cache(maxsize=4)
+def _touch(triangles: TriangleCatalogue) -> None:
+    """Read a number of each page of the mapped table: a page that is new to the process takes longer than a look-up."""
+    _ = triangles.compiled
+    triangles.shape.ravel()[:: PAGE_BYTES // triangles.shape.itemsize].max(initial=0)
+    triangles.counter_clockwise[::PAGE_BYTES].any()

@@ -92,6 +92,12 @@ class Camera:
         """The frame's centre (not the principal point), px."""
         return (self.width - 1) / 2, (self.height - 1) / 2
 
+    @cached_property
+    def centre_from_axis(self) -> tuple[float, float, float]:
+        """How far the frame's centre is from the axis, across and down, and the height of a row, in focal lengths."""
+        x, y = self.centre_px
+        return (x - self.cx) / self.fx, (y - self.cy) / self.fy, 1 / self.fy
+
     def scaled(self, factor: float) -> "Camera":
         """The camera with its focal lengths multiplied by `factor`."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.sky import Labels
+from starpos.core.labels import Labels
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
@@ -138,7 +138,7 @@ class Catalogue:
 
     def labels(self, index: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
         """Names and V magnitudes (n,) of the rows `index` (n,)."""
-        return self._labels.of(np.asarray(index, np.intp))
+        return self._labels.of(np.ascontiguousarray(index, np.intp))
 
     def names(self, index: np.ndarray) -> tuple[str, ...]:
         """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""

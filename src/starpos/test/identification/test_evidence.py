@@ -141,15 +141,20 @@ def test_the_priors_share_half_of_the_probability(catalogue, rng, monkeypatch):
 
     def judge(field, sky, prior, enough):
         tried[id(prior)] = prior
-        return real(field, sky, prior, enough)
+        return judged(field, sky, prior, enough)
 
-    real = full.judge
-    for module in (full, search):
-        monkeypatch.setattr(module, "judge", judge)
+    def anywhere(focal_px, log_share):
+        prior = lost(focal_px, log_share)
+        tried[id(prior)] = prior
+        return prior
+
+    judged, lost = full.judge, search.anywhere
+    monkeypatch.setattr(full, "judge", judge)
+    monkeypatch.setattr(search, "anywhere", anywhere)
     assert not list(search.near_or_lost(field, sky, priors, search.STAGES))
-    *led, lost = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
+    *led, unled = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
     assert sorted(led) == pytest.approx([1 / 8, 1 / 8, 1 / 4])
-    assert lost < 1 / 2
+    assert unled < 1 / 2
 
 
 def test_a_pose_that_the_prior_excludes_is_worth_nothing(rng):
