@@ -100,7 +100,7 @@ def test_a_wrong_focal_length_of_exif_costs_time_only(off, solver, catalogue, rn
 
 
 def test_a_telephone_s_widest_lens_is_found_where_exif_tells_it(solver, catalogue, rng):
-    """Of 13 mm on film's frame: wider than the fields that are searched where nothing is told."""
+    """Lens of 13 mm on film's frame: wider than the fields that are searched where nothing is told."""
     xy, axis, focal_px = seen(catalogue, 114.0, 3.5, rng)
     s = solver.identify(replace(listed(xy), rough_focal_px=1.05 * focal_px))
     assert s.ok
