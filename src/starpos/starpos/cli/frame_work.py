@@ -162,11 +162,15 @@ class Identifying:
             solver.prepare(item.width, item.height)
         begin = time.process_time()
         stars = stars_of(item)
-        answer = solver.identify(stars, look=look_at(item, stars))
-        if answer.status is Status.NOT_IDENTIFIED:
+
+        def identified(stars: Stars) -> Solution:
+            answer = solver.identify(stars, look=look_at(item, stars))
+            if answer.status is not Status.NOT_IDENTIFIED:
+                return answer
             part = solver.identify(stars, look=look_at(item, stars), part=PART)
-            answer = part if part.ok else answer
-        answer = identified_otherwise(item, stars, answer, solver.identify)
+            return part if part.ok else answer
+
+        answer = identified_otherwise(item, stars, identified(stars), identified)
         return answer, 1000 * (time.process_time() - begin)
 
 
