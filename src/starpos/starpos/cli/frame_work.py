@@ -17,18 +17,23 @@ from typing import TYPE_CHECKING
 from starpos.cli.options import clock_of
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, StarposError
+from starpos.fix.again import PART, identified_otherwise
 from starpos.fix.blind import BlindSolver
 from starpos.fix.pointing import IDEAL
-from starpos.fix.solution import Solution
+from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
+from starpos.identification.blind import STAGES
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.sky import catalogue
+
+# of the search at every scale, for stars that are detected otherwise
+QUICK = STAGES[:2]
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -157,7 +162,15 @@ class Identifying:
             solver.prepare(item.width, item.height)
         begin = time.process_time()
         stars = stars_of(item)
-        answer = solver.identify(stars, look=look_at(item, stars))
+
+        def identified(stars: Stars) -> Solution:
+            answer = solver.identify(stars, look=look_at(item, stars))
+            if answer.status is not Status.NOT_IDENTIFIED:
+                return answer
+            part = solver.identify(stars, look=look_at(item, stars), part=PART)
+            return part if part.ok else answer
+
+        answer = identified_otherwise(item, stars, identified(stars), identified)
         return answer, 1000 * (time.process_time() - begin)
 
 
@@ -172,7 +185,9 @@ class IdentifyingBlind:
         solver = BlindSolver(catalogue.load_catalogue())
         solver.prepare()
         begin = time.process_time()
-        answer = solver.identify(stars_of(item))
+        stars = stars_of(item)
+        answer = solver.identify(stars)
+        answer = identified_otherwise(item, stars, answer, replace(solver, stages=QUICK).identify)
         return answer, 1000 * (time.process_time() - begin)
 
 

@@ -68,19 +68,24 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, predicted: Priors = (), look: Look | None = None) -> Solution:
+    def identify(
+        self, stars: Stars, predicted: Priors = (), look: Look | None = None, part: float = 1.0
+    ) -> Solution:
         """Names of the stars and pointing of the camera, predicted or anywhere.  Stars without a time: J2000 places.
 
         look: what their frame shows where stars should be, asked if the stars alone are too few.
+        part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
+            if part != 1.0:
+                triangles = triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field: FrameStars | wide.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look))
+                    return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look, part))
                 field = field_of(
                     directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
                 )

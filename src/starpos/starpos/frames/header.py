@@ -56,11 +56,11 @@ def times(header: Mapping, place: str) -> tuple[float | None, float | None, floa
     key = next((k for k in START if header.get(k) not in (None, "")), None)
     if key is None or exposure is None:
         return None, exposure, 0.0
-    start = header[key]
+    start = _as_today(header[key])
     if key == "DATE-OBS" and "T" not in str(start) and header.get("TIME-OBS"):
         start = f"{start}T{header['TIME-OBS']}"
     # a day without an hour is not a time
-    if isinstance(start, str) and re.fullmatch(r"\d{4}-\d\d-\d\d", start.strip()):
+    if isinstance(start, str) and re.fullmatch(r"\d{4}-\d\d-\d\d", start):
         return None, exposure, 0.0
     scale = str(header.get("TIMESYS", "UTC")).strip().lower()
     if scale not in SCALES:
@@ -71,6 +71,14 @@ def times(header: Mapping, place: str) -> tuple[float | None, float | None, floa
             f"{place}: its {key} is {start!r}, which is no text; write it like 2026-11-02T18:00:00.000."
         )
     return _middle(start, exposure, scale, f"{place}: its {key}"), exposure, _rounding(start)
+
+
+def _as_today(start: Any) -> Any:
+    """Text as FITS wants it today, of a day of the 20th century as FITS had it before 1999, or with a space for the T."""
+    if not isinstance(start, str):
+        return start
+    text = re.sub(r"^(\d\d)/(\d\d)/(\d\d)(?!\d)", r"19\3-\2-\1", start.strip())
+    return re.sub(r"^(\d{4}-\d\d-\d\d) +(?=\d\d:)", r"\1T", text)
 
 
 def _rounding(start: Any) -> float:

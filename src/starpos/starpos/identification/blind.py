@@ -26,8 +26,9 @@ from starpos.instrument.camera import Camera
 
 # Fields from corner to corner that are tried, deg.
 SMALLEST_DEG, LARGEST_DEG = 0.6, 100.0
-# A focal length that is roughly known may be off by this factor.
-ROUGHLY = 1.2
+# A focal length that is roughly known may be off by this factor. With it wider fields are tried too, as telephones have
+# them: up to this many deg.
+ROUGHLY, LARGEST_TOLD_DEG = 1.2, 130.0
 # (number of brightest stars, their error in px)
 STAGES = (10, 0.4), (15, 0.4), (21, 0.4), (12, 2.0)
 # A step of the focal length is at most this; and so small that it changes the shape of no quad by more than that.
@@ -77,10 +78,12 @@ def identify_blind(
     if len(xy) < FEWEST_STARS:
         return None
     half_diagonal_px = np.hypot(width, height) / 2
-    shortest, longest = (half_diagonal_px / np.tan(np.radians(d / 2)) for d in (LARGEST_DEG, SMALLEST_DEG))
+    told, shortest, longest = (
+        half_diagonal_px / np.tan(np.radians(d / 2)) for d in (LARGEST_TOLD_DEG, LARGEST_DEG, SMALLEST_DEG)
+    )
     spans = [(shortest, longest)]
-    if near_px is not None and shortest < near_px < longest:
-        spans.insert(0, (max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
+    if near_px is not None and told < near_px < longest:
+        spans.insert(0, (max(told, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
     camera = Camera.from_focal(width, height, shortest)
     frame = stars_at(camera, xy, sigma_px)
     tries = [(np.arange(len(xy)), 1.0, ENOUGH)]

@@ -99,6 +99,14 @@ def test_a_wrong_focal_length_of_exif_costs_time_only(off, solver, catalogue, rn
     assert s.ok and looks(s, axis) > 1 - 1e-6 and s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
 
 
+def test_a_telephone_s_widest_lens_is_found_where_exif_tells_it(solver, catalogue, rng):
+    """Lens of 13 mm on film's frame: wider than the fields that are searched where nothing is told."""
+    xy, axis, focal_px = seen(catalogue, 114.0, 3.5, rng)
+    s = solver.identify(replace(listed(xy), rough_focal_px=1.05 * focal_px))
+    assert s.ok
+    assert np.sqrt(2 - 2 * looks(s, axis)) < 1 / focal_px
+
+
 def test_a_mirrored_frame_is_found_and_said(solver, catalogue, rng):
     xy, axis, _ = seen(catalogue, 8.0, 8.5, rng)
     s = solver.identify(listed(np.stack([xy[:, 0], HEIGHT - 1 - xy[:, 1]], 1)))
