@@ -165,7 +165,8 @@ class Identifying:
 
         def identified(stars: Stars) -> Solution:
             answer = solver.identify(stars, look=look_at(item, stars))
-            if answer.status is not Status.NOT_IDENTIFIED:
+            # of a list, points of chance are given up soon
+            if answer.status is not Status.NOT_IDENTIFIED or isinstance(item, Stars):
                 return answer
             part = solver.identify(stars, look=look_at(item, stars), part=PART)
             return part if part.ok else answer
