@@ -116,7 +116,7 @@ cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rule
         for row in range(s.size):
             for column in range(p.bound[2 * row], p.bound[2 * row + 1]):
                 place = row * s.size + column
-                if s.phase[place] == phase or not rules.own:
+                if not rules.own or s.phase[place] == phase:
                     _take(s, star, row, column, p, n)
                     s.outlier[place] &= s.good[place]
                     p.weight[n] = s.good[place] and not s.outlier[place]

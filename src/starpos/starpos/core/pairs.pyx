@@ -4,7 +4,7 @@
 
 from libc.math cimport NAN, fabs, sqrt
 from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy, memset
+from libc.string cimport memset
 
 import numpy as np
 
@@ -43,8 +43,8 @@ cdef extern from *:
 cdef enum:
     # Parameters of both stars.
     ALL = 2 * MOST
-    # Numbers kept of each pixel: of each star 5, and 5 of their light.
-    COLUMNS = 15
+    # Numbers kept of each pixel: of each star 5, 5 of their light, and row and column.
+    COLUMNS = 17
 
 # One step moves a star so far (px) at most; if none moves so far, and no flux changes by that share, the fit has settled.
 cdef double FARTHEST = 0.5, SETTLED = 1e-8
@@ -67,6 +67,8 @@ cdef struct Pixels:
     int *place
     # Places of the others.
     int *rest
+    double *row
+    double *column
     double *signal
     double *noise2
     double *light
@@ -106,6 +108,7 @@ cdef int _begin(Pixels *p, int area) except -1:
     p.rest = p.place + room
     p.signal, p.noise2, p.light = columns, columns + room, columns + 2 * room
     p.weight, p.residual = columns + 3 * room, columns + 4 * room
+    p.row, p.column = columns + 15 * room, columns + 16 * room
     for k in range(2):
         columns += 5 * room
         p.of[k].dx, p.of[k].dy, p.of[k].value = columns, columns + room, columns + 2 * room
@@ -117,21 +120,24 @@ cdef void _gather(
     const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p
 ) noexcept nogil:
     """Take the good pixels of a stamp within reach of a star, to be fitted with the weight 1, or all, with 0 for the others."""
-    cdef int place, phase, k, n = 0, others = 0
+    cdef int place, phase, row, column, k, n = 0, others = 0
     for phase in range(rules.phases):
         p.first[phase] = n
-        for place in range(s.size * s.size):
-            if rules.own and s.phase[place] != phase:
-                continue
-            if s.good[place] and _near(s, star, psf, rules, place):
-                p.place[n] = place
-                n += 1
-            else:
-                p.rest[others] = place
-                others += 1
+        for row in range(s.size):
+            for column in range(s.size):
+                place = row * s.size + column
+                if rules.own and s.phase[place] != phase:
+                    continue
+                if s.good[place] and _near(s, star, psf, rules, row, column):
+                    p.place[n], p.row[n], p.column[n] = place, row, column
+                    n += 1
+                elif all_pixels:
+                    p.rest[others] = place
+                    others += 1
     p.count = p.all = p.first[rules.phases] = n
     if all_pixels:
-        memcpy(p.place + n, p.rest, others * sizeof(int))
+        for k in range(others):
+            p.place[n + k], p.row[n + k], p.column[n + k] = p.rest[k], p.rest[k] // s.size, p.rest[k] % s.size
         p.all += others
     for k in range(p.all):
         place = p.place[k]
@@ -141,12 +147,12 @@ cdef void _gather(
         _evaluate(s, &star[k], psf, rules, p, &p.of[k])
 
 
-cdef inline bint _near(const Stamp *s, const Star *star, const Local *psf, Rules rules, int place) noexcept nogil:
+cdef inline bint _near(const Stamp *s, const Star *star, const Local *psf, Rules rules, int row, int column) noexcept nogil:
     """Whether a pixel is within reach of one of the stars."""
     cdef double dx, dy, u, v
     cdef int k
     for k in range(2):
-        dx, dy = s.left + place % s.size - star[k].x, s.top + place // s.size - star[k].y
+        dx, dy = s.left + column - star[k].x, s.top + row - star[k].y
         u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
         if u * u + v * v < rules.widths2:
             return True
@@ -158,7 +164,7 @@ cdef void _evaluate(const Stamp *s, const Star *star, const Local *psf, Rules ru
     cdef double gain
     cdef int k
     for k in range(p.all):
-        of.dx[k], of.dy[k] = s.left + p.place[k] % s.size - star.x, s.top + p.place[k] // s.size - star.y
+        of.dx[k], of.dy[k] = s.left + p.column[k] - star.x, s.top + p.row[k] - star.y
     # the others last: a whole block is written
     evaluate(psf, of.dx, of.dy, p.count, of.value, of.by_x, of.by_y)
     values(psf, of.dx + p.count, of.dy + p.count, p.all - p.count, of.value + p.count)

@@ -29,7 +29,7 @@ cdef extern from *:
         }
     }
     /* The Gaussian of a peak at n of a block's places. */
-    STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, int n, double peak, double *restrict out) {
+    STARPOS_FUSED static void starpos_gauss(const double *u, const double *v, int n, double peak, double *restrict out) {
         for (int p = 0; p < n; p++)
             out[p] = -0.5 * (u[p] * u[p] + v[p] * v[p]);
         starpos_exps(out, n);
@@ -37,7 +37,7 @@ cdef extern from *:
             out[p] *= peak;
     }
     /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
-    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v, int n,
+    STARPOS_FUSED static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v, int n,
                                             double *restrict value, double *restrict by_u, double *restrict by_v) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
         starpos_hermites(u, n, rows, fu);
@@ -69,7 +69,7 @@ cdef extern from *:
         }
     }
     /* The sum alone. */
-    STARPOS_WIDE static void starpos_sum(const double *series, int rows, int columns, const double *u, const double *v, int n,
+    STARPOS_FUSED static void starpos_sum(const double *series, int rows, int columns, const double *u, const double *v, int n,
                                          double *restrict value) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
         starpos_hermites(u, n, rows - 1, fu);
