@@ -16,7 +16,7 @@ from starpos.core.sums cimport products, weigh
 cdef extern from *:
     """
     /* Products of three columns with three others and the weights, summed over n pixels: ad, ae, af, bd, be, bf, cd, ce, cf. */
-    STARPOS_WIDE static void starpos_crossed(const double *weight, const double *const *one, const double *const *other, int n,
+    STARPOS_FUSED static void starpos_crossed(const double *weight, const double *const *one, const double *const *other, int n,
                                              double *out) {
         starpos_four sums[3][3] = {{{0}}};
         for (int p = 0; p + 4 <= n; p += 4) {

@@ -8,7 +8,7 @@ cdef extern from *:
     typedef double starpos_four __attribute__((vector_size(32)));
     typedef double starpos_fours __attribute__((vector_size(32), aligned(8)));
     /* What a star of this flux leaves of n pixels, and their weights over the variance of sky and light. */
-    STARPOS_WIDE static void starpos_weigh(const double *restrict signal, const double *restrict noise2,
+    STARPOS_FUSED static void starpos_weigh(const double *restrict signal, const double *restrict noise2,
                                            const double *restrict value, double flux, double dn_per_photon, double misfit2,
                                            int n, double *restrict weight, double *restrict residual) {
         for (int p = 0; p < n; p++) {
@@ -18,7 +18,7 @@ cdef extern from *:
         }
     }
     /* Products with the weights, summed over n pixels: xx, xy, yy, xf, yf, ff, xr, yr, fr. */
-    STARPOS_WIDE static void starpos_products(const double *weight, const double *x, const double *y, const double *f,
+    STARPOS_FUSED static void starpos_products(const double *weight, const double *x, const double *y, const double *f,
                                               const double *r, int n, double *out) {
         starpos_four xx = {0}, xy = {0}, yy = {0}, xf = {0}, yf = {0}, ff = {0}, xr = {0}, yr = {0}, fr = {0};
         for (int p = 0; p + 4 <= n; p += 4) {

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import spatial
 
 from starpos.core.moments import own_shapes
+from starpos.core.neighbours import near_pairs
 from starpos.core.noise import light_noise, of_phases, strangeness
 from starpos.core.order import quantile
 from starpos.core.stamps import greyed
@@ -161,7 +162,7 @@ def _teachers(
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
     weight = np.clip(mass / np.median(stamps.noise, axis=(1, 2)), 1, LOUDEST) ** 2
     psf = widened(psf, x[near], y[near], ratio[near], weight[near])
-    widths = relative_widths(seen, psf.at(x, y).shape + blur * np.eye(2), window)
+    widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
@@ -226,7 +227,7 @@ def reach_of(psf: Psf) -> int:
     # where the widths are the same everywhere, one place tells them
     quarters = QUARTERS if len(psf.widths) > 1 else QUARTERS[:1]
     x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-    widest = np.linalg.eigvalsh(psf.at(np.tile(x, len(y)), np.repeat(y, len(x))).shape).max()
+    widest = np.linalg.eigvalsh(psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max()
     return min(max(math.ceil(3.5 * math.sqrt(widest)) + 1, 4), MAX_REACH)
 
 
@@ -239,7 +240,7 @@ def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which peaks (N,) have no neighbour within 12 px above a fiftieth of their height, and which have no higher one."""
-    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(12, output_type="ndarray")
+    pairs = near_pairs(x.astype(float), y.astype(float), 12)
     alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):
         alone[a[height[b] > 0.02 * height[a]]] = False
