@@ -56,7 +56,9 @@ class Case:
 
     def __str__(self) -> str:
         kind = ", 8 bit" * (self.bits == 8) + ", mosaic (sep: made grey)" * self.mosaic
-        return f"{self.mpx:g} Mpx, {self.stars} stars{kind}" + f", {100 * self.hot:g} % hot pixels" * (self.hot > 0)
+        return f"{self.mpx:g} Mpx, {self.stars} stars{kind}" + f", {100 * self.hot:g} % hot pixels" * (
+            self.hot > 0
+        )
 
 
 CASES = [
@@ -217,10 +219,7 @@ def main():
     programs = {"starpos": with_starpos}
     if peers.is_here("sep"):
         programs["sep"] = peers.with_sep
-    print(
-        f"{'frame':60}"
-        + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs)
-    )
+    print(f"{'frame':60}" + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs))
     for case, found in cases(programs, CASES, options.repeat):
         line = f"{case!s:60}"
         for m in found.values():

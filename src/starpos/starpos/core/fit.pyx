@@ -108,39 +108,35 @@ cdef int _begin(Pixels *p, int area) except -1:
 
 cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
     """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, place, phase, n = 0
+    cdef int row, column, place, phase, k, n = 0
     for row in range(s.size):
         p.bound[2 * row], p.bound[2 * row + 1] = _inside(psf, s.top + row - star.y, s.left - star.x, s.size, rules.widths2)
     for phase in range(rules.phases):
         p.first[phase] = n
         for row in range(s.size):
+            place = row * s.size
             for column in range(p.bound[2 * row], p.bound[2 * row + 1]):
-                place = row * s.size + column
-                if not rules.own or s.phase[place] == phase:
-                    _take(s, star, row, column, p, n)
-                    s.outlier[place] &= s.good[place]
-                    p.weight[n] = s.good[place] and not s.outlier[place]
+                if not rules.own or s.phase[place + column] == phase:
+                    p.place[n], p.dx[n], p.dy[n] = place + column, s.left + column - star.x, s.top + row - star.y
                     n += 1
     p.count = p.first[rules.phases] = n
     for row in range(s.size if all_pixels else 0):
         for column in range(s.size):
             if not p.bound[2 * row] <= column < p.bound[2 * row + 1]:
-                _take(s, star, row, column, p, n)
-                s.outlier[p.place[n]], p.weight[n] = False, 0.0
+                p.place[n] = row * s.size + column
+                p.dx[n], p.dy[n] = s.left + column - star.x, s.top + row - star.y
                 n += 1
     p.all = n
+    for k in range(n):
+        place = p.place[k]
+        p.signal[k], p.noise2[k] = s.signal[place], <double>s.noise[place] * s.noise[place]
+        s.outlier[place] &= s.good[place] & (k < p.count)
+        p.weight[k] = s.good[place] & (k < p.count) & ~s.outlier[place]
     # the others last: a whole block is written
     evaluate(psf, p.dx, p.dy, p.count, p.value, p.by_x, p.by_y)
     values(psf, p.dx + p.count, p.dy + p.count, p.all - p.count, p.value + p.count)
     if rules.own:
         _by_own_gain(s, star, p)
-
-
-cdef inline void _take(const Stamp *s, const Star *star, int row, int column, Pixels *p, int n) noexcept nogil:
-    """Take a pixel of a stamp as number n."""
-    cdef int place = row * s.size + column
-    p.place[n], p.dx[n], p.dy[n] = place, s.left + column - star.x, s.top + row - star.y
-    p.signal[n], p.noise2[n] = s.signal[place], <double>s.noise[place] * s.noise[place]
 
 
 cdef void _by_own_gain(const Stamp *s, const Star *star, Pixels *p) noexcept nogil:

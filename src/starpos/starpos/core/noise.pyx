@@ -161,9 +161,9 @@ def of_phases(
     _alike(noise, signal, value, phase, value)
     if noise.shape[0] != n:
         raise ValueError(f"{noise.shape[0]} noises of {n} stars: one each is needed")
-    fluxes, informations = np.zeros((2, n, phases))
+    fluxes, weights = np.zeros((2, n, phases))
     cdef double[:, ::1] flux = fluxes
-    cdef double[:, ::1] information = informations
+    cdef double[:, ::1] information = weights
     for k in range(n):
         for j in range(area):
             p = (&phase[k, 0, 0])[j]
@@ -178,4 +178,4 @@ def of_phases(
         for p in range(phases):
             information[k, p] = max(information[k, p], 1e-12)
             flux[k, p] /= information[k, p]
-    return fluxes, informations
+    return fluxes, weights

@@ -10,7 +10,7 @@ cdef extern from *:
     #define STARPOS_WIDE
     #endif
     #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
-    #define STARPOS_FUSED __attribute__((target_clones("arch=x86-64-v3", "default")))
+    #define STARPOS_FUSED __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
     #else
     #define STARPOS_FUSED STARPOS_WIDE
     #endif

@@ -142,7 +142,13 @@ def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
 def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray, np.ndarray]:
     """Pixel x, y (N,) px, off the star's centre, where the fit leaves the most light."""
     row, column = brightest_left(
-        fit.residual, stamps.good, *stamps.corner(fit.x, fit.y), psf.axes, NEAREST_PX, FIT_WIDTHS + 2, SMOOTHING
+        fit.residual,
+        stamps.good,
+        *stamps.corner(fit.x, fit.y),
+        psf.axes,
+        NEAREST_PX,
+        FIT_WIDTHS + 2,
+        SMOOTHING,
     )
     return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
 
