@@ -2,8 +2,8 @@
 """CPU time and memory of detection against the frame's size and kind, the number of stars and the share of hot pixels.
 
 `benchmark_detection.py [--repeat N] [--peers FOLDER]`: medians of N.  sep with windowed positions works on the same
-frames, by turns, if it can be imported (peers.py), on those of a colour mosaic made grey by OpenCV, which counts.  Memory is the growth of the process at its peak, over the frame's
-own bytes (Linux only).
+frames, by turns, if it can be imported (peers.py); those of a colour mosaic are made grey for it by OpenCV, in its time.
+Memory is the growth of the process at its peak, over the frame's own bytes (Linux only).
 """
 
 import argparse

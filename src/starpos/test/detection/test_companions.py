@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the compiled core looks for around stars: near points, light that a fit leaves, phases' fluxes; beside plain forms."""
+"""Near points, light that a fit leaves, and fluxes of phases, of the compiled core, beside their plain forms."""
 
 import numpy as np
 import pytest
