@@ -26,7 +26,7 @@ from starpos.frames.frame import Frame
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, Stars, no_stars
 
 # Pixels of stars that are fitted together, on a small and on a large frame: about 2 and 6 MB.
-CHUNK_PIXELS = 60_000, 120_000
+CHUNK_PIXELS = 30_000, 120_000
 # Peaks looked at, or twice the stars wanted if that is more: hot pixels are peaks too.
 PEAKS = 10_000
 # Pixels that are fitted, for each of so many peaks: 2 million take some 10 s. With as many stars, or with wide ones, the
@@ -205,7 +205,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if picture.trail_px is not None:
         lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail_px)
     pixels = (2 * lesson.reach + 1) ** 2
-    chunk = max(1, int(np.clip(plane.size // 16, *CHUNK_PIXELS)) // pixels)
+    chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - picture.halvings) // pixels)
     chunks = [slice(i, min(i + chunk, most)) for i in range(0, most, chunk)]
     parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
