@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time and memory of detection against the frame's size, the number of stars and the share of hot pixels.
+"""CPU time and memory of detection against the frame's size and kind, the number of stars and the share of hot pixels.
 
 `benchmark_detection.py [--repeat N] [--peers FOLDER]`: medians of N.  sep with windowed positions works on the same
-frames, by turns, if it can be imported (peers.py).  Memory is the growth of the process at its peak, over the frame's
-own bytes (Linux only).
+frames, by turns, if it can be imported (peers.py); those of a colour mosaic are made grey for it by OpenCV, in its time.
+Memory is the growth of the process at its peak, over the frame's own bytes (Linux only).
 """
 
 import argparse
@@ -14,12 +14,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 
 # CPU time is compared, so each program gets one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import cv2
 import numpy as np
 import peers
 from table import Cost, Row
@@ -36,11 +38,36 @@ SIZES = {
     60: (9488, 6324),
 }
 STARS_PER_MPX, STAR_COUNTS, HOT = 15, (10, 100, 1000, 5000), (0.0001, 0.001, 0.003)
-# Mpx, stars, share of hot pixels
+# Of 8 bits and of a mosaic: Mpx, stars.
+KINDS = ((2, 30), (2, 1000), (21, 315), (21, 5000))
+# DN of a step where 8 bits are enough for the frame's noise; sensitivity of a mosaic's colours, rows by columns.
+STEP_DN, COLOURS, PATTERN = 14, np.array([[0.6, 1.0], [1.0, 0.7]], np.float32), "rggb"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A frame: Mpx, stars, share of hot pixels, bits of a pixel, and whether it is a colour mosaic."""
+
+    mpx: float
+    stars: int
+    hot: float = 0.0
+    bits: int = 16
+    mosaic: bool = False
+
+    def __str__(self) -> str:
+        kind = ", 8 bit" * (self.bits == 8) + ", mosaic (sep: made grey)" * self.mosaic
+        return f"{self.mpx:g} Mpx, {self.stars} stars{kind}" + f", {100 * self.hot:g} % hot pixels" * (
+            self.hot > 0
+        )
+
+
 CASES = [
-    *((mpx, round(STARS_PER_MPX * mpx), 0.0) for mpx in SIZES),
-    *((21, n, 0.0) for n in STAR_COUNTS),
-    *((21, 315, hot) for hot in HOT),
+    *(Case(mpx, round(STARS_PER_MPX * mpx)) for mpx in SIZES),
+    *(Case(21, n) for n in STAR_COUNTS),
+    *(Case(2, n) for n in (*STAR_COUNTS, 300)),
+    *(Case(21, 315, hot) for hot in HOT),
+    *(Case(mpx, n, bits=8) for mpx, n in KINDS),
+    *(Case(mpx, n, bits=bits, mosaic=True) for bits in (16, 8) for mpx, n in KINDS),
 ]
 QUICK = [CASES[1], CASES[3]]
 # DN; px; px: half a second of the sky.
@@ -64,10 +91,12 @@ class Measured:
         return Cost(self.ms, f"{self.found} found, {self.off_px:.3f} px off")
 
 
-def exposure(size, count, rng, hot=0.0):
-    """Make a 16-bit frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, most of them faint.
+def exposure(size, count, rng, hot=0.0, bits=16, mosaic=False):
+    """Make a frame of `size` (columns, rows) px with `count` trailed stars, 500 to 100000 DN, most of them faint.
 
-    hot: the share of hot pixels, which have 100 DN more or above, 2000 on average.
+    hot     the share of hot pixels, which have 100 DN more or above, 2000 on average
+    bits    16, or 8 with steps of STEP_DN
+    mosaic  whether its pixels see COLOURS
     Returns the frame and the places (count, 2) of its stars in px, the brightest first.
     """
     columns, rows = size
@@ -82,13 +111,30 @@ def exposure(size, count, rng, hot=0.0):
         pixels[stamp] += rng.poisson(star * (flux / star.sum()))
     which = np.flatnonzero(rng.random(pixels.size) < hot)
     pixels.flat[which] += 100 + rng.exponential(2000, len(which))
-    return np.clip(np.rint(pixels), 0, 65535).astype(np.uint16), place[np.argsort(-light)]
+    if mosaic:
+        for row, column in np.ndindex(2, 2):
+            pixels[row::2, column::2] *= COLOURS[row, column]
+    kind, step = (np.uint8, STEP_DN) if bits == 8 else (np.uint16, 1)
+    return np.clip(np.rint(pixels / step), 0, np.iinfo(kind).max).astype(kind), place[np.argsort(-light)]
 
 
-def with_starpos(pixels):
+def with_starpos(pixels, pattern=""):
     """Places (N, 2) px by starpos."""
-    stars = detect(Frame(pixels)).stars
+    stars = detect(Frame(pixels, pattern=pattern)).stars
     return np.stack([stars.x, stars.y], 1)
+
+
+def of_mosaic(work, pixels):
+    """Places (N, 2) px by a program of others, which has the mosaic made grey first."""
+    return work(cv2.cvtColor(pixels, cv2.COLOR_BayerBG2GRAY))
+
+
+def on_mosaics(programs: dict[str, Callable]) -> dict[str, Callable]:
+    """The programs, to be called with the pixels of a mosaic. OpenCV calls this pattern by its second row."""
+    return {
+        name: partial(with_starpos, pattern=PATTERN) if work is with_starpos else partial(of_mosaic, work)
+        for name, work in programs.items()
+    }
 
 
 def off_px(found, place) -> float:
@@ -136,15 +182,15 @@ def compared(programs: dict[str, Callable], path: Path, repeat: int) -> dict[str
     }
 
 
-def cases(programs: dict[str, Callable], which, repeat: int) -> Iterator[tuple[float, int, float, dict]]:
+def cases(programs: dict[str, Callable], which, repeat: int) -> Iterator[tuple[Case, dict[str, Measured]]]:
     """Each case, as in CASES, with what each program makes of it."""
     rng = np.random.default_rng(1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frame.npz"
-        for mpx, count, hot in which:
-            pixels, place = exposure(SIZES[mpx], count, rng, hot)
+        for case in which:
+            pixels, place = exposure(SIZES[case.mpx], case.stars, rng, case.hot, case.bits, case.mosaic)
             np.savez(path, pixels=pixels, place=place)
-            yield mpx, count, hot, compared(programs, path, repeat)
+            yield case, compared(on_mosaics(programs) if case.mosaic else programs, path, repeat)
 
 
 def rows(options) -> Iterator[Row]:
@@ -153,8 +199,8 @@ def rows(options) -> Iterator[Row]:
     sep = {name: work for name, work in here.items() if name == "sep"}
     rest = [] if options.quick else [case for case in CASES if case not in QUICK]
     for beside, which in ((here, QUICK), (sep, rest)):
-        for mpx, count, hot, found in cases({"starpos": with_starpos} | beside, which, options.rounds):
-            what = f"detection, {mpx:g} Mpx, {count} stars" + f", {100 * hot:g} % hot pixels" * (hot > 0)
+        for case, found in cases({"starpos": with_starpos} | beside, which, options.rounds):
+            what = f"detection, {case}"
             ours = found.pop("starpos").cost
             for name, theirs in found.items():
                 yield Row(what, ours, name, theirs.cost)
@@ -173,14 +219,11 @@ def main():
     programs = {"starpos": with_starpos}
     if peers.is_here("sep"):
         programs["sep"] = peers.with_sep
-    print(
-        f"{'Mpx':>6} {'stars':>6} {'hot':>6}"
-        + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs)
-    )
-    for mpx, count, hot, found in cases(programs, CASES, options.repeat):
-        line = f"{mpx:6g} {count:6d} {hot:6g}"
+    print(f"{'frame':60}" + "".join(f" | {name:>8} found {'ms':>7} ms/Mpx memory" for name in programs))
+    for case, found in cases(programs, CASES, options.repeat):
+        line = f"{case!s:60}"
         for m in found.values():
-            line += f" | {m.found:14d} {m.ms:7.1f} {m.ms / mpx:6.1f} {m.memory:6.2f}"
+            line += f" | {m.found:14d} {m.ms:7.1f} {m.ms / case.mpx:6.1f} {m.memory:6.2f}"
         print(line, flush=True)
 
 

@@ -148,25 +148,32 @@ cdef inline void solved(const double *factor, double *b, int n) noexcept nogil:
 
 
 cdef inline double median(double *values, int n) noexcept nogil:
-    """The value (n,) that would stand at n // 2 if they were sorted (Hoare's selection); it disturbs their order."""
+    """The value (n,) that would stand at n // 2 if they were sorted; it disturbs their order.
+
+    Selection by parting them at one of them, again and again; without branches, whose outcome no processor could guess.
+    """
     cdef int low = 0, high = n - 1, k = n // 2, i, j
-    cdef double pivot
+    cdef double pivot, value
     while low < high:
-        pivot = values[k]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < k:
-            low = i
+        pivot, i = values[k], low
+        for j in range(low, high + 1):
+            value, values[j] = values[j], values[i]
+            values[i] = value
+            i += value < pivot
         if k < i:
-            high = j
+            high = i - 1
+        elif i > low:
+            low = i
+        else:
+            # none is lower: then those that are equal go first
+            for j in range(low, high + 1):
+                value, values[j] = values[j], values[i]
+                values[i] = value
+                i += value <= pivot
+            # as many are found, or it is not a number
+            if k < i or i == low:
+                return pivot
+            low = i
     return values[k]
 
 

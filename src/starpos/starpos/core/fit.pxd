@@ -13,7 +13,6 @@ cdef class Rules:
     cdef double held, dn_per_photon, misfit2, widths2, outlier2, faint
 
 
-cdef bint invert(double *normal, int n, double *out) noexcept nogil
 cdef int sound_stamps(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] phase, Rules rules,

@@ -2,25 +2,20 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Weighted least-squares fit of a star's place, flux and gains to its stamp, by Gauss-Newton, one star after the other."""
 
-from libc.math cimport NAN, ceil, floor, isfinite, log, sqrt
+from libc.math cimport NAN, ceil, floor, isfinite, sqrt
 from libc.stdlib cimport free, malloc
 from libc.string cimport memset
 
 import numpy as np
 
-from starpos.core.algebra cimport factored, solved
+from starpos.core.equations cimport invert, solve
 from starpos.core.limits cimport unsigned_char, within
-from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
+from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
 from starpos.core.sums cimport products, weigh
 
 cdef enum:
     # Numbers kept of each pixel.
     COLUMNS = 9
-    # Parameters of two stars.
-    LARGEST = 2 * MOST
-
-# Equations whose scaled determinant is smaller have no solution.
-cdef double SINGULAR = log(1e-9)
 
 
 cdef class Rules:
@@ -48,9 +43,12 @@ cdef class Rules:
 
 
 cdef struct Pixels:
-    # Pixels of a stamp, one after the other: places in the stamp, offsets px from the star, the light and the sky's
-    # variance, the PSF and its derivatives times the star's gain, and the weight in the fit.
+    # Pixels of a stamp, one after the other: first those within reach of the star, phase after phase, then the others if
+    # all are asked for. Places in the stamp, offsets px from the star, the light and the sky's variance, the PSF and (only
+    # within reach) its derivatives times the star's gain, and the weight in the fit.
     int count
+    int all
+    int[PHASES + 1] first
     int *place
     double *dx
     double *dy
@@ -61,6 +59,8 @@ cdef struct Pixels:
     double *by_y
     double *weight
     double *residual
+    # Of each row of the stamp the first column within reach, and the one after the last.
+    int *bound
 
 
 cdef struct Star:
@@ -90,14 +90,16 @@ cdef struct Stamp:
 
 cdef int _begin(Pixels *p, int area) except -1:
     """Take memory for so many pixels, and for whole blocks of them."""
-    cdef int room = blocks(area) * BLOCK
+    # the last step of a block may begin anywhere
+    cdef int room = (blocks(area) + 1) * BLOCK
     cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
-    p.place = <int *>malloc(room * sizeof(int))
+    p.place = <int *>malloc((room + 2 * area) * sizeof(int))
     if columns == NULL or p.place == NULL:
         free(columns)
         free(p.place)
         raise MemoryError
-    p.count = 0
+    p.bound = p.place + room
+    p.count = p.all = 0
     p.dx, p.dy, p.signal, p.noise2 = columns, columns + room, columns + 2 * room, columns + 3 * room
     p.value, p.by_x, p.by_y = columns + 4 * room, columns + 5 * room, columns + 6 * room
     p.weight, p.residual = columns + 7 * room, columns + 8 * room
@@ -106,29 +108,46 @@ cdef int _begin(Pixels *p, int area) except -1:
 
 cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
     """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, place, k, first, last, n = 0
-    cdef double dy, gain
-    cdef bint fitted
+    cdef int row, column, place, phase, k, n = 0
     for row in range(s.size):
-        dy = s.top + row - star.y
-        first, last = _inside(psf, dy, s.left - star.x, s.size, rules.widths2)
-        for column in range(0 if all_pixels else first, s.size if all_pixels else last):
-            place = row * s.size + column
-            p.place[n], p.dx[n], p.dy[n], p.signal[n] = place, s.left + column - star.x, dy, s.signal[place]
-            p.noise2[n] = <double>s.noise[place] * s.noise[place]
-            fitted = first <= column < last and s.good[place]
-            s.outlier[place] &= fitted
-            p.weight[n] = fitted and not s.outlier[place]
-            n += 1
-    p.count = n
-    evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
-    # in whole fours
-    for k in range(n, (n + 3) // 4 * 4):
-        p.weight[k] = p.residual[k] = 0.0
+        p.bound[2 * row], p.bound[2 * row + 1] = _inside(psf, s.top + row - star.y, s.left - star.x, s.size, rules.widths2)
+    for phase in range(rules.phases):
+        p.first[phase] = n
+        for row in range(s.size):
+            place = row * s.size
+            for column in range(p.bound[2 * row], p.bound[2 * row + 1]):
+                if not rules.own or s.phase[place + column] == phase:
+                    p.place[n], p.dx[n], p.dy[n] = place + column, s.left + column - star.x, s.top + row - star.y
+                    n += 1
+    p.count = p.first[rules.phases] = n
+    for row in range(s.size if all_pixels else 0):
+        for column in range(s.size):
+            if not p.bound[2 * row] <= column < p.bound[2 * row + 1]:
+                p.place[n] = row * s.size + column
+                p.dx[n], p.dy[n] = s.left + column - star.x, s.top + row - star.y
+                n += 1
+    p.all = n
+    for k in range(n):
+        place = p.place[k]
+        p.signal[k], p.noise2[k] = s.signal[place], <double>s.noise[place] * s.noise[place]
+        s.outlier[place] &= s.good[place] & (k < p.count)
+        p.weight[k] = s.good[place] & (k < p.count) & ~s.outlier[place]
+    # the others last: a whole block is written
+    evaluate(psf, p.dx, p.dy, p.count, p.value, p.by_x, p.by_y)
+    values(psf, p.dx + p.count, p.dy + p.count, p.all - p.count, p.value + p.count)
     if rules.own:
-        for k in range(n):
-            gain = star.gain[s.phase[p.place[k]]]
-            p.value[k], p.by_x[k], p.by_y[k] = p.value[k] * gain, p.by_x[k] * gain, p.by_y[k] * gain
+        _by_own_gain(s, star, p)
+
+
+cdef void _by_own_gain(const Stamp *s, const Star *star, Pixels *p) noexcept nogil:
+    """Multiply the PSF and its derivatives by the star's gains."""
+    cdef double gain
+    cdef int k
+    for k in range(p.all):
+        gain = star.gain[s.phase[p.place[k]]]
+        p.value[k] *= gain
+        if k < p.count:
+            p.by_x[k], p.by_y[k] = p.by_x[k] * gain, p.by_y[k] * gain
 
 
 cdef inline (int, int) _inside(const Local *psf, double dy, double left, int size, double widths2) noexcept nogil:
@@ -158,7 +177,7 @@ cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint 
     """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
     cdef double faintest = 0.0, light, variance
     cdef int k
-    weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)
+    weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.all, p.weight, p.residual)
     if not mark:
         return
     memset(s.outlier, 0, s.size * s.size)
@@ -173,84 +192,52 @@ cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint 
             s.outlier[p.place[k]] = p.residual[k] * p.residual[k] > rules.outlier2 * variance
 
 
-cdef void _sum_up(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
-    """Set the normal equations, normal (K, K), lower half, and star.right (K,)."""
-    cdef double[9] sums
-    cdef double flux = star.flux
-    cdef int n = rules.parameters
-    products(p.weight, p.by_x, p.by_y, p.value, p.residual, (p.count + 3) // 4 * 4, sums)
-    normal[0], normal[n], normal[n + 1] = flux * flux * sums[0], flux * flux * sums[1], flux * flux * sums[2]
-    normal[2 * n], normal[2 * n + 1], normal[2 * n + 2] = flux * sums[3], flux * sums[4], sums[5]
-    star.right[0], star.right[1], star.right[2] = flux * sums[6], flux * sums[7], sums[8]
-    star.information = sums[5]
-    if rules.own:
-        _sum_up_gains(s, star, rules, p, normal)
+cdef void _sum_up(Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
+    """Set the normal equations, normal (K, K), lower half, and star.right (K,).
 
-
-cdef void _sum_up_gains(const Stamp *s, Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
-    """Set the rows of the star's own gains, which are held near the frame's. A pixel knows the gain of its phase alone."""
-    cdef double g, w
-    cdef int k, a, row, n = rules.parameters
-    for a in range(rules.own):
-        row = 3 + a
-        memset(&normal[row * n], 0, n * sizeof(double))
-        normal[row * n + row], star.right[row] = rules.held, -star.colour[a] * rules.held
-    for k in range(p.count):
-        row = 3 + s.phase[p.place[k]]
-        g, w = _by_gain(star, rules, p, k, row - 3), p.weight[k]
-        normal[row * n] += w * g * star.flux * p.by_x[k]
-        normal[row * n + 1] += w * g * star.flux * p.by_y[k]
-        normal[row * n + 2] += w * g * p.value[k]
-        normal[row * n + row] += w * g * g
-        star.right[row] += w * g * p.residual[k]
-
-
-cdef inline double _by_gain(const Star *star, Rules rules, const Pixels *p, int k, int phase) noexcept nogil:
-    """The derivative of a pixel by the star's gain at its phase, over the frame's."""
-    return star.flux * p.value[k] * rules.gain[phase] / star.gain[phase]
-
-
-cdef bint invert(double *normal, int n, double *out) noexcept nogil:
-    """Set `out` (n, n) to the inverse of the lower half of normal (n, n), NaN if singular; whether it is not.
-
-    It is scaled first, because fluxes are a million times larger than pixels.
+    A pixel knows the gain of its phase alone; the star's own gains are held near the frame's.
     """
-    cdef double[LARGEST] scale
-    cdef double[LARGEST] column
-    cdef double volume
-    cdef int a, b
-    for a in range(n):
-        scale[a] = sqrt(normal[a * n + a])
-    for a in range(n):
-        for b in range(a + 1):
-            normal[a * n + b] /= scale[a] * scale[b]
-    volume = factored(normal, n)
-    if not volume > SINGULAR:
-        for a in range(n * n):
-            out[a] = NAN
-        return False
-    for a in range(n):
-        for b in range(n):
-            column[b] = 1.0 if a == b else 0.0
-        solved(normal, column, n)
-        for b in range(n):
-            out[b * n + a] = column[b] / (scale[a] * scale[b])
-    return True
+    cdef double[9] sums
+    cdef double flux = star.flux, by
+    cdef int n = rules.parameters, phase, first, row
+    memset(normal, 0, n * n * sizeof(double))
+    memset(star.right, 0, n * sizeof(double))
+    for phase in range(rules.phases):
+        first = p.first[phase]
+        products(
+            p.weight + first, p.by_x + first, p.by_y + first, p.value + first, p.residual + first, p.first[phase + 1] - first,
+            sums,
+        )
+        normal[0] += flux * flux * sums[0]
+        normal[n] += flux * flux * sums[1]
+        normal[n + 1] += flux * flux * sums[2]
+        normal[2 * n] += flux * sums[3]
+        normal[2 * n + 1] += flux * sums[4]
+        normal[2 * n + 2] += sums[5]
+        star.right[0] += flux * sums[6]
+        star.right[1] += flux * sums[7]
+        star.right[2] += sums[8]
+        if rules.own:
+            row, by = 3 + phase, _by_gain(star, rules, 1.0, phase)
+            normal[row * n], normal[row * n + 1], normal[row * n + 2] = by * flux * sums[3], by * flux * sums[4], by * sums[5]
+            normal[row * n + row] = rules.held + by * by * sums[5]
+            star.right[row] = by * sums[8] - star.colour[phase] * rules.held
+    star.information = normal[2 * n + 2]
+
+
+cdef inline double _by_gain(const Star *star, Rules rules, double value, int phase) noexcept nogil:
+    """The derivative of a pixel with this value of the PSF by the star's gain at its phase, over the frame's."""
+    return star.flux * value * rules.gain[phase] / star.gain[phase]
 
 
 cdef void _step(Star *star, Rules rules) noexcept nogil:
-    """Move the star to where its equations say, at most 1 px."""
-    cdef double[MOST] step
-    cdef int a, b, n = rules.parameters
-    for a in range(n):
-        step[a] = 0.0
-        for b in range(n):
-            step[a] += star.covariance[a * n + b] * star.right[b]
-    star.x += max(-1.0, min(step[0], 1.0))
-    star.y += max(-1.0, min(step[1], 1.0))
-    star.flux += step[2]
+    """Move the star by the solution of its equations, star.right (K,), at most 1 px."""
+    cdef int a
+    star.x += max(-1.0, min(star.right[0], 1.0))
+    star.y += max(-1.0, min(star.right[1], 1.0))
+    star.flux += star.right[2]
     for a in range(rules.own):
-        star.colour[a] = max(-0.9, min(star.colour[a] + step[3 + a], 3.0))
+        star.colour[a] = max(-0.9, min(star.colour[a] + star.right[3 + a], 3.0))
         star.gain[a] = rules.gain[a] * (1 + star.colour[a])
 
 
@@ -267,10 +254,15 @@ cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels
             star.flux = _first_flux(p)
         # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
         _weigh(s, star, rules, p, 1 <= round_ < rounds - 1)
-        _sum_up(s, star, rules, p, normal)
-        star.solved = invert(normal, rules.parameters, star.covariance)
+        _sum_up(star, rules, p, normal)
+        if round_ < rounds - 1:
+            star.solved = solve(normal, rules.parameters, star.right)
+        else:
+            star.solved = invert(normal, rules.parameters, star.covariance)
         if not star.solved:
             star.x = star.y = star.flux = NAN
+            for k in range(rules.parameters * rules.parameters):
+                star.covariance[k] = NAN
             return
         if round_ < rounds - 1:
             _step(star, rules)
@@ -293,11 +285,11 @@ cdef void _leverages(const Stamp *s, const Star *star, Rules rules, const Pixels
         phase, total = s.phase[p.place[k]], 0.0
         slope[0], slope[1], slope[2] = star.flux * p.by_x[k], star.flux * p.by_y[k], p.value[k]
         if rules.own:
-            slope[3], row[3] = _by_gain(star, rules, p, k, phase), 3 + phase
+            slope[3], row[3] = _by_gain(star, rules, p.value[k], phase), 3 + phase
         for a in range(most):
             for b in range(most):
                 total += slope[a] * slope[b] * star.covariance[row[a] * n + row[b]]
-        leverage[k] = <float>(total * p.weight[k])
+        leverage[p.place[k]] = <float>(total * p.weight[k])
 
 
 def fitted(
@@ -367,17 +359,19 @@ cdef double _told(
 ) noexcept nogil:
     """Set what is told of each pixel, and how many were fitted; chi-square per degree of freedom."""
     cdef double chi2 = 0.0
-    cdef int k, count = 0
+    cdef int k, place, count = 0
     pixels[0] = 0.0
     if not star.solved:
         for k in range(s.size * s.size):
             residual[k] = model[k] = NAN
             s.outlier[k] = False
         return NAN
-    for k in range(p.count):
-        residual[k], model[k], used[k] = <float>p.residual[k], <float>(p.signal[k] - p.residual[k]), p.weight[k] > 0
+    for k in range(p.all):
+        place = p.place[k]
+        residual[place], model[place] = <float>p.residual[k], <float>(p.signal[k] - p.residual[k])
+        used[place] = p.weight[k] > 0
         chi2 += p.residual[k] * p.residual[k] * p.weight[k]
-        count += used[k]
+        count += used[place]
     pixels[0] = count
     return chi2 / max(count - 3, 1)
 

@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Moments of images through elliptical Gaussian windows, and the places of images by them."""
 
-from libc.math cimport INFINITY, NAN, exp, fabs, isnan, rint
+from libc.math cimport INFINITY, NAN, exp, fabs, isnan, rint, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
@@ -76,6 +76,9 @@ cdef extern from *:
 cdef enum:
     LANES = 8
 
+# A window's Gaussian is nothing (7e-10 of its peak) beyond so many of its widths.
+cdef double WIDTHS = 6.5
+
 
 cdef struct Image:
     # In rows of whole lanes, beyond its own columns dark.
@@ -103,19 +106,32 @@ cdef void _take(Image *image, const float *signal) noexcept nogil:
             image.light[j * image.stride + i] = 0.0
 
 
+cdef inline int _within(double place, int most) noexcept nogil:
+    """The whole number below a place, from 0 to so many; what is not a number is 0."""
+    return <int>max(0.0, min(place, <double>most))
+
+
 cdef void _moments(const Image *image, const double *window, double left, double top, double *out) noexcept nogil:
     """Set `out` (6,) to sum, mean x, y and covariance xx, xy, yy through a window (2, 2) px2; NaN without light."""
     cdef double volume = window[0] * window[3] - window[1] * window[2]
     cdef double xx = window[3] / volume, xy = -window[1] / volume, yy = window[0] / volume, change = exp(-yy)
     # from the row nearest to the window's middle to both sides
-    cdef int middle = <int>max(0.0, min(rint(-top), image.size - 1.0)), block, first, k
+    cdef int middle = <int>max(0.0, min(rint(-top), image.size - 1.0)), k
+    cdef int begin = _within(-top - WIDTHS * sqrt(window[3]), middle), end
+    cdef int first = _within(-left - WIDTHS * sqrt(window[0]), image.size), last
+    end = 1 + _within(-top + WIDTHS * sqrt(window[3]) + 1, image.size - 1)
+    last = 1 + _within(-left + WIDTHS * sqrt(window[0]) + 1, image.size - 1)
+    # in whole lanes
+    last = first + (max(last - first, 1) + LANES - 1) // LANES * LANES
+    first -= max(last - image.stride, 0)
     for k in range(6):
         out[k] = 0.0
-    for block in range(image.stride // LANES):
-        first = block * LANES
+    while first < min(last, image.stride):
         add_columns(
-            image.light + first, image.size, image.stride, middle, left + first, top + middle, xx, xy, yy, change, out
+            image.light + begin * image.stride + first, end - begin, image.stride, middle - begin, left + first, top + middle,
+            xx, xy, yy, change, out,
         )
+        first += LANES
     if not out[0] > 0:
         for k in range(1, 6):
             out[k] = NAN

@@ -8,17 +8,46 @@ from libc.string cimport memset
 
 import numpy as np
 
-from starpos.core.fit cimport MOST, PHASES, Rules, invert, sound_stamps
-from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound
+from starpos.core.equations cimport invert, solve
+from starpos.core.fit cimport MOST, PHASES, Rules, sound_stamps
+from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
+from starpos.core.sums cimport products, weigh
+
+cdef extern from *:
+    """
+    /* Products of three columns with three others and the weights, summed over n pixels: ad, ae, af, bd, be, bf, cd, ce, cf. */
+    STARPOS_FUSED static void starpos_crossed(const double *weight, const double *const *one, const double *const *other, int n,
+                                             double *out) {
+        starpos_four sums[3][3] = {{{0}}};
+        for (int p = 0; p + 4 <= n; p += 4) {
+            const starpos_four w = *(const starpos_fours *)(weight + p);
+            for (int a = 0; a < 3; a++) {
+                const starpos_four wa = w * *(const starpos_fours *)(one[a] + p);
+                for (int b = 0; b < 3; b++)
+                    sums[a][b] += wa * *(const starpos_fours *)(other[b] + p);
+            }
+        }
+        for (int a = 0; a < 3; a++)
+            for (int b = 0; b < 3; b++) {
+                double sum = (sums[a][b][0] + sums[a][b][1]) + (sums[a][b][2] + sums[a][b][3]);
+                for (int p = n / 4 * 4; p < n; p++)
+                    sum += weight[p] * one[a][p] * other[b][p];
+                out[3 * a + b] = sum;
+            }
+    }
+    """
+    void crossed "starpos_crossed"(
+        const double *weight, const double *const *one, const double *const *other, int n, double *out
+    ) noexcept nogil
 
 cdef enum:
     # Parameters of both stars.
     ALL = 2 * MOST
-    # Numbers kept of each pixel: of each star 5, and 5 of their light.
-    COLUMNS = 15
+    # Numbers kept of each pixel: of each star 5, 5 of their light, and row and column.
+    COLUMNS = 17
 
 # One step moves a star so far (px) at most; if none moves so far, and no flux changes by that share, the fit has settled.
-cdef double FARTHEST = 0.5, SETTLED = 1e-9
+cdef double FARTHEST = 0.5, SETTLED = 1e-8
 
 
 cdef struct Image:
@@ -31,8 +60,15 @@ cdef struct Image:
 
 
 cdef struct Pixels:
+    # First those that are fitted, phase after phase, then the others if all are asked for.
     int count
+    int all
+    int[PHASES + 1] first
     int *place
+    # Places of the others.
+    int *rest
+    double *row
+    double *column
     double *signal
     double *noise2
     double *light
@@ -61,15 +97,18 @@ cdef struct Stamp:
 
 cdef int _begin(Pixels *p, int area) except -1:
     """Take memory for so many pixels, and for whole blocks of them."""
-    cdef int room = blocks(area) * BLOCK, k
+    # the last step of a block may begin anywhere
+    cdef int room = (blocks(area) + 1) * BLOCK, k
     cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
-    p.place = <int *>malloc(room * sizeof(int))
+    p.place = <int *>malloc((room + area) * sizeof(int))
     if columns == NULL or p.place == NULL:
         free(columns)
         free(p.place)
         raise MemoryError
+    p.rest = p.place + room
     p.signal, p.noise2, p.light = columns, columns + room, columns + 2 * room
     p.weight, p.residual = columns + 3 * room, columns + 4 * room
+    p.row, p.column = columns + 15 * room, columns + 16 * room
     for k in range(2):
         columns += 5 * room
         p.of[k].dx, p.of[k].dy, p.of[k].value = columns, columns + room, columns + 2 * room
@@ -80,31 +119,60 @@ cdef int _begin(Pixels *p, int area) except -1:
 cdef void _gather(
     const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p
 ) noexcept nogil:
-    """Take the pixels of a stamp within reach of a star, or all; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, place, k, j, n = 0
-    cdef double dx, dy, u, v, gain
-    cdef bint inside
-    for row in range(s.size):
-        for column in range(s.size):
-            inside = False
-            for k in range(2):
-                dx, dy = s.left + column - star[k].x, s.top + row - star[k].y
-                u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
-                inside = inside or u * u + v * v < rules.widths2
-                p.of[k].dx[n], p.of[k].dy[n] = dx, dy
-            place = row * s.size + column
-            if all_pixels or (inside and s.good[place]):
-                p.place[n], p.signal[n], p.noise2[n] = place, s.signal[place], <double>s.noise[place] * s.noise[place]
-                p.weight[n] = 1.0 if inside and s.good[place] else 0.0
-                n += 1
-    p.count = n
+    """Take the good pixels of a stamp within reach of a star, to be fitted with the weight 1, or all, with 0 for the others."""
+    cdef int place, phase, row, column, k, n = 0, others = 0
+    for phase in range(rules.phases):
+        p.first[phase] = n
+        for row in range(s.size):
+            for column in range(s.size):
+                place = row * s.size + column
+                if rules.own and s.phase[place] != phase:
+                    continue
+                if s.good[place] and _near(s, star, psf, rules, row, column):
+                    p.place[n], p.row[n], p.column[n] = place, row, column
+                    n += 1
+                elif all_pixels:
+                    p.rest[others] = place
+                    others += 1
+    p.count = p.all = p.first[rules.phases] = n
+    if all_pixels:
+        for k in range(others):
+            p.place[n + k], p.row[n + k], p.column[n + k] = p.rest[k], p.rest[k] // s.size, p.rest[k] % s.size
+        p.all += others
+    for k in range(p.all):
+        place = p.place[k]
+        p.signal[k], p.noise2[k] = s.signal[place], <double>s.noise[place] * s.noise[place]
+        p.weight[k] = 1.0 if k < n else 0.0
     for k in range(2):
-        evaluate(psf, p.of[k].dx, p.of[k].dy, n, p.of[k].value, p.of[k].by_x, p.of[k].by_y)
-        for j in range(n if rules.own else 0):
-            gain = star[k].gain[s.phase[p.place[j]]]
-            p.of[k].value[j] *= gain
-            p.of[k].by_x[j] *= gain
-            p.of[k].by_y[j] *= gain
+        _evaluate(s, &star[k], psf, rules, p, &p.of[k])
+
+
+cdef inline bint _near(const Stamp *s, const Star *star, const Local *psf, Rules rules, int row, int column) noexcept nogil:
+    """Whether a pixel is within reach of one of the stars."""
+    cdef double dx, dy, u, v
+    cdef int k
+    for k in range(2):
+        dx, dy = s.left + column - star[k].x, s.top + row - star[k].y
+        u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
+        if u * u + v * v < rules.widths2:
+            return True
+    return False
+
+
+cdef void _evaluate(const Stamp *s, const Star *star, const Local *psf, Rules rules, const Pixels *p, Image *of) noexcept nogil:
+    """Set a star's image at the pixels, and its derivatives at those that are fitted."""
+    cdef double gain
+    cdef int k
+    for k in range(p.all):
+        of.dx[k], of.dy[k] = s.left + p.column[k] - star.x, s.top + p.row[k] - star.y
+    # the others last: a whole block is written
+    evaluate(psf, of.dx, of.dy, p.count, of.value, of.by_x, of.by_y)
+    values(psf, of.dx + p.count, of.dy + p.count, p.all - p.count, of.value + p.count)
+    for k in range(p.all if rules.own else 0):
+        gain = star.gain[s.phase[p.place[k]]]
+        of.value[k] *= gain
+        if k < p.count:
+            of.by_x[k], of.by_y[k] = of.by_x[k] * gain, of.by_y[k] * gain
 
 
 cdef void _first_fluxes(const Pixels *p, Star *star) noexcept nogil:
@@ -122,62 +190,70 @@ cdef void _first_fluxes(const Pixels *p, Star *star) noexcept nogil:
 
 cdef void _weigh(const Star *star, Rules rules, Pixels *p) noexcept nogil:
     """Set residuals and weights by the model."""
-    cdef double light
     cdef int k
-    for k in range(p.count):
-        light = star[0].flux * p.of[0].value[k] + star[1].flux * p.of[1].value[k]
-        p.residual[k] = p.signal[k] - light
-        light = max(light, 0.0)
-        p.weight[k] /= p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
+    for k in range(p.all):
+        p.light[k] = star[0].flux * p.of[0].value[k] + star[1].flux * p.of[1].value[k]
+    weigh(p.signal, p.noise2, p.light, 1.0, rules.dn_per_photon, rules.misfit2, p.all, p.weight, p.residual)
 
 
-cdef void _sum_up(const Stamp *s, const Star *star, Rules rules, const Pixels *p, double *normal, double *right) noexcept nogil:
+cdef void _products(const Pixels *p, int first, int n, double *square, double *right) noexcept nogil:
+    """Sums over n pixels of the products (6, 6), lower half, of both stars' derivatives and values, and with the residuals (6,)."""
+    cdef const double *column[6]
+    cdef double[9] sums
+    cdef int k, a, b
+    for k in range(2):
+        column[3 * k], column[3 * k + 1] = p.of[k].by_x + first, p.of[k].by_y + first
+        column[3 * k + 2] = p.of[k].value + first
+        products(p.weight + first, column[3 * k], column[3 * k + 1], column[3 * k + 2], p.residual + first, n, sums)
+        a = 21 * k
+        square[a], square[a + 6], square[a + 7] = sums[0], sums[1], sums[2]
+        square[a + 12], square[a + 13], square[a + 14] = sums[3], sums[4], sums[5]
+        right[3 * k], right[3 * k + 1], right[3 * k + 2] = sums[6], sums[7], sums[8]
+    crossed(p.weight + first, column + 3, column, n, sums)
+    for a in range(3):
+        for b in range(3):
+            square[6 * (3 + a) + b] = sums[3 * a + b]
+
+
+cdef void _sum_up(const Star *star, Rules rules, const Pixels *p, double *normal, double *right) noexcept nogil:
     """Set the normal equations of both stars, normal (K, K), lower half, and right (K,).
 
     A pixel knows of each star the place, the flux and the gain of its own phase, which is held near the frame's.
     """
+    # of each unknown: what a column is multiplied by, which one, and the unknown's row
     cdef double[8] slope
+    cdef int[8] column
     cdef int[8] row
-    cdef int n = 2 * rules.parameters, each = 4 if rules.own else 3, k, j, a, b, phase
-    cdef double w
+    cdef double[36] square
+    cdef double[6] with_residual
+    cdef int n = 2 * rules.parameters, each = 4 if rules.own else 3, k, a, b, phase
     memset(normal, 0, n * n * sizeof(double))
     memset(right, 0, n * sizeof(double))
-    for k in range(2):
-        for a in range(3):
-            row[k * each + a] = k * rules.parameters + a
-        for a in range(rules.own):
-            b = k * rules.parameters + 3 + a
-            normal[b * n + b], right[b] = rules.held, -star[k].colour[a] * rules.held
-    for j in range(p.count):
-        phase = s.phase[p.place[j]]
+    for phase in range(rules.phases):
+        _products(p, p.first[phase], p.first[phase + 1] - p.first[phase], square, with_residual)
         for k in range(2):
-            a = k * each
-            slope[a], slope[a + 1] = star[k].flux * p.of[k].by_x[j], star[k].flux * p.of[k].by_y[j]
-            slope[a + 2] = p.of[k].value[j]
+            for a in range(each):
+                column[k * each + a], row[k * each + a] = 3 * k + min(a, 2), k * rules.parameters + a
+                slope[k * each + a] = star[k].flux if a < 2 else 1.0
             if rules.own:
-                slope[a + 3] = star[k].flux * p.of[k].value[j] * rules.gain[phase] / star[k].gain[phase]
-                row[a + 3] = k * rules.parameters + 3 + phase
+                a = k * each + 3
+                slope[a], row[a] = star[k].flux * rules.gain[phase] / star[k].gain[phase], k * rules.parameters + 3 + phase
+                normal[row[a] * n + row[a]], right[row[a]] = rules.held, -star[k].colour[phase] * rules.held
         for a in range(2 * each):
-            w = p.weight[j] * slope[a]
-            right[row[a]] += w * p.residual[j]
+            right[row[a]] += slope[a] * with_residual[column[a]]
             for b in range(a + 1):
-                normal[row[a] * n + row[b]] += w * slope[b]
+                normal[row[a] * n + row[b]] += slope[a] * slope[b] * square[6 * column[a] + column[b]]
 
 
-cdef bint _move(Star *star, Rules rules, const double *covariance, const double *right, double least) noexcept nogil:
-    """Move both stars to where their equations say; whether they have settled.
+cdef bint _move(Star *star, Rules rules, const double *step, double least) noexcept nogil:
+    """Move both stars by the solution of their equations, step (K,); whether they have settled.
 
     A flux keeps the share `least` in one step: a star without light could not move any more, its place changes nothing.
     """
-    cdef int n = 2 * rules.parameters, k, a, b
-    cdef double[MOST] step
+    cdef int k, a
     cdef double before
     cdef bint settled = True
     for k in range(2):
-        for a in range(rules.parameters):
-            step[a] = 0.0
-            for b in range(n):
-                step[a] += covariance[(k * rules.parameters + a) * n + b] * right[b]
         star[k].x += max(-FARTHEST, min(step[0], FARTHEST))
         star[k].y += max(-FARTHEST, min(step[1], FARTHEST))
         before = star[k].flux
@@ -187,6 +263,7 @@ cdef bint _move(Star *star, Rules rules, const double *covariance, const double 
             star[k].colour[a] = max(-0.9, min(star[k].colour[a] + step[3 + a], 3.0))
             star[k].gain[a] = rules.gain[a] * (1 + star[k].colour[a])
             settled = settled and fabs(step[3 + a]) < SETTLED
+        step += rules.parameters
     return settled
 
 
@@ -213,19 +290,16 @@ cdef void _fit(
         if round_ == 0:
             _first_fluxes(p, star)
         _weigh(star, rules, p)
-        _sum_up(s, star, rules, p, normal, right)
+        _sum_up(star, rules, p, normal, right)
+        if not settled:
+            # without a solution nothing moves any more
+            settled = not solve(normal, n, right) or _move(star, rules, right, least)
+            continue
         for a in range(6):
             for b in range(6):
                 known[6 * a + b] = normal[(a // 3 * rules.parameters + a % 3) * n + b // 3 * rules.parameters + b % 3]
-        if not invert(normal, n, covariance):
-            # without a solution nothing moves any more
-            if settled:
-                break
-            settled = True
-            continue
-        if settled:
-            break
-        settled = _move(star, rules, covariance, right, least)
+        invert(normal, n, covariance)
+        break
     invert(known, 6, inverse)
     sigma[0], sigma[1] = sqrt(inverse[14]), sqrt(inverse[35])
 
@@ -288,9 +362,9 @@ def fitted_pairs(
                 for a in range(rules.phases):
                     gains[j, k, a] = star[j].gain[a]
                 for a in range(area):
-                    model[j, k, a] = <float>(star[j].flux * p.of[j].value[a])
+                    model[j, k, p.place[a]] = <float>(star[j].flux * p.of[j].value[a])
             for a in range(area):
-                used[k, a] = p.weight[a] > 0
+                used[k, p.place[a]] = p.weight[a] > 0
                 chi2[k] += p.residual[a] * p.residual[a] * p.weight[a]
     free(p.signal)
     free(p.place)

@@ -32,6 +32,7 @@ cdef int sound(const double[:, :, ::1] axes, const double[:, :, ::1] series, int
 cdef void evaluate(
     const Local *psf, const double *dx, const double *dy, int n, double *value, double *by_x, double *by_y
 ) noexcept nogil
+cdef void values(const Local *psf, const double *dx, const double *dy, int n, double *value) noexcept nogil
 cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil
 cdef void terms_at(
     const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out

@@ -29,7 +29,7 @@ cdef extern from *:
         }
     }
     /* The Gaussian of a peak at n of a block's places. */
-    STARPOS_WIDE static void starpos_gauss(const double *u, const double *v, int n, double peak, double *restrict out) {
+    STARPOS_FUSED static void starpos_gauss(const double *u, const double *v, int n, double peak, double *restrict out) {
         for (int p = 0; p < n; p++)
             out[p] = -0.5 * (u[p] * u[p] + v[p] * v[p]);
         starpos_exps(out, n);
@@ -37,7 +37,7 @@ cdef extern from *:
             out[p] *= peak;
     }
     /* The sum of series[i, j] h_i(u) h_j(v) without the Gaussian, and what its derivatives by -u and -v are with it. */
-    STARPOS_WIDE static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v, int n,
+    STARPOS_FUSED static void starpos_series(const double *series, int rows, int columns, const double *u, const double *v, int n,
                                             double *restrict value, double *restrict by_u, double *restrict by_v) {
         double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
         starpos_hermites(u, n, rows, fu);
@@ -68,6 +68,30 @@ cdef extern from *:
             }
         }
     }
+    /* The sum alone. */
+    STARPOS_FUSED static void starpos_sum(const double *series, int rows, int columns, const double *u, const double *v, int n,
+                                         double *restrict value) {
+        double fu[STARPOS_ORDERS + 1][STARPOS_BLOCK], fv[STARPOS_ORDERS + 1][STARPOS_BLOCK];
+        starpos_hermites(u, n, rows - 1, fu);
+        starpos_hermites(v, n, columns - 1, fv);
+        for (int first = 0; first < n; first += STARPOS_LANES) {
+            double sum[STARPOS_LANES] = {0};
+            for (int i = 0; i < rows; i++) {
+                double across[STARPOS_LANES] = {0};
+                for (int j = 0; j < columns; j++) {
+                    const double c = series[i * columns + j];
+                    if (c == 0)
+                        continue;
+                    for (int p = 0; p < STARPOS_LANES; p++)
+                        across[p] += c * fv[j][first + p];
+                }
+                for (int p = 0; p < STARPOS_LANES; p++)
+                    sum[p] += fu[i][first + p] * across[p];
+            }
+            for (int p = 0; p < STARPOS_LANES; p++)
+                value[first + p] = sum[p];
+        }
+    }
     /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian. */
     STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
                                            const double *gauss, float *out) {
@@ -86,6 +110,9 @@ cdef extern from *:
     void series_at "starpos_series"(
         const double *series, int rows, int columns, const double *u, const double *v, int n, double *value,
         double *by_u, double *by_v,
+    ) noexcept nogil
+    void sum_at "starpos_sum"(
+        const double *series, int rows, int columns, const double *u, const double *v, int n, double *value
     ) noexcept nogil
     void each_at "starpos_terms"(
         const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
@@ -141,6 +168,21 @@ cdef void evaluate(
             value[first + p] *= gauss[p]
             by_x[first + p] = (psf.axes[0] * by_u[p] + psf.axes[2] * by_v[p]) * gauss[p]
             by_y[first + p] = (psf.axes[1] * by_u[p] + psf.axes[3] * by_v[p]) * gauss[p]
+
+
+cdef void values(const Local *psf, const double *dx, const double *dy, int n, double *value) noexcept nogil:
+    """The PSF at n offsets (px) from a star; room for whole blocks."""
+    cdef double[BLOCK] u
+    cdef double[BLOCK] v
+    cdef double[BLOCK] gauss
+    cdef int block, first, some, p
+    for block in range(blocks(n)):
+        first = block * BLOCK
+        some = min(BLOCK, n - first)
+        scaled(psf, dx + first, dy + first, some, u, v, gauss)
+        sum_at(psf.series, psf.rows, psf.columns, u, v, whole(some), value + first)
+        for p in range(some):
+            value[first + p] *= gauss[p]
 
 
 cdef inline int _offsets(double left, double top, int size, int first, double *dx, double *dy) noexcept nogil:

@@ -7,32 +7,55 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+cimport starpos.core.wide
 from starpos.core.algebra cimport middle
+
+cdef extern from *:
+    """
+    /* Take a row of n pixels that lies on the frame, whose columns alternate between two phases (or are of one): most are so,
+       and the loop takes wide registers. level, noise: of the first column and of the second; full: 1, not 255. */
+    #define STARPOS_TAKE_ROW(name, pixel) \
+    STARPOS_WIDE static void name(const pixel *restrict line, int n, int limit, const float *level, const float *noise, \
+                                  const unsigned char *phase, float *restrict signal, float *restrict sky, \
+                                  unsigned char *restrict good, unsigned char *restrict full, unsigned char *restrict part) { \
+        const float levels[2] = {level[0], level[1]}, noises[2] = {noise[0], noise[1]}; \
+        const unsigned char phases[2] = {phase[0], phase[1]}; \
+        for (int j = 0; j < n; j++) { \
+            const unsigned char white = line[j] >= limit; \
+            signal[j] = (float)line[j] - (j & 1 ? levels[1] : levels[0]); \
+            sky[j] = j & 1 ? noises[1] : noises[0]; \
+            part[j] = j & 1 ? phases[1] : phases[0]; \
+            full[j] = white; \
+            good[j] = white ^ 1; \
+        } \
+    }
+    STARPOS_TAKE_ROW(starpos_take_8, unsigned char)
+    STARPOS_TAKE_ROW(starpos_take_16, unsigned short)
+    """
+    void take_8 "starpos_take_8"(
+        const unsigned char *line, int n, int limit, const float *level, const float *noise, const unsigned char *phase,
+        float *signal, float *sky, unsigned char *good, unsigned char *full, unsigned char *part,
+    ) noexcept nogil
+    void take_16 "starpos_take_16"(
+        const unsigned short *line, int n, int limit, const float *level, const float *noise, const unsigned char *phase,
+        float *signal, float *sky, unsigned char *good, unsigned char *full, unsigned char *part,
+    ) noexcept nogil
+
 
 cdef enum:
     # No pixel is as bright.
     BEYOND = 65536
 
+ctypedef unsigned char unsigned_char
+
 ctypedef fused pixel_t:
-    unsigned char
+    unsigned_char
     unsigned short
 
 
 cdef inline Py_ssize_t _inside(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
     """The row or column of n that is nearest to k."""
     return max(0, min(k, n - 1))
-
-
-cdef inline void _take_row(
-    const pixel_t *line, int size, int limit, float level, float noise, float *signal, float *sky, unsigned char *good,
-    unsigned char *full, unsigned char *phase,
-) noexcept nogil:
-    """Take a row of a stamp that lies on the frame, without a mosaic: most are so, and the loop takes wide registers."""
-    cdef int j
-    for j in range(size):
-        signal[j], sky[j], phase[j] = <float>line[j] - level, noise, 0
-        full[j] = line[j] >= limit
-        good[j] = not full[j]
 
 
 def around(
@@ -52,6 +75,9 @@ def around(
     cdef int limit = <int>ceil(saturation) if saturation < BEYOND else BEYOND, value
     cdef const pixel_t *line
     cdef bint on, full, whole
+    cdef float[2] levels
+    cdef float[2] noises
+    cdef unsigned char[2] parts
     if not (y.shape[0] == level.shape[0] == noise.shape[0] == n and noise.shape[1] == phases and phases in (1, 4)):
         raise ValueError("a row, and a level and noise for each of 1 or 4 phases, are needed for each column of a star")
     if reach < 0 or not (height and width):
@@ -61,15 +87,24 @@ def around(
     cdef unsigned char[:, :, ::1] mark = marks.reshape(3, n, size * size)
     with nogil:
         for k in range(n):
-            whole = phases == 1 and reach <= x[k] < width - reach
+            whole = reach <= x[k] < width - reach
             for i in range(size):
                 row, place = y[k] - reach + i, i * size
                 line = &plane[_inside(row, height), 0]
                 if whole and 0 <= row < height:
-                    _take_row(
-                        line + x[k] - reach, size, limit, level[k, 0], noise[k, 0], &sky[0, k, place], &sky[1, k, place],
-                        &mark[0, k, place], &mark[1, k, place], &mark[2, k, place],
-                    )
+                    for j in range(2):
+                        parts[j] = <unsigned char>(2 * (row & 1) + (x[k] - reach + j & 1)) if phases > 1 else 0
+                        levels[j], noises[j] = level[k, parts[j]], noise[k, parts[j]]
+                    if pixel_t is unsigned_char:
+                        take_8(
+                            line + x[k] - reach, size, limit, levels, noises, parts, &sky[0, k, place], &sky[1, k, place],
+                            &mark[0, k, place], &mark[1, k, place], &mark[2, k, place],
+                        )
+                    else:
+                        take_16(
+                            line + x[k] - reach, size, limit, levels, noises, parts, &sky[0, k, place], &sky[1, k, place],
+                            &mark[0, k, place], &mark[1, k, place], &mark[2, k, place],
+                        )
                     continue
                 for j in range(x[k] - reach, x[k] + reach + 1):
                     on = 0 <= row < height and 0 <= j < width
@@ -144,3 +179,28 @@ def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_ma
             found[1, k] = per_mad * middle(score, many)
     free(score)
     return out[0], out[1]
+
+
+def greyed(const float[:, :, ::1] signal):
+    """Images (N, S, S) smoothed along both axes by 1/4, 1/2, 1/4, which removes a mosaic's pattern; they end as in a level."""
+    cdef Py_ssize_t n = signal.shape[0], k, i, j, left, right
+    cdef Py_ssize_t rows = signal.shape[1], columns = signal.shape[2]
+    cdef const float *above
+    cdef const float *own
+    cdef const float *below
+    out = np.empty((n, rows, columns), np.float32)
+    cdef float[:, :, ::1] smooth = out
+    cdef float *line = <float *>malloc(max(columns, 1) * sizeof(float))
+    if line == NULL:
+        raise MemoryError
+    with nogil:
+        for k in range(n):
+            for i in range(rows):
+                above, own, below = &signal[k, max(i - 1, 0), 0], &signal[k, i, 0], &signal[k, min(i + 1, rows - 1), 0]
+                for j in range(columns):
+                    line[j] = <float>0.5 * own[j] + <float>0.25 * (above[j] + below[j])
+                for j in range(columns):
+                    left, right = max(j - 1, 0), min(j + 1, columns - 1)
+                    smooth[k, i, j] = <float>0.5 * line[j] + <float>0.25 * (line[left] + line[right])
+    free(line)
+    return out

@@ -271,3 +271,78 @@ def one_pixel(
                     star += residual[k, row, column] * residual[k, row, column] / variance + log(variance / sky2)
             sums[0, k], sums[1, k], counts[0, k], counts[1, k] = one - most, star, count, white
     return sums_[0], sums_[1], counts_[0], counts_[1]
+
+
+def counted(const unsigned char[:, :, ::1] mark):
+    """How many pixels of each stamp (N, S, S) are marked: (N,)."""
+    cdef Py_ssize_t n = mark.shape[0], area = mark.shape[1] * mark.shape[2], k, j
+    cdef int count
+    out = np.empty(n, np.intp)
+    cdef Py_ssize_t[::1] number = out
+    for k in range(n):
+        count = 0
+        for j in range(area):
+            count += (&mark[k, 0, 0])[j] != 0
+        number[k] = count
+    return out
+
+
+def brightest_left(
+    const float[:, :, ::1] residual, const unsigned char[:, :, ::1] good, const double[::1] left, const double[::1] top,
+    const double[:, :, ::1] axes, double nearest, double widths, const double[::1] weight,
+):
+    """Row and column (N,) of the pixel where a fit leaves the most light, of the good pixels smoothed.
+
+    left, top        (N,) px: of each stamp's (N, S, S) first column and row from its star
+    axes             (N, 2, 2) or (1, 2, 2): of the PSF
+    nearest, widths  the pixel is not nearer to the star (px), and within so many widths of the PSF
+    weight           (reach + 1,): of the smoothing, from the middle outwards, along both axes; images end as in a mirror
+    """
+    cdef Py_ssize_t n = residual.shape[0], k, a
+    cdef int size = residual.shape[1], reach = weight.shape[0] - 1, row, column, j
+    cdef double dx, dy, u, v, value, most
+    _alike(residual.shape, good.shape)
+    if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
+        raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
+    if not 0 <= reach < size:
+        raise ValueError(f"a smoothing that reaches {reach} px in stamps of {size} px")
+    out = np.zeros((2, n), np.intp)
+    cdef Py_ssize_t[:, ::1] place = out
+    cdef double *plain = <double *>malloc(2 * size * size * sizeof(double))
+    if plain == NULL:
+        raise MemoryError
+    cdef double *across = plain + size * size
+    with nogil:
+        for k in range(n):
+            a, most = k if axes.shape[0] > 1 else 0, -1e300
+            for j in range(size * size):
+                plain[j] = (&residual[k, 0, 0])[j] if (&good[k, 0, 0])[j] else 0.0
+            for row in range(size):
+                for column in range(size):
+                    value = weight[0] * plain[row * size + column]
+                    for j in range(1, reach + 1):
+                        value += weight[j] * (
+                            plain[_mirrored(row - j, size) * size + column] + plain[_mirrored(row + j, size) * size + column]
+                        )
+                    across[row * size + column] = value
+            for row in range(size):
+                dy = top[k] + row
+                for column in range(size):
+                    dx = left[k] + column
+                    u, v = axes[a, 0, 0] * dx + axes[a, 0, 1] * dy, axes[a, 1, 0] * dx + axes[a, 1, 1] * dy
+                    if dx * dx + dy * dy < nearest * nearest or not u * u + v * v < widths * widths:
+                        continue
+                    value = weight[0] * across[row * size + column]
+                    for j in range(1, reach + 1):
+                        value += weight[j] * (
+                            across[row * size + _mirrored(column - j, size)] + across[row * size + _mirrored(column + j, size)]
+                        )
+                    if value > most:
+                        most, place[0, k], place[1, k] = value, row, column
+    free(plain)
+    return out[0], out[1]
+
+
+cdef inline int _mirrored(int k, int n) noexcept nogil:
+    """The pixel that stands for k beyond the edges of n: the first one again, and so on."""
+    return -k - 1 if k < 0 else 2 * n - 1 - k if k >= n else k

@@ -3,11 +3,16 @@
 
 cdef extern from *:
     """
-    /* Chosen when the module is loaded, with the same results. */
+    /* Chosen when the module is loaded: WIDE with the same results, FUSED with products and sums rounded once, not twice. */
     #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
     #define STARPOS_WIDE __attribute__((target_clones("avx2", "default")))
     #else
     #define STARPOS_WIDE
+    #endif
+    #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
+    #define STARPOS_FUSED __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+    #else
+    #define STARPOS_FUSED STARPOS_WIDE
     #endif
     /* Put e to the power of each of n numbers in its place, to 3e-16 of it; beyond +-700 as there.
        Unlike libm's it takes wide registers. */

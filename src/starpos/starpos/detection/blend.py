@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 import numpy as np
-from scipy import ndimage
 
 from starpos.core.pairs import fitted_pairs
+from starpos.core.vetting import brightest_left, counted
 from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import LocalPsf, Psf
 from starpos.detection.stamps import Stamps
@@ -24,6 +24,9 @@ GAIN = 30.0
 # Companions fainter than this share of the star may be faults of the PSF.
 DIMMEST = 0.03
 ROUNDS = 10
+# It is looked for at least so far (px) from the star, with a Gaussian of 0.8 px, from its middle outwards.
+NEAREST_PX, SMOOTHING = 1.0, np.exp(-0.5 * (np.arange(4) / 0.8) ** 2)
+SMOOTHING /= 2 * SMOOTHING.sum() - SMOOTHING[0]
 # One step of the fit never leaves a star less than this share of its flux.
 LEAST = 0.05
 
@@ -118,8 +121,8 @@ def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
     freedom = np.maximum(fit.pixels - 3, 1)
     with np.errstate(invalid="ignore"):
-        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (fit.outlier.sum((1, 2)) > 2)
-    return odd & ~stamps.full.any((1, 2)) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
+        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (counted(fit.outlier) > 2)
+    return odd & (counted(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
 def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
@@ -138,10 +141,15 @@ def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
 
 def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray, np.ndarray]:
     """Pixel x, y (N,) px, off the star's centre, where the fit leaves the most light."""
-    dx, dy = stamps.offsets(fit.x, fit.y)
-    left = ndimage.gaussian_filter(stamps.good * fit.residual, (0, 0.8, 0.8))
-    left[(dx**2 + dy**2 < 1) | ~psf.within(dx, dy, FIT_WIDTHS + 2)] = -np.inf
-    row, column = np.divmod(left.reshape(len(left), -1).argmax(1), left.shape[2])
+    row, column = brightest_left(
+        fit.residual,
+        stamps.good,
+        *stamps.corner(fit.x, fit.y),
+        psf.axes,
+        NEAREST_PX,
+        FIT_WIDTHS + 2,
+        SMOOTHING,
+    )
     return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
 
 

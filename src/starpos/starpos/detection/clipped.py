@@ -75,7 +75,7 @@ def _tops(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _near(places: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     """Whether one of the places (M, 2) is near each of the peaks (N, 2), px."""
-    if not len(places):
+    if not (len(places) and len(peaks)):
         return np.zeros(len(peaks), bool)
     return spatial.cKDTree(places).query(peaks, distance_upper_bound=NEAR)[0] < NEAR
 

@@ -10,6 +10,7 @@ from scipy import sparse, spatial
 
 from starpos.core.background import between
 from starpos.core.mesh import above
+from starpos.core.neighbours import near_pairs
 from starpos.core.order import median
 from starpos.core.peaks import peaks, smoothed
 from starpos.detection.background import Background
@@ -283,7 +284,7 @@ def _join_plateaus(
     x: np.ndarray, y: np.ndarray, height: np.ndarray, flat: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Peaks x, y, height (N,) with one peak in the middle of each plateau of a saturated star."""
-    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(flat + 0.5, output_type="ndarray")
+    pairs = near_pairs(x.astype(float), y.astype(float), flat + 0.5)
     if len(pairs) == 0:
         return x.astype(int), y.astype(int), height
     graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (len(x), len(x)))

@@ -5,11 +5,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage, spatial
+from scipy import spatial
 
 from starpos.core.moments import own_shapes
-from starpos.core.noise import light_noise, strangeness
+from starpos.core.neighbours import near_pairs
+from starpos.core.noise import light_noise, of_phases, strangeness
 from starpos.core.order import quantile
+from starpos.core.stamps import greyed
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
@@ -56,8 +58,8 @@ DEVIANT = 5.0
 MAX_REACH, QUARTERS = 20, np.arange(5) / 4
 # Brighter stars than this SNR get no more weight when the widths over the field are fitted.
 LOUDEST = 100
-# A kernel whose response vanishes at the Nyquist frequency, so that it removes a mosaic; px2 it adds to a covariance.
-SMOOTHING, SMOOTHING_WIDTH = np.array([0.25, 0.5, 0.25], np.float32), 0.5
+# px2 that the smoothing which removes a mosaic adds to a covariance: its response vanishes at the Nyquist frequency.
+SMOOTHING_WIDTH = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,7 @@ def _teachers(
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
     weight = np.clip(mass / np.median(stamps.noise, axis=(1, 2)), 1, LOUDEST) ** 2
     psf = widened(psf, x[near], y[near], ratio[near], weight[near])
-    widths = relative_widths(seen, psf.at(x, y).shape + blur * np.eye(2), window)
+    widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
@@ -225,7 +227,7 @@ def reach_of(psf: Psf) -> int:
     # where the widths are the same everywhere, one place tells them
     quarters = QUARTERS if len(psf.widths) > 1 else QUARTERS[:1]
     x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-    widest = np.linalg.eigvalsh(psf.at(np.tile(x, len(y)), np.repeat(y, len(x))).shape).max()
+    widest = np.linalg.eigvalsh(psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max()
     return min(max(math.ceil(3.5 * math.sqrt(widest)) + 1, 4), MAX_REACH)
 
 
@@ -233,14 +235,12 @@ def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
     """Stamps smoothed so that the mosaic's pattern vanishes, and the px2 which that added to the covariances."""
     if not background.is_mosaic:
         return stamps, 0.0
-    signal = ndimage.convolve1d(stamps.signal, SMOOTHING, axis=1, mode="nearest")
-    signal = ndimage.convolve1d(signal, SMOOTHING, axis=2, mode="nearest")
-    return replace(stamps, signal=signal), SMOOTHING_WIDTH
+    return replace(stamps, signal=greyed(stamps.signal)), SMOOTHING_WIDTH
 
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which peaks (N,) have no neighbour within 12 px above a fiftieth of their height, and which have no higher one."""
-    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(12, output_type="ndarray")
+    pairs = near_pairs(x.astype(float), y.astype(float), 12)
     alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):
         alone[a[height[b] > 0.02 * height[a]]] = False
@@ -267,10 +267,10 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
 
     value (N, S, S): the PSF at the stars' pixels.
     """
-    phases = stamps.phase[..., None] == np.arange(len(before.gain))
-    weight = (stamps.good / before.variance(stamps.noise, stamps.signal))[..., None] * phases
-    information = (weight * (value * value)[..., None]).sum((1, 2))
-    own = (weight * (value * stamps.signal)[..., None]).sum((1, 2)) / np.maximum(information, 1e-12)
+    own, information = of_phases(
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
+        len(before.gain),
+    )  # fmt: skip
     # 1e-3 DN is far below any star
     mean = np.maximum(own.mean(1, keepdims=True), 1e-3)
     own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)

@@ -22,6 +22,8 @@ from starpos.core.shapes import clipped
 MONOMIALS = 6
 # Limits of the squared widths at a place of the field over the mean ones.
 NARROW, BROAD = 0.25, 6.0
+# The series of a Gaussian.
+GAUSSIAN = np.ones((1, 1, 1))
 # of the series that a trail has along it
 TRAIL_ORDER = 24
 
@@ -41,12 +43,6 @@ class LocalPsf:
     def shape(self) -> np.ndarray:
         """Covariances (N, 2, 2) px2 of the Gaussians that the series multiply."""
         return shapes_of(self.axes)
-
-    def within(self, dx: np.ndarray, dy: np.ndarray, widths: float) -> np.ndarray:
-        """Whether pixels at the offsets dx, dy px from the stars' centres lie within so many widths of them."""
-        axes = self.axes.astype(np.float32)[..., None, None]
-        u, v = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy, axes[:, 1, 0] * dx + axes[:, 1, 1] * dy
-        return u * u + v * v < widths**2
 
     def evaluate(
         self, left: np.ndarray, top: np.ndarray, size: int
@@ -88,6 +84,10 @@ class Psf:
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px."""
         return LocalPsf(*local(*_points(x, y), self.box, self.axes, self.widths, self.series, NARROW, BROAD))
+
+    def shapes_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Covariances (N, 2, 2) px2, or (1, 2, 2), of the Gaussians of the PSF at the points x, y (N,) px."""
+        return shapes_of(local(*_points(x, y), self.box, self.axes, self.widths, GAUSSIAN, NARROW, BROAD)[0])
 
     def monomials(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Monomials (N, 6) of x, y scaled to -1..1 over the box; all but the first have zero mean over it."""

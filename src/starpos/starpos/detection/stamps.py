@@ -64,13 +64,6 @@ class Stamps:
         """Offsets (N,) px of the first column and row from the points x, y (N,) px."""
         return self.x - self.reach - x, self.y - self.reach - y
 
-    def offsets(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets of every pixel from the points x, y (N,) px: float32 (N, 1, S) and (N, S, 1)."""
-        grid = np.arange(-self.reach, self.reach + 1)
-        dx = (grid + (self.x - x)[:, None]).astype(np.float32)
-        dy = (grid + (self.y - y)[:, None]).astype(np.float32)
-        return dx[:, None, :], dy[:, :, None]
-
 
 COLUMNS = tuple(f.name for f in fields(Stamps))
 

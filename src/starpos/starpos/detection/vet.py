@@ -2,8 +2,8 @@
 """Turn peaks into measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
 
 import numpy as np
-from scipy import spatial
 
+from starpos.core.neighbours import near_pairs
 from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
 from starpos.detection.blend import with_companions
@@ -21,6 +21,8 @@ SPECK = 3
 SPIKE = 3
 # Widths of the PSF (3 are 1.3 FWHM): of closer pairs each star's position depends on the other's.
 RESOLVED = 3.0
+# Farther neighbours are not looked at.
+FAR = 6.0
 # A single star's chi-square stays below this; twigs, nebulae and covered stars exceed it.
 STRANGE = 3.0
 # An image with more than so many times a star's squared width is not a single star.
@@ -56,7 +58,7 @@ def measure(
         return stamps, _take_spikes(stamps, lesson)
 
     stamps, spike = cut_at(x, y)
-    shape = psf.at(x, y).shape
+    shape = psf.shapes_at(x, y)
     x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
     stamps, spike, fit = with_companions(stamps, spike, fit, psf, lesson.response, cut_at)
@@ -68,7 +70,7 @@ def measure(
     dot = _is_dot(stamps, fit, lesson.response)
     own_light(stamps.signal, stamps.noise, spike, fit.model, fit.outlier, SPECK, LOUD)
     smooth, blur = grey(stamps, background)
-    shape = psf.at(stamps.x, stamps.y).shape
+    shape = psf.shapes_at(stamps.x, stamps.y)
     window = window_for(shape)
     _, _, seen = moments(smooth, fit.x, fit.y, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
@@ -139,7 +141,7 @@ def resolve(columns: dict[str, np.ndarray], psf: Psf) -> dict[str, np.ndarray]:
     # in widths of the PSF
     points = np.stack([columns["x"], columns["y"]], 1) @ psf.axes.T
     # the brighter star of each pair first
-    pairs = np.sort(spatial.cKDTree(points).query_pairs(6.0, output_type="ndarray"), axis=1)
+    pairs = near_pairs(*np.ascontiguousarray(points.T), FAR)
     apart = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
     ratio = columns["flux"][pairs[:, 1]] / columns["flux"][pairs[:, 0]]
     keep = np.ones(n, bool)

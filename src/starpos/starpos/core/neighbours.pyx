@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Which of many points are near each other."""
+
+from libc.stdlib cimport free, malloc, realloc
+
+import numpy as np
+
+
+def near_pairs(const double[::1] x, const double[::1] y, double reach):
+    """All pairs (M, 2) of the points x, y (N,) that are not farther from each other than the reach, the lower number first.
+
+    The points are sorted by y, so that each meets only those of a strip below it. What is not a number is near nothing.
+    """
+    cdef Py_ssize_t n = x.shape[0], count = 0, room = 4 * n + 16, i, j, k, m
+    cdef double dx, dy
+    if y.shape[0] != n:
+        raise ValueError(f"{n} columns and {y.shape[0]} rows of points: as many are needed")
+    cdef const Py_ssize_t[::1] order = np.argsort(y)
+    cdef Py_ssize_t *pair = <Py_ssize_t *>malloc(2 * room * sizeof(Py_ssize_t))
+    cdef Py_ssize_t *more
+    if pair == NULL:
+        raise MemoryError
+    try:
+        for i in range(n):
+            k = order[i]
+            for j in range(i + 1, n):
+                m = order[j]
+                dx, dy = x[m] - x[k], y[m] - y[k]
+                if not dy <= reach:
+                    break
+                if not dx * dx + dy * dy <= reach * reach:
+                    continue
+                if count == room:
+                    room *= 2
+                    more = <Py_ssize_t *>realloc(pair, 2 * room * sizeof(Py_ssize_t))
+                    if more == NULL:
+                        raise MemoryError
+                    pair = more
+                pair[2 * count], pair[2 * count + 1] = min(k, m), max(k, m)
+                count += 1
+        out = np.empty((count, 2), np.intp)
+        if count:
+            out[:] = <Py_ssize_t[:count, :2]>pair
+        return out
+    finally:
+        free(pair)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Near points, light that a fit leaves, and fluxes of phases, of the compiled core, beside their plain forms."""
+
+import numpy as np
+import pytest
+from scipy import ndimage, spatial
+
+from starpos.core.neighbours import near_pairs
+from starpos.core.noise import of_phases
+from starpos.core.stamps import greyed
+from starpos.core.vetting import brightest_left, counted
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 300])
+def test_near_pairs_are_those_of_a_tree(number, rng):
+    # whole px: many are equally far, and exactly as far as the reach
+    x, y = rng.integers(0, 60, (2, number)).astype(float)
+    expected = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(5.0, output_type="ndarray")
+    found = near_pairs(x, y, 5.0)
+    assert sorted(map(tuple, found)) == sorted(map(tuple, expected))
+
+
+def test_what_is_no_number_is_near_nothing():
+    x, y = np.array([1.0, np.nan, 1.0, 2.0]), np.array([1.0, 1.0, np.nan, 1.0])
+    assert near_pairs(x, y, 3.0).tolist() == [[0, 3]]
+    with pytest.raises(ValueError, match="4 columns and 3 rows"):
+        near_pairs(x, y[:3], 3.0)
+
+
+def test_images_are_made_grey_as_by_two_convolutions(rng):
+    images, weight = rng.normal(0, 9, (5, 7, 7)).astype(np.float32), np.array([0.25, 0.5, 0.25])
+    expected = ndimage.convolve1d(
+        ndimage.convolve1d(images, weight, axis=1, mode="nearest"), weight, axis=2, mode="nearest"
+    )
+    np.testing.assert_allclose(greyed(images), expected, atol=1e-5)
+
+
+def test_the_brightest_pixel_left_is_that_of_a_filtered_image(rng):
+    residual, good = rng.normal(0, 1, (30, 15, 15)).astype(np.float32), rng.random((30, 15, 15)) < 0.9
+    left, top = rng.uniform(-8, -6, (2, 30))
+    axes = np.array([[0.5, 0.2], [-0.2, 0.7]]) * rng.uniform(0.8, 1.2, (30, 1, 1))
+    weight = np.exp(-0.5 * (np.arange(4) / 0.8) ** 2)
+    weight /= 2 * weight.sum() - weight[0]
+    dx, dy = (left[:, None] + np.arange(15))[:, None, :], (top[:, None] + np.arange(15))[:, :, None]
+    dx, dy = np.broadcast_arrays(dx, dy)
+    u, v = np.einsum("nij,jnab->inab", axes, np.stack([dx, dy]))
+    smooth = ndimage.gaussian_filter((good * residual).astype(float), (0, 0.8, 0.8))
+    smooth[(dx**2 + dy**2 < 1) | (u**2 + v**2 >= 9)] = -np.inf
+    expected = np.divmod(smooth.reshape(30, -1).argmax(1), 15)
+    found = brightest_left(residual, good.view(np.uint8), left, top, axes, 1.0, 3.0, weight)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_marks_are_counted(rng):
+    marks = rng.random((6, 9, 9)) < 0.3
+    np.testing.assert_array_equal(counted(marks), marks.sum((1, 2)))
+
+
+def test_fluxes_of_phases_are_weighted_means(rng):
+    signal, noise = (
+        rng.normal(50, 20, (8, 7, 7)).astype(np.float32),
+        rng.uniform(2, 4, (8, 7, 7)).astype(np.float32),
+    )
+    value, good = rng.uniform(0, 0.1, (8, 7, 7)).astype(np.float32), rng.random((8, 7, 7)) < 0.8
+    phase = rng.integers(0, 4, (8, 7, 7)).astype(np.uint8)
+    light = np.maximum(signal, 0)
+    weight = good / (noise**2 + 0.7 * light + (0.05 * light) ** 2)
+    flux, information = of_phases(signal, noise, good, phase, value, 0.7, 0.05, 4)
+    for k in range(4):
+        own = weight * (phase == k)
+        np.testing.assert_allclose(information[:, k], (own * value**2).sum((1, 2)), rtol=1e-5)
+        np.testing.assert_allclose(
+            flux[:, k] * information[:, k], (own * value * signal).sum((1, 2)), rtol=1e-5
+        )
