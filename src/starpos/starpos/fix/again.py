@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Another try for a frame that was not identified: by smaller triangles, then by stars that are detected otherwise."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from starpos.detection.negative import negative_of
-from starpos.detection.otherwise import WAYS, otherwise
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.identification.second_look import ENOUGH
 
-# Each other way to see a frame is another try, with a second look of its own: together they add 0.01 wrong answers in
-# 1e9 frames.
-ENOUGH_OTHERWISE = ENOUGH + math.log(10 * len(WAYS))
+# Each of at most so many other ways to see a frame is another try, with a second look of its own: together they add 0.01
+# wrong answers in 1e9 frames.
+MOST_WAYS = 3
+ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MOST_WAYS)
 # Where stars fill a part of a frame only (a roof, clouds, a white half), triangles of a field this share as large are.
 PART = 0.6
 
@@ -28,7 +28,12 @@ def identified_otherwise(
     """
     if isinstance(item, Stars) or answer.status not in (Status.NOT_IDENTIFIED, Status.TOO_FEW_STARS):
         return answer
-    for others in otherwise(negative_of(item) if stars.negative else item, stars.window):
+    # slow to import, and seldom needed
+    from starpos.detection.negative import negative_of
+    from starpos.detection.otherwise import otherwise
+
+    seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
+    for others in itertools.islice(seen, MOST_WAYS):
         found = identify(replace(others, negative=stars.negative))
         if found.attitude is not None and found.attitude.log_odds >= ENOUGH_OTHERWISE:
             return found
