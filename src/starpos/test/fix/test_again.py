@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from starpos.detection import otherwise as ways
 from starpos.fix import again
 from starpos.fix.again import PART, identified_otherwise
 from starpos.fix.solution import Solution, Status
@@ -60,7 +61,7 @@ def test_an_answer_by_stars_detected_otherwise_needs_more_evidence(frame, catalo
     stars = stars_of_cygnus(catalogue, rng)
     good = Solver(Instrument(FOCAL_PX), catalogue).identify(stars, part=PART)
     lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
-    monkeypatch.setattr(again, "otherwise", lambda frame, window: iter([stars, stars, stars]))
+    monkeypatch.setattr(ways, "otherwise", lambda frame, window: iter([stars, stars, stars]))
     assert identified_otherwise(frame, stars, lost, lambda s: good) is good
     weak = replace(good, attitude=replace(good.attitude, log_odds=again.ENOUGH_OTHERWISE - 0.1))
     tries = iter([weak, lost, good])
