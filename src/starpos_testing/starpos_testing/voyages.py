@@ -86,7 +86,17 @@ def carried(wave, begin, rate):
     return lambda t: begin + rate * t + wave(t)
 
 
-def path_of(kind, seconds, rng):
+def wandered(rng, walk, seconds, terms=24):
+    """The way that a velocity leads which walks at random from 0 by `walk` m/s/sqrt(s), for so many seconds.
+
+    The first terms of the walk's series by Karhunen and Loeve: as smooth as an accelerometer needs it.
+    """
+    rate = (np.arange(terms) + 0.5) * np.pi / seconds
+    velocity = rng.normal(0, walk * np.sqrt(2 / seconds), terms) / rate
+    return lambda t: (velocity / rate * (1 - np.cos(np.multiply.outer(t, rate)))).sum(-1)
+
+
+def path_of(kind, seconds, rng, wind_walk=0.0):
     """Functions of time: displacement (N, 3) in m east, north, up, and roll, pitch, yaw (N, 3) in rad (ROS)."""
     begin = rng.uniform(0, 2 * np.pi)
     grid = np.arange(-1.0, seconds + 1.0, 0.05)
@@ -108,6 +118,12 @@ def path_of(kind, seconds, rng):
         bank, wind = np.arctan(20 * 2 * np.pi / 100 / 9.81), rng.normal(0, 3, 2)
         lean = [carried(waves(rng, 0.02, 2, 8), -bank, 0.0), waves(rng, 0.02, 2, 8)]
         heave = [carried(waves(rng, 0.5, 5, 20), 0.0, v) for v in (*wind, 0.0)]
+        if wind_walk:
+            ways = [wandered(rng, wind_walk, seconds) for _ in range(2)]
+            heave[:2] = [
+                lambda t, steady=steady, way=way: steady(t) + way(t)
+                for steady, way in zip(heave, ways, strict=False)
+            ]
     elif kind == "parked":
         lean = [lambda t, a=a: a + 0 * t for a in (0.03, -0.02)]
     else:
@@ -153,10 +169,14 @@ def made(
     mount_deg=1.0,
     velocity_sigma=0.03,
     errors=True,
+    wind_walk=0.0,
 ):
-    """Record a voyage; without `errors` the readings are exact, the mount as believed and the stars where they are."""
+    """Record a voyage; without `errors` the readings are exact, the mount as believed and the stars where they are.
+
+    wind_walk: of a drone's wind, m/s/sqrt(s) an axis; it is steady else.
+    """
     rng, on = np.random.default_rng(seed), float(errors)
-    displacement, angles = path_of(kind, seconds, rng)
+    displacement, angles = path_of(kind, seconds, rng, wind_walk)
     origin, axes = ellipsoid_place(latitude_deg, longitude_deg, height_m)
 
     def place(t):
