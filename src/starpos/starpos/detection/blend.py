@@ -10,7 +10,7 @@ import numpy as np
 from starpos.core.pairs import fitted_pairs
 from starpos.core.vetting import brightest_left, counted
 from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
-from starpos.detection.psf import LocalPsf, Psf
+from starpos.detection.psf import FieldPsf, LocalPsf
 from starpos.detection.stamps import Stamps
 
 # A companion is tried where chi-square is so many sigma above that of a single star.
@@ -60,7 +60,7 @@ def with_companions(
     stamps: Stamps,
     spike: np.ndarray,
     fit: Fit,
-    psf: Psf,
+    psf: FieldPsf,
     response: Response,
     cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
 ) -> tuple[Stamps, np.ndarray, Fit]:
@@ -125,7 +125,7 @@ def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     return odd & (counted(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
-def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
+def _fit_pairs(stamps: Stamps, fit: Fit, psf: FieldPsf, response: Response) -> Pairs:
     """Fit a star and a companion to each stamp by Gauss-Newton on all their parameters.
 
     The companion starts where the single star's fit leaves the most light.
