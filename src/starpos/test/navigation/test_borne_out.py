@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 from voyage_calls import navigated, nees, sigma_m
 
 from starpos.navigation.borne_out import independent_means
@@ -20,14 +21,25 @@ def side(request):
 
 def test_combinations_of_means_are_independent_of_each_other_and_of_trends(side):
     """Against the covariances of all velocities, written down by definition."""
-    values = np.stack([independent_means(T, side, one, 7)[0] for one in np.eye(len(T))], 1)
-    _, walks = independent_means(T, side, np.zeros(len(T)), 7)
-    assert len(walks) >= 5
-    assert values @ values.T == pytest.approx(np.eye(len(walks)), abs=1e-9)
+    values = np.stack([independent_means(T, side, one, 7).values for one in np.eye(len(T))], 1)
+    means = independent_means(T, side, np.zeros(len(T)), 7)
+    assert len(means.walks) >= 5
+    assert values @ values.T == pytest.approx(np.eye(len(values)), abs=1e-9)
     walked = np.minimum.outer(T, T) * (side @ side.T)
-    assert values @ walked @ values.T == pytest.approx(np.diag(walks), abs=1e-9 * walks.max())
+    assert values @ walked @ values.T == pytest.approx(np.diag(means.walks), abs=1e-9 * means.walks.max())
     trend = side @ [3.0, -2.0] + T * (side @ [0.01, 0.02])
-    assert values @ trend == pytest.approx(np.zeros(len(walks)), abs=1e-8)
+    assert values @ trend == pytest.approx(np.zeros(len(values)), abs=1e-8)
+    swing = (side @ [0.0, 1.0]) * np.sin(2 * np.pi * T / T[-1]) * T[-1] / (2 * np.pi)
+    assert values @ swing == pytest.approx(means.swings[:, 3], abs=1e-8)
+
+
+def test_likelihood_is_that_of_all_covariances_together(side, rng):
+    means = independent_means(T, side, rng.normal(size=len(T)), 7)
+    variance = rng.uniform(0.5, 2, (3, len(means.values)))
+    for one, likely in zip(variance, means.log_likelihood(variance, 0.003), strict=True):
+        covariance = np.diag(one) + 0.003**2 * means.swings @ means.swings.T
+        by_definition = multivariate_normal(np.zeros(len(one)), covariance).logpdf(means.values)
+        assert likely - len(one) * np.log(2 * np.pi) / 2 == pytest.approx(by_definition)
 
 
 def voyage_in(wind, seed):
