@@ -56,21 +56,21 @@ class Pairs:
     chi2: np.ndarray
 
 
-def with_companions(
+def pairs_among(
     stamps: Stamps,
     spike: np.ndarray,
     fit: Fit,
     psf: Psf,
     response: Response,
     cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
-) -> tuple[Stamps, np.ndarray, Fit]:
-    """Stamps, spikes and fit with the companions as further rows; each star's stamp is without the other's light.
+) -> tuple[np.ndarray, tuple[Stamps, np.ndarray, Fit] | None]:
+    """Which stars (N,) have companions; and stamps, spikes and fit of these and then of their companions, if there are any.
 
-    cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of their pixels are spikes (N, S, S).
+    Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of their pixels are spikes (N, S, S).
     """
     odd = np.flatnonzero(_surprising(stamps, fit))
     if len(odd) == 0:
-        return stamps, spike, fit
+        return odd, None
     crowd, alone = stamps.take(odd), _rows(fit, odd)
     before = crowd.good * alone.residual**2 / response.variance(crowd.noise, alone.model)
     pairs = _fit_pairs(crowd, alone, psf, response)
@@ -85,7 +85,7 @@ def with_companions(
         real &= (before * used).sum((1, 2)) - pairs.chi2 > GAIN * np.maximum(pairs.chi2 / freedom, 1)
         real &= flux[1] > DIMMEST * flux[0]
     if not real.any():
-        return stamps, spike, fit
+        return odd[:0], None
     odd, used, whole = odd[real], used[real], away[1, real] < stamps.reach - 1
     x, y, flux, gains, sigma, covariance, models = (
         values[:, real]
@@ -110,10 +110,10 @@ def with_companions(
     for name, value in together.items():
         own = getattr(second, name)
         together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
-    return (
-        _with_pairs(stamps, odd, first_stamps, second_stamps),
-        np.concatenate([spike, second_spike]),
-        _with_pairs(fit, odd, first, replace(second, **together)),
+    return odd, (
+        _both(first_stamps, second_stamps),
+        np.concatenate([spike[odd], second_spike]),
+        _both(first, replace(second, **together)),
     )
 
 
@@ -158,10 +158,7 @@ def _rows(fit: Fit, index: np.ndarray) -> Fit:
     return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
 
 
-def _with_pairs(old: Rows, index: np.ndarray, first: Rows, second: Rows) -> Rows:
-    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `first`, and `second` follows."""
-    joined = {}
-    for f in fields(old):
-        joined[f.name] = np.concatenate([getattr(old, f.name), getattr(second, f.name)])
-        joined[f.name][index] = getattr(first, f.name)
-    return replace(old, **joined)
+def _both(first: Rows, second: Rows) -> Rows:
+    """The rows of two dataclasses of arrays, one after the other."""
+    rows = {f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(first)}
+    return replace(first, **rows)

@@ -6,7 +6,7 @@ import numpy as np
 from starpos.core.neighbours import near_pairs
 from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
-from starpos.detection.blend import with_companions
+from starpos.detection.blend import pairs_among
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
 from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import Psf
@@ -61,7 +61,30 @@ def measure(
     shape = psf.shapes_at(x, y)
     x, y = centroid(grey(stamps, background)[0], shape)
     fit = fit_stars(stamps, psf, x, y, lesson.response)
-    stamps, spike, fit = with_companions(stamps, spike, fit, psf, lesson.response, cut_at)
+    paired, pairs = pairs_among(stamps, spike, fit, psf, lesson.response, cut_at)
+    single = np.ones(len(x), bool)
+    single[paired] = False
+    columns = _columns(stamps, spike, fit, background, lesson, min_snr, single)
+    if pairs is None:
+        return columns
+    both = _columns(*pairs, background, lesson, min_snr, np.ones(2 * len(paired), bool))
+    return {name: np.concatenate([column, both[name]]) for name, column in columns.items()}
+
+
+def _columns(
+    stamps: Stamps,
+    spike: np.ndarray,
+    fit: Fit,
+    background: Background,
+    lesson: Lesson,
+    min_snr: float,
+    wanted: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """The columns that `measure` explains of fitted stars, of those that are wanted (N,) and are stars.
+
+    spike (N, S, S): which pixels have the mean of their neighbours. The stamps' light is changed.
+    """
+    psf = lesson.psf
     local = psf.at(fit.x, fit.y)
     matched, foreign, full, edge = looks(
         stamps.signal, stamps.noise, stamps.good, stamps.full, spike, fit.residual, fit.model, fit.used, fit.outlier,
@@ -78,7 +101,7 @@ def measure(
     with np.errstate(invalid="ignore", divide="ignore"):
         snr = fit.flux / fit.flux_sigma
         c = fit.covariance * misfit[:, None, None]
-        sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
+        sound = wanted & np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
         sound &= (fit.flux > 0) & (matched >= min_snr) & ~dot
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
