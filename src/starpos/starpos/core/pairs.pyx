@@ -9,9 +9,9 @@ from libc.string cimport memset
 import numpy as np
 
 from starpos.core.equations cimport invert, invert_scaled, scaled_factor, solve_scaled
-from starpos.core.fit cimport MOST, PHASES, Rules, is_settled, sound_stamps
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
-from starpos.core.sums cimport products, weigh
+from starpos.core.rules cimport MOST, PHASES, Rules, first_of_phase, is_settled, rows_within, sound_stamps
+from starpos.core.sums cimport chi_square, products, weigh
 
 cdef extern from *:
     """
@@ -65,6 +65,9 @@ cdef struct Pixels:
     int all
     int[PHASES + 1] first
     int *place
+    # Of each row of the stamp the first column within reach, and the one after the last: of the star, of the other.
+    int *bound
+    int *other
     double *row
     double *column
     double *signal
@@ -98,11 +101,12 @@ cdef int _begin(Pixels *p, int area) except -1:
     # the last step of a block may begin anywhere
     cdef int room = (blocks(area) + 1) * BLOCK, k
     cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
-    p.place = <int *>malloc(room * sizeof(int))
+    p.place = <int *>malloc((room + 4 * area) * sizeof(int))
     if columns == NULL or p.place == NULL:
         free(columns)
         free(p.place)
         raise MemoryError
+    p.bound, p.other = p.place + room, p.place + room + 2 * area
     p.signal, p.noise2, p.light = columns, columns + room, columns + 2 * room
     p.weight, p.residual = columns + 3 * room, columns + 4 * room
     p.row, p.column = columns + 15 * room, columns + 16 * room
@@ -115,19 +119,23 @@ cdef int _begin(Pixels *p, int area) except -1:
 
 cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, Pixels *p) noexcept nogil:
     """Take the good pixels of a stamp within reach of a star, to be fitted with the weight 1."""
-    cdef int place, phase, row, column, k, n = 0
+    cdef int place, phase, row, column, last, k, n = 0, step = 2 if rules.own else 1
+    rows_within(psf.axes, s.left - star[0].x, s.top - star[0].y, s.size, rules.widths2, p.bound)
+    rows_within(psf.axes, s.left - star[1].x, s.top - star[1].y, s.size, rules.widths2, p.other)
     for phase in range(rules.phases):
         p.first[phase] = n
         for row in range(s.size):
-            for column in range(s.size):
+            column, last = _both_within(p, row)
+            if rules.own:
+                column = first_of_phase(s.phase + row * s.size, column, last, phase)
+            while column < last:
                 place = row * s.size + column
-                if (not rules.own or s.phase[place] == phase) and s.good[place] and _near(s, star, psf, rules, row, column):
+                if s.good[place] and _within(p, row, column):
                     p.place[n], p.row[n], p.column[n] = place, row, column
+                    p.signal[n], p.noise2[n], p.weight[n] = s.signal[place], <double>s.noise[place] * s.noise[place], 1.0
                     n += 1
+                column += step
     p.count = p.all = p.first[rules.phases] = n
-    for k in range(n):
-        place = p.place[k]
-        p.signal[k], p.noise2[k], p.weight[k] = s.signal[place], <double>s.noise[place] * s.noise[place], 1.0
     for k in range(2):
         _offset(s, &star[k], p, &p.of[k], 0)
         evaluate(psf, p.of[k].dx, p.of[k].dy, n, p.of[k].value, p.of[k].by_x, p.of[k].by_y)
@@ -141,7 +149,7 @@ cdef void _gather_rest(const Stamp *s, const Star *star, const Local *psf, Rules
     for row in range(s.size):
         for column in range(s.size):
             place = row * s.size + column
-            if not (s.good[place] and _near(s, star, psf, rules, row, column)):
+            if not (s.good[place] and _within(p, row, column)):
                 p.place[n], p.row[n], p.column[n] = place, row, column
                 p.signal[n], p.weight[n] = s.signal[place], 0.0
                 n += 1
@@ -155,16 +163,18 @@ cdef void _gather_rest(const Stamp *s, const Star *star, const Local *psf, Rules
         p.residual[k] = p.signal[k] - star[0].flux * p.of[0].value[k] - star[1].flux * p.of[1].value[k]
 
 
-cdef inline bint _near(const Stamp *s, const Star *star, const Local *psf, Rules rules, int row, int column) noexcept nogil:
+cdef inline bint _within(const Pixels *p, int row, int column) noexcept nogil:
     """Whether a pixel is within reach of one of the stars."""
-    cdef double dx, dy, u, v
-    cdef int k
-    for k in range(2):
-        dx, dy = s.left + column - star[k].x, s.top + row - star[k].y
-        u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
-        if u * u + v * v < rules.widths2:
-            return True
-    return False
+    return p.bound[2 * row] <= column < p.bound[2 * row + 1] or p.other[2 * row] <= column < p.other[2 * row + 1]
+
+
+cdef inline (int, int) _both_within(const Pixels *p, int row) noexcept nogil:
+    """The first column of a row within reach of one of the stars, and the one after the last."""
+    if p.bound[2 * row] == p.bound[2 * row + 1]:
+        return p.other[2 * row], p.other[2 * row + 1]
+    if p.other[2 * row] == p.other[2 * row + 1]:
+        return p.bound[2 * row], p.bound[2 * row + 1]
+    return min(p.bound[2 * row], p.other[2 * row]), max(p.bound[2 * row + 1], p.other[2 * row + 1])
 
 
 cdef void _offset(const Stamp *s, const Star *star, const Pixels *p, Image *of, int first) noexcept nogil:
@@ -388,7 +398,7 @@ def fitted_pairs(
                     gains[j, k, a] = star[j].gain[a]
             for a in range(area):
                 used[k, p.place[a]] = p.weight[a] > 0
-                chi2[k] += p.residual[a] * p.residual[a] * p.weight[a]
+            chi2[k] = chi_square(p.weight, p.residual, p.count)
     free(p.signal)
     free(p.place)
     x, y, flux, sigmas = stars_

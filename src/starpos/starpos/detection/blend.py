@@ -64,14 +64,17 @@ def pairs_among(
     response: Response,
     cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
 ) -> tuple[np.ndarray, tuple[Stamps, np.ndarray, Fit] | None]:
-    """Which stars (N,) have companions; and stamps, spikes and fit of these and then of their companions, if there are any.
+    """Rows of stars that have companions; and stamps, spikes and fit of these, then of the companions, if there are any.
 
-    Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of their pixels are spikes (N, S, S).
+    Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of
+    their pixels are spikes (N, S, S).
     """
     odd = np.flatnonzero(_surprising(stamps, fit))
     if len(odd) == 0:
         return odd, None
     crowd, alone = stamps.take(odd), _rows(fit, odd)
+    light = _light(crowd, psf, alone.x, alone.y, alone.flux, alone.gains)
+    alone = replace(alone, model=light, residual=crowd.signal - light)
     before = crowd.good * alone.residual**2 / response.variance(crowd.noise, alone.model)
     pairs = _fit_pairs(crowd, alone, psf, response)
     x, y, flux, used = pairs.x, pairs.y, pairs.flux, pairs.used
@@ -99,8 +102,7 @@ def pairs_among(
     )  # fmt: skip
     first_stamps = replace(both, signal=both.signal - models[1])
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
-    light = psf.at(x[0], y[0]).evaluate(*second_stamps.corner(x[0], y[0]), stamps.size)[0]
-    light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
+    light = _light(second_stamps, psf, x[0], y[0], flux[0], gains[0])
     noise = np.sqrt(response.variance(second_stamps.noise, light))
     second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
     second = fit_stars(second_stamps, psf, x[1], y[1], response, rounds=3)
@@ -123,6 +125,14 @@ def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (counted(fit.outlier) > 2)
     return odd & (counted(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
+
+
+def _light(
+    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, flux: np.ndarray, gains: np.ndarray
+) -> np.ndarray:
+    """The light (N, S, S) float32, DN, of stars at x, y (N,) px, with flux (N,) and gains (N, P), on whole stamps."""
+    light = psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)[0]
+    return light * (gains_at(gains, stamps.phase) * flux.astype(np.float32)[:, None, None])
 
 
 def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:

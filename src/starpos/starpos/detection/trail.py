@@ -42,7 +42,9 @@ def with_trail(
     psfs = [lesson.psf, *(trailed(sigma, trail) for sigma in (own, *USUAL_SIGMAS))]
     stamps = cut(plane, background, x[peaks], y[peaks], max(map(reach_of, psfs)), saturation)
     begin = stamps.x.astype(float), stamps.y.astype(float)
-    fits = [fit_stars(stamps, psf, *begin, lesson.response, ROUNDS, leverage=True) for psf in psfs]
+    fits = [
+        fit_stars(stamps, psf, *begin, lesson.response, ROUNDS, leverage=True, whole=True) for psf in psfs
+    ]
     left = _left(stamps, fits, lesson)
     best = int(np.argmin(left[1:])) + 1
     unknowns = OF_SHAPE + np.count_nonzero(lesson.psf.series) - 1
