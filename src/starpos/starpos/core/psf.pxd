@@ -34,5 +34,5 @@ cdef void evaluate(
 cdef void values(const Local *psf, const double *dx, const double *dy, int n, double *value) noexcept nogil
 cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil
 cdef void terms_at(
-    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
+    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out, int apart
 ) noexcept nogil

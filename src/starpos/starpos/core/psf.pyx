@@ -17,6 +17,7 @@ cdef extern from *:
     #define STARPOS_STEPS 8
     typedef double starpos_eight __attribute__((vector_size(64)));
     typedef double starpos_eights __attribute__((vector_size(64), aligned(8)));
+    typedef float starpos_floats __attribute__((vector_size(32), aligned(4)));
     /* Of 0, 1, 2 ..., and 1 over them; set when the module is loaded. */
     static double starpos_root[STARPOS_ORDERS + 2], starpos_over_root[STARPOS_ORDERS + 2];
     /* Hermite polynomials over sqrt(k!), k = 0 .. order, of so many steps of numbers u. */
@@ -105,18 +106,20 @@ cdef extern from *:
             ((starpos_eights *)value)[s] = sum * gauss[s];
         }
     }
-    /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian. */
-    STARPOS_WIDE static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
-                                           const double *gauss, float *out) {
-        starpos_eight places[2][STARPOS_STEPS], fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+    /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian, of a block; rows of `out` lie so far apart. */
+    STARPOS_FUSED static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
+                                           const double *gauss, float *out, int apart) {
+        starpos_eight places[3][STARPOS_STEPS], fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
         memcpy(places[0], u, sizeof places[0]);
         memcpy(places[1], v, sizeof places[1]);
+        memcpy(places[2], gauss, sizeof places[2]);
         starpos_hermites(places[0], STARPOS_STEPS, highest, fu);
         starpos_hermites(places[1], STARPOS_STEPS, highest, fv);
         for (int t = 0; t < count; t++) {
-            const double *a = (const double *)fu[orders[2 * t]], *b = (const double *)fv[orders[2 * t + 1]];
-            for (int p = 0; p < STARPOS_BLOCK; p++)
-                out[t * STARPOS_BLOCK + p] = (float)(a[p] * b[p] * gauss[p]);
+            const starpos_eight *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
+            starpos_floats *row = (starpos_floats *)(out + t * apart);
+            for (int s = 0; s < STARPOS_STEPS; s++)
+                row[s] = __builtin_convertvector(a[s] * b[s] * places[2][s], starpos_floats);
         }
     }
     """
@@ -134,7 +137,8 @@ cdef extern from *:
         const double *dx, const double *dy, int n, double *value,
     ) noexcept nogil
     void each_at "starpos_terms"(
-        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
+        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out,
+        int apart,
     ) noexcept nogil
 
 for order in range(ORDERS + 2):
@@ -240,7 +244,7 @@ def evaluated(
 
 
 cdef void terms_at(
-    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
+    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out, int apart
 ) noexcept nogil:
-    """Set `out` (T, BLOCK) to single terms h_i(u) h_j(v) of a block's pixels, (i, j) in orders (T, 2), times the Gaussian."""
-    each_at(orders, count, highest, u, v, gauss, out)
+    """Set single terms h_i(u) h_j(v) of a block's pixels, (i, j) in orders (T, 2), times the Gaussian; their rows lie so far apart."""
+    each_at(orders, count, highest, u, v, gauss, out, apart)
