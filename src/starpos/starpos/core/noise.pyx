@@ -179,3 +179,41 @@ def of_phases(
             information[k, p] = max(information[k, p], 1e-12)
             flux[k, p] /= information[k, p]
     return fluxes, weights
+
+
+def unit_light(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] phase,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const Py_ssize_t[::1] rows, const double[::1] flux,
+    const double[:, ::1] gains, double dn_per_photon, double misfit2,
+):
+    """The pixels (M, S, S) of stars that teach over their fluxes and gains, and the inverse variances; 0 if not used.
+
+    signal, noise, phase  (M, S, S) of these stars
+    model, used           (N, S, S) of a fit, in which these are `rows` (M,), with flux (N,) and gains (N, P)
+    dn_per_photon         DN2 of variance for each DN of light, and
+    misfit2               for its square
+    """
+    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], k, j, row
+    cdef float light, sky
+    cdef double scale
+    _alike(noise, model, model, used, model)
+    _alike(noise, signal, signal, phase, signal)
+    if noise.shape[0] != n or not within[Py_ssize_t](&rows[0], n, 0, model.shape[0] - 1):
+        raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
+    if flux.shape[0] != model.shape[0] or gains.shape[0] != flux.shape[0]:
+        raise ValueError(f"{flux.shape[0]} fluxes and {gains.shape[0]} gains of {model.shape[0]} fits: one each is needed")
+    if n and np.max(phase, initial=0) >= gains.shape[1]:
+        raise ValueError(f"a pixel of phase {np.max(phase)}: there are {gains.shape[1]}")
+    out = np.empty((2, n, noise.shape[1], noise.shape[2]), np.float32)
+    cdef float[:, :, :, ::1] found = out
+    with nogil:
+        for k in range(n if area else 0):
+            row = rows[k]
+            for j in range(area):
+                scale = flux[row] * gains[row, (&phase[k, 0, 0])[j]]
+                light, sky = max((&model[row, 0, 0])[j], <float>0), (&noise[k, 0, 0])[j]
+                (&found[0, k, 0, 0])[j] = <float>((&signal[k, 0, 0])[j] / scale)
+                (&found[1, k, 0, 0])[j] = <float>(
+                    (&used[row, 0, 0])[j] * scale * scale / (sky * sky + (dn_per_photon + misfit2 * light) * light)
+                )
+    return out[0], out[1]

@@ -9,11 +9,11 @@ from scipy import spatial
 
 from starpos.core.moments import own_shapes
 from starpos.core.neighbours import near_pairs
-from starpos.core.noise import light_noise, of_phases, strangeness
-from starpos.core.order import quantile
+from starpos.core.noise import light_noise, of_phases, strangeness, unit_light
+from starpos.core.order import quantile, row_medians
 from starpos.core.stamps import greyed
 from starpos.detection.background import Background
-from starpos.detection.fit import Fit, Response, fit_stars, gains_at
+from starpos.detection.fit import Fit, Response, fit_stars
 from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
 from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
@@ -160,7 +160,8 @@ def _teachers(
     ratio = np.nan_to_num(psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T)
     extremes = np.linalg.eigvalsh(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
-    weight = np.clip(mass / np.median(stamps.noise, axis=(1, 2)), 1, LOUDEST) ** 2
+    noise = row_medians(stamps.noise.reshape(len(x), -1))
+    weight = np.clip(mass / noise, 1, LOUDEST) ** 2
     psf = widened(psf, x[near], y[near], ratio[near], weight[near])
     widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
@@ -227,7 +228,9 @@ def reach_of(psf: Psf) -> int:
     # where the widths are the same everywhere, one place tells them
     quarters = QUARTERS if len(psf.widths) > 1 else QUARTERS[:1]
     x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-    widest = np.linalg.eigvalsh(psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max()
+    shape = psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))
+    xx, xy, yy = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    widest = float(((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)).max())
     return min(max(math.ceil(3.5 * math.sqrt(widest)) + 1, 4), MAX_REACH)
 
 
@@ -288,12 +291,11 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
 
 def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Response, terms: Terms) -> Psf:
     """Refine the PSF once, by the sound stars of a fit, which are those in stamps."""
-    x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
-    scale = gains_at(fit.gains[sound], stamps.phase) * flux[:, None, None]
-    left, top = stamps.corner(x, y)
-    light = fit.model[sound]
+    x, y = fit.x[sound], fit.y[sound]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
-    variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
-    weight = fit.used[sound] * scale**2 / variance
-    brightness, phases = stamps.signal / scale, len(response.gain)
-    return refine(psf, x, y, left, top, brightness, weight.astype(np.float32), stamps.phase, phases, terms)
+    brightness, weight = unit_light(
+        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, np.flatnonzero(sound), fit.flux, fit.gains,
+        response.dn_per_photon, response.misfit**2 + 0.02**2,
+    )  # fmt: skip
+    left, top = stamps.corner(x, y)
+    return refine(psf, x, y, left, top, brightness, weight, stamps.phase, len(response.gain), terms)
