@@ -3,6 +3,7 @@
 """The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
 
 from libc.math cimport M_PI, fabs, sqrt
+from libc.stdlib cimport free, malloc
 
 import numpy as np
 
@@ -203,44 +204,41 @@ cdef void values(const Local *psf, const double *dx, const double *dy, int n, do
         )
 
 
-cdef inline int _offsets(double left, double top, int size, int first, double *dx, double *dy) noexcept nogil:
-    """Set the offsets (px) of a stamp's pixels from the first on, at most a block; how many."""
-    cdef int n = min(BLOCK, size * size - first), p
-    for p in range(n):
-        dx[p], dy[p] = left + (first + p) % size, top + (first + p) // size
-    return n
-
-
 def evaluated(
     const double[:, :, ::1] axes, const double[:, :, ::1] series, const double[::1] left, const double[::1] top, int size
 ):
-    """The PSFs of N stars at the pixels of their stamps, and the derivatives by the stars' x and y: (N, size, size) each.
+    """The PSFs of N stars at the pixels of their stamps: (N, size, size) float32.
 
     axes       (N, 2, 2) or (1, 2, 2), and
     series     (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
     left, top  (N,) px: of the first column and the first row from each star's centre
     """
-    cdef int stars = left.shape[0], area = size * size, n, k, block, first, p, place
-    cdef double[BLOCK] dx
-    cdef double[BLOCK] dy
-    cdef double[3][BLOCK] found
+    cdef int stars = left.shape[0], area = size * size, k, row, column, n
     cdef Local psf
     sound(axes, series, stars)
     if top.shape[0] != stars or size < 1:
         raise ValueError(f"{stars} stars, {top.shape[0]} rows, stamps of {size} px: as many rows as stars, and at least a pixel")
-    out = np.empty((3, stars, size, size), np.float32)
-    cdef float[:, :, ::1] image = out.reshape(3, stars, area)
+    out = np.empty((stars, size, size), np.float32)
+    cdef float[:, ::1] image = out.reshape(stars, area)
+    cdef int room = blocks(area) * BLOCK
+    cdef double *dx = <double *>malloc(3 * room * sizeof(double))
+    if dx == NULL:
+        raise MemoryError
+    cdef double *dy = dx + room
+    cdef double *value = dx + 2 * room
     with nogil:
         for k in range(stars):
             local_of(axes, series, k, &psf)
-            for block in range(blocks(area)):
-                first = block * BLOCK
-                n = _offsets(left[k], top[k], size, first, dx, dy)
-                evaluate(&psf, dx, dy, n, found[0], found[1], found[2])
-                for place in range(3):
-                    for p in range(n):
-                        image[place, k, first + p] = <float>found[place][p]
-    return out[0], out[1], out[2]
+            n = 0
+            for row in range(size):
+                for column in range(size):
+                    dx[n], dy[n] = left[k] + column, top[k] + row
+                    n += 1
+            values(&psf, dx, dy, area, value)
+            for n in range(area):
+                image[k, n] = <float>value[n]
+    free(dx)
+    return out
 
 
 cdef void terms_at(

@@ -257,7 +257,7 @@ def respond(
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
-        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)[0], before)
+        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size), before)
     photon, misfit = light_noise(
         stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, np.flatnonzero(sound), before.dn_per_photon,
         before.misfit, DEVIANT,

@@ -44,10 +44,8 @@ class LocalPsf:
         """Covariances (N, 2, 2) px2 of the Gaussians that the series multiply."""
         return shapes_of(self.axes)
 
-    def evaluate(
-        self, left: np.ndarray, top: np.ndarray, size: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The PSF and its derivatives by the star's x and y at the pixels of N stamps: three arrays (N, size, size).
+    def evaluate(self, left: np.ndarray, top: np.ndarray, size: int) -> np.ndarray:
+        """The PSF at the pixels of N stamps (N, size, size).
 
         left, top (N,) px: of each stamp's first column and row from its star's centre.
         """

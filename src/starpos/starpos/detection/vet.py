@@ -6,7 +6,7 @@ import numpy as np
 from starpos.core.neighbours import near_pairs
 from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
-from starpos.detection.blend import pairs_among
+from starpos.detection.blend import Fitted, joined, pairs_among, rows_of, surprising
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
 from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import Psf
@@ -45,10 +45,12 @@ def measure(
     lesson: Lesson,
     saturation: float,
     min_snr: float,
+    chunk: int,
 ) -> dict[str, np.ndarray]:
     """Measure the stars among the peaks x, y (N,) int px: columns x, y, flux, snr, covariance, flags, chi2, wide.
 
-    The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have.
+    The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have, and
+    chunk how many are measured at once.
     """
     psf = lesson.psf
 
@@ -57,18 +59,33 @@ def measure(
         level(stamps.signal, stamps.noise, SIGMA_PER_MAD, RAISED, UNEVEN, OWN)
         return stamps, _take_spikes(stamps, lesson)
 
-    stamps, spike = cut_at(x, y)
-    shape = psf.shapes_at(x, y)
-    x, y = centroid(grey(stamps, background)[0], shape)
-    fit = fit_stars(stamps, psf, x, y, lesson.response)
-    paired, pairs = pairs_among(stamps, spike, fit, psf, lesson.response, cut_at)
-    single = np.ones(len(x), bool)
-    single[paired] = False
-    columns = _columns(stamps, spike, fit, background, lesson, min_snr, single)
-    if pairs is None:
-        return columns
-    both = _columns(*pairs, background, lesson, min_snr, np.ones(2 * len(paired), bool))
-    return {name: np.concatenate([column, both[name]]) for name, column in columns.items()}
+    def measured(stars: Fitted, wanted: np.ndarray) -> dict[str, np.ndarray]:
+        return _columns(*stars, background, lesson, min_snr, wanted)
+
+    def with_companions(odd: list[Fitted]) -> list[dict[str, np.ndarray]]:
+        stamps, spikes, fits = zip(*odd, strict=True)
+        stars: Fitted = joined(stamps), np.concatenate(spikes), joined(fits)
+        paired, pairs = pairs_among(stars, psf, lesson.response, cut_at)
+        alone = measured(stars, ~paired)
+        return [alone] if pairs is None else [alone, measured(pairs, np.ones(len(pairs[1]), bool))]
+
+    parts: list[dict[str, np.ndarray]] = []
+    # those of several chunks together, because most chunks have a few
+    odd: list[Fitted] = []
+    for first in range(0, len(x), chunk):
+        peak = x[first : first + chunk], y[first : first + chunk]
+        stamps, spike = cut_at(*peak)
+        begin = centroid(grey(stamps, background)[0], psf.shapes_at(*peak))
+        fit = fit_stars(stamps, psf, *begin, lesson.response)
+        strange = surprising(stamps, fit)
+        rows = np.flatnonzero(strange)
+        if len(rows):
+            odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
+        parts.append(measured((stamps, spike, fit), ~strange))
+        if odd and (sum(len(star[1]) for star in odd) >= chunk or first + chunk >= len(x)):
+            parts += with_companions(odd)
+            odd = []
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _columns(
@@ -129,7 +146,7 @@ def _misfit(fit: Fit) -> np.ndarray:
 def _take_spikes(stamps: Stamps, lesson: Lesson) -> np.ndarray:
     """Pixels (N, S, S) much brighter than their neighbours, as in no star: the stamps have the mean of these there."""
     beside = np.full(len(stamps.x), -1.0)
-    star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)[0]
+    star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)
     top, four = star[:, 1, 1], (star[:, 0, 1] + star[:, 2, 1] + star[:, 1, 0] + star[:, 1, 2]) * 0.25
     # at least 1, because a ring has a dark middle
     sharpest = SPIKE * np.maximum(1.0, top / np.maximum(four, 1e-3 * np.abs(top))).astype(np.float32)

@@ -173,10 +173,8 @@ def test_phases_that_do_not_alternate_are_refused(rng):
 def test_psf_is_the_sum_of_its_terms(rng):
     axes, series = psfs(rng, 6)
     left, top = -7 + rng.uniform(-1, 1, (2, 6))
-    for found, plain in zip(
-        evaluated(axes, series, left, top, SIZE), plain_psf(axes, series, left, top, SIZE), strict=True
-    ):
-        np.testing.assert_allclose(found, plain, rtol=1e-5, atol=1e-7)
+    plain = plain_psf(axes, series, left, top, SIZE)[0]
+    np.testing.assert_allclose(evaluated(axes, series, left, top, SIZE), plain, rtol=1e-5, atol=1e-7)
 
 
 def test_a_star_without_light_has_no_place(rng):
