@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, spatial
 
-from starpos.core.neighbours import any_near, near_pairs
+from starpos.core.neighbours import any_near, near_pairs, nearest
 from starpos.core.noise import of_phases, unit_light
 from starpos.core.stamps import greyed
 from starpos.core.vetting import brightest_left, counted
@@ -39,6 +39,16 @@ def test_points_near_others_are_those_of_distances(number, rng):
     np.testing.assert_array_equal(any_near(x, y, *others, 5.0), (apart < 5).any(0))
     with pytest.raises(ValueError, match="as many"):
         any_near(x, y, others[0], others[1, 1:], 5.0)
+
+
+@pytest.mark.parametrize(("number", "count"), [(0, 0), (1, 1), (2, 1), (300, 100)])
+def test_the_nearest_point_is_that_of_distances(number, count, rng):
+    x, y = rng.integers(0, 99, (2, number)).astype(float)
+    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    np.fill_diagonal(apart, np.inf)
+    np.testing.assert_allclose(nearest(x, y, count), apart.min(1, initial=np.inf)[:count], rtol=1e-14)
+    with pytest.raises(ValueError, match="as many"):
+        nearest(x, y, number + 1)
 
 
 @pytest.mark.parametrize("phases", [1, 4])
