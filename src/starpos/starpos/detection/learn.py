@@ -11,6 +11,7 @@ from starpos.core.moments import own_shapes
 from starpos.core.neighbours import near_pairs
 from starpos.core.noise import light_noise, of_phases, strangeness, unit_light
 from starpos.core.order import quantile, row_medians
+from starpos.core.shapes import squared_widths
 from starpos.core.stamps import greyed
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars
@@ -144,7 +145,7 @@ def _teachers(
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     # a shape as wide as the stamps is the sky's
-    if shape is not None and np.linalg.eigvalsh(shape)[0] > 0.9 * (stamps.reach / 2) ** 2:
+    if shape is not None and squared_widths(shape[None])[0, 0] > 0.9 * (stamps.reach / 2) ** 2:
         shape = None
     if shape is None or len(stamps.x) < ALIKE:
         around = _highest(plane, background, x[clear], y[clear], saturation)
@@ -158,7 +159,7 @@ def _teachers(
     window = window_for(shape)
     mass, _, seen = moments(smooth, x, y, window)
     ratio = np.nan_to_num(psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T)
-    extremes = np.linalg.eigvalsh(ratio)
+    extremes = squared_widths(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
     noise = row_medians(stamps.noise.reshape(len(x), -1))
     weight = np.clip(mass / noise, 1, LOUDEST) ** 2
@@ -228,9 +229,7 @@ def reach_of(psf: Psf) -> int:
     # where the widths are the same everywhere, one place tells them
     quarters = QUARTERS if len(psf.widths) > 1 else QUARTERS[:1]
     x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-    shape = psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))
-    xx, xy, yy = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
-    widest = float(((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)).max())
+    widest = float(squared_widths(psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max())
     return min(max(math.ceil(3.5 * math.sqrt(widest)) + 1, 4), MAX_REACH)
 
 

@@ -77,7 +77,8 @@ class Psf:
     @property
     def fwhm_px(self) -> float:
         """Geometric mean over the two axes of the mean star's full width at half maximum."""
-        return float(np.sqrt(8 * np.log(2)) * abs(np.linalg.det(self.axes)) ** -0.5)
+        (a, b), (c, d) = self.axes.tolist()
+        return math.sqrt(8 * math.log(2)) * abs(a * d - b * c) ** -0.5
 
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px."""

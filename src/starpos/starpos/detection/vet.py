@@ -4,6 +4,7 @@
 import numpy as np
 
 from starpos.core.neighbours import near_pairs
+from starpos.core.shapes import squared_widths
 from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
 from starpos.detection.blend import Fitted, joined, pairs_among, rows_of, surprising
@@ -125,7 +126,7 @@ def _columns(
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
         slack = 3 / matched
         # through a window wider than the star, noise changes the width more
-        loose = slack * np.sqrt(np.linalg.det(window) / np.linalg.det(shape))
+        loose = slack * np.sqrt(squared_widths(window).prod(1) / squared_widths(shape).prod(1))
         wide = (widths[:, 1] > WIDE + loose - slack) & ~full
         sound &= full | (widths[:, 0] > 0.45 - loose)
         sound &= ~wide | ((widths[:, 0] < NARROW) & (matched > CERTAIN))
