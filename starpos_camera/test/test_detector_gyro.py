@@ -13,6 +13,7 @@ from test_detector import Feed
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame
+from starpos.frames.trail import Trail
 from starpos.instrument.camera import Camera
 from starpos_common.messages import camera_to_message, unix_to_stamp
 from starpos_testing.skies.rendered import field, noisy
@@ -42,7 +43,7 @@ def turn(feed, mid_s):
 def test_a_star_is_found_by_the_trail_that_the_readings_tell(feed, listener):
     rng = np.random.default_rng(4)
     frame = Frame(noisy(field(SIZE, np.array([[70.3, 59.6, 1500.0]]), trail=TRAIL), rng))
-    alone, told = (detect(replace(frame, trail_px=trail)).stars for trail in (None, TRAIL))
+    alone, told = (detect(replace(frame, trail=trail)).stars for trail in (None, Trail(middle_px=TRAIL)))
     assert len(alone) == 0 and len(told) == 1
     feed.infos.publish(camera_to_message(Camera.from_focal(*SIZE[::-1], FOCAL_PX), "optical", 1793642400.0))
 

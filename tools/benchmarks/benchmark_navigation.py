@@ -20,13 +20,24 @@ from starpos.navigation.laws import LAWS
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.units import ARCSEC
-from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL, TACTICAL, MadeVoyage, made
+from starpos_testing.voyages import (
+    CAMERA_TO_BODY,
+    INDUSTRIAL,
+    TACTICAL,
+    MadeVoyage,
+    made,
+    turbulent_wind,
+    walking_wind,
+)
 
 EARTH_M = 6.37e6
 GRADES = {"industrial": INDUSTRIAL, "tactical": TACTICAL}
 VEHICLES = "rover", "ship", "drone", "parked"
-# A drone in a wind that changes as much as its law of motion says; in the other voyages it is steady.
-WINDY = "drone in a changing wind"
+# The wind of a drone: as its law of motion says, and as air is on a breezy night; in the other voyages it is steady.
+WINDS = {
+    "drone in a changing wind": walking_wind(LAWS["drone"].drift_walk),
+    "drone in turbulence of 0.7 m/s": turbulent_wind(0.7),
+}
 CADENCE_S, RATE_HZ = 2.0, 50.0
 # of a voyage in the table of bench.py
 VOYAGE_S = 300.0
@@ -63,12 +74,10 @@ def scores(record: MadeVoyage, voyage: Voyage) -> np.ndarray:
 
 def scored(vehicle: str, grade: str, seconds: float, seed: int) -> tuple[np.ndarray, float]:
     """The scores of one voyage, and its CPU time in s."""
-    model = GRADES[grade]
-    wind_walk = 0.0
-    if vehicle == WINDY:
-        vehicle, wind_walk = "drone", LAWS["drone"].drift_walk
+    model, wind = GRADES[grade], WINDS.get(vehicle)
+    vehicle = vehicle.split()[0]
     record = made(
-        vehicle, seconds, 1000 + seed, model=model, rate_hz=RATE_HZ, cadence_s=CADENCE_S, wind_walk=wind_walk
+        vehicle, seconds, 1000 + seed, model=model, rate_hz=RATE_HZ, cadence_s=CADENCE_S, more_wind=wind
     )
     begin = time.process_time()
     found = scores(record, navigated(record, vehicle, model))
@@ -90,7 +99,7 @@ def main() -> None:
     parser.add_argument("--voyages", type=int, default=8, help="of each kind")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="of the first voyage (0)")
     parser.add_argument("--seconds", type=float, default=1200.0)
-    every = *VEHICLES, WINDY
+    every = *VEHICLES, *WINDS
     parser.add_argument("--vehicles", nargs="+", choices=every, default=every)
     args = parser.parse_args()
     print(

@@ -86,17 +86,38 @@ def carried(wave, begin, rate):
     return lambda t: begin + rate * t + wave(t)
 
 
-def wandered(rng, walk, seconds, terms=24):
-    """The way that a velocity leads which walks at random from 0 by `walk` m/s/sqrt(s), for so many seconds.
+def walking_wind(walk, terms=160):
+    """A wind that walks at random from 0 by `walk` m/s/sqrt(s): a function of generator and seconds that makes its way.
 
-    The first terms of the walk's series by Karhunen and Loeve: as smooth as an accelerometer needs it.
+    A way is a function of time, in m.  The first terms of the walk's series by Karhunen and Loeve: as smooth as an
+    accelerometer needs it.
     """
-    rate = (np.arange(terms) + 0.5) * np.pi / seconds
-    velocity = rng.normal(0, walk * np.sqrt(2 / seconds), terms) / rate
-    return lambda t: (velocity / rate * (1 - np.cos(np.multiply.outer(t, rate)))).sum(-1)
+
+    def way(rng, seconds):
+        rate = (np.arange(terms) + 0.5) * np.pi / seconds
+        velocity = rng.normal(0, walk * np.sqrt(2 / seconds), terms) / rate
+        return lambda t: (velocity / rate * (1 - np.cos(np.multiply.outer(t, rate)))).sum(-1)
+
+    return way
 
 
-def path_of(kind, seconds, rng, wind_walk=0.0):
+def turbulent_wind(stddev, outer_s=600.0, terms=160):
+    """A wind of that standard deviation, m/s, whose spectrum falls with the frequency's 5/3rd power beyond 1/outer_s.
+
+    Likewise; sines of periods from 10 s to two hours (Kolmogorov 1941).
+    """
+
+    def way(rng, seconds):
+        edges = np.geomspace(1 / 7200, 0.1, terms + 1)
+        rate, phase = 2 * np.pi * np.sqrt(edges[1:] * edges[:-1]), rng.uniform(0, 2 * np.pi, terms)
+        power = np.diff(edges) / (1 + (rate * outer_s / np.pi) ** (5 / 3))
+        length = stddev * np.sqrt(2 * power / power.sum()) / rate
+        return lambda t: (length * (np.sin(np.multiply.outer(t, rate) + phase) - np.sin(phase))).sum(-1)
+
+    return way
+
+
+def path_of(kind, seconds, rng, more_wind=None):
     """Functions of time: displacement (N, 3) in m east, north, up, and roll, pitch, yaw (N, 3) in rad (ROS)."""
     begin = rng.uniform(0, 2 * np.pi)
     grid = np.arange(-1.0, seconds + 1.0, 0.05)
@@ -118,8 +139,8 @@ def path_of(kind, seconds, rng, wind_walk=0.0):
         bank, wind = np.arctan(20 * 2 * np.pi / 100 / 9.81), rng.normal(0, 3, 2)
         lean = [carried(waves(rng, 0.02, 2, 8), -bank, 0.0), waves(rng, 0.02, 2, 8)]
         heave = [carried(waves(rng, 0.5, 5, 20), 0.0, v) for v in (*wind, 0.0)]
-        if wind_walk:
-            ways = [wandered(rng, wind_walk, seconds) for _ in range(2)]
+        if more_wind is not None:
+            ways = [more_wind(rng, seconds) for _ in range(2)]
             heave[:2] = [
                 lambda t, steady=steady, way=way: steady(t) + way(t)
                 for steady, way in zip(heave, ways, strict=False)
@@ -169,14 +190,14 @@ def made(
     mount_deg=1.0,
     velocity_sigma=0.03,
     errors=True,
-    wind_walk=0.0,
+    more_wind=None,
 ):
     """Record a voyage; without `errors` the readings are exact, the mount as believed and the stars where they are.
 
-    wind_walk: of a drone's wind, m/s/sqrt(s) an axis; it is steady else.
+    more_wind: of a drone, an axis, beside a steady one: `walking_wind`, `turbulent_wind`.
     """
     rng, on = np.random.default_rng(seed), float(errors)
-    displacement, angles = path_of(kind, seconds, rng, wind_walk)
+    displacement, angles = path_of(kind, seconds, rng, more_wind)
     origin, axes = ellipsoid_place(latitude_deg, longitude_deg, height_m)
 
     def place(t):

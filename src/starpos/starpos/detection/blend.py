@@ -10,7 +10,7 @@ import numpy as np
 from starpos.core.pairs import fitted_pairs
 from starpos.core.vetting import brightest_left, counted
 from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
-from starpos.detection.psf import LocalPsf, Psf
+from starpos.detection.psf import FieldPsf, LocalPsf
 from starpos.detection.stamps import Stamps
 
 # A companion is tried where chi-square is so many sigma above that of a single star.
@@ -60,7 +60,7 @@ class Pairs:
 
 def pairs_among(
     stars: Fitted,
-    psf: Psf,
+    psf: FieldPsf,
     response: Response,
     cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
 ) -> tuple[np.ndarray, Fitted | None]:
@@ -125,14 +125,14 @@ def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
 
 
 def _light(
-    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, flux: np.ndarray, gains: np.ndarray
+    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, flux: np.ndarray, gains: np.ndarray
 ) -> np.ndarray:
     """The light (N, S, S) float32, DN, of stars at x, y (N,) px, with flux (N,) and gains (N, P), on whole stamps."""
     light = psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)
     return light * (gains_at(gains, stamps.phase) * flux.astype(np.float32)[:, None, None])
 
 
-def _fit_pairs(stamps: Stamps, fit: Fit, psf: Psf, response: Response) -> Pairs:
+def _fit_pairs(stamps: Stamps, fit: Fit, psf: FieldPsf, response: Response) -> Pairs:
     """Fit a star and a companion to each stamp by Gauss-Newton on all their parameters.
 
     The companion starts where the single star's fit leaves the most light.

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.core.fit import fitted
 from starpos.core.rules import Rules
-from starpos.detection.psf import Psf
+from starpos.detection.psf import FieldPsf
 from starpos.detection.stamps import Stamps
 
 # Sigmas above the model, and that share of the star's brightest pixel, from which a pixel is not the star's alone.
@@ -91,7 +91,7 @@ COLUMNS = tuple(f.name for f in fields(Fit))
 
 def fit_stars(
     stamps: Stamps,
-    psf: Psf,
+    psf: FieldPsf,
     x: np.ndarray,
     y: np.ndarray,
     response: Response,

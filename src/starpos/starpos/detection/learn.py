@@ -15,7 +15,7 @@ from starpos.core.shapes import squared_widths
 from starpos.core.stamps import greyed
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars
-from starpos.detection.psf import BROAD, NARROW, Psf, gaussian
+from starpos.detection.psf import BROAD, NARROW, FieldPsf, Psf, gaussian
 from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
     FARTHEST,
@@ -55,8 +55,8 @@ FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
 # Residuals of more sigma teach nothing of the noise.
 DEVIANT = 5.0
-# Largest distance from a star's centre to its stamp's edge, px; where in the box that stars lie in its end is looked for.
-MAX_REACH, QUARTERS = 20, np.arange(5) / 4
+# Largest distance from a star's centre to its stamp's edge, px.
+MAX_REACH = 20
 # Brighter stars than this SNR get no more weight when the widths over the field are fitted.
 LOUDEST = 100
 # px2 that the smoothing which removes a mosaic adds to a covariance: its response vanishes at the Nyquist frequency.
@@ -70,7 +70,7 @@ class Lesson:
     teachers: how many stars have taught them.
     """
 
-    psf: Psf
+    psf: FieldPsf
     response: Response
     reach: int
     teachers: int
@@ -223,14 +223,9 @@ def _most_alike(stamps: Stamps) -> np.ndarray:
     return sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
 
 
-def reach_of(psf: Psf) -> int:
+def reach_of(psf: FieldPsf) -> int:
     """Distance from a star's centre, px, at which its stamp ends: 3.5 widths of the widest star in the field."""
-    (left, top), (right, bottom) = psf.box
-    # where the widths are the same everywhere, one place tells them
-    quarters = QUARTERS if len(psf.widths) > 1 else QUARTERS[:1]
-    x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-    widest = float(squared_widths(psf.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max())
-    return min(max(math.ceil(3.5 * math.sqrt(widest)) + 1, 4), MAX_REACH)
+    return min(max(math.ceil(3.5 * math.sqrt(psf.widest_px2())) + 1, 4), MAX_REACH)
 
 
 def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
@@ -251,7 +246,7 @@ def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndar
 
 
 def respond(
-    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, fit: Fit, sound: np.ndarray, before: Response
+    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, fit: Fit, sound: np.ndarray, before: Response
 ) -> Response:
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
     gain, spread = before.gain, before.colour_spread

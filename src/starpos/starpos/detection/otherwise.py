@@ -43,7 +43,7 @@ def otherwise(frame: Frame, window: tuple[int, int, int, int] | None) -> Iterato
             continue
         if flat:
             reduced = _flattened(reduced if halvings or not mosaic else cv2.GaussianBlur(reduced, (3, 3), 0))
-        seen = replace(frame, pixels=reduced, pattern="", trail_px=None)
+        seen = replace(frame, pixels=reduced, pattern="", trail=None)
         settings = DetectionSettings(mesh_px=MESH_PX) if flat else DetectionSettings()
         yield _enlarged(detect(seen, settings).stars, 2**halvings, frame, window)
 

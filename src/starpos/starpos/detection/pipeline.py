@@ -24,6 +24,7 @@ from starpos.detection.window import window_of
 from starpos.errors import FrameError
 from starpos.frames.frame import Frame
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, Stars, no_stars
+from starpos.frames.trail import Trail
 
 # Pixels of stars that are fitted together, on a small and on a large frame: about 2 and 6 MB.
 CHUNK_PIXELS = 30_000, 120_000
@@ -109,7 +110,7 @@ class _Picture:
     plane     (h, w) of a frame, or of one reduced by two, which may be reduced so many times (halvings) more
     mosaic    whether its pixels are of several colours
     about     what a frame's Stars know of it
-    trail_px  (2,) how far a star moves during the exposure; None if nobody said
+    trail     how stars move during the exposure; None if nobody said
     """
 
     plane: np.ndarray
@@ -117,7 +118,7 @@ class _Picture:
     settings: DetectionSettings
     about: dict[str, Any]
     halvings: int
-    trail_px: np.ndarray | None
+    trail: Trail | None
 
     def halved(self) -> tuple["_Picture", int]:
         """The picture of half the size, and the flux of 1 DN in it."""
@@ -132,7 +133,7 @@ class _Picture:
             settings=settings,
             about=self.about | {"width": plane.shape[1], "height": plane.shape[0]},
             halvings=self.halvings - 1,
-            trail_px=None if self.trail_px is None else self.trail_px / 2,
+            trail=None if self.trail is None else self.trail.halved(),
         )
         return smaller, gain
 
@@ -149,7 +150,7 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         settings=settings,
         about=about,
         halvings=MOST_HALVINGS,
-        trail_px=None if frame.trail_px is None else np.array(frame.trail_px),
+        trail=frame.trail,
     )
     return _detect(picture)
 
@@ -202,8 +203,8 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         background = replace(background, streaks=streaks)
     saturation = _saturation(plane, x, y, settings)
     lesson = learn(plane, background, x, y, height, saturation)
-    if picture.trail_px is not None:
-        lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail_px)
+    if picture.trail is not None:
+        lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - picture.halvings) // pixels)

@@ -8,24 +8,24 @@ units of the star's widths. The series has no term of first order, so its centre
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike
 
 from starpos.core.field import local, monomials, shapes_of
 from starpos.core.psf import evaluated
-from starpos.core.shapes import clipped
+from starpos.core.shapes import clipped, squared_widths
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
 # Limits of the squared widths at a place of the field over the mean ones.
 NARROW, BROAD = 0.25, 6.0
+# Where in the box the widest star is looked for.
+QUARTERS = np.arange(5) / 4
 # The series of a Gaussian.
 GAUSSIAN = np.ones((1, 1, 1))
-# of the series that a trail has along it
-TRAIL_ORDER = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,21 +52,10 @@ class LocalPsf:
         return evaluated(self.axes, self.series, left, top, size)
 
 
-@dataclass(frozen=True, eq=False)
-class Psf:
-    """The PSF of a frame; `at` gives it at the places of stars.
-
-    axes    (2, 2): those of the mean star, as in LocalPsf
-    widths  (K, 2, 2): squared widths along these axes, as coefficients of K monomials of the field's coordinates; K is
-            6, or 1 if they are the same everywhere
-    series  (K, I, J): coefficients of the series, in the same way
-    box     (2, 2): lowest and highest x, y, px, of the stars it was learnt from; beyond, the PSF is that of its edge
-    """
+class FieldPsf(ABC):
+    """The PSF of a frame; `at` gives it at the places of stars. axes (2, 2): those of the mean star, as in LocalPsf."""
 
     axes: np.ndarray
-    widths: np.ndarray
-    series: np.ndarray
-    box: np.ndarray
 
     @property
     def shape(self) -> np.ndarray:
@@ -80,6 +69,35 @@ class Psf:
         (a, b), (c, d) = self.axes.tolist()
         return math.sqrt(8 * math.log(2)) * abs(a * d - b * c) ** -0.5
 
+    @abstractmethod
+    def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
+        """The PSF at the points x, y (N,) px."""
+
+    @abstractmethod
+    def widest_px2(self) -> float:
+        """The largest squared width of a star in the field."""
+
+    @abstractmethod
+    def shapes_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Covariances (N, 2, 2) px2, or (1, 2, 2), of the Gaussians of the PSF at the points x, y (N,) px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Psf(FieldPsf):
+    """The PSF as it is learnt.
+
+    axes    (2, 2)
+    widths  (K, 2, 2): squared widths along these axes, as coefficients of K monomials of the field's coordinates; K is
+            6, or 1 if they are the same everywhere
+    series  (K, I, J): coefficients of the series, in the same way
+    box     (2, 2): lowest and highest x, y, px, of the stars it was learnt from; beyond, the PSF is that of its edge
+    """
+
+    axes: np.ndarray
+    widths: np.ndarray
+    series: np.ndarray
+    box: np.ndarray
+
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px."""
         return LocalPsf(*local(*_points(x, y), self.box, self.axes, self.widths, self.series, NARROW, BROAD))
@@ -87,6 +105,14 @@ class Psf:
     def shapes_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Covariances (N, 2, 2) px2, or (1, 2, 2), of the Gaussians of the PSF at the points x, y (N,) px."""
         return shapes_of(local(*_points(x, y), self.box, self.axes, self.widths, GAUSSIAN, NARROW, BROAD)[0])
+
+    def widest_px2(self) -> float:
+        """The largest squared width of a star within the box."""
+        (left, top), (right, bottom) = self.box
+        # where the widths are the same everywhere, one place tells them
+        quarters = QUARTERS if len(self.widths) > 1 else QUARTERS[:1]
+        x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
+        return float(squared_widths(self.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max())
 
     def monomials(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Monomials (N, 6) of x, y scaled to -1..1 over the box; all but the first have zero mean over it."""
@@ -111,22 +137,6 @@ def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) ->
     axes = np.ascontiguousarray((vectors / np.sqrt(values)).T[::-1])
     box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]], float)
     return Psf(axes, np.eye(2)[None], np.ones((1, 1, 1)), box)
-
-
-def trailed(sigma: float, trail: np.ndarray) -> Psf:
-    """The Psf of a round Gaussian of sigma px that moves evenly along a trail (2,) px.
-
-    The coefficient of h_i is its mean over the light: that of He_i / sqrt(i!) over +-sqrt(3), where an even spread has a
-    variance of 1, times the power i / 2 of the trail's share of the variance along it.
-    """
-    psf = gaussian(np.eye(2) * sigma**2 + np.outer(trail, trail) / 12)
-    share = 1 - sigma**2 * (psf.axes[0] @ psf.axes[0])
-    even = np.arange(0, TRAIL_ORDER + 1, 2)
-    root = np.array([math.sqrt(3 * math.factorial(i)) for i in even])
-    highest = hermite_e.hermeval(np.sqrt(3), np.eye(TRAIL_ORDER + 2)[:, even + 1])
-    series = np.zeros((1, TRAIL_ORDER + 1, 1))
-    series[0, even, 0] = share ** (even / 2) * highest / ((even + 1) * root)
-    return replace(psf, series=series)
 
 
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from starpos.detection.background import Background
 from starpos.detection.blend import Fitted, joined, pairs_among, rows_of, surprising
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
 from starpos.detection.learn import Lesson, grey
-from starpos.detection.psf import Psf
+from starpos.detection.psf import FieldPsf
 from starpos.detection.shape import centroid, moments, relative_widths, window_for
 from starpos.detection.stamps import RAISED, UNEVEN, Stamps, cut
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
@@ -168,7 +168,7 @@ def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
     return (one < star) & (likely | (one < 0.5 * star)) & (full < SPECK)
 
 
-def resolve(columns: dict[str, np.ndarray], psf: Psf) -> dict[str, np.ndarray]:
+def resolve(columns: dict[str, np.ndarray], psf: FieldPsf) -> dict[str, np.ndarray]:
     """Sort the columns by flux, keep one of several fits of the same star, and flag close neighbours as BLENDED.
 
     A wide image is kept only if no better one was measured there.

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frames.exposure import LARGEST_SIDE_PX, Exposure, check_size
+from starpos.frames.exposure import Exposure, check_size
+from starpos.frames.trail import Trail
 
 # A header may claim any size; this many pixels fit into a small robot's memory.
 MAX_PIXELS = 200_000_000
@@ -21,15 +22,14 @@ class Frame(Exposure):
 
     pixels      (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
     pattern     the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
-    trail_px    (x, y) by which a star in the middle moves during the exposure; None: unknown. Of a camera that rolls
-                about its axis trails differ over the frame, and this says nothing of it
+    trail       how its stars move during the exposure; None: unknown
 
-    FrameError for other types, shapes, sizes, patterns or trails.
+    FrameError for other types, shapes, sizes or patterns.
     """
 
     pixels: np.ndarray
     pattern: str = ""
-    trail_px: tuple[float, float] | None = None
+    trail: Trail | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -48,10 +48,6 @@ class Frame(Exposure):
         if self.pattern not in PATTERNS or (colour and self.pattern):
             allowed = "''" if colour else ", ".join(map(repr, PATTERNS))
             raise FrameError(f"{place}: the colour pattern is {self.pattern!r}; it must be {allowed}.")
-        if self.trail_px is not None and not np.hypot(*self.trail_px) < LARGEST_SIDE_PX:
-            raise FrameError(
-                f"{place}: the trail is {self.trail_px}; give two finite numbers of px, or None where it is unknown."
-            )
 
     def __repr__(self) -> str:
         return f"<{self.place}: {self.width} x {self.height} px, {self.pixels.dtype}>"

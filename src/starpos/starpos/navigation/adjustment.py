@@ -12,6 +12,7 @@ import numpy as np
 from starpos.earth.gravity import zenith_at
 from starpos.errors import FixError, VoyageError
 from starpos.navigation import sanity
+from starpos.navigation.borne_out import borne_out
 from starpos.navigation.chain import Chain, Smoothed, log_likelihood, smoothed
 from starpos.navigation.laws import MotionLaw, carried
 from starpos.navigation.links import Links, links_of
@@ -42,6 +43,8 @@ NEAR_M = 2000.0
 NOTABLE = 4.0
 # no step on the Earth is longer
 FARTHEST_M, MOST_ROUNDS = 2e7, 25
+# a law is weighed until its terms change by a smaller factor, and so often at most
+LAW_CHANGE, MOST_WEIGHINGS = 1.1, 4
 # stars are seen anew where the zenith has moved by more: 2 m of refraction
 ZENITH_MOVED = 1e-3
 STANDING_SIGMA = 2e-3
@@ -73,7 +76,7 @@ class Adjustment:
             raise VoyageError(
                 "no velocity lies on the voyage: check that its clock and that of the camera agree"
             )
-        self.law = self._law(vessel)
+        self.stated_law = self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.known = Beforehand(
             mount=vessel.mount_stddev,
@@ -83,6 +86,7 @@ class Adjustment:
         )
         self.model = vessel.model
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
+        self.weighings = 0
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
         self.strays = 0
@@ -111,6 +115,13 @@ class Adjustment:
             for kind, excess in self.excess.items()
             if excess > NOTABLE
         ]
+        if self.law is not None and self.stated_law is not None:
+            more = self.law.drift_walk / self.stated_law.drift_walk
+            if more**2 > NOTABLE:
+                said.append(
+                    f"wind or current change {more:.1f} times as much as the law of motion says: the claim is widened by "
+                    "that"
+                )
         return tuple(said)
 
     def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
@@ -121,8 +132,6 @@ class Adjustment:
         stars, motion = self._begin()
         solution: Smoothed | None = None
         zenith, step, sigma = np.zeros(3), np.inf, 1.0
-        # where a law stands in for velocities, its own errors hide those of the readings
-        weighed = self.odometry is None
         for k in range(MOST_ROUNDS):
             # equations of another place tell neither how the stars are seen nor which measurements are wrong
             near = step < min(NEAR_M, sigma)
@@ -140,12 +149,10 @@ class Adjustment:
             variance = np.trace(solution.covariance[:, PLACE, PLACE], axis1=1, axis2=2)
             sigma = float(np.sqrt(variance.min()))
             progress("adjusting", min(0.95, (k + 1) / 8))
-            if near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma):
-                if weighed:
-                    progress("adjusting", 1.0)
-                    return motion, solution, k + 1
-                self._weigh(chain, links)
-                weighed = True
+            settled = near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma)
+            if settled and not self._weighed(motion, chain, links):
+                progress("adjusting", 1.0)
+                return motion, solution, k + 1
         raise FixError(
             f"the voyage's place does not settle (the last step was {step:.0f} m): check the IMU's axes and units, "
             "and what is said of the vehicle"
@@ -165,6 +172,25 @@ class Adjustment:
             stars = self._attitudes(None)
         motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
         return stars, motion
+
+    def _weighed(self, motion: Motion, chain: Chain, links: Links) -> bool:
+        """Whether the record changes how much is believed of its own noise, or of the law that stands in for velocities.
+
+        Not both: the law's errors hide those of the readings.
+        """
+        self.weighings += 1
+        if self.odometry is not None:
+            if self.weighings == 1:
+                self._weigh(chain, links)
+            return self.weighings == 1
+        if self.law is None or self.stated_law is None or self.weighings > MOST_WEIGHINGS:
+            return False
+        law = borne_out(self.stated_law, motion)
+        change = np.log([law.drift_walk / self.law.drift_walk, law.rest_stddev / self.law.rest_stddev])
+        if np.abs(change).max() < np.log(LAW_CHANGE):
+            return False
+        self.law = law
+        return True
 
     def _weigh(self, chain: Chain, links: Links) -> None:
         """Raise the accelerometer's noise to what the voyage shows: of vibration some is left in sums."""

@@ -22,6 +22,17 @@ class MotionLaw:
     climb_stddev: float
     rest_s: float
 
+    def rest_at(self, apart_s: float) -> float:
+        """The rest at times so far apart, m/s: as white noise that in the long run scatters as what keeps its sign."""
+        return self.rest_stddev * self._longer(apart_s)
+
+    def climb_at(self, apart_s: float) -> float:
+        """Climbing likewise."""
+        return self.climb_stddev * self._longer(apart_s)
+
+    def _longer(self, apart_s: float) -> float:
+        return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
+
 
 LAWS = {
     # a path at a walk, that turns and stops as it likes

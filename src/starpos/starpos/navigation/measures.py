@@ -167,11 +167,9 @@ def law_lacks(motion: Motion, law: MotionLaw) -> Lacks:
     aside = np.cross(up, nose) * motion.speed[:, None]
     rows[:, :, TURN] = -aside[:, :, None] * up[:, None, :]
     rows[:, :, -1] = nose * motion.speed[:, None] + drift - motion.velocity
-    # the mean of what keeps its sign for a while: as white noise that scatters as much in the long run
-    apart = float(np.median(np.diff(motion.utc_unix_s)))
-    longer = max(1.0, 2 * law.rest_s / apart)
+    apart_s = float(np.median(np.diff(motion.utc_unix_s)))
     upward = up[:, :, None] * up[:, None, :]
-    covariance = longer * (law.rest_stddev**2 * level + law.climb_stddev**2 * upward)
+    covariance = law.rest_at(apart_s) ** 2 * level + law.climb_at(apart_s) ** 2 * upward
     return Lacks(index=np.arange(count), rows=rows, covariance=covariance)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from starpos.frames.frame import Frame
+from starpos.frames.trail import Trail
 from starpos.instrument.instrument import TOP_OF_FRAME
 from starpos.recording.messages import message_to_camera
 from starpos.session.parameters import known_instrument
@@ -47,6 +48,11 @@ class Trails:
         turn = self._readings.turn(begin_s, end_s, MOST_MISSING * frame.exposure_s, np.zeros(3))
         if turn is None:
             return frame
-        # where a star that was on the axis is at the end
-        x, y, z = self._link @ turn.T @ self._link.T[:, 2]
-        return replace(frame, trail_px=(float(self._focal_px * x / z), float(self._focal_px * y / z)))
+        # of directions at the beginning into those at the end; its last column is where a star on the axis goes
+        moved = self._link @ turn.T @ self._link.T
+        x, y, z = moved[:, 2]
+        trail = Trail(
+            middle_px=(float(self._focal_px * x / z), float(self._focal_px * y / z)),
+            roll_rad=float(np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])),
+        )
+        return replace(frame, trail=trail)

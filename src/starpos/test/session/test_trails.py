@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from imu_readings import reading
+from scipy.spatial.transform import Rotation
 
 from starpos.errors import InstrumentError, VoyageError
 from starpos.frames.frame import Frame
+from starpos.instrument.instrument import TOP_OF_FRAME
 from starpos.session import trails
 from starpos.session.trails import Trails
 
@@ -44,23 +46,39 @@ def turn(told, rate, begin_s=MID_S - 0.1, end_s=MID_S + 0.1):
 )
 def test_stars_move_as_the_camera_turns(told, rate, way):
     turn(told, rate)
-    trail = told.told(FRAME).trail_px
-    assert trail == pytest.approx(np.multiply(way, 0.1 * EXPOSURE_S * FOCAL_PX), abs=0.02)
+    trail = told.told(FRAME).trail
+    assert trail.middle_px == pytest.approx(np.multiply(way, 0.1 * EXPOSURE_S * FOCAL_PX), abs=0.02)
+
+
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.8), (0.05, -0.1, -0.6), (0.2, 0.1, 0.05)])
+def test_each_star_moves_along_its_own_trail(told, rate):
+    """Against directions that the body's turn carries into the camera's axes, projected at both ends of the exposure."""
+    turn(told, rate)
+    trail = told.told(FRAME).trail
+    link, size = np.array(TOP_OF_FRAME), np.array([1936, 1216])
+    ends = [Rotation.from_rotvec(np.array(rate) * t).as_matrix() for t in (-EXPOSURE_S / 2, EXPOSURE_S / 2)]
+    for at in ([967.5, 607.5], [300.0, 200.0], [1900.0, 100.0], [5.0, 1210.0]):
+        away = np.array(at) - (size - 1) / 2
+        seen = [link @ end.T @ link.T @ [*away, FOCAL_PX] for end in ends]
+        begin, end = (FOCAL_PX * v[:2] / v[2] for v in seen)
+        found = trail.at(*np.array(at)[:, None], *size)[0]
+        # what a trail of the middle and a roll leave out: the tangent's share, 4 % in the corner
+        assert found == pytest.approx(end - begin, abs=0.05 + 0.08 * np.hypot(*trail.middle_px))
 
 
 def test_where_anything_lacks_there_is_none(told):
-    assert told.told(FRAME).trail_px is None
+    assert told.told(FRAME).trail is None
     turn(told, (0.1, 0.0, 0.0), end_s=MID_S)
-    assert told.told(FRAME).trail_px is None
+    assert told.told(FRAME).trail is None
     turn(told, (0.1, 0.0, 0.0), begin_s=MID_S)
-    assert told.told(FRAME).trail_px is not None
-    assert told.told(replace(FRAME, exposure_s=None)).trail_px is None
-    assert told.told(replace(FRAME, mid_unix_s=None)).trail_px is None
+    assert told.told(FRAME).trail is not None
+    assert told.told(replace(FRAME, exposure_s=None)).trail is None
+    assert told.told(replace(FRAME, mid_unix_s=None)).trail is None
     with pytest.raises(VoyageError, match="NaN"):
         told.take_imu(reading(MID_S + 1.0, (np.nan, 0.0, 0.0)))
     unknown = Trails("")
     turn(unknown, (0.1, 0.0, 0.0))
-    assert unknown.told(FRAME).trail_px is None
+    assert unknown.told(FRAME).trail is None
 
 
 def test_a_broken_instrument_file_is_told(tmp_path):

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A law of motion as a record bears it out: how much wind and gusts change from one minute to the next.
+
+Only what goes across the nose tells it, since the speed along the nose is unknown.  A trend, steady from end to end of
+the record, is what an error of the place looks like: it tells nothing, and calm air may drift slowly without a gust.
+So the record may widen how fast the drift changes, and never narrows it.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.gravity import geodetic_place, zenith_at
+from starpos.navigation.laws import MotionLaw
+from starpos.navigation.motion import Motion
+
+# means over so long are compared, of a long record over longer; fewer tell nothing
+MEAN_S, FEWEST, MOST = 60.0, 5, 40
+# factors of the law that are tried; the law is believed within a factor of e, 1 sigma
+WALKS, RESTS = 2.0 ** np.arange(0, 5.1, 0.25), 2.0 ** np.arange(-6, 4.1, 0.25)
+# directions in which means are less sure than the surest by such a factor are none
+RANK = 1e-6
+
+
+def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
+    """The law with walk of the drift and size of the rest by the posterior mean of their variances, given a voyage."""
+    t = motion.utc_unix_s - motion.utc_unix_s[0]
+    number = int(min(t[-1] // MEAN_S, MOST))
+    if number < FEWEST:
+        return law
+    side, across = _sideways(motion)
+    latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[len(motion) // 2]))
+    misfit, walks = independent_means(t, side @ enu_axes(latitude, longitude)[:2].T, across, number)
+    rest = law.rest_at(float(np.median(np.diff(t))))
+    variance = (WALKS[:, None, None] * law.drift_walk) ** 2 * walks + (RESTS[:, None] * rest) ** 2
+    likely = -(np.log(variance) + misfit**2 / variance).sum(-1) / 2
+    likely -= (np.log(WALKS)[:, None] ** 2 + np.log(RESTS) ** 2) / 2
+    weight = np.exp(likely - likely.max())
+    weight /= weight.sum()
+    walk2, rest2 = weight.sum(1) @ WALKS**2, weight.sum(0) @ RESTS**2
+    # gusts that cancel in a minute still disturb each node
+    gusts = float(np.std(across - np.einsum("ki,ki->k", side, motion.drift)))
+    return replace(
+        law,
+        drift_walk=law.drift_walk * float(np.sqrt(walk2)),
+        rest_stddev=law.rest_stddev * max(float(np.sqrt(rest2)), gusts / rest),
+    )
+
+
+def _sideways(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Level directions (K, 3) across the nose at each node, and the velocity (K,) along them."""
+    side = np.cross(zenith_at(motion.place), motion.attitude[:, :, 0])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    return side, np.einsum("ki,ki->k", side, motion.velocity)
+
+
+def independent_means(
+    t: np.ndarray, side: np.ndarray, across: np.ndarray, number: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Combinations of the means of velocities across the nose, free of a steady drift and of its steady change.
+
+    t (K,) from 0, side (K, 2) level, across (K,).  Returns their values, which white noise of 1 m/s at the nodes makes
+    scatter by 1, and the variances that a drift adds which walks by 1 m/s/sqrt(s), each independent of the others.
+    """
+    block = np.minimum((t / t[-1] * number).astype(int), number - 1)
+    here = block == np.arange(number)[:, None]
+    means = (here[:, None, :] * side.T).reshape(2 * number, -1) / np.repeat(here.sum(1), 2)[:, None]
+    # a step of the drift is in all that comes after it
+    steps = np.cumsum((means[:, :, None] * side)[:, ::-1], 1)[:, ::-1]
+    begin, change = steps[:, 0], (means * t) @ side
+    steps = (steps * np.sqrt(np.diff(t, prepend=0.0))[:, None]).reshape(2 * number, -1)
+    # whitened, without directions that nothing was seen of
+    axes, size, _ = np.linalg.svd(means, full_matrices=False)
+    seen = size > RANK * size[0]
+    white = (axes[:, seen] / size[seen]).T
+    told = white @ np.hstack([begin, change])
+    left, share, _ = np.linalg.svd(told)
+    free = left[:, int((share > RANK * share[0]).sum()) :].T @ white
+    walks, turn = np.linalg.eigh(free @ steps @ steps.T @ free.T)
+    return turn.T @ (free @ (means @ across)), np.maximum(walks, 0.0)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A law of motion weighed by a record: what its means tell of the wind, and the claims that follow."""
+
+import numpy as np
+import pytest
+from voyage_calls import navigated, nees, sigma_m
+
+from starpos.navigation.borne_out import independent_means
+from starpos.navigation.laws import LAWS
+from starpos_testing.voyages import made, turbulent_wind, walking_wind
+
+T = np.arange(0.0, 420.0, 1.5)
+
+
+@pytest.fixture(params=[100.0, 1000.0, np.inf], ids=["circling", "turning slowly", "straight on"])
+def side(request):
+    turn = 2 * np.pi * T / request.param
+    return np.stack([-np.sin(turn), np.cos(turn)], 1)
+
+
+def test_combinations_of_means_are_independent_of_each_other_and_of_trends(side):
+    """Against the covariances of all velocities, written down by definition."""
+    values = np.stack([independent_means(T, side, one, 7)[0] for one in np.eye(len(T))], 1)
+    _, walks = independent_means(T, side, np.zeros(len(T)), 7)
+    assert len(walks) >= 5
+    assert values @ values.T == pytest.approx(np.eye(len(walks)), abs=1e-9)
+    walked = np.minimum.outer(T, T) * (side @ side.T)
+    assert values @ walked @ values.T == pytest.approx(np.diag(walks), abs=1e-9 * walks.max())
+    trend = side @ [3.0, -2.0] + T * (side @ [0.01, 0.02])
+    assert values @ trend == pytest.approx(np.zeros(len(walks)), abs=1e-8)
+
+
+def voyage_in(wind, seed):
+    record = made("drone", 900, seed, rate_hz=25, cadence_s=3.0, more_wind=wind)
+    return record, navigated(record, "drone", velocity=False)
+
+
+def test_a_wind_as_the_law_has_it_is_claimed_as_it_is():
+    """NEES of place and heading, 3 in the mean: the sum of four lies between 0.1 % and 99.9 % of chi-squared of 12."""
+    scores = []
+    for seed in range(4):
+        record, voyage = voyage_in(walking_wind(LAWS["drone"].drift_walk), seed)
+        scores.append(nees(voyage, record))
+        assert not voyage.faults
+    assert 2.2 < sum(scores) < 32.9, scores
+
+
+def test_a_wind_that_changes_more_widens_the_claim_and_is_told():
+    record, voyage = voyage_in(turbulent_wind(1.0), 5)
+    assert voyage.last.law.drift_walk > 2 * LAWS["drone"].drift_walk
+    assert "wind or current change" in voyage.faults[0]
+    assert sigma_m(voyage) > 2 * sigma_m(voyage_in(None, 5)[1])
+    assert nees(voyage, record) < 16
+
+
+def test_a_steady_wind_is_not_believed_to_stay_so():
+    """An unseen trend of 0.3 m/s in ten minutes remains possible; gusts that nobody saw do not."""
+    _, voyage = voyage_in(None, 6)
+    law = voyage.last.law
+    assert law.drift_walk == pytest.approx(LAWS["drone"].drift_walk, rel=0.05)
+    assert law.rest_stddev < 0.5 * LAWS["drone"].rest_stddev
