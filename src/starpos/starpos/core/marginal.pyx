@@ -66,7 +66,9 @@ cdef struct Pixels:
     float *design
 
 
-cdef void _add(Pixels *pixels, const Local *psf, const int[:, ::1] orders, int highest, int phases, double *normal, double *right) noexcept nogil:
+cdef void _add(
+    Pixels *pixels, const Local *psf, const int[:, ::1] orders, int highest, int phases, double *normal, double *right
+) noexcept nogil:
     """Add the pixels to the equations: of the terms, then of the gains, x and y."""
     cdef double[BLOCK] u
     cdef double[BLOCK] v

@@ -25,7 +25,7 @@ cdef extern from *:
             const starpos_eight s = *(const starpos_eights *)(light + k), sky = *(const starpos_eights *)(noise2 + k);
             const starpos_eight r2 = *(const starpos_eights *)(square + k), variance = sky + (photon + misfit2 * s) * s;
             const starpos_eight all = s / variance, excess = (r2 - sky) / variance;
-            const starpos_eight a = (starpos_eight)((starpos_marks)all & (r2 < limit2 * variance)), b = a * s;
+            const starpos_eight a = (starpos_eight)((starpos_marks)all & (starpos_marks)(r2 < limit2 * variance)), b = a * s;
             sums[0] += all * all;
             sums[1] += a * a;
             sums[2] += a * b;

@@ -107,7 +107,7 @@ cdef extern from *:
             ((starpos_eights *)value)[s] = sum * gauss[s];
         }
     }
-    /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian, of a block; rows of `out` lie so far apart. */
+    /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian, of a block; in rows of `out` so far apart. */
     STARPOS_FUSED static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
                                            const double *gauss, float *out, int apart) {
         starpos_eight places[3][STARPOS_STEPS], fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
@@ -244,5 +244,5 @@ def evaluated(
 cdef void terms_at(
     const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out, int apart
 ) noexcept nogil:
-    """Set single terms h_i(u) h_j(v) of a block's pixels, (i, j) in orders (T, 2), times the Gaussian; their rows lie so far apart."""
+    """Set rows of `out`, so far apart, to terms h_i(u) h_j(v) of a block's pixels times the Gaussian; (i, j) in orders (T, 2)."""
     each_at(orders, count, highest, u, v, gauss, out, apart)
