@@ -22,33 +22,44 @@ cdef inline bint scaled_factor(double *normal, int n, double *scale) noexcept no
     return factored(normal, n) > log(1e-9)
 
 
-cdef inline bint invert(double *normal, int n, double *out) noexcept nogil:
-    """Set `out` (n, n) to the inverse of the lower half of normal (n, n), NaN if singular; whether it is not."""
-    cdef double[LARGEST] scale
+cdef inline void invert_scaled(const double *factor, int n, const double *scale, double *out) noexcept nogil:
+    """Set `out` (n, n) to the inverse of equations by their scaled factor (n, n)."""
     cdef double[LARGEST] column
     cdef int a, b
-    if not scaled_factor(normal, n, scale):
-        for a in range(n * n):
-            out[a] = NAN
-        return False
     for a in range(n):
         for b in range(n):
             column[b] = scale[b] if a == b else 0.0
-        solved(normal, column, n)
+        solved(factor, column, n)
         for b in range(n):
             out[b * n + a] = column[b] * scale[b]
-    return True
+
+
+cdef inline void solve_scaled(const double *factor, int n, const double *scale, double *right) noexcept nogil:
+    """Replace right (n,) by the solution of equations by their scaled factor (n, n)."""
+    cdef int a
+    for a in range(n):
+        right[a] *= scale[a]
+    solved(factor, right, n)
+    for a in range(n):
+        right[a] *= scale[a]
+
+
+cdef inline bint invert(double *normal, int n, double *out) noexcept nogil:
+    """Set `out` (n, n) to the inverse of the lower half of normal (n, n), NaN if singular; whether it is not."""
+    cdef double[LARGEST] scale
+    cdef int a
+    if scaled_factor(normal, n, scale):
+        invert_scaled(normal, n, scale, out)
+        return True
+    for a in range(n * n):
+        out[a] = NAN
+    return False
 
 
 cdef inline bint solve(double *normal, int n, double *right) noexcept nogil:
     """Replace right (n,) by the solution of the equations of the lower half of normal (n, n); False if they are singular."""
     cdef double[LARGEST] scale
-    cdef int a
     if not scaled_factor(normal, n, scale):
         return False
-    for a in range(n):
-        right[a] *= scale[a]
-    solved(normal, right, n)
-    for a in range(n):
-        right[a] *= scale[a]
+    solve_scaled(normal, n, scale, right)
     return True

@@ -11,77 +11,89 @@ import numpy as np
 cimport starpos.core.wide
 from starpos.core.algebra cimport factored, solved
 from starpos.core.limits cimport unsigned_char, within
-from starpos.core.psf cimport BLOCK, ORDERS, Local, evaluate, local_of, scaled, sound, terms_at
+from starpos.core.psf cimport BLOCK, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
 
 cdef extern from *:
     """
-    /* As BLOCK; in eights, which a compiler left to itself takes one by one. */
-    #define STARPOS_EIGHTS 8
-    typedef float starpos_eight __attribute__((vector_size(32)));
-    typedef float starpos_floats __attribute__((vector_size(32), aligned(4)));
-    /* Add to the lower half of normal (k, k) and to right (k,) what a block of pixels says; design (k, block). */
-    STARPOS_WIDE static void starpos_gram(const float *design, const float *weight, const float *value, int k,
+    /* Pixels whose products are summed in single precision; sixteen at once, which a compiler left to itself takes one by one. */
+    #define STARPOS_ROOM 128
+    #define STARPOS_SIXTEENS 8
+    typedef float starpos_sixteen __attribute__((vector_size(64)));
+    typedef float starpos_sixteens __attribute__((vector_size(64), aligned(4)));
+    static inline double starpos_all(const starpos_sixteen *sums) {
+        const float *v = (const float *)sums;
+        return ((double)((v[0] + v[8]) + (v[4] + v[12])) + (double)((v[1] + v[9]) + (v[5] + v[13])))
+            + ((double)((v[2] + v[10]) + (v[6] + v[14])) + (double)((v[3] + v[11]) + (v[7] + v[15])));
+    }
+    /* Add to the lower half of normal (k, k) and to right (k,) what so many steps of pixels say; design (k, room). */
+    STARPOS_FUSED static void starpos_gram(const float *design, const float *weight, const float *value, int k, int steps,
                                           double *normal, double *right) {
-        const starpos_floats *row = (const starpos_floats *)design, *w = (const starpos_floats *)weight;
-        const starpos_floats *v = (const starpos_floats *)value;
+        const starpos_sixteens *row = (const starpos_sixteens *)design, *w = (const starpos_sixteens *)weight;
+        const starpos_sixteens *v = (const starpos_sixteens *)value;
         for (int a = 0; a < k; a++) {
-            starpos_eight weighted[STARPOS_EIGHTS], sum = {0};
-            for (int p = 0; p < STARPOS_EIGHTS; p++) {
-                weighted[p] = row[a * STARPOS_EIGHTS + p] * w[p];
-                sum += weighted[p] * v[p];
+            starpos_sixteen weighted[STARPOS_SIXTEENS], sum = {0};
+            for (int s = 0; s < steps; s++) {
+                weighted[s] = row[a * STARPOS_SIXTEENS + s] * w[s];
+                sum += weighted[s] * v[s];
             }
-            for (int p = 0; p < 8; p++)
-                right[a] += sum[p];
+            right[a] += starpos_all(&sum);
             for (int b = 0; b <= a; b++) {
-                starpos_eight even = {0}, odd = {0};
-                for (int p = 0; p < STARPOS_EIGHTS; p += 2) {
-                    even += weighted[p] * row[b * STARPOS_EIGHTS + p];
-                    odd += weighted[p + 1] * row[b * STARPOS_EIGHTS + p + 1];
-                }
-                even += odd;
-                normal[a * k + b] += (double)((even[0] + even[4]) + (even[1] + even[5]))
-                    + (double)((even[2] + even[6]) + (even[3] + even[7]));
+                starpos_sixteen product = {0};
+                for (int s = 0; s < steps; s++)
+                    product += weighted[s] * row[b * STARPOS_SIXTEENS + s];
+                normal[a * k + b] += starpos_all(&product);
             }
         }
     }
     """
     void gram "starpos_gram"(
-        const float *design, const float *weight, const float *value, int k, double *normal, double *right
+        const float *design, const float *weight, const float *value, int k, int steps, double *normal, double *right
     ) noexcept nogil
 
+cdef enum:
+    ROOM = 128
+    STEP = 16
 
-cdef struct Block:
-    # Pixels side by side: offsets px, weights, brightness without the mean star, and phases; the columns of the equations.
+
+cdef struct Pixels:
+    # Offsets px, weights, brightness without the mean star, and phases; the columns of the equations.
     int count
-    double[BLOCK] dx
-    double[BLOCK] dy
-    float[BLOCK] weight
-    float[BLOCK] value
-    unsigned char[BLOCK] phase
+    double[ROOM] dx
+    double[ROOM] dy
+    float[ROOM] weight
+    float[ROOM] value
+    unsigned char[ROOM] phase
     float *design
 
 
-cdef void _add(Block *block, const Local *psf, const int[:, ::1] orders, int highest, int phases, double *normal, double *right) noexcept nogil:
-    """Add a block's pixels to the equations: of the terms, then of the gains, x and y."""
+cdef void _add(
+    Pixels *pixels, const Local *psf, const int[:, ::1] orders, int highest, int phases, double *normal, double *right
+) noexcept nogil:
+    """Add the pixels to the equations: of the terms, then of the gains, x and y."""
     cdef double[BLOCK] u
     cdef double[BLOCK] v
     cdef double[BLOCK] gauss
     cdef double[3][BLOCK] star
-    cdef int terms = orders.shape[0], free_ = phases + 2, p, k
-    cdef float *own = block.design + terms * BLOCK
-    scaled(psf, block.dx, block.dy, block.count, u, v, gauss)
-    if terms:
-        terms_at(&orders[0, 0], terms, highest, u, v, gauss, block.design)
-    evaluate(psf, block.dx, block.dy, block.count, star[0], star[1], star[2])
-    memset(own, 0, free_ * BLOCK * sizeof(float))
-    for p in range(block.count):
-        own[block.phase[p] * BLOCK + p] = <float>star[0][p]
-        own[phases * BLOCK + p], own[(phases + 1) * BLOCK + p] = <float>star[1][p], <float>star[2][p]
-        block.value[p] -= <float>gauss[p]
-    for p in range(block.count, BLOCK):
-        block.weight[p] = block.value[p] = 0.0
-    gram(block.design, block.weight, block.value, terms + free_, normal, right)
-    block.count = 0
+    cdef int terms = orders.shape[0], free_ = phases + 2, block, first, some, p, k
+    cdef float *own = pixels.design + terms * ROOM
+    memset(own, 0, free_ * ROOM * sizeof(float))
+    for block in range(blocks(pixels.count)):
+        first = block * BLOCK
+        some = min(BLOCK, pixels.count - first)
+        scaled(psf, pixels.dx + first, pixels.dy + first, some, u, v, gauss)
+        if terms:
+            terms_at(&orders[0, 0], terms, highest, u, v, gauss, pixels.design + first, ROOM)
+        evaluate(psf, pixels.dx + first, pixels.dy + first, some, star[0], star[1], star[2])
+        for p in range(some):
+            k = first + p
+            own[pixels.phase[k] * ROOM + k] = <float>star[0][p]
+            own[phases * ROOM + k], own[(phases + 1) * ROOM + k] = <float>star[1][p], <float>star[2][p]
+            pixels.value[k] -= <float>gauss[p]
+    # the last step is filled up
+    for k in range(pixels.count, (pixels.count + STEP - 1) // STEP * STEP):
+        pixels.weight[k] = pixels.value[k] = 0.0
+    gram(pixels.design, pixels.weight, pixels.value, terms + free_, (pixels.count + STEP - 1) // STEP, normal, right)
+    pixels.count = 0
 
 
 cdef void _eliminate(double *normal, double *right, int terms, int free_, double[:, ::1] out, double[::1] out_right) noexcept nogil:
@@ -131,7 +143,7 @@ def marginal(
     """
     cdef int n = left.shape[0], size = brightness.shape[1], count = orders.shape[0], highest = 1, k, row, column
     cdef int each = count + phases + 2
-    cdef Block block
+    cdef Pixels pixels
     cdef Local psf
     sound(axes, series, n)
     for images, rows, columns in (
@@ -153,32 +165,32 @@ def marginal(
     cdef double[:, :, ::1] normals = out
     cdef double[:, ::1] rights = right_
     cdef double *normal = <double *>malloc(each * (each + 1) * sizeof(double))
-    block.design = <float *>malloc(each * BLOCK * sizeof(float))
-    if normal == NULL or block.design == NULL:
+    pixels.design = <float *>malloc(each * ROOM * sizeof(float))
+    if normal == NULL or pixels.design == NULL:
         free(normal)
-        free(block.design)
+        free(pixels.design)
         raise MemoryError
     with nogil:
         for k in range(n):
             local_of(axes, series, k, &psf)
             memset(normal, 0, each * (each + 1) * sizeof(double))
-            block.count = 0
+            pixels.count = 0
             for row in range(size):
                 for column in range(size):
                     if not weight[k, row, column] > 0:
                         continue
-                    block.dx[block.count], block.dy[block.count] = left[k] + column, top[k] + row
-                    block.weight[block.count] = weight[k, row, column]
-                    block.value[block.count] = brightness[k, row, column]
-                    block.phase[block.count] = phase[k, row, column]
-                    block.count += 1
-                    if block.count == BLOCK:
-                        _add(&block, &psf, orders, highest, phases, normal, normal + each * each)
-            if block.count:
-                _add(&block, &psf, orders, highest, phases, normal, normal + each * each)
+                    pixels.dx[pixels.count], pixels.dy[pixels.count] = left[k] + column, top[k] + row
+                    pixels.weight[pixels.count] = weight[k, row, column]
+                    pixels.value[pixels.count] = brightness[k, row, column]
+                    pixels.phase[pixels.count] = phase[k, row, column]
+                    pixels.count += 1
+                    if pixels.count == ROOM:
+                        _add(&pixels, &psf, orders, highest, phases, normal, normal + each * each)
+            if pixels.count:
+                _add(&pixels, &psf, orders, highest, phases, normal, normal + each * each)
             _eliminate(normal, normal + each * each, count, phases + 2, normals[k], rights[k])
     free(normal)
-    free(block.design)
+    free(pixels.design)
     return out, right_
 
 

@@ -4,6 +4,7 @@
 
 from libc.math cimport INFINITY, NAN, exp, fabs, isnan, rint, sqrt
 from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy, memset
 
 import numpy as np
 
@@ -13,63 +14,64 @@ from starpos.core.shapes cimport Shape, clipped_to, inverse, put_shape, shape_be
 
 cdef extern from *:
     """
-    /* Columns that are summed at once, in quadruples: left to itself a compiler takes them one by one. */
+    /* Columns that are summed side by side, and groups of these whose Gaussians are made at once: left to itself a compiler
+       takes them one by one. */
     #define STARPOS_LANES 8
-    #define STARPOS_FOURS 2
-    typedef double starpos_four __attribute__((vector_size(32)));
-    typedef double starpos_anywhere __attribute__((vector_size(32), aligned(8)));
-    /* Sums of columns side by side: of their light through a window, and of it times the distance in y and its square.
+    #define STARPOS_GROUPS 8
+    typedef double starpos_eight __attribute__((vector_size(64)));
+    typedef float starpos_pixels __attribute__((vector_size(32), aligned(4)));
+    /* Sums over groups of columns of their light through a window, and of it times x, y, xx, xy and yy.
        A column's neighbours in a Gaussian have a ratio, which changes by a constant factor from row to row. */
-    STARPOS_WIDE static void starpos_columns(const double *light, int rows, int stride, int middle, double dx, double dy,
-                                             double xx, double xy, double yy, double change, double *out) {
-        starpos_four sum[STARPOS_FOURS] = {{0}}, sum_y[STARPOS_FOURS] = {{0}}, sum_yy[STARPOS_FOURS] = {{0}};
-        starpos_four first[STARPOS_FOURS], down[STARPOS_FOURS], up[STARPOS_FOURS];
-        for (int p = 0; p < STARPOS_LANES; p++) {
-            const double x = dx + p;
-            ((double *)first)[p] = -0.5 * (xx * x * x + 2 * xy * x * dy + yy * dy * dy);
-            ((double *)down)[p] = -(xy * x + yy * (dy + 0.5));
-        }
-        starpos_exps((double *)first, STARPOS_LANES);
-        starpos_exps((double *)down, STARPOS_LANES);
-        for (int k = 0; k < STARPOS_FOURS; k++)
-            up[k] = change / down[k];
-        for (int side = 0; side < 2; side++) {
-            const int step = side ? -1 : 1, count = side ? middle : rows - middle;
-            const double *from = light + (side ? middle - 1 : middle) * stride;
-            starpos_four through[STARPOS_FOURS], ratio[STARPOS_FOURS];
-            double y = side ? dy - 1 : dy;
-            for (int k = 0; k < STARPOS_FOURS; k++) {
-                through[k] = side ? first[k] * up[k] : first[k];
-                ratio[k] = side ? up[k] * change : down[k];
-            }
-            for (int j = 0; j < count; j++) {
-                const starpos_anywhere *row = (const starpos_anywhere *)from;
-                for (int k = 0; k < STARPOS_FOURS; k++) {
-                    const starpos_four some = through[k] * row[k], lever = some * y;
-                    sum[k] += some;
-                    sum_y[k] += lever;
-                    sum_yy[k] += lever * y;
-                    through[k] *= ratio[k];
-                    ratio[k] *= change;
+    STARPOS_FUSED static void starpos_columns(const float *light, int rows, int stride, int groups, int middle, double dx,
+                                             double dy, double xx, double xy, double yy, double change, double *out) {
+        const starpos_eight lanes = {0, 1, 2, 3, 4, 5, 6, 7};
+        starpos_eight total[6] = {{0}}, power[2 * STARPOS_GROUPS];
+        for (int g = 0; g < groups; g++) {
+            const starpos_eight x = dx + g * STARPOS_LANES + lanes;
+            const int at = g % STARPOS_GROUPS;
+            if (at == 0) {
+                const int some = groups - g < STARPOS_GROUPS ? groups - g : STARPOS_GROUPS;
+                for (int k = 0; k < some; k++) {
+                    const starpos_eight off = x + k * STARPOS_LANES;
+                    power[2 * k] = -0.5 * (xx * off * off + 2 * xy * dy * off + yy * dy * dy);
+                    power[2 * k + 1] = -(xy * off + yy * (dy + 0.5));
                 }
-                y += step;
-                from += step * stride;
+                starpos_exps((double *)power, 2 * some * STARPOS_LANES);
             }
+            const starpos_eight first = power[2 * at], down = power[2 * at + 1], up = change / down;
+            starpos_eight sum = {0}, sum_y = {0}, sum_yy = {0};
+            for (int side = 0; side < 2; side++) {
+                const int step = side ? -1 : 1, count = side ? middle : rows - middle;
+                const float *row = light + g * STARPOS_LANES + (side ? middle - 1 : middle) * stride;
+                starpos_eight through = side ? first * up : first, ratio = side ? up * change : down;
+                double y = side ? dy - 1 : dy;
+                for (int j = 0; j < count; j++) {
+                    const starpos_eight some = through * __builtin_convertvector(*(const starpos_pixels *)row, starpos_eight);
+                    const starpos_eight lever = some * y;
+                    sum += some;
+                    sum_y += lever;
+                    sum_yy += lever * y;
+                    through *= ratio;
+                    ratio *= change;
+                    y += step;
+                    row += step * stride;
+                }
+            }
+            total[0] += sum;
+            total[1] += sum * x;
+            total[2] += sum_y;
+            total[3] += sum * x * x;
+            total[4] += sum_y * x;
+            total[5] += sum_yy;
         }
-        for (int p = 0; p < STARPOS_LANES; p++) {
-            const double x = dx + p, some = sum[p / 4][p % 4], lever = sum_y[p / 4][p % 4];
-            out[0] += some;
-            out[1] += some * x;
-            out[2] += lever;
-            out[3] += some * x * x;
-            out[4] += lever * x;
-            out[5] += sum_yy[p / 4][p % 4];
-        }
+        for (int k = 0; k < 6; k++)
+            out[k] = ((total[k][0] + total[k][1]) + (total[k][2] + total[k][3]))
+                + ((total[k][4] + total[k][5]) + (total[k][6] + total[k][7]));
     }
     """
-    void add_columns "starpos_columns"(
-        const double *light, int rows, int stride, int middle, double dx, double dy, double xx, double xy, double yy,
-        double change, double *out,
+    void sum_columns "starpos_columns"(
+        const float *light, int rows, int stride, int groups, int middle, double dx, double dy, double xx, double xy,
+        double yy, double change, double *out,
     ) noexcept nogil
 
 
@@ -82,7 +84,7 @@ cdef double WIDTHS = 6.5
 
 cdef struct Image:
     # In rows of whole lanes, beyond its own columns dark.
-    double *light
+    float *light
     int size
     int stride
 
@@ -90,7 +92,7 @@ cdef struct Image:
 cdef int _begin(Image *image, int size) except -1:
     """Take memory for an image (size, size)."""
     image.size, image.stride = size, (size + LANES - 1) // LANES * LANES
-    image.light = <double *>malloc(max(size * image.stride, 1) * sizeof(double))
+    image.light = <float *>malloc(max(size * image.stride, 1) * sizeof(float))
     if image.light == NULL:
         raise MemoryError
     return 0
@@ -98,12 +100,10 @@ cdef int _begin(Image *image, int size) except -1:
 
 cdef void _take(Image *image, const float *signal) noexcept nogil:
     """Take the pixels (S, S) of an image."""
-    cdef int j, i
+    cdef int j
     for j in range(image.size):
-        for i in range(image.size):
-            image.light[j * image.stride + i] = signal[j * image.size + i]
-        for i in range(image.size, image.stride):
-            image.light[j * image.stride + i] = 0.0
+        memcpy(image.light + j * image.stride, signal + j * image.size, image.size * sizeof(float))
+        memset(image.light + j * image.stride + image.size, 0, (image.stride - image.size) * sizeof(float))
 
 
 cdef inline int _within(double place, int most) noexcept nogil:
@@ -124,14 +124,10 @@ cdef void _moments(const Image *image, const double *window, double left, double
     # in whole lanes
     last = first + (max(last - first, 1) + LANES - 1) // LANES * LANES
     first -= max(last - image.stride, 0)
-    for k in range(6):
-        out[k] = 0.0
-    while first < min(last, image.stride):
-        add_columns(
-            image.light + begin * image.stride + first, end - begin, image.stride, middle - begin, left + first, top + middle,
-            xx, xy, yy, change, out,
-        )
-        first += LANES
+    sum_columns(
+        image.light + begin * image.stride + first, end - begin, image.stride, (min(last, image.stride) - first) // LANES,
+        middle - begin, left + first, top + middle, xx, xy, yy, change, out,
+    )
     if not out[0] > 0:
         for k in range(1, 6):
             out[k] = NAN

@@ -2,6 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Which of many points are near each other."""
 
+from libc.math cimport INFINITY, sqrt
 from libc.stdlib cimport free, malloc, realloc
 
 import numpy as np
@@ -45,3 +46,61 @@ def near_pairs(const double[::1] x, const double[::1] y, double reach):
         return out
     finally:
         free(pair)
+
+
+def any_near(const double[::1] x, const double[::1] y, const double[::1] to_x, const double[::1] to_y, double reach):
+    """Whether one of the points x, y (N,) is nearer than the reach to each of others (M,): (M,) bool.
+
+    What is not a number is near nothing.
+    """
+    cdef Py_ssize_t n = x.shape[0], m = to_x.shape[0], k, low, high, half
+    cdef double dx, dy
+    if y.shape[0] != n or to_y.shape[0] != m:
+        raise ValueError(f"{n} and {m} columns, {y.shape[0]} and {to_y.shape[0]} rows of points: as many are needed")
+    out = np.zeros(m, np.uint8)
+    cdef unsigned char[::1] found = out
+    cdef const Py_ssize_t[::1] order = np.argsort(y)
+    for k in range(m):
+        # the first point that is not too far above
+        low, high = 0, n
+        while low < high:
+            half = (low + high) // 2
+            if not y[order[half]] <= to_y[k] - reach:
+                high = half
+            else:
+                low = half + 1
+        while low < n and y[order[low]] < to_y[k] + reach and not found[k]:
+            dx, dy = x[order[low]] - to_x[k], y[order[low]] - to_y[k]
+            found[k] = dx * dx + dy * dy < reach * reach
+            low += 1
+    return out.view(bool)
+
+
+def nearest(const double[::1] x, const double[::1] y, Py_ssize_t count):
+    """How far each of the first `count` of the points x, y (N,) is from the nearest other one; infinity if it is alone.
+
+    They are numbers.
+    """
+    cdef Py_ssize_t n = x.shape[0], i, j, k, step
+    cdef double dx, dy, least2
+    if y.shape[0] != n or not 0 <= count <= n:
+        raise ValueError(f"{count} of {n} columns and {y.shape[0]} rows of points: as many are needed")
+    out = np.empty(count)
+    cdef double[::1] apart = out
+    cdef const Py_ssize_t[::1] order = np.argsort(y)
+    for i in range(n):
+        k = order[i]
+        if k >= count:
+            continue
+        least2 = INFINITY
+        # upwards, then downwards, until rows are farther than what was found
+        for step in range(-1, 2, 2):
+            j = i + step
+            while 0 <= j < n:
+                dx, dy = x[order[j]] - x[k], y[order[j]] - y[k]
+                if dy * dy >= least2:
+                    break
+                least2 = min(least2, dx * dx + dy * dy)
+                j += step
+        apart[k] = sqrt(least2)
+    return out

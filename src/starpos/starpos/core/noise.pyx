@@ -2,25 +2,62 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The noise that grows with a star's light, from what fits leave."""
 
-from libc.math cimport hypot, sqrt
+from libc.math cimport INFINITY, hypot, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+cimport starpos.core.wide
 from starpos.core.limits cimport within
 
+cdef extern from *:
+    """
+    /* Eight pixels at once, which a compiler left to itself takes one by one. */
+    typedef double starpos_eight __attribute__((vector_size(64)));
+    typedef double starpos_eights __attribute__((vector_size(64), aligned(8)));
+    typedef long long starpos_marks __attribute__((vector_size(64)));
+    /* Sums over n pixels (whole eights) of the light over its variance squared, and, of pixels whose square is not too large
+       for it, of the products of light, light squared and the excess, each over the variance: pp, pq, qq, p, q. */
+    STARPOS_FUSED static void starpos_light_sums(const double *noise2, const double *light, const double *square, int n,
+                                                double photon, double misfit2, double limit2, double *out) {
+        starpos_eight sums[6] = {{0}};
+        for (int k = 0; k < n; k += 8) {
+            const starpos_eight s = *(const starpos_eights *)(light + k), sky = *(const starpos_eights *)(noise2 + k);
+            const starpos_eight r2 = *(const starpos_eights *)(square + k), variance = sky + (photon + misfit2 * s) * s;
+            const starpos_eight all = s / variance, excess = (r2 - sky) / variance;
+            const starpos_eight a = (starpos_eight)((starpos_marks)all & (starpos_marks)(r2 < limit2 * variance)), b = a * s;
+            sums[0] += all * all;
+            sums[1] += a * a;
+            sums[2] += a * b;
+            sums[3] += b * b;
+            sums[4] += a * excess;
+            sums[5] += b * excess;
+        }
+        for (int k = 0; k < 6; k++)
+            out[k] = ((sums[k][0] + sums[k][1]) + (sums[k][2] + sums[k][3]))
+                + ((sums[k][4] + sums[k][5]) + (sums[k][6] + sums[k][7]));
+    }
+    """
+    void light_sums "starpos_light_sums"(
+        const double *noise2, const double *light, const double *square, int n, double photon, double misfit2, double limit2,
+        double *out,
+    ) noexcept nogil
+
 cdef enum:
+    # Pixels that are summed at once.
+    LANES = 8
     ROUNDS = 4
 
 # Smaller singular values, as a share of the largest, are 0; residuals are at most so much more certain than they look.
 cdef double SINGULAR = 1e-12, CERTAIN = 0.1
 
 
-cdef struct Pixel:
-    # The sky's variance, the light, and the residual's square as it would be without the fit.
-    double noise2
-    double light
-    double square
+cdef struct Pixels:
+    # The sky's variance, the light, and the residual's square as it would be without the fit; at the end some without light.
+    int count
+    double *noise2
+    double *light
+    double *square
 
 
 cdef (double, double) _two_terms(double pp, double pq, double qq, double p, double q) noexcept nogil:
@@ -43,25 +80,18 @@ cdef (double, double) _two_terms(double pp, double pq, double qq, double p, doub
     return 0.0, b
 
 
-cdef (double, double) _fitted(const Pixel *each, Py_ssize_t n, double photon, double misfit2, double outlier2) noexcept nogil:
+cdef (double, double) _fitted(const Pixels *p, double photon, double misfit2, double outlier2) noexcept nogil:
     """DN of a photon, with 1 sigma of its error, and misfit squared, from those before."""
-    cdef double pp, pq, qq, p, q, information = 0.0, a, b, variance, excess
-    cdef bint first
-    cdef Py_ssize_t k
+    cdef double[6] sums
     cdef int round_
     for round_ in range(ROUNDS):
-        pp = pq = qq = p = q = information = 0.0
-        first = not photon + misfit2 > 0
-        for k in range(n):
-            variance = each[k].noise2 + (photon + misfit2 * each[k].light) * each[k].light
-            a = each[k].light / variance
-            information += a * a
-            if first or each[k].square < outlier2 * variance:
-                b, excess = a * each[k].light, (each[k].square - each[k].noise2) / variance
-                pp, pq, qq, p, q = pp + a * a, pq + a * b, qq + b * b, p + a * excess, q + b * excess
-        photon, misfit2 = _two_terms(pp, pq, qq, p, q)
+        # at first nothing is known that could be exceeded
+        light_sums(
+            p.noise2, p.light, p.square, p.count, photon, misfit2, outlier2 if photon + misfit2 > 0 else INFINITY, sums
+        )
+        photon, misfit2 = _two_terms(sums[1], sums[2], sums[3], sums[4], sums[5])
     # because errors given too small do more harm than too large ones
-    return photon + sqrt(2 / max(information, 1e-12)), misfit2
+    return photon + sqrt(2 / max(sums[0], 1e-12)), misfit2
 
 
 cdef int _alike(
@@ -92,26 +122,31 @@ def light_noise(
     photon, misfit                   before
     outlier                          sigmas beyond which a residual teaches nothing
     """
-    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], count = 0, k, j, row
+    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], room = n * area + LANES, k, j, row
     cdef double misfit2
+    cdef Pixels p
     _alike(noise, model, residual, used, leverage)
     if noise.shape[0] != n or not within[Py_ssize_t](&rows[0], n, 0, model.shape[0] - 1):
         raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
-    cdef Pixel *each = <Pixel *>malloc(max(n * area, 1) * sizeof(Pixel))
-    if each == NULL:
+    p.noise2 = <double *>malloc(3 * room * sizeof(double))
+    if p.noise2 == NULL:
         raise MemoryError
+    p.count, p.light, p.square = 0, p.noise2 + room, p.noise2 + 2 * room
     with nogil:
         for k in range(n if area else 0):
             row = rows[k]
             for j in range(area):
                 if (&used[row, 0, 0])[j]:
-                    each[count].noise2 = <double>(&noise[k, 0, 0])[j] * (&noise[k, 0, 0])[j]
-                    each[count].light = max((&model[row, 0, 0])[j], 0.0)
-                    each[count].square = <double>(&residual[row, 0, 0])[j] * (&residual[row, 0, 0])[j]
-                    each[count].square /= max(1.0 - (&leverage[row, 0, 0])[j], CERTAIN)
-                    count += 1
-        photon, misfit2 = _fitted(each, count, photon, misfit * misfit, outlier * outlier)
-    free(each)
+                    p.noise2[p.count] = <double>(&noise[k, 0, 0])[j] * (&noise[k, 0, 0])[j]
+                    p.light[p.count] = max((&model[row, 0, 0])[j], 0.0)
+                    p.square[p.count] = <double>(&residual[row, 0, 0])[j] * (&residual[row, 0, 0])[j]
+                    p.square[p.count] /= max(1.0 - (&leverage[row, 0, 0])[j], CERTAIN)
+                    p.count += 1
+        while p.count % LANES:
+            p.noise2[p.count], p.light[p.count], p.square[p.count] = 1.0, 0.0, 0.0
+            p.count += 1
+        photon, misfit2 = _fitted(&p, photon, misfit * misfit, outlier * outlier)
+    free(p.noise2)
     return photon, sqrt(misfit2)
 
 
@@ -179,3 +214,41 @@ def of_phases(
             information[k, p] = max(information[k, p], 1e-12)
             flux[k, p] /= information[k, p]
     return fluxes, weights
+
+
+def unit_light(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] phase,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const Py_ssize_t[::1] rows, const double[::1] flux,
+    const double[:, ::1] gains, double dn_per_photon, double misfit2,
+):
+    """The pixels (M, S, S) of stars that teach over their fluxes and gains, and the inverse variances; 0 if not used.
+
+    signal, noise, phase  (M, S, S) of these stars
+    model, used           (N, S, S) of a fit, in which these are `rows` (M,), with flux (N,) and gains (N, P)
+    dn_per_photon         DN2 of variance for each DN of light, and
+    misfit2               for its square
+    """
+    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], k, j, row
+    cdef float light, sky
+    cdef double scale
+    _alike(noise, model, model, used, model)
+    _alike(noise, signal, signal, phase, signal)
+    if noise.shape[0] != n or not within[Py_ssize_t](&rows[0], n, 0, model.shape[0] - 1):
+        raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
+    if flux.shape[0] != model.shape[0] or gains.shape[0] != flux.shape[0]:
+        raise ValueError(f"{flux.shape[0]} fluxes and {gains.shape[0]} gains of {model.shape[0]} fits: one each is needed")
+    if n and np.max(phase, initial=0) >= gains.shape[1]:
+        raise ValueError(f"a pixel of phase {np.max(phase)}: there are {gains.shape[1]}")
+    out = np.empty((2, n, noise.shape[1], noise.shape[2]), np.float32)
+    cdef float[:, :, :, ::1] found = out
+    with nogil:
+        for k in range(n if area else 0):
+            row = rows[k]
+            for j in range(area):
+                scale = flux[row] * gains[row, (&phase[k, 0, 0])[j]]
+                light, sky = max((&model[row, 0, 0])[j], <float>0), (&noise[k, 0, 0])[j]
+                (&found[0, k, 0, 0])[j] = <float>((&signal[k, 0, 0])[j] / scale)
+                (&found[1, k, 0, 0])[j] = <float>(
+                    (&used[row, 0, 0])[j] * scale * scale / (sky * sky + (dn_per_photon + misfit2 * light) * light)
+                )
+    return out[0], out[1]

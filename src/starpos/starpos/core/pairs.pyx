@@ -2,16 +2,16 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Weighted least-squares fit of two stars to one stamp: places, fluxes and gains of both, by Gauss-Newton."""
 
-from libc.math cimport NAN, fabs, sqrt
+from libc.math cimport NAN, sqrt
 from libc.stdlib cimport free, malloc
 from libc.string cimport memset
 
 import numpy as np
 
-from starpos.core.equations cimport invert, solve
-from starpos.core.fit cimport MOST, PHASES, Rules, sound_stamps
+from starpos.core.equations cimport invert, invert_scaled, scaled_factor, solve_scaled
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
-from starpos.core.sums cimport products, weigh
+from starpos.core.rules cimport MOST, PHASES, Rules, first_of_phase, is_settled, rows_within, sound_stamps
+from starpos.core.sums cimport chi_square, products, weigh
 
 cdef extern from *:
     """
@@ -46,8 +46,8 @@ cdef enum:
     # Numbers kept of each pixel: of each star 5, 5 of their light, and row and column.
     COLUMNS = 17
 
-# One step moves a star so far (px) at most; if none moves so far, and no flux changes by that share, the fit has settled.
-cdef double FARTHEST = 0.5, SETTLED = 1e-8
+# One step moves a star so far (px) at most.
+cdef double FARTHEST = 0.5
 
 
 cdef struct Image:
@@ -60,13 +60,14 @@ cdef struct Image:
 
 
 cdef struct Pixels:
-    # First those that are fitted, phase after phase, then the others if all are asked for.
+    # First those that are fitted, phase after phase, then, at last, the others.
     int count
     int all
     int[PHASES + 1] first
     int *place
-    # Places of the others.
-    int *rest
+    # Of each row of the stamp the first column within reach, and the one after the last: of the star, of the other.
+    int *bound
+    int *other
     double *row
     double *column
     double *signal
@@ -100,12 +101,12 @@ cdef int _begin(Pixels *p, int area) except -1:
     # the last step of a block may begin anywhere
     cdef int room = (blocks(area) + 1) * BLOCK, k
     cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
-    p.place = <int *>malloc((room + area) * sizeof(int))
+    p.place = <int *>malloc((room + 4 * area) * sizeof(int))
     if columns == NULL or p.place == NULL:
         free(columns)
         free(p.place)
         raise MemoryError
-    p.rest = p.place + room
+    p.bound, p.other = p.place + room, p.place + room + 2 * area
     p.signal, p.noise2, p.light = columns, columns + room, columns + 2 * room
     p.weight, p.residual = columns + 3 * room, columns + 4 * room
     p.row, p.column = columns + 15 * room, columns + 16 * room
@@ -116,59 +117,78 @@ cdef int _begin(Pixels *p, int area) except -1:
     return 0
 
 
-cdef void _gather(
-    const Stamp *s, const Star *star, const Local *psf, Rules rules, bint all_pixels, Pixels *p
-) noexcept nogil:
-    """Take the good pixels of a stamp within reach of a star, to be fitted with the weight 1, or all, with 0 for the others."""
-    cdef int place, phase, row, column, k, n = 0, others = 0
+cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, Pixels *p) noexcept nogil:
+    """Take the good pixels of a stamp within reach of a star, to be fitted with the weight 1."""
+    cdef int place, phase, row, column, last, k, n = 0, step = 2 if rules.own else 1
+    rows_within(psf.axes, s.left - star[0].x, s.top - star[0].y, s.size, rules.widths2, p.bound)
+    rows_within(psf.axes, s.left - star[1].x, s.top - star[1].y, s.size, rules.widths2, p.other)
     for phase in range(rules.phases):
         p.first[phase] = n
         for row in range(s.size):
-            for column in range(s.size):
+            column, last = _both_within(p, row)
+            if rules.own:
+                column = first_of_phase(s.phase + row * s.size, column, last, phase)
+            while column < last:
                 place = row * s.size + column
-                if rules.own and s.phase[place] != phase:
-                    continue
-                if s.good[place] and _near(s, star, psf, rules, row, column):
+                if s.good[place] and _within(p, row, column):
                     p.place[n], p.row[n], p.column[n] = place, row, column
+                    p.signal[n], p.noise2[n], p.weight[n] = s.signal[place], <double>s.noise[place] * s.noise[place], 1.0
                     n += 1
-                elif all_pixels:
-                    p.rest[others] = place
-                    others += 1
+                column += step
     p.count = p.all = p.first[rules.phases] = n
-    if all_pixels:
-        for k in range(others):
-            p.place[n + k], p.row[n + k], p.column[n + k] = p.rest[k], p.rest[k] // s.size, p.rest[k] % s.size
-        p.all += others
-    for k in range(p.all):
-        place = p.place[k]
-        p.signal[k], p.noise2[k] = s.signal[place], <double>s.noise[place] * s.noise[place]
-        p.weight[k] = 1.0 if k < n else 0.0
     for k in range(2):
-        _evaluate(s, &star[k], psf, rules, p, &p.of[k])
+        _offset(s, &star[k], p, &p.of[k], 0)
+        evaluate(psf, p.of[k].dx, p.of[k].dy, n, p.of[k].value, p.of[k].by_x, p.of[k].by_y)
+        if rules.own:
+            _by_own_gain(s, &star[k], p, &p.of[k], 0)
 
 
-cdef inline bint _near(const Stamp *s, const Star *star, const Local *psf, Rules rules, int row, int column) noexcept nogil:
+cdef void _gather_rest(const Stamp *s, const Star *star, const Local *psf, Rules rules, Pixels *p) noexcept nogil:
+    """Take the other pixels too, with the weight 0."""
+    cdef int row, column, place, k, n = p.count
+    for row in range(s.size):
+        for column in range(s.size):
+            place = row * s.size + column
+            if not (s.good[place] and _within(p, row, column)):
+                p.place[n], p.row[n], p.column[n] = place, row, column
+                p.signal[n], p.weight[n] = s.signal[place], 0.0
+                n += 1
+    p.all = n
+    for k in range(2):
+        _offset(s, &star[k], p, &p.of[k], p.count)
+        values(psf, p.of[k].dx + p.count, p.of[k].dy + p.count, n - p.count, p.of[k].value + p.count)
+        if rules.own:
+            _by_own_gain(s, &star[k], p, &p.of[k], p.count)
+    for k in range(p.count, n):
+        p.residual[k] = p.signal[k] - star[0].flux * p.of[0].value[k] - star[1].flux * p.of[1].value[k]
+
+
+cdef inline bint _within(const Pixels *p, int row, int column) noexcept nogil:
     """Whether a pixel is within reach of one of the stars."""
-    cdef double dx, dy, u, v
+    return p.bound[2 * row] <= column < p.bound[2 * row + 1] or p.other[2 * row] <= column < p.other[2 * row + 1]
+
+
+cdef inline (int, int) _both_within(const Pixels *p, int row) noexcept nogil:
+    """The first column of a row within reach of one of the stars, and the one after the last."""
+    if p.bound[2 * row] == p.bound[2 * row + 1]:
+        return p.other[2 * row], p.other[2 * row + 1]
+    if p.other[2 * row] == p.other[2 * row + 1]:
+        return p.bound[2 * row], p.bound[2 * row + 1]
+    return min(p.bound[2 * row], p.other[2 * row]), max(p.bound[2 * row + 1], p.other[2 * row + 1])
+
+
+cdef void _offset(const Stamp *s, const Star *star, const Pixels *p, Image *of, int first) noexcept nogil:
+    """Set the offsets of the pixels from a star, from a pixel on."""
     cdef int k
-    for k in range(2):
-        dx, dy = s.left + column - star[k].x, s.top + row - star[k].y
-        u, v = psf.axes[0] * dx + psf.axes[1] * dy, psf.axes[2] * dx + psf.axes[3] * dy
-        if u * u + v * v < rules.widths2:
-            return True
-    return False
+    for k in range(first, p.all):
+        of.dx[k], of.dy[k] = s.left + p.column[k] - star.x, s.top + p.row[k] - star.y
 
 
-cdef void _evaluate(const Stamp *s, const Star *star, const Local *psf, Rules rules, const Pixels *p, Image *of) noexcept nogil:
-    """Set a star's image at the pixels, and its derivatives at those that are fitted."""
+cdef void _by_own_gain(const Stamp *s, const Star *star, const Pixels *p, Image *of, int first) noexcept nogil:
+    """Multiply a star's image, and where it is fitted the derivatives, by its gains, from a pixel on."""
     cdef double gain
     cdef int k
-    for k in range(p.all):
-        of.dx[k], of.dy[k] = s.left + p.column[k] - star.x, s.top + p.row[k] - star.y
-    # the others last: a whole block is written
-    evaluate(psf, of.dx, of.dy, p.count, of.value, of.by_x, of.by_y)
-    values(psf, of.dx + p.count, of.dy + p.count, p.all - p.count, of.value + p.count)
-    for k in range(p.all if rules.own else 0):
+    for k in range(first, p.all):
         gain = star.gain[s.phase[p.place[k]]]
         of.value[k] *= gain
         if k < p.count:
@@ -191,9 +211,9 @@ cdef void _first_fluxes(const Pixels *p, Star *star) noexcept nogil:
 cdef void _weigh(const Star *star, Rules rules, Pixels *p) noexcept nogil:
     """Set residuals and weights by the model."""
     cdef int k
-    for k in range(p.all):
+    for k in range(p.count):
         p.light[k] = star[0].flux * p.of[0].value[k] + star[1].flux * p.of[1].value[k]
-    weigh(p.signal, p.noise2, p.light, 1.0, rules.dn_per_photon, rules.misfit2, p.all, p.weight, p.residual)
+    weigh(p.signal, p.noise2, p.light, 1.0, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)
 
 
 cdef void _products(const Pixels *p, int first, int n, double *square, double *right) noexcept nogil:
@@ -245,61 +265,71 @@ cdef void _sum_up(const Star *star, Rules rules, const Pixels *p, double *normal
                 normal[row[a] * n + row[b]] += slope[a] * slope[b] * square[6 * column[a] + column[b]]
 
 
-cdef bint _move(Star *star, Rules rules, const double *step, double least) noexcept nogil:
-    """Move both stars by the solution of their equations, step (K,); whether they have settled.
+cdef void _move(Star *star, Rules rules, const double *step, double least) noexcept nogil:
+    """Move both stars by a step (K,).
 
     A flux keeps the share `least` in one step: a star without light could not move any more, its place changes nothing.
     """
     cdef int k, a
-    cdef double before
-    cdef bint settled = True
     for k in range(2):
         star[k].x += max(-FARTHEST, min(step[0], FARTHEST))
         star[k].y += max(-FARTHEST, min(step[1], FARTHEST))
-        before = star[k].flux
-        star[k].flux = max(before + step[2], least * before)
-        settled = settled and fabs(step[0]) + fabs(step[1]) < SETTLED and fabs(step[2]) < SETTLED * fabs(before)
+        star[k].flux = max(star[k].flux + step[2], least * star[k].flux)
         for a in range(rules.own):
             star[k].colour[a] = max(-0.9, min(star[k].colour[a] + step[3 + a], 3.0))
             star[k].gain[a] = rules.gain[a] * (1 + star[k].colour[a])
-            settled = settled and fabs(step[3 + a]) < SETTLED
         step += rules.parameters
-    return settled
 
 
 cdef void _fit(
     const Stamp *s, const Local *psf, Rules rules, int rounds, double least, Pixels *p, Star *star, double *covariance,
-    double *sigma,
+    double *sigma, double *step,
 ) noexcept nogil:
     """Fit two stars that have first places, and least fluxes; the pixels are at last all of the stamp.
 
-    Sets covariance (K, K), and each flux's sigma at known gains.
+    Sets covariance (K, K), each flux's sigma at known gains, and a last step (K,), so short that pixels need not follow it.
     """
     cdef double[ALL * ALL] normal
+    cdef double[ALL] scale
+    cdef double[ALL] right
     cdef double[36] known
     cdef double[36] inverse
-    cdef double[ALL] right
+    cdef double length2, before = 0.0
     cdef int round_, k, a, b, n = 2 * rules.parameters
-    cdef bint settled = False
+    cdef bint solved = False
     for k in range(2):
         for a in range(rules.phases):
             star[k].colour[a], star[k].gain[a] = 0.0, rules.gain[a]
     for round_ in range(rounds + 1):
-        settled = settled or round_ == rounds
-        _gather(s, star, psf, rules, settled, p)
+        _gather(s, star, psf, rules, p)
         if round_ == 0:
             _first_fluxes(p, star)
         _weigh(star, rules, p)
         _sum_up(star, rules, p, normal, right)
-        if not settled:
-            # without a solution nothing moves any more
-            settled = not solve(normal, n, right) or _move(star, rules, right, least)
-            continue
         for a in range(6):
             for b in range(6):
                 known[6 * a + b] = normal[(a // 3 * rules.parameters + a % 3) * n + b // 3 * rules.parameters + b % 3]
-        invert(normal, n, covariance)
-        break
+        memset(step, 0, n * sizeof(double))
+        solved = scaled_factor(normal, n, scale)
+        # without a solution nothing moves any more
+        if not solved or round_ == rounds:
+            break
+        for a in range(n):
+            step[a] = right[a]
+        solve_scaled(normal, n, scale, step)
+        length2 = 0.0
+        for a in range(n):
+            length2 += step[a] * right[a]
+        if is_settled(sqrt(length2), before, rules):
+            break
+        before = sqrt(length2)
+        _move(star, rules, step, least)
+    if solved:
+        invert_scaled(normal, n, scale, covariance)
+    else:
+        for a in range(n * n):
+            covariance[a] = NAN
+    _gather_rest(s, star, psf, rules, p)
     invert(known, 6, inverse)
     sigma[0], sigma[1] = sqrt(inverse[14]), sqrt(inverse[35])
 
@@ -328,6 +358,7 @@ def fitted_pairs(
     cdef Stamp s
     cdef double[ALL * ALL] covariance
     cdef double[2] sigma
+    cdef double[ALL] step
     sound_stamps(signal, noise, good, phase, rules)
     sound(axes, series, n)
     if not (corner.shape[0] == first.shape[1] == least_flux.shape[0] == n and rounds > 0):
@@ -352,7 +383,11 @@ def fitted_pairs(
             for j in range(2):
                 star[j].x, star[j].y, star[j].flux = first[j, k, 0], first[j, k, 1], least_flux[k]
             local_of(axes, series, k, &psf)
-            _fit(&s, &psf, rules, rounds, least, &p, star, covariance, sigma)
+            _fit(&s, &psf, rules, rounds, least, &p, star, covariance, sigma, step)
+            for j in range(2):
+                for a in range(area):
+                    model[j, k, p.place[a]] = <float>(star[j].flux * p.of[j].value[a])
+            _move(star, rules, step, least)
             for j in range(2):
                 column[0, j, k], column[1, j, k], column[2, j, k] = star[j].x, star[j].y, star[j].flux
                 column[3, j, k] = sigma[j]
@@ -361,11 +396,9 @@ def fitted_pairs(
                         covariances[j, k, a, b] = covariance[(j * rules.parameters + a) * most + j * rules.parameters + b]
                 for a in range(rules.phases):
                     gains[j, k, a] = star[j].gain[a]
-                for a in range(area):
-                    model[j, k, p.place[a]] = <float>(star[j].flux * p.of[j].value[a])
             for a in range(area):
                 used[k, p.place[a]] = p.weight[a] > 0
-                chi2[k] += p.residual[a] * p.residual[a] * p.weight[a]
+            chi2[k] = chi_square(p.weight, p.residual, p.count)
     free(p.signal)
     free(p.place)
     x, y, flux, sigmas = stars_

@@ -2,9 +2,8 @@
 # cython: cdivision=True
 
 cdef enum:
-    # Pixels that are evaluated together, and in one step, and terms of a series along one axis.
+    # Pixels that are evaluated together, and terms of a series along one axis.
     BLOCK = 64
-    LANES = 8
     ORDERS = 32
 
 
@@ -13,18 +12,18 @@ cdef inline int blocks(int pixels) noexcept nogil:
     return (pixels + BLOCK - 1) // BLOCK
 
 
-cdef inline int whole(int pixels) noexcept nogil:
-    """So many pixels, or some more, are evaluated in whole steps."""
-    return (pixels + LANES - 1) // LANES * LANES
-
-
 cdef struct Local:
-    # The PSF at a star's place, as `detection.psf.LocalPsf` has it: axes (2, 2), series (rows, columns), and the Gaussian's peak.
+    # The PSF at a star's place, as `detection.psf.LocalPsf` has it: axes (2, 2), the Gaussian's peak, and the series
+    # (rows, columns) by its terms other than 0, row after row: of each row the first, and of each term its column, its
+    # coefficient, and that times the square root of the column + 1.
     double[4] axes
     double peak
-    const double *series
     int rows
     int columns
+    int[ORDERS + 1] first
+    int[ORDERS * ORDERS] column
+    double[ORDERS * ORDERS] term
+    double[ORDERS * ORDERS] slope
 
 
 cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series, int k, Local *out) noexcept nogil
@@ -35,5 +34,5 @@ cdef void evaluate(
 cdef void values(const Local *psf, const double *dx, const double *dy, int n, double *value) noexcept nogil
 cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil
 cdef void terms_at(
-    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out
+    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out, int apart
 ) noexcept nogil

@@ -33,6 +33,17 @@ def inverted(const double[:, :, ::1] shape):
     return out
 
 
+def squared_widths(const double[:, :, ::1] shape):
+    """Eigenvalues (N, 2) of covariances (N, 2, 2), the smaller first."""
+    cdef Py_ssize_t n = _count(shape, shape, shape), k
+    out = np.empty((n, 2))
+    cdef double[:, ::1] width = out
+    with nogil:
+        for k in range(n):
+            width[k, 0], width[k, 1] = sides(shape_of(shape, k))
+    return out
+
+
 def clipped(const double[:, :, ::1] shape, double least, double most, double exponent):
     """Covariances (N, 2, 2) with eigenvalues of at least and at most so much, to a power."""
     cdef Py_ssize_t n = _count(shape, shape, shape), k

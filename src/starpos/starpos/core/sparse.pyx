@@ -106,3 +106,27 @@ def third_highest(const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py
             most = count if top[2] > highest else max(most, count)
             highest = top[2]
     return highest, most
+
+
+def thirds(const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y):
+    """The third highest (N,) of the nine pixels around x, y (N,); beyond the frame are those of its edge."""
+    cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, i, j
+    cdef int value
+    cdef int[3] top
+    cdef const pixel_t *line
+    if y.shape[0] != n or not (height and width):
+        raise ValueError(f"{n} columns and {y.shape[0]} rows of pixels on a frame of {width} x {height} px: as many are needed")
+    out = np.empty(n)
+    cdef double[::1] third = out
+    with nogil:
+        for k in range(n):
+            top[0] = top[1] = top[2] = -1
+            for i in range(-1, 2):
+                line = &plane[max(0, min(y[k] + i, height - 1)), 0]
+                for j in range(-1, 2):
+                    value = line[max(0, min(x[k] + j, width - 1))]
+                    top[2] = max(top[2], min(value, top[1]))
+                    top[1] = max(top[1], min(value, top[0]))
+                    top[0] = max(top[0], value)
+            third[k] = top[2]
+    return out

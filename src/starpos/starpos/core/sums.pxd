@@ -17,6 +17,48 @@ cdef extern from *:
             weight[p] /= noise2[p] + dn_per_photon * some + misfit2 * some * some;
         }
     }
+    /* Sums over n pixels of their PSF squared and times the signal, with the weights over the sky's variance. */
+    STARPOS_FUSED static void starpos_of_sky(const double *weight, const double *noise2, const double *f, const double *signal,
+                                            int n, double *out) {
+        starpos_four ff = {0}, fs = {0};
+        for (int p = 0; p + 4 <= n; p += 4) {
+            const starpos_four c = *(const starpos_fours *)(f + p);
+            const starpos_four wc = *(const starpos_fours *)(weight + p) / *(const starpos_fours *)(noise2 + p) * c;
+            ff += wc * c;
+            fs += wc * *(const starpos_fours *)(signal + p);
+        }
+        out[0] = (ff[0] + ff[1]) + (ff[2] + ff[3]);
+        out[1] = (fs[0] + fs[1]) + (fs[2] + fs[3]);
+        for (int p = n / 4 * 4; p < n; p++) {
+            out[0] += weight[p] / noise2[p] * f[p] * f[p];
+            out[1] += weight[p] / noise2[p] * f[p] * signal[p];
+        }
+    }
+    STARPOS_FUSED static double starpos_chi_square(const double *weight, const double *residual, int n) {
+        starpos_four sums = {0};
+        for (int p = 0; p + 4 <= n; p += 4) {
+            const starpos_four r = *(const starpos_fours *)(residual + p);
+            sums += *(const starpos_fours *)(weight + p) * r * r;
+        }
+        double sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+        for (int p = n / 4 * 4; p < n; p++)
+            sum += weight[p] * residual[p] * residual[p];
+        return sum;
+    }
+    /* Whether one of n pixels has no weight, or is above the model by more than so many squared sigmas. */
+    STARPOS_WIDE static int starpos_any_bright(const double *weight, const double *residual, double limit2, int n) {
+        long long any = 0;
+        for (int p = 0; p < n; p++)
+            any |= (weight[p] == 0) | ((residual[p] > 0) & (residual[p] * residual[p] * weight[p] > limit2));
+        return any != 0;
+    }
+    /* Of each of n pixels the weight times a quadratic form xx, xy, yy, xf, yf, ff. */
+    STARPOS_FUSED static void starpos_squares(const double *weight, const double *x, const double *y, const double *f,
+                                             const double *form, int n, double *restrict out) {
+        const double xx = form[0], xy = 2 * form[1], yy = form[2], xf = 2 * form[3], yf = 2 * form[4], ff = form[5];
+        for (int p = 0; p < n; p++)
+            out[p] = weight[p] * (x[p] * (xx * x[p] + xy * y[p] + xf * f[p]) + y[p] * (yy * y[p] + yf * f[p]) + ff * f[p] * f[p]);
+    }
     /* Products with the weights, summed over n pixels: xx, xy, yy, xf, yf, ff, xr, yr, fr. */
     STARPOS_FUSED static void starpos_products(const double *weight, const double *x, const double *y, const double *f,
                                               const double *r, int n, double *out) {
@@ -53,4 +95,12 @@ cdef extern from *:
     ) noexcept nogil
     void products "starpos_products"(
         const double *weight, const double *x, const double *y, const double *f, const double *r, int n, double *out
+    ) noexcept nogil
+    void of_sky "starpos_of_sky"(
+        const double *weight, const double *noise2, const double *f, const double *signal, int n, double *out
+    ) noexcept nogil
+    double chi_square "starpos_chi_square"(const double *weight, const double *residual, int n) noexcept nogil
+    bint any_bright "starpos_any_bright"(const double *weight, const double *residual, double limit2, int n) noexcept nogil
+    void squares "starpos_squares"(
+        const double *weight, const double *x, const double *y, const double *f, const double *form, int n, double *out
     ) noexcept nogil

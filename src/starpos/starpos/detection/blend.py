@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two stars in one image: where one star does not explain the light, a companion is tried and both are fitted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
@@ -31,6 +31,8 @@ SMOOTHING /= 2 * SMOOTHING.sum() - SMOOTHING[0]
 LEAST = 0.05
 
 Rows = TypeVar("Rows", Fit, Stamps)
+# Stars with stamps, which of their pixels have the mean of their neighbours (N, S, S), and fits.
+Fitted = tuple[Stamps, np.ndarray, Fit]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,51 +58,48 @@ class Pairs:
     chi2: np.ndarray
 
 
-def with_companions(
-    stamps: Stamps,
-    spike: np.ndarray,
-    fit: Fit,
+def pairs_among(
+    stars: Fitted,
     psf: FieldPsf,
     response: Response,
     cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
-) -> tuple[Stamps, np.ndarray, Fit]:
-    """Stamps, spikes and fit with the companions as further rows; each star's stamp is without the other's light.
+) -> tuple[np.ndarray, Fitted | None]:
+    """Which of N surprising stars have companions, (N,) bool; and these stars, then the companions, if there are any.
 
-    cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of their pixels are spikes (N, S, S).
+    Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of
+    their pixels are spikes (N, S, S).
     """
-    odd = np.flatnonzero(_surprising(stamps, fit))
-    if len(odd) == 0:
-        return stamps, spike, fit
-    crowd, alone = stamps.take(odd), _rows(fit, odd)
+    crowd, spike, alone = stars
+    light = _light(crowd, psf, alone.x, alone.y, alone.flux, alone.gains)
+    alone = replace(alone, model=light, residual=crowd.signal - light)
     before = crowd.good * alone.residual**2 / response.variance(crowd.noise, alone.model)
     pairs = _fit_pairs(crowd, alone, psf, response)
     x, y, flux, used = pairs.x, pairs.y, pairs.flux, pairs.used
     pixels = used.sum((1, 2))
     freedom = np.maximum(pixels - 6, 1)
     apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
-    away = np.maximum(np.abs(x - stamps.x[odd]), np.abs(y - stamps.y[odd]))
+    away = np.maximum(np.abs(x - crowd.x), np.abs(y - crowd.y))
     with np.errstate(invalid="ignore"):
         real = (flux > FAINTEST * pairs.flux_sigma).all(0) & np.isfinite(pairs.chi2) & (apart > CLOSEST)
-        real &= (away[0] < stamps.reach - 1) & (away[1] < stamps.reach + 2)
+        real &= (away[0] < crowd.reach - 1) & (away[1] < crowd.reach + 2)
         real &= (before * used).sum((1, 2)) - pairs.chi2 > GAIN * np.maximum(pairs.chi2 / freedom, 1)
         real &= flux[1] > DIMMEST * flux[0]
     if not real.any():
-        return stamps, spike, fit
-    odd, used, whole = odd[real], used[real], away[1, real] < stamps.reach - 1
+        return real, None
+    used, whole = used[real], away[1, real] < crowd.reach - 1
     x, y, flux, gains, sigma, covariance, models = (
         values[:, real]
         for values in (x, y, flux, pairs.gains, pairs.flux_sigma, pairs.covariance, pairs.models)
     )
-    both = stamps.take(odd)
+    both = crowd.take(real)
     first = replace(
-        _rows(fit, odd), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
+        rows_of(alone, real), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
         chi2=(pairs.chi2 / freedom)[real], pixels=pixels[real], residual=both.signal - models.sum(0), model=models[0],
         used=used, outlier=np.zeros_like(used),
     )  # fmt: skip
     first_stamps = replace(both, signal=both.signal - models[1])
     second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
-    light = psf.at(x[0], y[0]).evaluate(*second_stamps.corner(x[0], y[0]), stamps.size)[0]
-    light *= gains_at(gains[0], second_stamps.phase) * flux[0].astype(np.float32)[:, None, None]
+    light = _light(second_stamps, psf, x[0], y[0], flux[0], gains[0])
     noise = np.sqrt(response.variance(second_stamps.noise, light))
     second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
     second = fit_stars(second_stamps, psf, x[1], y[1], response, rounds=3)
@@ -110,19 +109,27 @@ def with_companions(
     for name, value in together.items():
         own = getattr(second, name)
         together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
-    return (
-        _with_pairs(stamps, odd, first_stamps, second_stamps),
-        np.concatenate([spike, second_spike]),
-        _with_pairs(fit, odd, first, replace(second, **together)),
+    return real, (
+        joined([first_stamps, second_stamps]),
+        np.concatenate([spike[real], second_spike]),
+        joined([first, replace(second, **together)]),
     )
 
 
-def _surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
+def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
     freedom = np.maximum(fit.pixels - 3, 1)
     with np.errstate(invalid="ignore"):
         odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (counted(fit.outlier) > 2)
     return odd & (counted(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
+
+
+def _light(
+    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, flux: np.ndarray, gains: np.ndarray
+) -> np.ndarray:
+    """The light (N, S, S) float32, DN, of stars at x, y (N,) px, with flux (N,) and gains (N, P), on whole stamps."""
+    light = psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)
+    return light * (gains_at(gains, stamps.phase) * flux.astype(np.float32)[:, None, None])
 
 
 def _fit_pairs(stamps: Stamps, fit: Fit, psf: FieldPsf, response: Response) -> Pairs:
@@ -153,15 +160,14 @@ def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray
     return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
 
 
-def _rows(fit: Fit, index: np.ndarray) -> Fit:
+def rows_of(fit: Fit, index: np.ndarray) -> Fit:
     """The rows `index` of a Fit."""
     return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
 
 
-def _with_pairs(old: Rows, index: np.ndarray, first: Rows, second: Rows) -> Rows:
-    """A copy of the dataclass of arrays `old` in which the rows `index` are those of `first`, and `second` follows."""
-    joined = {}
-    for f in fields(old):
-        joined[f.name] = np.concatenate([getattr(old, f.name), getattr(second, f.name)])
-        joined[f.name][index] = getattr(first, f.name)
-    return replace(old, **joined)
+def joined(parts: Sequence[Rows]) -> Rows:
+    """The rows of dataclasses of arrays, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])}
+    return replace(parts[0], **rows)

@@ -7,8 +7,9 @@ pixels above half its height.
 
 import cv2
 import numpy as np
-from scipy import spatial
 
+from starpos.core.neighbours import any_near
+from starpos.core.sparse import thirds
 from starpos.detection.background import Background
 from starpos.detection.discs import FLAT, FULLEST, LONGEST, MOST, columns_of, with_discs
 from starpos.frames.stars import SATURATED
@@ -41,12 +42,19 @@ def with_clipped(
     saturated = (stars["flags"] & SATURATED) != 0
     told = np.sqrt(np.maximum(stars["chi2"], 1.0)) < TOLD * stars["snr"]
     told |= ~saturated & (stars["chi2"] < STRANGE)
-    level, top = background.near(x, y)[0].mean(1), _tops(plane, x, y)
+    # the third highest pixel, because hot ones may exceed saturation
+    level, top = background.near(x, y)[0].mean(1), thirds(plane, x, y)
     sky = background.typical[0]
-    peaks, places = np.stack([x, y], 1), np.stack([stars["x"], stars["y"]], 1)
     lost = top - sky > FLAT * (top.max() - sky)
-    lost[lost] = ~_near(places[told], peaks[lost])
-    lost |= _near(places[saturated & ~told], peaks)
+    at_x, at_y, own_x, own_y, untold = (
+        x.astype(float),
+        y.astype(float),
+        stars["x"],
+        stars["y"],
+        saturated & ~told,
+    )
+    lost[lost] = ~any_near(own_x[told], own_y[told], at_x[lost], at_y[lost], NEAR)
+    lost |= any_near(own_x[untold], own_y[untold], at_x, at_y, NEAR)
     # what stands on a roof is the roof's
     lost = np.flatnonzero(lost & (top - level > OWN * (top - sky)))[:MOST]
     reach = max(LEAST_REACH, round(REACH * fwhm_px))
@@ -59,25 +67,9 @@ def with_clipped(
     if not clipped:
         return stars
     discs = columns_of(clipped, fwhm_px, float(top.max()) - sky)
-    apart = np.hypot(places[:, :1] - discs["x"], places[:, 1:] - discs["y"])
+    apart = np.hypot(own_x[:, None] - discs["x"], own_y[:, None] - discs["y"])
     known = told | ~(apart < discs["radius"]).any(1)
     return with_discs({name: column[known] for name, column in stars.items()}, discs, fwhm_px)
-
-
-def _tops(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The third highest (N,) of the nine pixels around x, y (N,) int, because hot ones may exceed saturation."""
-    rows, columns = (
-        np.clip(v[:, None] + np.arange(-1, 2), 0, n - 1) for v, n in zip((y, x), plane.shape, strict=True)
-    )
-    around = plane[rows[:, :, None], columns[:, None, :]].reshape(len(x), 9)
-    return np.partition(around, -3, axis=1)[:, -3].astype(float)
-
-
-def _near(places: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Whether one of the places (M, 2) is near each of the peaks (N, 2), px."""
-    if not (len(places) and len(peaks)):
-        return np.zeros(len(peaks), bool)
-    return spatial.cKDTree(places).query(peaks, distance_upper_bound=NEAR)[0] < NEAR
 
 
 def _image(

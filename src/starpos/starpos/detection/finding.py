@@ -10,7 +10,7 @@ from scipy import sparse, spatial
 
 from starpos.core.background import between
 from starpos.core.mesh import above
-from starpos.core.neighbours import near_pairs
+from starpos.core.neighbours import near_pairs, nearest
 from starpos.core.order import median
 from starpos.core.peaks import peaks, smoothed
 from starpos.detection.background import Background
@@ -106,13 +106,11 @@ def _no_dots(plane: np.ndarray, background: Background, peaks: Peaks) -> Peaks:
 
 def _crowded(peaks: Peaks) -> bool:
     """Whether most of the brightest peaks have a similar one within CROWD px."""
-    points = np.stack([peaks.x, peaks.y], 1)
-    if len(points) < 2:
+    if len(peaks.x) < 2:
         return False
-    leaders = points[:LEADERS]
-    alike = points[peaks.height > 0.5 * peaks.height[len(leaders) - 1]]
-    nearest = spatial.cKDTree(alike).query(leaders, [2])[0].ravel()
-    return median(nearest) < CROWD
+    leaders = min(len(peaks.x), LEADERS)
+    alike = peaks.height > 0.5 * peaks.height[leaders - 1]
+    return median(nearest(peaks.x[alike].astype(float), peaks.y[alike].astype(float), leaders)) < CROWD
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
@@ -239,10 +237,9 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     if not scatter > 1:
         return 1.0, 1.0
     # a roof or a tree that covers a part of the frame must not raise the threshold elsewhere
-    columns = min(PARTS, score.shape[1])
-    parts = np.array_split(score.reshape(len(tops), -1, score.shape[1]), columns, axis=2)
-    sides = [_low_side(part.reshape(len(tops), -1)) for part in parts]
-    part_low, part_below, part_usual = np.concatenate(sides, axis=1)
+    part_low, part_below, part_usual = np.concatenate(
+        [_low_side(p) for p in _parts(score, len(tops))], axis=1
+    )
     typical = median(np.minimum(part_usual - part_below, part_below - part_low))
     typical = typical if score.size > SAMPLES * part_low.size else np.inf
     whole = tied = float(min(scatter, UNEVENEST * typical / kernel.norm))
@@ -255,8 +252,20 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     return tied, max(1.0, whole / tied)
 
 
+def _parts(score: np.ndarray, down: int) -> list[np.ndarray]:
+    """Scores (rows, columns) in parts, so many below each other and up to PARTS side by side: (parts, N) of each size."""
+    across = min(PARTS, score.shape[1])
+    width, wider = divmod(score.shape[1], across)
+    sizes = (slice(wider * (width + 1)), wider), (slice(wider * (width + 1), None), across - wider)
+    return [
+        score[:, some].reshape(down, len(score) // down, count, -1).swapaxes(1, 2).reshape(down * count, -1)
+        for some, count in sizes
+        if count
+    ]
+
+
 def _low_side(score: np.ndarray) -> np.ndarray:
-    """Quantiles (3, ...) of scores (..., N) at -2, -1 and 0 sigma of a Gaussian.
+    """Quantiles (3,) or (3, R) of scores (N,) or (R, N) at -2, -1 and 0 sigma of a Gaussian.
 
     np.quantile has the same: it takes longer to begin.
     """
@@ -265,7 +274,7 @@ def _low_side(score: np.ndarray) -> np.ndarray:
     low = place.astype(int)
     above_it = ordered[..., np.minimum(low + 1, ordered.shape[-1] - 1)]
     ordered = ordered[..., low]
-    return np.moveaxis(ordered + (place - low) * (above_it - ordered), -1, 0)
+    return (ordered + (place - low) * (above_it - ordered)).T
 
 
 def _above_tail(height: np.ndarray, threshold: float) -> float:

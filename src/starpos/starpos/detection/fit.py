@@ -5,7 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core.fit import Rules, fitted
+from starpos.core.fit import fitted
+from starpos.core.rules import Rules
 from starpos.detection.psf import FieldPsf
 from starpos.detection.stamps import Stamps
 
@@ -13,6 +14,8 @@ from starpos.detection.stamps import Stamps
 OUTLIER, FAINT = 6.0, 0.15
 # Pixels within so many widths of the star are fitted; farther out there are only noise and neighbours.
 FIT_WIDTHS = 4.0
+# Sigmas that a fit may be from the place that more rounds would find: of 26 000 simulated stars none was 0.01 off.
+SETTLED = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,14 @@ class Response:
     def rules(self) -> Rules:
         """The rules by which the compiled core fits stars."""
         return Rules(
-            self.gain, self.colour_spread, self.dn_per_photon, self.misfit, FIT_WIDTHS, OUTLIER, FAINT
+            self.gain,
+            self.colour_spread,
+            self.dn_per_photon,
+            self.misfit,
+            FIT_WIDTHS,
+            OUTLIER,
+            FAINT,
+            SETTLED,
         )
 
     def variance(self, noise: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -54,7 +64,7 @@ class Fit:
     chi2              (N,) per degree of freedom
     pixels            (N,) how many pixels took part in the fit
     residual          (N, S, S) DN: signal minus model
-    model             (N, S, S) DN
+    model             (N, S, S) DN; 0 beyond FIT_WIDTHS, unless the whole is asked for
     used              (N, S, S) bool: pixels that took part in the fit
     outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
     leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise; empty if not
@@ -87,8 +97,11 @@ def fit_stars(
     response: Response,
     rounds: int = 5,
     leverage: bool = False,
+    whole: bool = False,
 ) -> Fit:
-    """Fit stars by Gauss-Newton, starting at the points x, y (N,) px; the leverage of pixels is told if it is asked for.
+    """Fit stars by Gauss-Newton, starting at the points x, y (N,) px.
+
+    The leverage of pixels is told if it is asked for, and so is the model of the whole stamp.
 
     On a mosaic nothing is interpolated: each pixel is compared with the PSF at its own place, times the gain of its
     colour. Each star's four gains are fitted too, held near the frame's by colour_spread, so that neither the mosaic's
@@ -98,7 +111,7 @@ def fit_stars(
     local = psf.at(x, y)
     columns = fitted(
         stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, np.stack([x, y], 1), local.axes,
-        local.series, response.rules, rounds, leverage,
+        local.series, response.rules, rounds, leverage, whole,
     )  # fmt: skip
     return Fit(**dict(zip(COLUMNS, columns, strict=True)))
 

@@ -9,11 +9,12 @@ from scipy import spatial
 
 from starpos.core.moments import own_shapes
 from starpos.core.neighbours import near_pairs
-from starpos.core.noise import light_noise, of_phases, strangeness
-from starpos.core.order import quantile
+from starpos.core.noise import light_noise, of_phases, strangeness, unit_light
+from starpos.core.order import quantile, row_medians
+from starpos.core.shapes import squared_widths
 from starpos.core.stamps import greyed
 from starpos.detection.background import Background
-from starpos.detection.fit import Fit, Response, fit_stars, gains_at
+from starpos.detection.fit import Fit, Response, fit_stars
 from starpos.detection.psf import BROAD, NARROW, FieldPsf, Psf, gaussian
 from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
 from starpos.detection.shape import (
@@ -144,7 +145,7 @@ def _teachers(
         stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
     shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
     # a shape as wide as the stamps is the sky's
-    if shape is not None and np.linalg.eigvalsh(shape)[0] > 0.9 * (stamps.reach / 2) ** 2:
+    if shape is not None and squared_widths(shape[None])[0, 0] > 0.9 * (stamps.reach / 2) ** 2:
         shape = None
     if shape is None or len(stamps.x) < ALIKE:
         around = _highest(plane, background, x[clear], y[clear], saturation)
@@ -158,9 +159,10 @@ def _teachers(
     window = window_for(shape)
     mass, _, seen = moments(smooth, x, y, window)
     ratio = np.nan_to_num(psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T)
-    extremes = np.linalg.eigvalsh(ratio)
+    extremes = squared_widths(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
-    weight = np.clip(mass / np.median(stamps.noise, axis=(1, 2)), 1, LOUDEST) ** 2
+    noise = row_medians(stamps.noise.reshape(len(x), -1))
+    weight = np.clip(mass / noise, 1, LOUDEST) ** 2
     psf = widened(psf, x[near], y[near], ratio[near], weight[near])
     widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
     alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
@@ -249,7 +251,7 @@ def respond(
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
-        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)[0], before)
+        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size), before)
     photon, misfit = light_noise(
         stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, np.flatnonzero(sound), before.dn_per_photon,
         before.misfit, DEVIANT,
@@ -283,12 +285,11 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
 
 def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Response, terms: Terms) -> Psf:
     """Refine the PSF once, by the sound stars of a fit, which are those in stamps."""
-    x, y, flux = fit.x[sound], fit.y[sound], fit.flux[sound].astype(np.float32)
-    scale = gains_at(fit.gains[sound], stamps.phase) * flux[:, None, None]
-    left, top = stamps.corner(x, y)
-    light = fit.model[sound]
+    x, y = fit.x[sound], fit.y[sound]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
-    variance = response.variance(stamps.noise, light) + (0.02 * light) ** 2
-    weight = fit.used[sound] * scale**2 / variance
-    brightness, phases = stamps.signal / scale, len(response.gain)
-    return refine(psf, x, y, left, top, brightness, weight.astype(np.float32), stamps.phase, phases, terms)
+    brightness, weight = unit_light(
+        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, np.flatnonzero(sound), fit.flux, fit.gains,
+        response.dn_per_photon, response.misfit**2 + 0.02**2,
+    )  # fmt: skip
+    left, top = stamps.corner(x, y)
+    return refine(psf, x, y, left, top, brightness, weight, stamps.phase, len(response.gain), terms)

@@ -208,9 +208,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - picture.halvings) // pixels)
-    chunks = [slice(i, min(i + chunk, most)) for i in range(0, most, chunk)]
-    parts = [measure(plane, background, x[c], y[c], lesson, saturation, settings.min_snr) for c in chunks]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    columns = measure(plane, background, x[:most], y[:most], lesson, saturation, settings.min_snr, chunk)
     columns = resolve(columns, lesson.psf)
     fwhm_px = lesson.psf.fwhm_px
     columns = with_discs(columns, find_discs(plane, background, fwhm_px, peaks.highest), fwhm_px)

@@ -7,6 +7,7 @@ series (Refregier 2003, MNRAS 338, 35) along the principal axes of the mean star
 units of the star's widths. The series has no term of first order, so its centre is the centroid of all light.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from starpos.core.field import local, monomials, shapes_of
 from starpos.core.psf import evaluated
-from starpos.core.shapes import clipped
+from starpos.core.shapes import clipped, squared_widths
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
@@ -43,10 +44,8 @@ class LocalPsf:
         """Covariances (N, 2, 2) px2 of the Gaussians that the series multiply."""
         return shapes_of(self.axes)
 
-    def evaluate(
-        self, left: np.ndarray, top: np.ndarray, size: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The PSF and its derivatives by the star's x and y at the pixels of N stamps: three arrays (N, size, size).
+    def evaluate(self, left: np.ndarray, top: np.ndarray, size: int) -> np.ndarray:
+        """The PSF at the pixels of N stamps (N, size, size).
 
         left, top (N,) px: of each stamp's first column and row from its star's centre.
         """
@@ -67,7 +66,8 @@ class FieldPsf(ABC):
     @property
     def fwhm_px(self) -> float:
         """Geometric mean over the two axes of the mean star's full width at half maximum."""
-        return float(np.sqrt(8 * np.log(2)) * abs(np.linalg.det(self.axes)) ** -0.5)
+        (a, b), (c, d) = self.axes.tolist()
+        return math.sqrt(8 * math.log(2)) * abs(a * d - b * c) ** -0.5
 
     @abstractmethod
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
@@ -112,7 +112,7 @@ class Psf(FieldPsf):
         # where the widths are the same everywhere, one place tells them
         quarters = QUARTERS if len(self.widths) > 1 else QUARTERS[:1]
         x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-        return float(np.linalg.eigvalsh(self.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max())
+        return float(squared_widths(self.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max())
 
     def monomials(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Monomials (N, 6) of x, y scaled to -1..1 over the box; all but the first have zero mean over it."""

@@ -54,7 +54,7 @@ def with_trail(
 
     def fitted(psf: FieldPsf) -> Fit:
         start = stamps.x.astype(float), stamps.y.astype(float)
-        return fit_stars(stamps, psf, *start, lesson.response, ROUNDS, leverage=True)
+        return fit_stars(stamps, psf, *start, lesson.response, ROUNDS, leverage=True, whole=True)
 
     fits = [fitted(lesson.psf), *map(fitted, tried)]
     for factor in FINER:

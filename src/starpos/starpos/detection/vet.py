@@ -4,9 +4,10 @@
 import numpy as np
 
 from starpos.core.neighbours import near_pairs
+from starpos.core.shapes import squared_widths
 from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
-from starpos.detection.blend import with_companions
+from starpos.detection.blend import Fitted, joined, pairs_among, rows_of, surprising
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
 from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import FieldPsf
@@ -45,10 +46,12 @@ def measure(
     lesson: Lesson,
     saturation: float,
     min_snr: float,
+    chunk: int,
 ) -> dict[str, np.ndarray]:
     """Measure the stars among the peaks x, y (N,) int px: columns x, y, flux, snr, covariance, flags, chi2, wide.
 
-    The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have.
+    The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have, and
+    chunk how many are measured at once.
     """
     psf = lesson.psf
 
@@ -57,11 +60,49 @@ def measure(
         level(stamps.signal, stamps.noise, SIGMA_PER_MAD, RAISED, UNEVEN, OWN)
         return stamps, _take_spikes(stamps, lesson)
 
-    stamps, spike = cut_at(x, y)
-    shape = psf.shapes_at(x, y)
-    x, y = centroid(grey(stamps, background)[0], shape)
-    fit = fit_stars(stamps, psf, x, y, lesson.response)
-    stamps, spike, fit = with_companions(stamps, spike, fit, psf, lesson.response, cut_at)
+    def measured(stars: Fitted, wanted: np.ndarray) -> dict[str, np.ndarray]:
+        return _columns(*stars, background, lesson, min_snr, wanted)
+
+    def with_companions(odd: list[Fitted]) -> list[dict[str, np.ndarray]]:
+        stamps, spikes, fits = zip(*odd, strict=True)
+        stars: Fitted = joined(stamps), np.concatenate(spikes), joined(fits)
+        paired, pairs = pairs_among(stars, psf, lesson.response, cut_at)
+        alone = measured(stars, ~paired)
+        return [alone] if pairs is None else [alone, measured(pairs, np.ones(len(pairs[1]), bool))]
+
+    parts: list[dict[str, np.ndarray]] = []
+    # those of several chunks together, because most chunks have a few
+    odd: list[Fitted] = []
+    for first in range(0, len(x), chunk):
+        peak = x[first : first + chunk], y[first : first + chunk]
+        stamps, spike = cut_at(*peak)
+        begin = centroid(grey(stamps, background)[0], psf.shapes_at(*peak))
+        fit = fit_stars(stamps, psf, *begin, lesson.response)
+        strange = surprising(stamps, fit)
+        rows = np.flatnonzero(strange)
+        if len(rows):
+            odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
+        parts.append(measured((stamps, spike, fit), ~strange))
+        if odd and (sum(len(star[1]) for star in odd) >= chunk or first + chunk >= len(x)):
+            parts += with_companions(odd)
+            odd = []
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _columns(
+    stamps: Stamps,
+    spike: np.ndarray,
+    fit: Fit,
+    background: Background,
+    lesson: Lesson,
+    min_snr: float,
+    wanted: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """The columns that `measure` explains of fitted stars, of those that are wanted (N,) and are stars.
+
+    spike (N, S, S): which pixels have the mean of their neighbours. The stamps' light is changed.
+    """
+    psf = lesson.psf
     local = psf.at(fit.x, fit.y)
     matched, foreign, full, edge = looks(
         stamps.signal, stamps.noise, stamps.good, stamps.full, spike, fit.residual, fit.model, fit.used, fit.outlier,
@@ -78,14 +119,14 @@ def measure(
     with np.errstate(invalid="ignore", divide="ignore"):
         snr = fit.flux / fit.flux_sigma
         c = fit.covariance * misfit[:, None, None]
-        sound = np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
+        sound = wanted & np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
         sound &= (fit.flux > 0) & (matched >= min_snr) & ~dot
         sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
         sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
         slack = 3 / matched
         # through a window wider than the star, noise changes the width more
-        loose = slack * np.sqrt(np.linalg.det(window) / np.linalg.det(shape))
+        loose = slack * np.sqrt(squared_widths(window).prod(1) / squared_widths(shape).prod(1))
         wide = (widths[:, 1] > WIDE + loose - slack) & ~full
         sound &= full | (widths[:, 0] > 0.45 - loose)
         sound &= ~wide | ((widths[:, 0] < NARROW) & (matched > CERTAIN))
@@ -106,7 +147,7 @@ def _misfit(fit: Fit) -> np.ndarray:
 def _take_spikes(stamps: Stamps, lesson: Lesson) -> np.ndarray:
     """Pixels (N, S, S) much brighter than their neighbours, as in no star: the stamps have the mean of these there."""
     beside = np.full(len(stamps.x), -1.0)
-    star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)[0]
+    star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)
     top, four = star[:, 1, 1], (star[:, 0, 1] + star[:, 2, 1] + star[:, 1, 0] + star[:, 1, 2]) * 0.25
     # at least 1, because a ring has a dark middle
     sharpest = SPIKE * np.maximum(1.0, top / np.maximum(four, 1e-3 * np.abs(top))).astype(np.float32)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy import ndimage, spatial
 
-from starpos.core.neighbours import near_pairs
-from starpos.core.noise import of_phases
+from starpos.core.neighbours import any_near, near_pairs, nearest
+from starpos.core.noise import of_phases, unit_light
 from starpos.core.stamps import greyed
 from starpos.core.vetting import brightest_left, counted
 
@@ -25,6 +25,54 @@ def test_what_is_no_number_is_near_nothing():
     assert near_pairs(x, y, 3.0).tolist() == [[0, 3]]
     with pytest.raises(ValueError, match="4 columns and 3 rows"):
         near_pairs(x, y[:3], 3.0)
+
+
+@pytest.mark.parametrize("number", [0, 1, 300])
+def test_points_near_others_are_those_of_distances(number, rng):
+    # whole px: many are exactly as far as the reach, which is not near
+    (x, y), others = (
+        rng.integers(0, 60, (2, number)).astype(float),
+        rng.integers(0, 60, (2, 200)).astype(float),
+    )
+    y[number // 2 : number // 2 + 3] = np.nan
+    apart = np.hypot(x[:, None] - others[0], y[:, None] - others[1])
+    np.testing.assert_array_equal(any_near(x, y, *others, 5.0), (apart < 5).any(0))
+    with pytest.raises(ValueError, match="as many"):
+        any_near(x, y, others[0], others[1, 1:], 5.0)
+
+
+@pytest.mark.parametrize(("number", "count"), [(0, 0), (1, 1), (2, 1), (300, 100)])
+def test_the_nearest_point_is_that_of_distances(number, count, rng):
+    x, y = rng.integers(0, 99, (2, number)).astype(float)
+    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    np.fill_diagonal(apart, np.inf)
+    np.testing.assert_allclose(nearest(x, y, count), apart.min(1, initial=np.inf)[:count], rtol=1e-14)
+    with pytest.raises(ValueError, match="as many"):
+        nearest(x, y, number + 1)
+
+
+@pytest.mark.parametrize("phases", [1, 4])
+def test_light_over_fluxes_and_gains_is_that_of_plain_sums(phases, rng):
+    rows, shape = np.array([0, 2, 3]), (3, 5, 5)
+    signal, model = rng.normal(9, 9, shape).astype(np.float32), rng.normal(9, 9, (5, 5, 5)).astype(np.float32)
+    noise, phase = (
+        rng.uniform(1, 2, shape).astype(np.float32),
+        rng.integers(0, phases, shape).astype(np.uint8),
+    )
+    used, flux, gains = (
+        rng.random(model.shape) < 0.7,
+        rng.uniform(9, 99, 5),
+        rng.uniform(0.5, 1.5, (5, phases)),
+    )
+    scale = flux[rows, None, None] * gains[rows[:, None, None], phase]
+    light = np.maximum(model[rows].astype(float), 0)
+    weight = used[rows] * scale**2 / (noise.astype(float) ** 2 + 0.3 * light + 0.01 * light**2)
+    given = signal, noise, phase, model, used, rows, flux, gains, 0.3, 0.01
+    for found, plain in zip(unit_light(*given), (signal / scale, weight), strict=True):
+        np.testing.assert_allclose(found, plain, rtol=1e-5)
+    for which, wrong in ((2, phase + 4), (5, rows + 2), (6, flux[1:]), (3, model[:, 1:].copy())):
+        with pytest.raises(ValueError, match=r"needed|phase|as the model"):
+            unit_light(*given[:which], wrong.astype(given[which].dtype), *given[which + 1 :])
 
 
 def test_images_are_made_grey_as_by_two_convolutions(rng):

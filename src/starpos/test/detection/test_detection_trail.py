@@ -39,7 +39,7 @@ def test_the_psf_of_a_trail_is_the_star_that_moves_along_it(length):
     sigma = np.sqrt((FWHM / 2.3548) ** 2 + 1 / 12)
     left = np.array([-20.2])
     psf = trailed(sigma, Trail(middle_px=tuple(trail)), 100, 100)
-    value = psf.at(np.zeros(1), np.zeros(1)).evaluate(left, left, size)[0][0]
+    value = psf.at(np.zeros(1), np.zeros(1)).evaluate(left, left, size)[0]
     light = star((size, size), 20.2, 20.2, FWHM, trail)
     assert value.sum() == pytest.approx(1, abs=1e-3)
     assert rms(value - light) < 0.05 * rms(light)

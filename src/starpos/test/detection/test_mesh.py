@@ -7,9 +7,9 @@ from scipy import ndimage
 
 from starpos.core.background import between, near
 from starpos.core.mesh import above, evened
-from starpos.core.order import median, quantile
+from starpos.core.order import median, quantile, row_medians
 from starpos.core.peaks import peaks, smoothed
-from starpos.core.sparse import any_flat, bright_squares, third_highest
+from starpos.core.sparse import any_flat, bright_squares, third_highest, thirds
 from starpos.detection.finding import SHARP, WIDE
 
 
@@ -97,6 +97,15 @@ def test_medians_and_quantiles_are_those_of_numpy(n, rng):
     assert np.isnan(median(np.append(values, np.nan)))
 
 
+@pytest.mark.parametrize("n", [1, 2, 9, 100])
+def test_medians_of_rows_are_those_of_numpy(n, rng):
+    values = rng.normal(0, 1, (7, n)).astype(np.float32)
+    values[2:4] = values[2:4, :1]
+    np.testing.assert_allclose(row_medians(values), np.median(values.astype(float), axis=1), atol=1e-15)
+    with pytest.raises(ValueError, match="no median"):
+        row_medians(values[:, :0])
+
+
 def test_nothing_has_no_median_and_no_quantile():
     assert np.isnan(median(np.zeros(0)))
     with pytest.raises(ValueError, match="there is none"):
@@ -159,3 +168,16 @@ def test_the_limit_of_peaks_is_linear_between_cells_and_another_in_each_strip(rn
     np.testing.assert_array_equal(highest, plane.max(1))
     with pytest.raises(ValueError, match="2 strips"):
         peaks(plane, np.array([1, 0], np.float32), 1, cells, 9, 0, 20)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_the_third_highest_of_nine_pixels_is_that_of_a_sorted_square(kind, rng):
+    """On the frame's edge the square goes on as the edge."""
+    for most in (3, 200):
+        plane = rng.integers(0, most, (6, 9)).astype(kind)
+        y, x = (v.ravel() for v in np.indices(plane.shape))
+        around = np.pad(plane, 1, mode="edge")
+        squares = [np.sort(around[j : j + 3, i : i + 3], axis=None)[-3] for i, j in zip(x, y, strict=True)]
+        np.testing.assert_array_equal(thirds(plane, x, y), squares)
+    with pytest.raises(ValueError, match="as many"):
+        thirds(plane, x, y[1:])

@@ -6,7 +6,7 @@ import pytest
 from test_fit import DN_PER_PHOTON, MISFIT, SIZE, SPREAD, plain_psf, psfs, rules, scaled
 
 from starpos.core.pairs import fitted_pairs
-from starpos.detection.fit import FIT_WIDTHS
+from starpos.detection.fit import FIT_WIDTHS, SETTLED
 
 LEAST = 0.05
 
@@ -101,7 +101,6 @@ def pairs_of_stars(rng, n, gain):
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
 @pytest.mark.parametrize("rounds", [1, 3, 12])
 def test_pairs_are_those_of_plain_sums(gain, rounds, rng):
-    """It ends early where nothing moves any more, which leaves less than 1e-8 px."""
     given = pairs_of_stars(rng, 12, gain)
     found = fitted_pairs(*given, rules(gain), rounds, LEAST)
     expected = plain_pairs(*given, gain, rounds)
@@ -109,6 +108,19 @@ def test_pairs_are_those_of_plain_sums(gain, rounds, rng):
         np.testing.assert_allclose(found[k], expected[k], rtol=1e-7, atol=1e-8)
     np.testing.assert_allclose(found[6], expected[6], rtol=1e-5, atol=1e-3)
     np.testing.assert_array_equal(found[7], expected[7])
+
+
+@pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
+def test_settled_pairs_are_those_of_many_rounds(gain, rng):
+    """To a hundredth of a sigma; and they are not made in all rounds."""
+    given = pairs_of_stars(rng, 40, gain)
+    found = fitted_pairs(*given, rules(gain, SETTLED), 20, LEAST)
+    many = fitted_pairs(*given, rules(gain), 20, LEAST)
+    sigma = np.sqrt(np.einsum("knii->kni", many[5]))
+    off = np.abs(np.stack(found[:2], -1) - np.stack(many[:2], -1)) / sigma
+    assert 1e-9 < off.max() < 0.01
+    np.testing.assert_allclose(found[2], many[2], rtol=1e-4)
+    np.testing.assert_allclose(found[8], many[8], rtol=0.01)
 
 
 def test_two_stars_at_one_place_have_no_errors(rng):

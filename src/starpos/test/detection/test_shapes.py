@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.core.shapes import before, clipped, inverted, relative, through
+from starpos.core.shapes import before, clipped, inverted, relative, squared_widths, through
 
 N = 30
 
@@ -23,6 +23,10 @@ def test_limits_and_powers_are_those_of_eigenvalues(shapes):
     for least, most, exponent in ((1.0, np.inf, 1.0), (0.25, 6.0, -0.5), (0.0, 0.5, 2.0)):
         expected = (vectors * np.clip(values, least, most)[:, None] ** exponent) @ vectors.transpose(0, 2, 1)
         np.testing.assert_allclose(clipped(shapes[0], least, most, exponent), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_squared_widths_are_those_of_a_library(shapes):
+    np.testing.assert_allclose(squared_widths(shapes[0]), np.linalg.eigvalsh(shapes[0]), rtol=1e-9)
 
 
 def test_inverses_are_those_of_a_library(shapes):
