@@ -26,6 +26,7 @@ from starpos_testing.voyages import (
     TACTICAL,
     MadeVoyage,
     made,
+    swinging_wind,
     turbulent_wind,
     walking_wind,
 )
@@ -37,6 +38,8 @@ VEHICLES = "rover", "ship", "drone", "parked"
 WINDS = {
     "drone in a changing wind": walking_wind(LAWS["drone"].drift_walk),
     "drone in turbulence of 0.7 m/s": turbulent_wind(0.7),
+    "drone, wind swings in 20 minutes": swinging_wind(0.3, 1200),
+    "drone, wind swings in 40 minutes": swinging_wind(0.3, 2400),
 }
 CADENCE_S, RATE_HZ = 2.0, 50.0
 # of a voyage in the table of bench.py
@@ -75,7 +78,7 @@ def scores(record: MadeVoyage, voyage: Voyage) -> np.ndarray:
 def scored(vehicle: str, grade: str, seconds: float, seed: int) -> tuple[np.ndarray, float]:
     """The scores of one voyage, and its CPU time in s."""
     model, wind = GRADES[grade], WINDS.get(vehicle)
-    vehicle = vehicle.split()[0]
+    vehicle = vehicle.split()[0].rstrip(",")
     record = made(
         vehicle, seconds, 1000 + seed, model=model, rate_hz=RATE_HZ, cadence_s=CADENCE_S, more_wind=wind
     )

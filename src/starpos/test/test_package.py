@@ -26,6 +26,13 @@ def test_the_metadata_is_whole():
     assert 'license_files=["LICENSES/*"]' in (PACKAGE / "setup.py").read_text()
 
 
+def test_a_wheel_is_tested_by_what_is_there():
+    text = (PACKAGE / "pyproject.toml").read_text()
+    places = {"project": REPOSITORY, "package": PACKAGE}
+    named = [places[place] / path for place, path in re.findall(r"\{(project|package)\}/([\w/.]+)", text)]
+    assert len(named) > 1 and [path for path in named if not path.exists()] == []
+
+
 def test_who_made_the_data_is_said():
     said = (REPOSITORY / "REUSE.toml").read_text()
     for data in PACKAGE.glob("starpos/*/data"):

@@ -117,6 +117,16 @@ def turbulent_wind(stddev, outer_s=600.0, terms=160):
     return way
 
 
+def swinging_wind(stddev, period_s):
+    """A wind that swings back and forth in so many seconds, by an amplitude of that standard deviation, m/s; likewise."""
+
+    def way(rng, seconds):
+        rate, phase, amplitude = 2 * np.pi / period_s, rng.uniform(0, 2 * np.pi), rng.normal(0, stddev)
+        return lambda t: amplitude / rate * (np.sin(rate * t + phase) - np.sin(phase))
+
+    return way
+
+
 def path_of(kind, seconds, rng, more_wind=None):
     """Functions of time: displacement (N, 3) in m east, north, up, and roll, pitch, yaw (N, 3) in rad (ROS)."""
     begin = rng.uniform(0, 2 * np.pi)
@@ -194,7 +204,7 @@ def made(
 ):
     """Record a voyage; without `errors` the readings are exact, the mount as believed and the stars where they are.
 
-    more_wind: of a drone, an axis, beside a steady one: `walking_wind`, `turbulent_wind`.
+    more_wind: of a drone, an axis, beside a steady one: `walking_wind`, `turbulent_wind`, `swinging_wind`.
     """
     rng, on = np.random.default_rng(seed), float(errors)
     displacement, angles = path_of(kind, seconds, rng, more_wind)

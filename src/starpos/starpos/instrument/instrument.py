@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Description of the instrument: its optics, how its parts are fixed to each other, and how well that is known."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -33,7 +34,7 @@ MOST_RESPONSE = 0.5
 _ideal = lru_cache(maxsize=4)(Camera.from_focal)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration:
     """A3, how well it is known, and when and how it was found; InstrumentError for impossible values.
 
@@ -53,8 +54,8 @@ class Calibration:
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     covariance_arcsec2: tuple = tuple(map(tuple, np.diag(UNKNOWN_ARCSEC) ** 2))
     remounted_arcsec: float = 0.0
-    utc_unix_s: float = float("nan")
-    temperature_c: float = float("nan")
+    utc_unix_s: float = math.nan
+    temperature_c: float = math.nan
     tilt_deg: tuple[float, ...] = (0.0, 0.0)
     frames: int = 0
     valid_days: float = float("inf")
@@ -101,6 +102,20 @@ class Calibration:
             )
         if not self.valid_days > 0:
             raise InstrumentError(f"valid_days is {self.valid_days}: must be positive")
+        for name in ("utc_unix_s", "temperature_c"):
+            if math.isnan(getattr(self, name)):
+                # the one that is found equal to itself, in sequences
+                object.__setattr__(self, name, math.nan)
+
+    def _all(self) -> tuple:
+        return tuple(getattr(self, f.name) for f in fields(self))
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all is equal, what is unknown too: Python 3.13's dataclasses with a NaN are unlike themselves."""
+        return self._all() == other._all() if isinstance(other, Calibration) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._all())
 
     def _check_response(self) -> None:
         """Raise InstrumentError for coefficients of a response that no sensor has."""

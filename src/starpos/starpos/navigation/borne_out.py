@@ -66,8 +66,8 @@ def _sideways(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
 class Means:
     """D combinations of the means of velocities across the nose, independent of each other.
 
-    values (D,): which white noise of 1 m/s at the nodes makes scatter by 1.  walks (D,): variances that a drift adds which
-    walks by 1 m/s/sqrt(s).  swings (D, S): what drifts add whose change swings by 1 m/s2.
+    values (D,): which white noise of 1 m/s at the nodes makes scatter by 1.  walks (D,): variances that a drift adds
+    which walks by 1 m/s/sqrt(s).  swings (D, S): what drifts add whose change swings by 1 m/s2.
     """
 
     values: np.ndarray

@@ -143,3 +143,11 @@ def test_focal_length_in_pixels():
 def test_a_calibration_of_other_than_three_numbers_is_refused(wrong):
     with pytest.raises(InstrumentError, match="is three numbers, one for each axis: give three"):
         Calibration.of(*wrong)
+
+
+def test_what_is_unknown_of_two_calibrations_makes_them_no_different():
+    """From Python 3.13 on a dataclass compares field by field, and a NaN is unlike itself."""
+    unknown, also = Calibration(), Calibration(utc_unix_s=float("nan"), temperature_c=np.float64("nan"))
+    assert unknown == also and hash(unknown) == hash(also) and Instrument(1.0) == Instrument(1.0)
+    assert unknown != replace(unknown, temperature_c=20.0) and unknown != replace(also, frames=1)
+    assert unknown != unknown.covariance_arcsec2
