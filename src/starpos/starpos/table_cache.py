@@ -35,7 +35,8 @@ def load_or_build(
 ) -> Table:
     """The table that `load` maps from a folder of the cache; built and kept there if there is none, or a broken one.
 
-    prefix: of the folder's name, KIND-FORMAT-; folders of other formats are removed.  what: is kept, for a warning.
+    prefix: of the folder's name, KIND-FORMAT-; folders of other formats are removed.
+    what: is kept, for a warning where it cannot be; '' for what is built soon enough to say nothing.
     """
     if (stored := load()) is not None:
         return stored
@@ -47,11 +48,12 @@ def load_or_build(
         try:
             _store(built, folder, prefix)
         except OSError as e:
-            warnings.warn(
-                f"{folder.parent}: {what} cannot be kept there ({e.strerror}), so that each start builds them again: "
-                "make the folder writable or set XDG_CACHE_HOME",
-                stacklevel=3,
-            )
+            if what:
+                warnings.warn(
+                    f"{folder.parent}: {what} cannot be kept there ({e.strerror}), so that each start builds them again: "
+                    "make the folder writable or set XDG_CACHE_HOME",
+                    stacklevel=3,
+                )
             return built
     return load() or built
 

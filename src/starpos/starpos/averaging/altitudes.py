@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.special import fdtri
 
 from starpos import rotation
 from starpos.averaging.average import SCATTER, Average
@@ -361,6 +360,11 @@ def _average(part: _Directions, answer: _Answer, frames: int) -> Average:
     )
 
 
+def two_and(free: int, share: float) -> float:
+    """Quantile of the F distribution with 2 and `free` degrees of freedom, which has a closed form."""
+    return free / 2 * float((1 - share) ** (-2 / free) - 1)
+
+
 def _excess(chi2: float, free: int) -> float:
     """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
 
@@ -369,7 +373,7 @@ def _excess(chi2: float, free: int) -> float:
     if free < 1 or chi2 <= free:
         return 0.0
     # the ellipse that holds a share WITHIN, over that of a known scatter
-    wide = fdtri(2, max(free, 2), WITHIN) / -np.log(1 - WITHIN)
+    wide = two_and(max(free, 2), WITHIN) / -np.log(1 - WITHIN)
     return float((chi2 / free - 1) * wide)
 
 

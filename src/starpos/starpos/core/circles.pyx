@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.triangles cimport CODES, angles_of, bin_of, code_of, is_counter_clockwise
+from starpos.core.triangles cimport CODES, bin_of, code_of, is_counter_clockwise
 
 
 cdef enum:
@@ -129,46 +129,50 @@ def binned(
 ):
     """The triangles of keys whose sides are longer than `shortest` and shorter than `longest`, rad, in bins of their shape.
 
-    v, rows  directions (S, 3) of all stars, and the rows (n,) of those that the keys number
+    v, rows  directions (S, 3) of all stars, and the rows (n,) of those that the keys number; keys ascend
 
     Returns corners (T, 3), counter_clockwise (T,), shape (T, 3) and bin_start, as `TriangleCatalogue` has them.
     """
-    cdef long long n = rows.shape[0], rest, a, b
+    cdef long long n = rows.shape[0], rest, a = 0, b
     cdef Py_ssize_t k, kept = 0
     cdef int i, j
     cdef int[3] corner
-    cdef double[3] side
-    cdef double[3] angle
+    cdef double[3] sine
+    cdef double[2] angle
     cdef double[3] per_unit
     cdef int[3] code
+    cdef double least = sin(shortest / 2), most = sin(longest / 2)
     per_unit[0], per_unit[1], per_unit[2] = CODES / (2 * M_PI / 3), CODES / (M_PI / 3), CODES / longest
-    of, codes = np.empty(len(keys), np.int32), np.empty((len(keys), 3), np.uint16)
-    corners_, turns_ = np.empty((len(keys), 3), np.int32), np.empty(len(keys), np.uint8)
+    of = np.empty(len(keys), np.int32)
+    made = np.empty((len(keys), 3), np.uint16), np.empty((len(keys), 3), np.int32), np.empty(len(keys), np.uint8)
     starts = np.zeros(bins + 1, np.int32)
     cdef int[::1] bin = of
-    cdef unsigned short[:, ::1] shape = codes
-    cdef int[:, ::1] corners = corners_
-    cdef unsigned char[::1] turns = turns_
+    cdef unsigned short[:, ::1] shape = made[0]
+    cdef int[:, ::1] corners = made[1]
+    cdef unsigned char[::1] turns = made[2]
     cdef int[::1] start = starts
     with nogil:
         for k in range(keys.shape[0]):
-            rest, a = keys[k] % (n * n), keys[k] // (n * n)
+            # keys rise
+            while keys[k] >= (a + 1) * n * n:
+                a += 1
+            rest = keys[k] - a * n * n
             b = rest // n
             corner[0], corner[1], corner[2] = rows[a], rows[b], rows[rest - b * n]
             for i in range(3):
-                side[i] = _side(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
+                sine[i] = _half_chord(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
             # the largest angle lies opposite the longest side
             for i in range(2):
                 for j in range(2 - i):
-                    if side[j] < side[j + 1]:
-                        side[j], side[j + 1] = side[j + 1], side[j]
+                    if sine[j] < sine[j + 1]:
+                        sine[j], sine[j + 1] = sine[j + 1], sine[j]
                         corner[j], corner[j + 1] = corner[j + 1], corner[j]
-            if not (side[0] < longest and side[2] > shortest):
+            if not (sine[0] < most and sine[2] > least):
                 continue
-            angles_of(side, angle)
+            _largest_and_smallest(sine, angle)
             code[0] = code_of(angle[0], M_PI / 3, per_unit[0])
-            code[1] = code_of(angle[2], 0.0, per_unit[1])
-            code[2] = code_of(side[0], 0.0, per_unit[2])
+            code[1] = code_of(angle[1], 0.0, per_unit[1])
+            code[2] = code_of(2 * asin(sine[0]), 0.0, per_unit[2])
             for i in range(3):
                 corners[kept, i], shape[kept, i] = corner[i], <unsigned short>code[i]
             turns[kept] = is_counter_clockwise(&v[corner[0], 0], &v[corner[1], 0], &v[corner[2], 0])
@@ -176,17 +180,40 @@ def binned(
             start[bin[kept] + 1] += 1
             kept += 1
     np.cumsum(starts, out=starts)
-    next_, order_ = starts[:bins].copy(), np.empty(kept, np.int32)
+    ordered = np.empty((kept, 3), np.uint16), np.empty((kept, 3), np.int32), np.empty(kept, np.uint8)
+    next_ = starts[:bins].copy()
     cdef int[::1] next = next_
-    cdef int[::1] order = order_
+    cdef unsigned short[:, ::1] shape_out = ordered[0]
+    cdef int[:, ::1] corners_out = ordered[1]
+    cdef unsigned char[::1] turns_out = ordered[2]
+    cdef Py_ssize_t to
     with nogil:
         for k in range(kept):
-            order[next[bin[k]]] = <int>k
+            to = next[bin[k]]
             next[bin[k]] += 1
-    return corners_[order_], turns_[order_].astype(bool), codes[order_], starts
+            for i in range(3):
+                corners_out[to, i], shape_out[to, i] = corners[k, i], shape[k, i]
+            turns_out[to] = turns[k]
+    return ordered[1], ordered[2].view(bool), ordered[0], starts
 
 
-cdef inline double _side(const double *a, const double *b) noexcept nogil:
-    """Angle between two directions, rad."""
+cdef inline double _half_chord(const double *a, const double *b) noexcept nogil:
+    """Half the chord between two directions, the sine of half the angle between them."""
     cdef double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2]
-    return 2 * asin(min(1.0, 0.5 * sqrt(x * x + y * y + z * z)))
+    return min(1.0, 0.5 * sqrt(x * x + y * y + z * z))
+
+
+cdef inline void _largest_and_smallest(const double *sine, double *angle) noexcept nogil:
+    """The largest and the smallest angle (2,) of a spherical triangle by the sines (3,) of its half sides, longest first.
+
+    As `angles_of`, by sums of half sides: without a sine of them, or an arc for each.
+    """
+    cdef double p = sine[0], q = sine[1], r = sine[2]
+    cdef double p_, q_, r_
+    p_, q_, r_ = sqrt(1 - p * p), sqrt(1 - q * q), sqrt(1 - r * r)
+    cdef double sum_sine = q * r_ + q_ * r, sum_cosine = q_ * r_ - q * r
+    cdef double off_sine = r * q_ - r_ * q, off_cosine = r_ * q_ + r * q
+    cdef double whole = sum_sine * p_ + sum_cosine * p, a = max(sum_sine * p_ - sum_cosine * p, 0.0)
+    cdef double b = max(p * off_cosine + p_ * off_sine, 0.0), c = max(p * off_cosine - p_ * off_sine, 0.0)
+    angle[0] = 2 * atan2(sqrt(b * c), sqrt(whole * a))
+    angle[1] = 2 * atan2(sqrt(a * b), sqrt(whole * c))

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+import erfa
 import numpy as np
 
 from starpos.errors import FrameError
@@ -33,6 +34,8 @@ KEYS = (
 # Time scales of TIMESYS that are read; UT1 would need tables.
 SCALES = ("utc", "tai", "tt", "tdb")
 MAX_EXPOSURE_S = 86400.0
+ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?))?Z?", re.ASCII)
+UNIX_EPOCH_JD, MJD_ZERO_JD, FARTHEST_MJD = 2440587.5, 2400000.5, 1e7
 # an MJD's last digit counts from here: below it lie the last bits of a double
 LEAST_MJD_STEP_S = 1e-3
 
@@ -95,26 +98,46 @@ def _rounding(start: Any) -> float:
 
 
 def _middle(start: Any, exposure_s: float, scale: str, what: str) -> float:
-    """Unix time of start (ISO 8601 text or an MJD) + exposure / 2, added in TAI: right across a leap second too."""
-    from astropy.utils import iers
+    """Unix time of start (ISO 8601 text or an MJD) + exposure / 2, added in TAI: right across a leap second too.
 
-    # before astropy.time is imported, which would download leap seconds
-    iers.conf.auto_download = False
-    from astropy.time import Time, TimeDelta
-
+    By ERFA alone: astropy's times, which are ERFA's, take as long to import as the rest of a program's start.
+    """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if isinstance(start, str):
-                begin = Time(start.strip().removesuffix("Z"), format="isot", scale=scale)
-            else:
-                begin = Time(float(start), format="mjd", scale=scale)
-            unix = float((begin.utc + TimeDelta(exposure_s / 2, format="sec")).unix)
-    except (ValueError, TypeError, OverflowError):
-        unix = np.nan
-    if not np.isfinite(unix):
-        raise FrameError(f"{what} is {start!r}, which is no time; write it like 2026-11-02T18:00:00.000.")
-    return unix
+            # of years whose leap seconds nobody knows
+            warnings.simplefilter("ignore", erfa.ErfaWarning)
+            day, part = _tai(*_day_of(start, scale), scale)
+            day, part = erfa.taiutc(day, part + exposure_s / 2 / DAY_S)
+    except (erfa.ErfaError, ValueError, TypeError, OverflowError):
+        raise FrameError(
+            f"{what} is {start!r}, which is no time; write it like 2026-11-02T18:00:00.000."
+        ) from None
+    return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)
+
+
+def _day_of(start: Any, scale: str) -> tuple[float, float]:
+    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD where that is UTC; ValueError for no time."""
+    if not isinstance(start, str):
+        if not abs(start := float(start)) < FARTHEST_MJD:
+            raise ValueError(start)
+        return MJD_ZERO_JD, start
+    found = ISO_TIME.fullmatch(start.strip())
+    if found is None:
+        raise ValueError(start)
+    *whole, seconds = found.groups()
+    return tuple(erfa.dtf2d(scale.upper(), *map(int, whole), float(seconds or 0)))
+
+
+def _tai(day: float, part: float, scale: str) -> tuple[float, float]:
+    """The Julian date in TAI of one in another scale, each in two parts."""
+    if scale == "tai":
+        return day, part
+    if scale == "utc":
+        return tuple(erfa.utctai(day, part))
+    if scale == "tdb":
+        # at the geocentre; the time of day has no part in it there
+        day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
+    return tuple(erfa.tttai(day, part))
 
 
 def shutter(header: Mapping, place: str) -> Shutter | None:

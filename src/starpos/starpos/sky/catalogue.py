@@ -19,7 +19,7 @@ from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
 from starpos.sky.zones import ZONES, cell_starts, rows_near
-from starpos.table_cache import rising
+from starpos.table_cache import cache_folder, load_or_build, mapped, rising
 from starpos.units import MAS, MAS_DEG
 
 # Julian year of ra and dec.
@@ -28,6 +28,8 @@ FORMAT = 3
 EPOCH_ZERO = 1900.0
 # A stored error is the smallest times CODE_STEP ** code.
 SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = 1.0, 0.1, 1.03
+# Names of the unpacked catalogue's folders in the cache, and kinds of numbers of its columns.
+PREFIX, KINDS = "stars-1-", "uiiiiuuuiii"
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
 Rows = np.ndarray | slice
@@ -280,5 +282,24 @@ def read(path: Path | str) -> Catalogue:
 
 @lru_cache(maxsize=2)
 def load_catalogue(path: str | None = None) -> Catalogue:
-    """The catalogue at `path`, else that named by STARPOS_CATALOGUE, else the committed one; each is read once."""
-    return read(path or os.environ.get("STARPOS_CATALOGUE") or COMMITTED)
+    """The catalogue at `path`, else that named by STARPOS_CATALOGUE, else the committed one; each is read once.
+
+    The committed one is kept unpacked in the cache, from which it is memory-mapped.
+    """
+    if (named := path or os.environ.get("STARPOS_CATALOGUE")) or not COMMITTED.is_file():
+        return read(named or COMMITTED)
+    about = COMMITTED.stat()
+    key = repr((str(COMMITTED), about.st_size, about.st_mtime_ns, FORMAT))
+    folder = cache_folder() / f"{PREFIX}{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    return load_or_build(folder, PREFIX, lambda: _map(folder), lambda: read(COMMITTED), "")
+
+
+def _map(folder: Path) -> Catalogue | None:
+    """The stored catalogue; None if it is missing or its columns do not fit together."""
+    found: Catalogue | None = mapped(Catalogue, folder, KINDS)
+    try:
+        if found is not None:
+            found.check()
+    except ValueError:
+        return None
+    return found

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import fdtri
 
-from starpos.averaging.altitudes import circle_of, place_of_circles
+from starpos.averaging.altitudes import circle_of, place_of_circles, two_and
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.fix.pointing import IDEAL
@@ -29,6 +30,11 @@ def circles(night, **instrument):
 
 def near_of(night):
     return np.radians(night.site.latitude_deg), np.radians(night.site.longitude_deg + 1)
+
+
+@pytest.mark.parametrize("free", [2, 3, 7, 60])
+def test_quantiles_are_those_of_scipy(free):
+    assert two_and(free, 0.95) == pytest.approx(fdtri(2, free, 0.95), rel=1e-12)
 
 
 def test_exact_elevations_give_the_exact_place(rng):

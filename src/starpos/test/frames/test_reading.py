@@ -3,6 +3,7 @@ import contextlib
 import os
 import struct
 import sys
+import warnings
 import zlib
 from datetime import datetime, timezone
 
@@ -10,10 +11,13 @@ import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.time import Time, TimeDelta
+from astropy.utils import iers
 
 from starpos.errors import LETTERS, FrameError, one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import Frame
+from starpos.frames.header import times
 from starpos.frames.reading import read_frame
 
 PIXELS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
@@ -85,6 +89,34 @@ def test_the_ways_a_header_can_tell_the_time_or_not(tmp_path, cards, middle):
 def test_an_mjd_of_few_decimals_has_the_error_of_its_last(tmp_path, mjd, sigma_s):
     frame = read_frame(write_fits(tmp_path / "a.fits", **{"MJD-OBS": mjd, "EXPTIME": 1}))
     assert frame.stamp_stddev_s == pytest.approx(sigma_s, rel=1e-6)
+
+
+HARD_TIMES = [
+    "2016-12-31T23:59:60.5", "2016-12-31T23:59:59.9", "2015-06-30T23:59:60", "2026-11-02T18:00", "2026-11-02T24:00:00",
+    "2026-02-30T18:00:00", "1955-01-01T00:00:00", "1969-06-01T00:00:00.25", "2026-11-02T18:00:60", "2026-11-02T18:60:00",
+    "2026-11-02t18:00:00", "2026-11-02T18:00:00+01:00", "2026-11-02T18:00:00.", "2026-11-02T18:00:0", "2026-306T18:00:00",
+    "-026-11-02T18:00:00", "2026-11-02T18:00:61", "2050-07-01T12:00:00.123456", 60000.25, 57753.99999, -1e4,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("scale", ["UTC", "TAI", "TT", "TDB"])
+def test_times_are_those_of_astropy(scale):
+    """Leap seconds, years without them, dates that are none: the middle of exposures to a microsecond, or a refusal."""
+    iers.conf.auto_download = False
+    for start in HARD_TIMES:
+        key, form = ("DATE-OBS", "isot") if isinstance(start, str) else ("MJD-OBS", "mjd")
+        for exposure_s in (0.0, 1.5, 3600.0):
+            header = {key: start, "EXPTIME": exposure_s, "TIMESYS": scale}
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    begin = Time(start, format=form, scale=scale.lower())
+                    middle = float((begin.utc + TimeDelta(exposure_s / 2, format="sec")).unix)
+            except ValueError:
+                with pytest.raises(FrameError, match="no time"):
+                    times(header, "it")
+                continue
+            assert times(header, "it")[0] == pytest.approx(middle, abs=1e-6), (start, exposure_s)
 
 
 @pytest.mark.parametrize("key", ["DATE-OBS", "DATE-BEG"])

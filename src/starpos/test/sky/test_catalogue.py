@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -254,6 +255,52 @@ def test_the_environment_names_another_catalogue(tmp_path, rng, monkeypatch):
     monkeypatch.setenv("STARPOS_CATALOGUE", str(tmp_path / "mine.npz"))
     assert len(load_catalogue()) == 100
     load_catalogue.cache_clear()
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """An empty cache, of which nothing is remembered."""
+    monkeypatch.delenv("STARPOS_CATALOGUE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    load_catalogue.cache_clear()
+    yield tmp_path / "starpos"
+    load_catalogue.cache_clear()
+
+
+def test_the_committed_catalogue_is_unpacked_once_then_mapped(own_cache, monkeypatch):
+    packed = load_catalogue()
+    load_catalogue.cache_clear()
+    monkeypatch.setattr(module, "read", lambda path: pytest.fail("unpacked again"))
+    kept = load_catalogue()
+    for column in fields(Catalogue):
+        np.testing.assert_array_equal(getattr(kept, column.name), getattr(packed, column.name))
+    assert kept.fingerprint == packed.fingerprint
+
+
+@pytest.mark.parametrize("column", ["ra_mas", "zone_start", "hip"])
+def test_a_broken_copy_of_the_catalogue_is_made_anew(column, own_cache):
+    good = load_catalogue().fingerprint
+    (folder,) = own_cache.iterdir()
+    path = folder / f"{column}.npy"
+    values = np.load(path)
+    path.unlink()
+    np.save(path, values[:-1] if column == "hip" else np.full_like(values, 2**31))
+    load_catalogue.cache_clear()
+    assert load_catalogue().fingerprint == good
+
+
+def test_a_newer_catalogue_is_another_copy(own_cache, tmp_path, monkeypatch, rng):
+    load_catalogue()
+    save(random_catalogue(rng, 100), tmp_path / "newer.npz")
+    monkeypatch.setattr(module, "COMMITTED", tmp_path / "newer.npz")
+    load_catalogue.cache_clear()
+    assert len(load_catalogue()) == 100
+
+
+def test_a_cache_that_cannot_be_written_costs_a_little_time_and_says_nothing(own_cache, recwarn):
+    own_cache.touch()
+    assert len(load_catalogue()) > 0
+    assert not recwarn.list
 
 
 def test_it_is_read_once(monkeypatch):
