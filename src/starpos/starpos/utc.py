@@ -5,6 +5,8 @@ import datetime
 
 from starpos.errors import TimeError
 
+UNIX_EPOCH_JD = 2440587.5
+
 
 def utc_text(utc_unix_s: float) -> str:
     """Unix seconds as ISO 8601 in UTC with milliseconds; in words where no calendar reaches."""

@@ -16,6 +16,7 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.frames.shutter import Shutter
 from starpos.units import DAY_S
+from starpos.utc import UNIX_EPOCH_JD
 
 START = ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG")
 KEYS = (
@@ -35,7 +36,7 @@ KEYS = (
 SCALES = ("utc", "tai", "tt", "tdb")
 MAX_EXPOSURE_S = 86400.0
 ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?))?Z?", re.ASCII)
-UNIX_EPOCH_JD, MJD_ZERO_JD, FARTHEST_MJD = 2440587.5, 2400000.5, 1e7
+MJD_ZERO_JD, FARTHEST_MJD = 2400000.5, 1e7
 # an MJD's last digit counts from here: below it lie the last bits of a double
 LEAST_MJD_STEP_S = 1e-3
 

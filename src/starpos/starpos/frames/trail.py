@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the stars of a frame move during its exposure, where somebody knows: a gyro, or who made the frame."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,19 +29,23 @@ class Trail:
                 "of less than half a turn, or None where it is unknown."
             )
 
+    @property
+    def _chord(self) -> float:
+        """Way of a star by the roll, over its distance from the middle."""
+        return 2 * math.sin(self.roll_rad / 2)
+
     def at(self, x: np.ndarray, y: np.ndarray, width: int, height: int) -> np.ndarray:
         """The ways (N, 2) px of stars that are at x, y (N,) px at mid-exposure, on a frame of that size."""
         across = np.stack([(height - 1) / 2 - y, x - (width - 1) / 2], -1)
-        return np.array(self.middle_px) + 2 * np.tan(self.roll_rad / 2) * across
+        return np.array(self.middle_px) + self._chord * across
 
     def mean_square(self, width: int, height: int) -> np.ndarray:
         """The mean (2, 2) px2 of the products of a way's components, over a frame."""
-        rolled = 2 * np.tan(self.roll_rad / 2)
-        return np.outer(self.middle_px, self.middle_px) + rolled**2 * np.diag([height**2, width**2]) / 12
+        return np.outer(self.middle_px, self.middle_px) + self._chord**2 * np.diag([height**2, width**2]) / 12
 
     def varies_px(self, width: int, height: int) -> float:
         """Px by which the way in a corner of a frame differs from that in the middle."""
-        return float(abs(2 * np.tan(self.roll_rad / 2)) * np.hypot(width, height) / 2)
+        return abs(self._chord) * math.hypot(width, height) / 2
 
     def halved(self) -> "Trail":
         """The trail on a frame reduced by two."""

@@ -76,7 +76,7 @@ class Adjustment:
             raise VoyageError(
                 "no velocity lies on the voyage: check that its clock and that of the camera agree"
             )
-        self.stated_law = self.law = self._law(vessel)
+        self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.known = Beforehand(
             mount=vessel.mount_stddev,
@@ -86,7 +86,8 @@ class Adjustment:
         )
         self.model = vessel.model
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
-        self.weighings = 0
+        # how many times as much wind or current change as their law says
+        self.weighings, self.more_drift = 0, 1.0
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
         self.strays = 0
@@ -115,13 +116,11 @@ class Adjustment:
             for kind, excess in self.excess.items()
             if excess > NOTABLE
         ]
-        if self.law is not None and self.stated_law is not None:
-            more = self.law.drift_walk / self.stated_law.drift_walk
-            if more**2 > NOTABLE:
-                said.append(
-                    f"wind or current change {more:.1f} times as much as the law of motion says: the claim is widened by "
-                    "that"
-                )
+        if self.more_drift**2 > NOTABLE:
+            said.append(
+                f"wind or current change {self.more_drift:.1f} times as much as the law of motion says: the claim is "
+                "widened by that"
+            )
         return tuple(said)
 
     def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
@@ -183,13 +182,14 @@ class Adjustment:
             if self.weighings == 1:
                 self._weigh(chain, links)
             return self.weighings == 1
-        if self.law is None or self.stated_law is None or self.weighings > MOST_WEIGHINGS:
+        stated = self._law(self.vessel)
+        if self.law is None or stated is None or self.weighings > MOST_WEIGHINGS:
             return False
-        law = borne_out(self.stated_law, motion)
+        law = borne_out(stated, motion)
         change = np.log([law.drift_walk / self.law.drift_walk, law.rest_stddev / self.law.rest_stddev])
         if np.abs(change).max() < np.log(LAW_CHANGE):
             return False
-        self.law = law
+        self.law, self.more_drift = law, law.drift_walk / stated.drift_walk
         return True
 
     def _weigh(self, chain: Chain, links: Links) -> None:

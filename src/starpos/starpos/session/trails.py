@@ -14,6 +14,8 @@ from starpos.session.parameters import known_instrument
 
 # this share of an exposure may be without readings
 MOST_MISSING = 0.1
+# of the angle by which a camera may turn in an exposure: 60 deg
+LEAST_COSINE = 0.5
 
 
 class Trails:
@@ -41,7 +43,7 @@ class Trails:
         self._focal_px = message_to_camera(message).fx
 
     def told(self, frame: Frame) -> Frame:
-        """The frame with its trail; as it is where time, exposure, focal length or readings lack."""
+        """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""
         if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
             return frame
         begin_s, end_s = (frame.mid_unix_s + share * frame.exposure_s for share in (-0.5, 0.5))
@@ -50,9 +52,9 @@ class Trails:
             return frame
         # of directions at the beginning into those at the end; its last column is where a star on the axis goes
         moved = self._link @ turn.T @ self._link.T
-        x, y, z = moved[:, 2]
-        trail = Trail(
-            middle_px=(float(self._focal_px * x / z), float(self._focal_px * y / z)),
-            roll_rad=float(np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])),
-        )
-        return replace(frame, trail=trail)
+        x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], LEAST_COSINE)
+        # turned so far that stars cross the frame: they leave no trail that could be told
+        if np.trace(moved) < 1 + 2 * LEAST_COSINE or np.hypot(x, y) > frame.width + frame.height:
+            return frame
+        roll_rad = np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])
+        return replace(frame, trail=Trail(middle_px=(float(x), float(y)), roll_rad=float(roll_rad)))

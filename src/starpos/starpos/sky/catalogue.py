@@ -7,6 +7,7 @@ give half of the accuracy of the roll about the optical axis, and so of the posi
 
 import hashlib
 import os
+import zipfile
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -284,12 +285,16 @@ def read(path: Path | str) -> Catalogue:
 def load_catalogue(path: str | None = None) -> Catalogue:
     """The catalogue at `path`, else that named by STARPOS_CATALOGUE, else the committed one; each is read once.
 
-    The committed one is kept unpacked in the cache, from which it is memory-mapped.
+    The committed one is kept unpacked in the cache, by its contents, and memory-mapped from there.
     """
-    if (named := path or os.environ.get("STARPOS_CATALOGUE")) or not COMMITTED.is_file():
-        return read(named or COMMITTED)
-    about = COMMITTED.stat()
-    key = repr((str(COMMITTED), about.st_size, about.st_mtime_ns, FORMAT))
+    if named := path or os.environ.get("STARPOS_CATALOGUE"):
+        return read(named)
+    try:
+        with zipfile.ZipFile(COMMITTED) as packed:
+            key = repr((FORMAT, [(column.filename, column.CRC) for column in packed.infolist()]))
+    except (OSError, zipfile.BadZipFile):
+        # which says what is wrong with it
+        return read(COMMITTED)
     folder = cache_folder() / f"{PREFIX}{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     return load_or_build(folder, PREFIX, lambda: _map(folder), lambda: read(COMMITTED), "")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import fdtri
 
-from starpos.averaging.altitudes import circle_of, place_of_circles, two_and
+from starpos.averaging.altitudes import circle_of, f_quantile, place_of_circles
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.fix.pointing import IDEAL
@@ -34,7 +34,7 @@ def near_of(night):
 
 @pytest.mark.parametrize("free", [2, 3, 7, 60])
 def test_quantiles_are_those_of_scipy(free):
-    assert two_and(free, 0.95) == pytest.approx(fdtri(2, free, 0.95), rel=1e-12)
+    assert f_quantile(free, 0.95) == pytest.approx(fdtri(2, free, 0.95), rel=1e-12)
 
 
 def test_exact_elevations_give_the_exact_place(rng):

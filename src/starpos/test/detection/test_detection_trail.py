@@ -67,18 +67,22 @@ WRONG = {
 }
 
 
+def off_px(frame, trail, stars):
+    """How far the stars (N, 3) of a frame are found from where they are; 2 px for those that are lost."""
+    found = detect(replace(frame, trail=trail)).stars
+    index = match(found, stars)
+    off = np.hypot(found.x[index] - stars[:, 0], found.y[index] - stars[:, 1])
+    return np.where(index >= 0, off, 2.0)
+
+
 @pytest.mark.parametrize("kind", WRONG)
 @pytest.mark.parametrize("electrons", [800, 8000])
 @pytest.mark.parametrize(("count", "length"), [(1, 10.0), (3, 5.0), (4, 15.0)])
 def test_a_wrong_trail_is_no_worse_than_none(count, length, electrons, kind, rng):
-    offs = {"none": [], "wrong": []}
+    none, wrong = [], []
     for frame, trail, stars in frames(count, length, electrons, rng):
-        for which, given in (("none", None), ("wrong", Trail(middle_px=tuple(WRONG[kind](trail))))):
-            found = detect(replace(frame, trail=given)).stars
-            index = match(found, stars)
-            off = np.hypot(found.x[index] - stars[:, 0], found.y[index] - stars[:, 1])
-            offs[which].append(np.where(index >= 0, off, 2.0))
-    none, wrong = (np.concatenate(offs[which]) for which in ("none", "wrong"))
+        none.append(off_px(frame, None, stars))
+        wrong.append(off_px(frame, Trail(middle_px=tuple(WRONG[kind](trail))), stars))
     assert rms(wrong) < 1.05 * rms(none)
 
 
@@ -129,15 +133,11 @@ def test_without_the_roll_stars_are_lost(rng):
 
 @pytest.mark.parametrize("told", [0.0, 0.003, 0.3])
 def test_a_wrong_roll_is_no_worse_than_none(told, rng):
-    offs = {"none": [], "wrong": []}
+    none, wrong = [], []
     for _ in range(6):
         frame, stars, _ = rolled(12, 0.01, rng)
-        for which, trail in (("none", None), ("wrong", Trail(middle_px=(0.0, 0.0), roll_rad=told))):
-            found = detect(replace(frame, trail=trail)).stars
-            index = match(found, stars)
-            off = np.hypot(found.x[index] - stars[:, 0], found.y[index] - stars[:, 1])
-            offs[which].append(np.where(index >= 0, off, 2.0))
-    none, wrong = (np.concatenate(offs[which]) for which in ("none", "wrong"))
+        none.append(off_px(frame, None, stars))
+        wrong.append(off_px(frame, Trail(middle_px=(0.0, 0.0), roll_rad=told), stars))
     assert rms(wrong) < 1.05 * rms(none)
 
 

@@ -15,7 +15,7 @@ from starpos.session import trails
 from starpos.session.trails import Trails
 
 MID_S, EXPOSURE_S, FOCAL_PX = 1793642400.0, 0.02, 4636.0
-FRAME = Frame(np.zeros((10, 10), np.uint8), mid_unix_s=MID_S, exposure_s=EXPOSURE_S)
+FRAME = Frame(np.zeros((400, 500), np.uint8), mid_unix_s=MID_S, exposure_s=EXPOSURE_S)
 
 
 @pytest.fixture
@@ -64,6 +64,13 @@ def test_each_star_moves_along_its_own_trail(told, rate):
         found = trail.at(*np.array(at)[:, None], *size)[0]
         # what a trail of the middle and a roll leave out: the tangent's share, 4 % in the corner
         assert found == pytest.approx(end - begin, abs=0.05 + 0.08 * np.hypot(*trail.middle_px))
+
+
+@pytest.mark.parametrize("rate", [(90.0, 0.0, 0.0), (0.0, 0.0, 90.0), (9.0, 9.0, 0.0), (0.0, 78.54, 0.0)])
+def test_a_frame_whose_stars_cross_it_is_as_it_is(told, rate):
+    """No node may stumble over turns of 90 deg and more, or over stars that leave it."""
+    turn(told, rate)
+    assert told.told(FRAME).trail is None
 
 
 def test_where_anything_lacks_there_is_none(told):
