@@ -63,11 +63,22 @@ def from_vector(v: ArrayLike) -> np.ndarray:
 
 def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Smallest rotation (3, 3) that takes the unit vector a to b, both (3,)."""
-    axis = np.cross(a, b)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12:
-        return np.eye(3) if a @ b > 0 else from_vector(np.pi * np.linalg.svd(a[None])[2][1])
-    return from_vector(axis / sine * np.arctan2(sine, a @ b))
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    cosine = ax * bx + ay * by + az * bz
+    if cosine < -0.9:
+        sine = math.hypot(x, y, z)
+        if sine < 1e-12:
+            return from_vector(np.pi * np.linalg.svd(a[None])[2][1])
+        return from_vector(np.array([x, y, z]) * (math.atan2(sine, cosine) / sine))
+    k = 1 / (1 + cosine)
+    return np.array(
+        [
+            [cosine + k * x * x, k * x * y - z, k * x * z + y],
+            [k * x * y + z, cosine + k * y * y, k * y * z - x],
+            [k * x * z - y, k * y * z + x, cosine + k * z * z],
+        ]
+    )
 
 
 def to_small_vector(r: np.ndarray) -> np.ndarray:
@@ -90,7 +101,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def cross_matrix(v: ArrayLike) -> np.ndarray:
     """The matrix (3, 3) [v]x, so that cross_matrix(v) @ w = v x w."""
-    x, y, z = np.asarray(v, float)
+    x, y, z = np.asarray(v, float).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 

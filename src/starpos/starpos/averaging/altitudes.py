@@ -14,14 +14,15 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.average import SCATTER, Average
+from starpos.core.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, EACH_POSE, ErrorTerm, symmetric_root, tilt_terms, time_terms
+from starpos.fix.budget import ALWAYS, EACH_POSE, ErrorTerm, tilt_terms, time_terms
 from starpos.frames.pointings import Pointing
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt, level_of
+from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import Mounting
 from starpos.normal import SIGMA_PER_MAD
 from starpos.sky.site import Site
@@ -77,9 +78,8 @@ def circle_of(
     clock_stddev_s: float,
 ) -> Circle:
     """The circle of one frame; FixError where its direction or A3 tell no altitude."""
-    up = mounting.up(tilt)
-    axis = camera.directions(*np.array(camera.centre_px)[:, None])[0]
-    seen = level_of(up) @ mounting.a3 @ axis
+    level = mounting.level(tilt)
+    seen = level.camera @ camera.directions(*camera.centre_px)
     sine = np.hypot(seen[0], seen[1])
     if sine < LEAST_SINE or seen[2] < MIN_COS_ZENITH:
         raise FixError(
@@ -87,14 +87,14 @@ def circle_of(
             "elevation tells a place between 0.6 and 87: lean it"
         )
     # up that errs by a small rotation of L lies nearer to the axis, or further
-    level = np.array([[-seen[1], seen[0], 0.0]]) / sine
-    terms = tilt_terms(level, tilt, mounting, earth.utc_unix_s)
+    rows = np.array([[-seen[1], seen[0], 0.0]]) / sine
+    terms = tilt_terms(rows, level, tilt, mounting, earth.utc_unix_s)
     if np.sqrt(terms[0].covariance[0, 0]) > MOST_A3_RAD:
         raise FixError(
             f"{pointing.place}: without a roll A3 has to be known to {MOST_A3_RAD / ARCSEC:.0f} arcsec: calibrate it at "
             "a known place, say how well it is known, or give pointings with their roll"
         )
-    true = atmosphere.refraction().unbend(seen[None])[0]
+    true = atmosphere.refraction().unbend(seen)
     z = float(np.arctan2(np.hypot(true[0], true[1]), true[2]))
     bent = (z - np.arctan2(sine, seen[2])) * atmosphere.relative_sigma
     return Circle(

@@ -22,7 +22,8 @@ from starpos.calibration.camera_adjustment import (
 )
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import Camera
+from starpos.instrument.lens import EQUIDISTANT
 
 # the sky has told a parameter if its sigma is below this share of the prior's
 TOLD = 0.5

@@ -14,7 +14,7 @@ from starpos.errors import FixError
 from starpos.fix.budget import EACH_POSE
 from starpos.fix.fix import Fix
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
-from starpos.instrument.response import COEFFICIENTS, response_columns, stated_variances
+from starpos.instrument.response import COEFFICIENTS, Zeroed, response_columns, stated_variances
 
 # sigma of a coefficient that is as good as known
 KNOWN = 1e-9
@@ -60,7 +60,8 @@ class Readings:
         if len(axes) != 1:
             raise FixError("some tilts have two axes and some three: give those of one inclinometer")
         mean = rotation.normalised(plumb.sum(0))
-        response = np.array([response_columns(s.tilt.theta, mean) for s in solved])
+        zeroed = Zeroed.at(mean, min(axes))
+        response = np.array([response_columns(s.tilt.theta, s.tilt.up, zeroed) for s in solved])
         walked = _wandering(solved, errors)
         variances = stated_variances(errors, axes.pop())
         return cls(

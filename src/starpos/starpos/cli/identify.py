@@ -13,7 +13,7 @@ from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import FrameError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
-from starpos.instrument.camera import PLUMB_BOB
+from starpos.instrument.lens import PLUMB_BOB
 from starpos.sky.catalogue import load_catalogue
 
 # of --csv

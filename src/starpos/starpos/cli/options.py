@@ -11,8 +11,9 @@ from starpos.errors import InstrumentError
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
-from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
+from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
 
 
 def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:

@@ -34,7 +34,7 @@ def enu_axes(latitude: float, longitude: float) -> np.ndarray:
 
 def meridian_turn(latitude: float) -> float:
     """Turn (rad) of north on the way of 1 rad to the east, tan(latitude), up to STEEPEST; finite at a pole."""
-    return float(np.clip(np.tan(latitude), -STEEPEST, STEEPEST))
+    return min(max(math.tan(latitude), -STEEPEST), STEEPEST)
 
 
 def curvature_radii_m(latitude: float) -> tuple[float, float]:

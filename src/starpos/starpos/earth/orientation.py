@@ -6,6 +6,7 @@ site: it is `station_velocity`, which the fix applies. The IERS table is the one
 needed.
 """
 
+import math
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -232,13 +233,15 @@ def _tai_minus_utc(utc_unix_s: float) -> float:
 def later(itrs: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """Directions (N, 3) in ITRS as they are so many seconds (N,) later, by the Earth's rotation alone."""
     angle = ROTATION_RAD_S * seconds
-    c, s, (x, y, z) = np.cos(angle), np.sin(angle), np.moveaxis(itrs, -1, 0)
-    return np.stack([c * x + s * y, c * y - s * x, z], -1)
+    c, s, x, y = np.cos(angle), np.sin(angle), itrs[..., 0], itrs[..., 1]
+    turned = itrs.copy()
+    turned[..., 0], turned[..., 1] = c * x + s * y, c * y - s * x
+    return turned
 
 
 def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
     """Velocity (3,) of the rotating ground in units of c, ITRS, at the place whose zenith is zenith_itrs (3,)."""
-    radius = EQUATOR_RADIUS_M / np.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
+    radius = EQUATOR_RADIUS_M / math.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
     return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import erfa
 import numpy as np
 
-from starpos.core.observed import Air
+from starpos.core.air import Air
 from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
@@ -78,7 +78,7 @@ class Atmosphere:
             temperature_stddev_c=12.0 if temperature_c is None else 2.0,
         )
 
-    @property
+    @cached_property
     def relative_sigma(self) -> float:
         """Standard deviation of the refraction over the refraction, which is proportional to pressure / temperature."""
         if self.pressure_pa == 0:
@@ -97,8 +97,13 @@ class Atmosphere:
 
     def refraction(self, factor: float = 1.0) -> "Refraction":
         """The model, with its bending multiplied by `factor` (1, or a step for a derivative)."""
+        a, b = self._constants
+        return Refraction(a * factor, b * factor)
+
+    @cached_property
+    def _constants(self) -> tuple[float, float]:
         a, b = erfa.refco(self.pressure_pa / 100, self.temperature_c, self.humidity, self.wavelength_um)
-        return Refraction(float(a) * factor, float(b) * factor)
+        return float(a), float(b)
 
 
 @dataclass(frozen=True)
@@ -114,23 +119,9 @@ class Refraction:
         return Air(self.a, self.b, MIN_COS_ZENITH)
 
     def bend(self, v: np.ndarray) -> np.ndarray:
-        """Raise unrefracted directions v (N, 3) in L to the observed ones (ERFA's eraAtioq, one Newton step)."""
-        horizontal = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-12)
-        up = np.maximum(v[..., 2], MIN_COS_ZENITH)
-        tan = horizontal / up
-        w = self.b * tan * tan
-        angle = (self.a + w) * tan / (1 + (self.a + 3 * w) / (up * up))
-        return _raise(v, horizontal, angle)
+        """Raise unrefracted directions v (..., 3) in L to the observed ones (ERFA's eraAtioq, one Newton step)."""
+        return self.compiled.bent(v)
 
     def unbend(self, u: np.ndarray) -> np.ndarray:
-        """Lower observed directions u (N, 3) in L to the unrefracted ones."""
-        horizontal = np.maximum(np.hypot(u[..., 0], u[..., 1]), 1e-12)
-        tan = horizontal / np.maximum(u[..., 2], MIN_COS_ZENITH)
-        return _raise(u, horizontal, -(self.a + self.b * tan * tan) * tan)
-
-
-def _raise(v: np.ndarray, horizontal: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Turn v by `angle` toward +Z within its vertical plane."""
-    c, s = np.cos(angle), np.sin(angle)
-    shrink = c - s * v[..., 2] / horizontal
-    return np.stack([v[..., 0] * shrink, v[..., 1] * shrink, c * v[..., 2] + s * horizontal], -1)
+        """Lower observed directions u (..., 3) in L to the unrefracted ones."""
+        return self.compiled.unbent(u)

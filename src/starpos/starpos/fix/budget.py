@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error budget of a fix: each source of error as what it does to place, heading and attitude."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
+from starpos.core.adjustment import gain_of, spread
+from starpos.core.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
-from starpos.instrument.inclinometer import Tilt, level_of, levelling_of
-from starpos.instrument.mounting import Mounting
+from starpos.frozen import at_once
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.mounting import Level, Mounting
 from starpos.units import HOUR_S
 
 ALWAYS = ("always",)
@@ -22,6 +27,7 @@ CALIBRATION = "calibration"
 UNKNOWN_TEMPERATURE_C = 14.0
 
 
+@at_once
 @dataclass(frozen=True)
 class ErrorTerm:
     """One source of error: its covariance is variance * factor @ factor.T.
@@ -63,6 +69,7 @@ def correlation(a: tuple, b: tuple) -> float:
     return len(set(a) & set(b)) / (len(a) * len(b)) ** 0.5 if a and b else 0.0
 
 
+@at_once
 @dataclass(frozen=True)
 class Place:
     """The place that A4 contains: latitude, longitude (rad); east and north as unit vectors (3,) of L."""
@@ -72,20 +79,22 @@ class Place:
     east: np.ndarray
     north: np.ndarray
 
-    @property
+    @cached_property
     def local_to_enu(self) -> np.ndarray:
         """Rotation (3, 3) of L into east, north, up."""
-        return np.stack([self.east, self.north, [0.0, 0.0, 1.0]])
+        return np.array([self.east, self.north, [0.0, 0.0, 1.0]])
 
 
 def place_of(a4: np.ndarray) -> Place:
     """Place from A4 (3, 3), which takes ITRS into L.  At a pole the longitude is 0, and north is that of longitude 0."""
     latitude, longitude = place_of_zenith(a4[2])
-    north = a4 @ enu_axes(latitude, longitude)[1]
-    north = rotation.normalised(np.array([north[0], north[1], 0.0]))
-    return Place(latitude, longitude, np.array([north[1], -north[0], 0.0]), north)
+    x, y, _ = (a4 @ enu_axes(latitude, longitude)[1]).tolist()
+    level = math.hypot(x, y)
+    north = np.array([x / level, y / level, 0.0])
+    return Place(latitude, longitude, np.array([y / level, -x / level, 0.0]), north)
 
 
+@at_once
 @dataclass(frozen=True)
 class Sensitivity:
     """Change of the rows of an ErrorTerm for small rotations about L's axes, (6, 3) each.
@@ -98,22 +107,22 @@ class Sensitivity:
     level: np.ndarray
 
     @classmethod
-    def of(cls, a4: np.ndarray, link_to_enu: np.ndarray) -> "Sensitivity":
-        """Sensitivity at A4 (3, 3) with the attitude link_to_enu (3, 3)."""
-        p = place_of(a4)
-        prime, meridian = curvature_radii_m(p.latitude)
+    def of(cls, place: Place, link_to_enu: np.ndarray) -> "Sensitivity":
+        """Sensitivity at a place with the attitude link_to_enu (3, 3)."""
+        prime, meridian = curvature_radii_m(place.latitude)
+        east, north = place.east, place.north
+        stars = np.zeros((6, 3))
         # a rotation by (dx, dy) moves the zenith among the stars by (-dy, dx)
-        moved = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        ground = np.stack([p.east @ moved * prime, p.north @ moved * meridian])
+        stars[0, 0], stars[0, 1] = prime * east[1], -prime * east[0]
+        stars[1, 0], stars[1, 1] = meridian * north[1], -meridian * north[0]
         # when the pole moves, north turns in L, and the attitude turns the other way against north
-        north_turns = np.array([0.0, 0.0, 1.0]) - meridian_turn(p.latitude) * p.north
-        about_up = np.stack([np.zeros(3), np.zeros(3), -north_turns])
-        return cls(
-            *(
-                np.vstack([ground, heading_row(spin, link_to_enu), spin])
-                for spin in (about_up, about_up + p.local_to_enu)
-            )
-        )
+        stars[5] = meridian_turn(place.latitude) * north
+        stars[5, 2] -= 1.0
+        level = stars.copy()
+        level[3:] += place.local_to_enu
+        to_heading = heading_row(link_to_enu)
+        stars[2], level[2] = to_heading @ stars[3:], to_heading @ level[3:]
+        return cls(stars, level)
 
 
 def heading_of(link_to_enu: np.ndarray) -> float:
@@ -121,23 +130,15 @@ def heading_of(link_to_enu: np.ndarray) -> float:
     return rotation.full_turn(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]))
 
 
-def heading_row(spin: np.ndarray, link_to_enu: np.ndarray) -> np.ndarray:
-    """Change (1, 3) of the heading where three small rotations turn the attitude by spin (3, 3) about east, north, up."""
-    east, north, up = link_to_enu[:, 0]
+def heading_row(link_to_enu: np.ndarray) -> np.ndarray:
+    """Change (3,) of the heading for small rotations of the attitude link_to_enu (3, 3) about east, north, up."""
+    east, north, up = link_to_enu[:, 0].tolist()
     level = max(east * east + north * north, 1e-12)
     # d azimuth = (north d_east - east d_north) / level, with d(forward) = spin x forward
-    return np.array([[east * up / level, north * up / level, -1.0]]) @ spin
+    return np.array([east * up / level, north * up / level, -1.0])
 
 
-def symmetric_root(covariance: np.ndarray) -> np.ndarray:
-    """Symmetric F with F F = covariance, which may be singular.
-
-    There is only one such F, so the terms of different frames agree in sign.
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
-
-
+@at_once
 @dataclass(frozen=True)
 class StarErrors:
     """Errors of the stars of a fix.
@@ -158,22 +159,24 @@ class StarErrors:
     ) -> "StarErrors":
         """Errors after weighted least squares.
 
-        slope (N, 2, P): derivatives in px of the P parameters, of which the first three rotate A4.
+        slope (N, 2, 4): derivatives in px of the parameters, of which the first three rotate A4.
         """
-        weighted = np.linalg.solve(centroids + catalogue, slope)
-        normal = np.einsum("nki,nkj->ij", slope, weighted)
-        return cls(
-            np.einsum("ij,nkj->ink", np.linalg.inv(normal), weighted)[:3], centroids, catalogue, same_stars
-        )
+        return cls(gain_of(slope, centroids + catalogue), centroids, catalogue, same_stars)
+
+    def rotated(self, errors_px: np.ndarray) -> np.ndarray:
+        """Rotation (3, ...) of A4 in rad that errors (N, 2, ...) of the predicted places in px make."""
+        number = 2 * len(errors_px)
+        return -self.gain.reshape(3, number) @ errors_px.reshape(number, *errors_px.shape[2:])
 
     def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """Covariance (3, 3) in rad2 of A4's rotation, from the covariances (N, 2, 2) in px2 of independent stars."""
-        return np.einsum("anj,njk,bnk->ab", self.gain, covariance, self.gain)
+        return spread(self.gain, covariance)
 
 
 def error_terms(
     sensitivity: Sensitivity,
     stars: StarErrors,
+    level: Level,
     tilt: Tilt,
     mounting: Mounting,
     refraction_rotation: np.ndarray,
@@ -189,13 +192,13 @@ def error_terms(
     errors of the rows' times.
     """
 
-    def factor_from_stars(covariance: np.ndarray) -> np.ndarray:
+    def of_stars(covariance: np.ndarray) -> np.ndarray:
         return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
 
-    calibration, *readings = tilt_terms(sensitivity.level, tilt, mounting, earth.utc_unix_s)
+    calibration, *readings = tilt_terms(sensitivity.level, level, tilt, mounting, earth.utc_unix_s)
     return (
-        ErrorTerm("centroids", factor_from_stars(stars.centroids)),
-        ErrorTerm("catalogue", factor_from_stars(stars.catalogue), shared=stars.same_stars),
+        ErrorTerm("centroids", of_stars(stars.centroids)),
+        ErrorTerm("catalogue", of_stars(stars.catalogue), shared=stars.same_stars),
         calibration,
         *readings,
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
@@ -204,23 +207,18 @@ def error_terms(
     )
 
 
-def tilt_terms(level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float) -> tuple[ErrorTerm, ...]:
-    """The sources of error of the level, A3's first; level (rows, 3): rows of the factors for a small rotation of L."""
-    up = mounting.up(tilt)
-    columns, response = mounting.response_at(tilt)
-    calibration = np.hstack(
-        [level_of(up) @ symmetric_root(mounting.calibration_covariance), _turn_error(up, mounting)]
-    )
+def tilt_terms(
+    rows: np.ndarray, level: Level, tilt: Tilt, mounting: Mounting, utc_unix_s: float
+) -> tuple[ErrorTerm, ...]:
+    """The sources of error of the level, A3's first; rows (n, 3): those of the factors for a small rotation of L."""
+    calibration, remounted = np.empty((3, 4)), level.a2 * mounting.remounted_rad
+    np.matmul(level.a2, mounting.calibration_root, out=calibration[:, :3])
+    calibration[:, 3] = _turn_error(level, mounting)
     return (
-        ErrorTerm(CALIBRATION, level @ calibration, shared=ALWAYS, posed=True),
-        ErrorTerm("remounting", level @ level_of(up) * mounting.remounted_rad, shared=ALWAYS, posed=True),
-        *_inclinometer_terms(level @ levelling_of(up, tilt.slope), tilt, mounting, utc_unix_s),
-        ErrorTerm(
-            "tilt response",
-            level @ levelling_of(up, columns) @ symmetric_root(response),
-            shared=ALWAYS,
-            posed=True,
-        ),
+        ErrorTerm(CALIBRATION, rows @ calibration, shared=ALWAYS, posed=True),
+        ErrorTerm("remounting", rows @ remounted, shared=ALWAYS, posed=True),
+        *_inclinometer_terms(rows @ (level.turns @ tilt.slope), tilt, mounting, utc_unix_s),
+        ErrorTerm("tilt response", rows @ (level.turns @ level.response), shared=ALWAYS, posed=True),
     )
 
 
@@ -230,20 +228,20 @@ def time_terms(
     """The sources of error of the Earth's rotation, which are the same for all directions."""
     (prime, meridian), north_turns = curvature_radii_m(latitude), meridian_turn(latitude)
     # the Earth's turn moves the place along its parallel, and north with it; another pole is another north
-    second_of_time = np.array([[prime * np.cos(latitude), 0, 0, 0, 0, 0]]).T * ROTATION_RAD_S
-    east, north = [prime, 0, north_turns, 0, 0, -north_turns], [0, meridian, 0, 0, 0, 0]
-    pole = np.array([east, north]).T * earth.orientation.pole_sigma
+    second_of_time, pole = np.zeros((6, 1)), np.zeros((6, 2))
+    second_of_time[0, 0] = prime * math.cos(latitude) * ROTATION_RAD_S
+    pole[[0, 2, 5], 0], pole[1, 1] = (prime, north_turns, -north_turns), meridian
     return (
         ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
         # a constant lag does not average away, and nobody can exclude one
         ErrorTerm("time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS),
         ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, shared=ALWAYS),
-        ErrorTerm("pole", pole, shared=ALWAYS),
+        ErrorTerm("pole", pole * earth.orientation.pole_sigma, shared=ALWAYS),
     )
 
 
-def _turn_error(up: np.ndarray, mounting: Mounting) -> np.ndarray:
-    """Error (3, 1) of L, as a small rotation about its axes, that an A3 with a large turn about the plumb line causes.
+def _turn_error(level: Level, mounting: Mounting) -> np.ndarray:
+    """Error (3,) of L, as a small rotation about its axes, that an A3 with a large turn about the plumb line causes.
 
     To first order a turn moves the lean since the calibration sideways only, which the calibration's own term holds.
     A large turn also makes that lean shorter, by its cosine.
@@ -251,34 +249,34 @@ def _turn_error(up: np.ndarray, mounting: Mounting) -> np.ndarray:
     then = mounting.calibrated_up
     variance = then @ mounting.calibration_covariance @ then + mounting.remounted_rad**2
     # the mean of (1 - cos)^2 over a Gaussian turn
-    shorter2 = 1.5 - 2 * np.exp(-variance / 2) + np.exp(-2 * variance) / 2
-    return levelling_of(up, (up - then)[:, None] * np.sqrt(max(shorter2, 0.0)))
+    shorter2 = 1.5 - 2 * math.exp(-variance / 2) + math.exp(-2 * variance) / 2
+    return level.turns @ (level.up - then) * math.sqrt(max(shorter2, 0.0))
 
 
 def _inclinometer_terms(
-    level: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
+    rows: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The inclinometer's terms; level (6, axes): rows of an ErrorTerm for an error of each angle.
+    """The inclinometer's terms; rows (n, axes): those of an ErrorTerm for an error of each angle.
 
     Its zero is not among them: the calibration's covariance includes it.
     """
     errors = mounting.inclinometer
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
     return (
-        ErrorTerm("tilt", level @ symmetric_root(tilt.noise), shared=tilt.times),
-        ErrorTerm("tilt quantisation", level * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
-        ErrorTerm("tilt pose", level * errors.pose_rad, shared=EACH_POSE),
+        ErrorTerm("tilt", rows @ symmetric_root(tilt.noise), shared=tilt.times),
+        ErrorTerm("tilt quantisation", rows * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
+        ErrorTerm("tilt pose", rows * errors.pose_rad, shared=EACH_POSE),
         ErrorTerm(
             "tilt drift",
-            level * errors.drift_rad_per_sqrt_hour / np.sqrt(HOUR_S),
+            rows * errors.drift_rad_per_sqrt_hour / math.sqrt(HOUR_S),
             shared=ALWAYS,
-            variance=since_s if np.isfinite(since_s) else 0.0,
+            variance=since_s if math.isfinite(since_s) else 0.0,
             walk_s=1.0,
             posed=True,
         ),
         ErrorTerm(
             "tilt temperature",
-            level * errors.temperature_rad_per_c * _warmer_c(tilt, mounting),
+            rows * errors.temperature_rad_per_c * _warmer_c(tilt, mounting),
             shared=ALWAYS,
         ),
     )
@@ -290,7 +288,7 @@ def _warmer_c(tilt: Tilt, mounting: Mounting) -> float:
     The stated error of a calibration with neither a date nor a temperature is for all temperatures.
     """
     warmer = tilt.temperature_c - mounting.calibrated_temperature_c
-    if np.isfinite(warmer):
-        return float(warmer)
-    dated = np.isfinite([mounting.calibrated_unix_s, mounting.calibrated_temperature_c]).any()
+    if math.isfinite(warmer):
+        return warmer
+    dated = math.isfinite(mounting.calibrated_unix_s) or math.isfinite(mounting.calibrated_temperature_c)
     return UNKNOWN_TEMPERATURE_C if dated else 0.0

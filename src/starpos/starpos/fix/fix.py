@@ -2,19 +2,20 @@
 """A4 from one frame: the place and the attitude of the instrument, with their covariance.
 
 The equation is that of the paper's section 4, A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
-site.  The residuals are formed in pixels, because the errors of the stars are known there.
+site.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from starpos import rotation
-from starpos.core.observed import observed
-from starpos.earth.orientation import EarthState, later, station_velocity
-from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.core.adjustment import Adjustment
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState, later, station_velocity
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
+from starpos.fix.adjustment import ISOTROPIC, Fitted, adjustment_of, fitted, share_free
 from starpos.fix.budget import (
     ALWAYS,
     ErrorTerm,
@@ -25,26 +26,25 @@ from starpos.fix.budget import (
     place_of,
     total_covariance,
 )
-from starpos.fix.outliers import expected_extra, judged
+from starpos.fix.outliers import expected_extra
 from starpos.fix.readable import InDegrees
 from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
+from starpos.frozen import at_once
 from starpos.identification import Identification
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt, level_of, levelling_of
+from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import Mounting
+from starpos.units import ARCSEC
 
-MAX_ROUNDS = 6
 # share of the frame's diagonal; stars that scatter more were not identified rightly
 MAX_SCATTER = 0.003
-MIN_STARS = 3
 STEP_REFRACTION = 0.01
 # so many stars tell whether two frames show the same ones
 MARKS = 20
-# the iteration ends at a step below this, in rad and as a share of the scale
-SETTLED, MOST_STEPS = 1e-13, 20
 
 
+@at_once
 @dataclass(frozen=True)
 class MatchedStars:
     """N identified stars.
@@ -67,6 +67,7 @@ def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarra
     return sound if sound.sum() >= enough else np.ones(len(sound), bool)
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
@@ -131,64 +132,47 @@ def solve_fix(
 ) -> Fix:
     """The fix of one frame from identified stars.
 
-    It starts from a closed solution (singular values) and goes on by Gauss-Newton over the rotation A4 and the plate
-    scale.  The derivatives are computed once: they hardly change over the arcseconds that are left.
     clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
     shutter: when each row was exposed; `earth` is of the row that is read first.
     Raises FixError if the stars are too few or do not agree.
     """
-    problem = _Adjustment(
-        stars.xy,
-        camera,
-        level_of(mounting.up(tilt)) @ mounting.a3,
-        later(earth.to_itrs(stars.places), shutter.later_s(stars.xy[:, 1], camera.height)),
-        atmosphere.refraction(),
-    )
-    catalogue_px2 = np.eye(2) * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
+    level, refraction = mounting.level(tilt), atmosphere.refraction()
+    g = level.camera
+    later_s = shutter.later_s(stars.xy[:, 1], camera.height)
+    problem = adjustment_of(stars.xy, camera, g, later(earth.to_itrs(stars.places), later_s), refraction)
+    catalogue_px2 = ISOTROPIC * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
     stated = stars.covariance_px2 + catalogue_px2
-    keep, jitter2 = np.ones(len(stars.xy), bool), 0.0
-    state, settled = problem.closed_form(), False
-    slope = problem.jacobian(state)
-    for _ in range(MAX_ROUNDS):
-        if keep.sum() < max(MIN_STARS, 0.5 * len(keep)):
-            raise FixError(
-                f"only {int(keep.sum())} of {len(keep)} identified stars agree on one attitude: no fix from them"
-            )
-        state = problem.refine(state, slope, stated + np.eye(2) * jitter2, keep)
-        if settled:
-            break
-        residual, before = problem.residual(state), (keep, jitter2)
-        jitter2, keep = judged(residual, stated, keep, _share_free(keep))
-        settled = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
-    if jitter2 > (MAX_SCATTER * np.hypot(camera.width, camera.height)) ** 2:
+    fit = fitted(problem, refraction.unbend(camera.directions(*stars.xy.T) @ g.T), stated)
+    if fit.jitter2 > (MAX_SCATTER * math.hypot(camera.width, camera.height)) ** 2:
         raise FixError(
-            f"the identified stars lie {np.sqrt(jitter2):.1f} px off the best attitude: check the camera's distortion"
+            f"the identified stars lie {math.sqrt(fit.jitter2):.1f} px off the best attitude: check the camera's "
+            "distortion"
         )
-    residual = problem.residual(state)[keep]
-    claimed2 = expected_extra(residual, stated[keep], _share_free(keep))
-    centroids = stars.covariance_px2[keep] + np.eye(2) * claimed2
+    keep, residual = fit.keep, fit.residual[fit.keep]
+    claimed2 = expected_extra(residual, stated[keep], share_free(keep))
+    centroids = stars.covariance_px2[keep] + ISOTROPIC * claimed2
     same_stars = ALWAYS if stars.index is None else tuple(stars.index[keep][:MARKS].tolist())
-    errors = StarErrors.of(slope[keep], centroids, catalogue_px2[keep], same_stars)
-    place = place_of(state.a4)
-    link_to_enu = place.local_to_enu @ problem.g @ mounting.link_to_camera
-    sensitivity, up = Sensitivity.of(state.a4, link_to_enu), mounting.up(tilt)
+    errors = StarErrors.of(fit.slope[keep], centroids, catalogue_px2[keep], same_stars)
+    place = place_of(fit.a4)
+    link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
+    sensitivity = Sensitivity.of(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
-    axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), up)[:, :2]
-    terms = _terms(
-        problem,
-        state,
-        keep,
+    axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
+    terms = error_terms(
+        sensitivity,
         errors,
+        level,
         tilt,
         mounting,
-        atmosphere,
+        _bending(problem, fit, errors, atmosphere),
+        _rolling(problem, fit, errors, shutter, camera.height),
+        place.latitude,
         earth,
-        (clock_stddev_s, stamp_stddev_s),
-        sensitivity,
-        shutter,
+        clock_stddev_s,
+        stamp_stddev_s,
     )
-    axis = camera.directions(*np.array(camera.centre_px)[:, None]) @ problem.g.T
-    bent = np.linalg.norm(rotation.cross(axis, problem.refraction.unbend(axis)))
+    axis = g @ camera.directions(*camera.centre_px)
+    bent = math.dist(axis, refraction.unbend(axis))
     return Fix(
         utc_unix_s=earth.utc_unix_s,
         latitude=place.latitude,
@@ -196,134 +180,33 @@ def solve_fix(
         heading=heading_of(link_to_enu),
         link_to_enu=link_to_enu,
         terms=terms,
-        levelling=sensitivity.level @ levelling_of(up, axes),
+        levelling=sensitivity.level @ (level.turns @ axes),
         used=np.flatnonzero(keep),
         residual_px=residual,
-        residual_arcsec=float(np.sqrt(np.mean(residual**2)) * camera.scale_arcsec),
-        jitter_px=float(np.sqrt(jitter2)),
-        focal_scale=state.scale,
-        zenith_distance=float(np.arccos(np.clip(axis[0, 2], -1, 1))),
-        refraction_arcsec=float(np.degrees(bent) * 3600),
-        diurnal_aberration_arcsec=float(np.degrees(np.linalg.norm(station_velocity(state.a4[2]))) * 3600),
+        residual_arcsec=math.sqrt(np.vdot(residual, residual) / residual.size) * camera.scale_arcsec,
+        jitter_px=math.sqrt(fit.jitter2),
+        focal_scale=fit.scale,
+        zenith_distance=math.acos(min(max(axis[2], -1.0), 1.0)),
+        refraction_arcsec=bent / ARCSEC,
+        diurnal_aberration_arcsec=math.hypot(*station_velocity(fit.a4[2])) / ARCSEC,
         ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
-        camera_to_itrs=state.a4.T @ problem.g,
-        camera_covariance=state.a4.T @ errors.rotation_covariance(centroids) @ state.a4,
+        camera_to_itrs=fit.a4.T @ g,
+        camera_covariance=fit.a4.T @ errors.rotation_covariance(centroids) @ fit.a4,
     )
 
 
-def _share_free(keep: np.ndarray) -> float:
-    """Share of the 2 N coordinates of N kept stars that four parameters leave free."""
-    return max(1 - 2 / keep.sum(), 1 / keep.sum())
+def _bending(problem: Adjustment, fit: Fitted, errors: StarErrors, atmosphere: Atmosphere) -> np.ndarray:
+    """Rotation (3,) of A4 in rad for 1 sigma of the refraction."""
+    stronger = problem.predict(fit.a4, fit.scale, atmosphere.refraction(1 + STEP_REFRACTION).compiled)
+    moved = (stronger - problem.xy - fit.residual)[fit.keep]
+    return errors.rotated(moved * (atmosphere.relative_sigma / STEP_REFRACTION))
 
 
-@dataclass(frozen=True)
-class _Estimate:
-    """A4 (3, 3), ITRS into L, and the factor on the focal length."""
-
-    a4: np.ndarray
-    scale: float
-
-
-@dataclass(frozen=True)
-class _Adjustment:
-    """The least-squares problem of a frame: stars at xy (N, 2) px with geocentric apparent directions itrs (N, 3).
-
-    g (3, 3): A2 A3, which takes C into L.
-    """
-
-    xy: np.ndarray
-    camera: Camera
-    g: np.ndarray
-    itrs: np.ndarray
-    refraction: Refraction
-
-    def closed_form(self) -> _Estimate:
-        """First estimate, by singular values, at the given focal length."""
-        local = self.refraction.unbend(self.camera.directions(*self.xy.T) @ self.g.T)
-        a4 = rotation.best_rotation(self.itrs, local)
-        # the diurnal aberration depends on the place that is sought
-        for _ in range(2):
-            a4 = rotation.best_rotation(self.itrs + station_velocity(a4[2]), local)
-        return _Estimate(a4, 1.0)
-
-    @cached_property
-    def principal_px(self) -> np.ndarray:
-        """The principal point (2,)."""
-        return np.array([self.camera.cx, self.camera.cy])
-
-    def predict(self, state: _Estimate, refraction: Refraction | None = None) -> np.ndarray:
-        """Pixels (N, 2) where the estimate has the stars."""
-        air = (refraction or self.refraction).compiled
-        v = observed(self.itrs, state.a4, station_velocity(state.a4[2]), air, self.g)
-        return self.principal_px + state.scale * (self.camera.project(v) - self.principal_px)
-
-    def residual(self, state: _Estimate) -> np.ndarray:
-        """Predicted minus seen places (N, 2) in px."""
-        return self.predict(state) - self.xy
-
-    def moved(self, state: _Estimate, p: np.ndarray) -> _Estimate:
-        """The estimate after a small rotation p[:3] about L's axes and a relative change p[3] of the scale."""
-        return _Estimate(rotation.from_vector(p[:3]) @ state.a4, state.scale * (1 + p[3]))
-
-    def refine(
-        self, state: _Estimate, slope: np.ndarray, covariance_px2: np.ndarray, keep: np.ndarray
-    ) -> _Estimate:
-        """The best estimate near `state` for the stars to keep (N,), by Gauss-Newton with derivatives slope (N, 2, 4).
-
-        Raises FixError if it does not converge.
-        """
-        slope = slope[keep]
-        weighted = (np.linalg.inv(covariance_px2[keep]) @ slope).reshape(-1, 4)
-        gain = np.linalg.solve(slope.reshape(-1, 4).T @ weighted, weighted.T)
-        for _ in range(MOST_STEPS):
-            step = -gain @ self.residual(state)[keep].ravel()
-            if not np.isfinite(step).all():
-                break
-            state = self.moved(state, step)
-            if np.abs(step).max() < SETTLED:
-                return state
-        raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
-
-    def jacobian(self, state: _Estimate) -> np.ndarray:
-        """Derivatives (N, 2, 4) of `predict` by the parameters of `moved`."""
-        air, ground = self.refraction.compiled, station_velocity(state.a4[2])
-        v, turned = observed(self.itrs, state.a4, ground, air, self.g, True)
-        from_principal = state.scale * (self.camera.project(v) - self.principal_px)
-        turned = state.scale * (self.camera.slopes(v) @ turned)
-        return np.concatenate([turned, from_principal[:, :, None]], -1)
-
-
-def _terms(
-    problem: _Adjustment,
-    state: _Estimate,
-    keep: np.ndarray,
-    errors: StarErrors,
-    tilt: Tilt,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    clock_and_stamp_stddev_s: tuple[float, float],
-    sensitivity: Sensitivity,
-    shutter: Shutter,
-) -> tuple[ErrorTerm, ...]:
-    """The budget of the fix: the errors of its stars, of refraction and shutter as they act on them, and all others."""
-    here = problem.predict(state)
-    stronger = problem.predict(state, atmosphere.refraction(1 + STEP_REFRACTION)) - here
-    bending = (
-        -np.einsum("ank,nk->a", errors.gain, stronger[keep]) / STEP_REFRACTION * atmosphere.relative_sigma
-    )
-    turned = replace(problem, itrs=later(problem.itrs, np.ones(len(problem.itrs)))).predict(state)
-    drift = turned - here
-    late = shutter.errors_s(problem.xy[:, 1], problem.camera.height)
-    rolling = -np.einsum("ank,nk,nc->ac", errors.gain, drift[keep], late[keep])
-    return error_terms(
-        sensitivity,
-        errors,
-        tilt,
-        mounting,
-        bending,
-        rolling,
-        place_of(state.a4).latitude,
-        earth,
-        *clock_and_stamp_stddev_s,
-    )
+def _rolling(
+    problem: Adjustment, fit: Fitted, errors: StarErrors, shutter: Shutter, height: int
+) -> np.ndarray:
+    """Rotation (3, 2) of A4 in rad for 1 sigma of the two errors of the rows' times."""
+    # in a second the sky turns about the pole, which is a column of A4
+    drift = fit.slope[fit.keep, :, :3] @ (-ROTATION_RAD_S * fit.a4[:, 2])
+    late = shutter.errors_s(problem.xy[fit.keep, 1], height)
+    return errors.rotated(drift[..., None] * late[:, None])

@@ -10,13 +10,14 @@ from dataclasses import replace
 import numpy as np
 
 from starpos import rotation
+from starpos.core.roots import symmetric_root
 from starpos.earth.orientation import EarthState
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.budget import ErrorTerm, Sensitivity, symmetric_root
+from starpos.fix.budget import ErrorTerm, Sensitivity, place_of
 from starpos.fix.fix import Fix, MatchedStars, solve_fix
 from starpos.frames.pointings import Pointing
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt, level_of
+from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import Mounting
 
 # the camera that sees the stars, and stands for one that is not known: only its axes count
@@ -57,10 +58,10 @@ def pointing_fix(
         np.zeros(STARS),
     )
     fix = solve_fix(stars, IDEAL, tilt, seen, atmosphere, earth, clock_stddev_s, pointing.stamp_stddev_s)
-    g, to_itrs = level_of(seen.up(tilt)) @ seen.a3, fix.camera_to_itrs
+    g, to_itrs = seen.level(tilt).camera, fix.camera_to_itrs
     # the centre's error turns the frame about two axes across its own, that of the roll about that axis
     own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
-    sensitivity = Sensitivity.of(g @ to_itrs.T, fix.link_to_enu)
+    sensitivity = Sensitivity.of(place_of(g @ to_itrs.T), fix.link_to_enu)
     return replace(
         fix,
         terms=(

@@ -9,7 +9,8 @@ from starpos.core.frame import FrameStars, all_within, ideal_frame, unit_vectors
 from starpos.frames.stars import EDGE_PX, Stars
 from starpos.identification.pose import LEAST_SIGMA_PX, TEST_STARS
 from starpos.identification.search import through
-from starpos.instrument.camera import PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
+from starpos.instrument.lens import PLUMB_BOB
 
 # Lower stars of a fisheye make no fix: what refraction does near the horizon no model tells.
 LEAST_ALTITUDE_RAD = math.radians(10)

@@ -14,8 +14,8 @@ from starpos.frozen import at_once
 from starpos.identification import Identification
 from starpos.identification.explained import Explained
 from starpos.identification.hint import Hint
-from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.lens import PLUMB_BOB
 
 # Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
 # not identified, nor are the bright stars there that should be.

@@ -33,7 +33,7 @@ from starpos.identification.triangles import TriangleCatalogue
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
 from starpos.instrument.camera_vertical import own_level
-from starpos.instrument.inclinometer import Tilt, level_of
+from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -136,8 +136,7 @@ class Solver:
         try:
             state, tilt = self.levelled(stars, tilt)
             camera, catalogue, triangles = self.view(stars.width, stars.height)
-            mounting = self.instrument.mounting
-            g = level_of(mounting.up(tilt)) @ mounting.a3
+            g = self.instrument.mounting.level(tilt).camera
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
@@ -249,8 +248,8 @@ class Solver:
             )
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
         if wide.is_wide(camera):
-            mounting = self.instrument.mounting
-            sines = directions_of(camera, stars)[found.star] @ (level_of(mounting.up(tilt)) @ mounting.a3)[2]
+            g = self.instrument.mounting.level(tilt).camera
+            sines = directions_of(camera, stars)[found.star] @ g[2]
             check_above_horizon(float(sines.mean()), self.instrument.calibration)
             use &= high_enough(sines)
         star, index = found.star[use], found.catalogue[use]

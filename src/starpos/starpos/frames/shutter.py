@@ -47,11 +47,11 @@ class Shutter:
 
     def errors_s(self, y: np.ndarray, height: int) -> np.ndarray:
         """Change (N, 2) of `later_s` for two independent errors of 1 sigma, which all frames share."""
-        if self.readout_s:
-            return self.readout_stddev_s * np.stack([self._share(y, height), np.zeros(len(y))], -1)
         # from an unknown end: what differs from row to row has either sign, and their mean comes too late by half
-        middle = np.full(len(y), 0.5)
-        return self.readout_stddev_s * np.stack([self._share(y, height) - middle, middle], -1)
+        middle = 0.0 if self.readout_s else 0.5
+        errors = np.empty((len(y), 2))
+        errors[:, 0], errors[:, 1] = self._share(y, height) - middle, middle
+        return self.readout_stddev_s * errors
 
     def _share(self, y: np.ndarray, height: int) -> np.ndarray:
         """Share (N,) of the readout that is over when the rows y (N,) are read."""

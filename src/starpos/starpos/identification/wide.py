@@ -32,7 +32,8 @@ from starpos.identification.pairs import close_pairs, mutual_nearest
 from starpos.identification.pose import Pose, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import Camera
+from starpos.instrument.lens import EQUIDISTANT
 from starpos.normal import SIGMA_PER_MAD
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import rows_near

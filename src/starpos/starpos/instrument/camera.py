@@ -11,12 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starpos.core.lens import Equidistant, Lens
 from starpos.errors import InstrumentError
-from starpos.instrument import equidistant, plumb_bob
-
-# ROS's names of the lens models that are understood, and the names of their coefficients.
-PLUMB_BOB, EQUIDISTANT = "plumb_bob", "equidistant"
-COEFFICIENTS = {PLUMB_BOB: plumb_bob.COEFFICIENTS, EQUIDISTANT: equidistant.COEFFICIENTS}
+from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB, lens_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +66,11 @@ class Camera:
         return cls(width=width, height=height, fx=focal_px, fy=focal_px, cx=cx, cy=cy, model=model)
 
     @cached_property
+    def lens(self) -> Lens:
+        """Its lens: directions in C, and places in focal lengths."""
+        return lens_of(self.model, self.distortion)
+
+    @cached_property
     def is_ideal(self) -> bool:
         """Whether the camera is a pinhole without distortion."""
         return self.model == PLUMB_BOB and not any(self.distortion)
@@ -81,11 +83,11 @@ class Camera:
     @property
     def half_diagonal_rad(self) -> float:
         """Angle to the frame's corner, without a pinhole's distortion, or to the end of a fisheye's picture."""
-        corner = 0.5 * np.hypot(self.width / self.fx, self.height / self.fy)
-        if self.model == PLUMB_BOB:
-            return float(np.arctan(corner))
-        angle = equidistant.angles(corner, self.distortion)
-        return float(angle) if np.isfinite(angle) else equidistant.reach(self.distortion)
+        corner = 0.5 * math.hypot(self.width / self.fx, self.height / self.fy)
+        if not isinstance(self.lens, Equidistant):
+            return math.atan(corner)
+        angle = self.lens.angle_at(corner)
+        return angle if math.isfinite(angle) else self.lens.reach
 
     @property
     def centre_px(self) -> tuple[float, float]:
@@ -104,10 +106,10 @@ class Camera:
 
     def sees(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Whether pixels x, y (N,) lie within the lens's picture: around that of a fisheye the frame may be black."""
-        x, y = (np.asarray(x, float) - self.cx) / self.fx, (np.asarray(y, float) - self.cy) / self.fy
-        if self.model == PLUMB_BOB:
-            return np.ones(x.shape, bool)
-        return np.hypot(x, y) < equidistant.picture(self.distortion)
+        places = self._places(x, y)
+        if not isinstance(self.lens, Equidistant):
+            return np.ones(places.shape[:-1], bool)
+        return np.hypot(places[..., 0], places[..., 1]) < self.lens.picture
 
     def directions(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Unit vectors (N, 3) in C of pixels x, y (N,): of a pinhole W = (X, Y, f) / norm, after undistortion.
@@ -115,17 +117,24 @@ class Camera:
         The paper prints another third component; docs/the_paper.md#star-vectors says why it is f. NaN outside the
         picture of a fisheye. Raises InstrumentError where the distortion of a pinhole cannot be inverted.
         """
-        x, y = (np.asarray(x, float) - self.cx) / self.fx, (np.asarray(y, float) - self.cy) / self.fy
-        lens = plumb_bob if self.model == PLUMB_BOB else equidistant
-        v = lens.rays(np.stack([x, y], -1), self.distortion)
-        return v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
+        v = self.lens.rays(self._places(x, y))
+        if self.model == PLUMB_BOB and np.isnan(v).any():
+            raise InstrumentError(
+                f"distortion {self.distortion} cannot be inverted inside the frame: calibrate the camera again"
+            )
+        return v
 
     def slopes(self, v: np.ndarray) -> np.ndarray:
         """Derivatives (N, 2, 3), px, of `project` at directions v (N, 3)."""
-        lens = plumb_bob if self.model == PLUMB_BOB else equidistant
-        return lens.slopes(v, self.distortion) * np.array([[self.fx], [self.fy]])
+        return self.lens.slopes(v) * np.array([[self.fx], [self.fy]])
 
     def project(self, v: ArrayLike) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind a pinhole, and outside the picture of a fisheye."""
-        lens = plumb_bob if self.model == PLUMB_BOB else equidistant
-        return lens.seen(np.asarray(v, float), self.distortion) * [self.fx, self.fy] + [self.cx, self.cy]
+        return self.lens.places(v) * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def _places(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Places (N, 2) of pixels x, y (N,), in focal lengths from the principal point."""
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        places = np.empty((*np.broadcast(x, y).shape, 2))
+        places[..., 0], places[..., 1] = (x - self.cx) / self.fx, (y - self.cy) / self.fy
+        return places

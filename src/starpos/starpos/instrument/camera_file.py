@@ -7,7 +7,8 @@ from pathlib import Path
 
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
-from starpos.instrument.camera import COEFFICIENTS, Camera
+from starpos.instrument.camera import Camera
+from starpos.instrument.lens import COEFFICIENTS
 
 # Most pixels along a frame's side.
 LARGEST_SIDE = 1_000_000

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inclinometer: its readings, its transfer function, and A2, which takes its frame S into the local level L."""
 
+import math
 from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,9 +79,9 @@ class Tilt:
     @property
     def axes(self) -> int:
         """Number of axes that were measured, 2 or 3."""
-        return 2 if np.isnan(self.theta_z) else 3
+        return 2 if math.isnan(self.theta_z) else 3
 
-    @property
+    @cached_property
     def theta(self) -> np.ndarray:
         """The elevations (axes,) in rad."""
         return np.array([self.theta_x, self.theta_y, self.theta_z])[: self.axes]
@@ -94,7 +96,7 @@ class Tilt:
         whole[2, 2] = np.trace(self.covariance) / 2 if np.isnan(self.variance_z) else self.variance_z
         return whole
 
-    @property
+    @cached_property
     def up(self) -> np.ndarray:
         """Up (3,), a unit vector in S."""
         return up_of(self.theta)
@@ -108,7 +110,7 @@ class Tilt:
         if self.axes == 3:
             up = self.up
             return (np.eye(3) - np.outer(up, up)) / np.linalg.norm(np.sin(self.theta))
-        return up_slope(self.theta)
+        return up_slope(self.theta, self.up)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,8 +201,8 @@ class InclinometerErrors:
         """
         if self.quantum_rad == 0:
             return 0.0
-        noise2 = np.diag(tilt.covariance).min() * tilt.samples / self.quantum_rad**2
-        return float(self.quantum_rad / np.sqrt(12) * np.exp(-2 * np.pi**2 * noise2))
+        noise2 = min(tilt.covariance[0, 0], tilt.covariance[1, 1]) * tilt.samples / self.quantum_rad**2
+        return float(self.quantum_rad / math.sqrt(12) * math.exp(-2 * math.pi**2 * noise2))
 
     def steps(self, tilt: Tilt) -> tuple:
         """The quantiser's steps on which the readings stand; the error of rounding is the same while they stay."""
@@ -233,17 +235,21 @@ def up_of(theta: np.ndarray) -> np.ndarray:
     sines = np.sin(np.asarray(theta, float))
     if sines.shape[-1] == 3:
         return rotation.normalised(sines)
-    third = np.sqrt(np.maximum(1 - np.sum(sines**2, -1, keepdims=True), 0.0))
-    return np.concatenate([sines, third], -1)
+    up = np.empty((*sines.shape[:-1], 3))
+    up[..., :2] = sines
+    up[..., 2] = np.sqrt(np.maximum(1 - np.einsum("...i,...i->...", sines, sines), 0.0))
+    return up
 
 
-def up_slope(theta: np.ndarray) -> np.ndarray:
-    """Derivatives (3, axes) of `up_of` by the elevations (axes,)."""
-    up, slope = up_of(theta), np.cos(theta)
+def up_slope(theta: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Derivatives (3, axes) of up (3,), as `up_of` has it, by the elevations theta (axes,)."""
+    cosines = np.cos(theta)
     if len(theta) == 3:
         across = np.eye(3) - np.outer(up, up)
-        return across * slope / np.linalg.norm(np.sin(theta))
-    return np.vstack([np.diag(slope), -up[:2] * slope / max(up[2], 1e-9)])
+        return across * cosines / np.linalg.norm(np.sin(theta))
+    (cx, cy), (x, y, z) = cosines.tolist(), up.tolist()
+    steep = max(z, 1e-9)
+    return np.array([[cx, 0.0], [0.0, cy], [-x * cx / steep, -y * cy / steep]])
 
 
 def level_of(up: np.ndarray) -> np.ndarray:
@@ -260,10 +266,12 @@ def level_of(up: np.ndarray) -> np.ndarray:
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
 
 
-def levelling_of(up: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Small rotation (3, n) of L about its axes for n errors that move up (3,) in S by slope (3, n); none about Z."""
-    moved = level_of(up) @ slope
-    return np.stack([moved[1], -moved[0], np.zeros(slope.shape[1])])
+def levelling_of(a2: np.ndarray) -> np.ndarray:
+    """What takes a move of up (3,) in S into a small rotation (3,) of L about its axes: (3, 3); none about Z.
+
+    a2 (3, 3): S into L.
+    """
+    return np.array([a2[1], -a2[0], np.zeros(3)])
 
 
 def sca100t_volts(

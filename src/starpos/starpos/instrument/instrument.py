@@ -11,9 +11,10 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError
 from starpos.frames.shutter import Shutter
-from starpos.instrument.camera import PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.camera_vertical import CameraVertical
 from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.lens import PLUMB_BOB
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.response import COEFFICIENTS
 from starpos.units import ARCSEC, DAY_S

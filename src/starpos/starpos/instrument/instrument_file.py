@@ -12,11 +12,12 @@ import numpy as np
 from starpos.errors import FrameError, InstrumentError, TimeError
 from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file, sensors, yaml_file
-from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
 from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, CameraVertical, level_errors
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
+from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
 from starpos.units import ARCSEC
 from starpos.utc import unix_of, utc_text
 

@@ -1,17 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations between camera, inclinometer and base link, as matrices with their errors."""
+"""Rotations between camera, inclinometer and base link, as matrices with their errors, and the level at a tilt."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
+from starpos.core.roots import symmetric_root
 from starpos.errors import InstrumentError
-from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, up_of
-from starpos.instrument.response import angles_at, response_columns, stated_variances
+from starpos.frozen import at_once
+from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, level_of, levelling_of, up_of
+from starpos.instrument.response import COEFFICIENTS, Zeroed, angles_at, response_columns, stated_variances
 
 # an error of its sine is none of the angle of a vertical axis
 LEAST_COSINE = 0.1
+
+
+@at_once
+@dataclass(frozen=True)
+class Level:
+    """The local level L that a tilt shows through a mounting.
+
+    up        (3,) in S, corrected by the response
+    a2        (3, 3): S into L
+    camera    (3, 3): C into L, A2 A3
+    response  (3, m): change of up for 1 sigma of each error of the response
+    """
+
+    up: np.ndarray
+    a2: np.ndarray
+    camera: np.ndarray
+    response: np.ndarray
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """What takes a move of up (3,) in S into a small rotation (3,) of L about its axes: (3, 3); none about Z."""
+        return levelling_of(self.a2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,34 +68,48 @@ class Mounting:
     response: tuple[float, ...] = ()
     response_covariance: tuple = ()
 
-    @property
+    @cached_property
     def calibrated_up(self) -> np.ndarray:
         """Up (3,) in S at the calibration."""
         return up_of(np.asarray(self.calibrated_tilt))
 
-    def response_at(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
-        """Change (3, m) of up for each coefficient of the response at a tilt, and their covariance (m, m).
+    @cached_property
+    def calibration_root(self) -> np.ndarray:
+        """The symmetric root (3, 3) in rad of the calibration's covariance."""
+        return symmetric_root(np.asarray(self.calibration_covariance, float))
+
+    def level(self, tilt: Tilt) -> Level:
+        """The level at a tilt; InstrumentError if the response that was found is not of such a sensor.
 
         Zeros that nobody found are as wrong as the axes contradict each other.
         """
-        if not self.response:
+        zeroed = self._zeroed[tilt.axes]
+        if self.response:
+            columns = response_columns(tilt.theta, tilt.up, zeroed)
+            if columns.shape[1] != len(self.response):
+                raise InstrumentError(
+                    f"the calibration's response has {len(self.response)} coefficients, and a tilt of {tilt.axes} axes "
+                    f"needs {columns.shape[1]}: calibrate with the inclinometer that is used"
+                )
+            up, response = (
+                rotation.normalised(tilt.up - columns @ self.response),
+                columns @ self._response_root,
+            )
+        else:
             # of three axes those that agree, as the calibration's do: so nothing counts at its lean
-            theta = angles_at(tilt.up, tilt.axes)
+            up, theta = tilt.up, angles_at(tilt.up, tilt.axes)
             variances = stated_variances(self.inclinometer, tilt.axes)
             wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), LEAST_COSINE)
             variances[: tilt.axes] += wrong**2
-            return response_columns(theta, self.calibrated_up), np.diag(variances)
-        columns = response_columns(tilt.theta, self.calibrated_up)
-        if columns.shape[1] != len(self.response):
-            raise InstrumentError(
-                f"the calibration's response has {len(self.response)} coefficients, and a tilt of {tilt.axes} axes needs "
-                f"{columns.shape[1]}: calibrate with the inclinometer that is used"
-            )
-        return columns, np.asarray(self.response_covariance)
+            response = response_columns(theta, tilt.up, zeroed) * np.sqrt(variances)
+        a2 = level_of(up)
+        return Level(up, a2, a2 @ self.a3, response)
 
-    def up(self, tilt: Tilt) -> np.ndarray:
-        """Up (3,) in S, corrected by the response."""
-        if not self.response:
-            return tilt.up
-        columns, _ = self.response_at(tilt)
-        return rotation.normalised(tilt.up - columns @ self.response)
+    @cached_property
+    def _response_root(self) -> np.ndarray:
+        return symmetric_root(np.asarray(self.response_covariance, float))
+
+    @cached_property
+    def _zeroed(self) -> dict[int, Zeroed]:
+        """Where the response counts nothing, by the number of axes."""
+        return {axes: Zeroed.at(self.calibrated_up, axes) for axes in COEFFICIENTS}

@@ -5,12 +5,13 @@ Each axis has a zero and a scale, and each pair of axes an angle that is not squ
 lean, so these count only away from it; a zero does so because an angle that is wrong by a constant is no rotation.
 """
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from starpos import rotation
-from starpos.instrument.inclinometer import InclinometerErrors, up_of, up_slope
+from starpos.instrument.inclinometer import InclinometerErrors, up_slope
 
 # number of coefficients by number of axes: zeros, scales, angles between axes
 COEFFICIENTS = {2: 5, 3: 9}
@@ -21,20 +22,40 @@ def angles_at(up: np.ndarray, axes: int) -> np.ndarray:
     return np.arcsin(np.clip(up, -1, 1))[:axes]
 
 
-def response_columns(theta: np.ndarray, calibrated_up: np.ndarray) -> np.ndarray:
-    """Change (3, m) of up in S, as read at the angles theta (axes,), for each coefficient of the response.
+@dataclass(frozen=True)
+class Zeroed:
+    """A lean at which the response counts nothing, because A3 was fitted there.
 
-    calibrated_up (3,): up in S at the calibration. There all columns are 0, because A3 holds the rest.
+    theta (axes,): its angles.  turns (axes, 3): the rotation of S that moves up as an error of each angle does.
+    """
+
+    theta: np.ndarray
+    turns: np.ndarray
+
+    @classmethod
+    def at(cls, up: np.ndarray, axes: int) -> "Zeroed":
+        """The lean at which up (3,) in S is, for a sensor of so many axes."""
+        theta = angles_at(up, axes)
+        return cls(theta, rotation.cross(up, up_slope(theta, up).T))
+
+
+def response_columns(theta: np.ndarray, up: np.ndarray, zeroed: Zeroed) -> np.ndarray:
+    """Change (3, m) of up (3,) in S, as read at the angles theta (axes,), for each coefficient of the response.
+
     The m coefficients are the zeros (rad), the scales (shares) and, for each pair of axes, the share of one axis' angle
     that the other shows.
     """
-    axes, then = len(theta), angles_at(calibrated_up, len(theta))
-    slope, lean = up_slope(theta), theta - then
+    axes, lean = len(theta), (theta - zeroed.theta).tolist()
+    # change of each angle for each coefficient
+    angles = np.zeros((axes, COEFFICIENTS[axes]))
+    for k in range(axes):
+        angles[k, k], angles[k, axes + k] = 1.0, lean[k]
+    for k, (i, j) in enumerate(combinations(range(axes), 2), 2 * axes):
+        angles[i, k], angles[j, k] = lean[j], lean[i]
+    columns = up_slope(theta, up) @ angles
     # a rotation of S by up x moved takes up there by `moved`
-    turns = rotation.cross(calibrated_up, up_slope(then).T)
-    zeros = slope - rotation.cross(turns, up_of(theta)).T
-    pairs = [slope[:, i] * lean[j] + slope[:, j] * lean[i] for i, j in combinations(range(axes), 2)]
-    return np.column_stack([zeros, slope * lean, *pairs])
+    columns[:, :axes] += rotation.cross_matrix(up) @ zeroed.turns.T
+    return columns
 
 
 def stated_variances(errors: InclinometerErrors, axes: int) -> np.ndarray:

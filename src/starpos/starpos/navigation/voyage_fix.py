@@ -58,7 +58,7 @@ def fix_of(motion: Motion, k: int, covariance: np.ndarray, errors: TimeErrors) -
     place_and_turn = slope @ covariance[np.ix_(columns, columns)] @ slope.T
     to_heading = np.zeros((3, 5))
     to_heading[:2, :2] = np.eye(2)
-    to_heading[2:, 2:] = heading_row(np.eye(3), attitude)
+    to_heading[2:, 2:] = heading_row(attitude)
     earth = earth_state(float(motion.utc_unix_s[k]))
     shared = total_covariance(time_terms(latitude, earth, errors.clock_s, errors.stamp_s))
     return VoyageFix(

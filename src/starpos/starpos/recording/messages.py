@@ -15,8 +15,9 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
-from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
+from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16

@@ -15,8 +15,9 @@ from starpos.earth.refraction import Atmosphere
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import Stars
-from starpos.instrument.camera import PLUMB_BOB, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.lens import PLUMB_BOB
 from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site, camera_to_enu

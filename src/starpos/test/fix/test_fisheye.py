@@ -12,8 +12,9 @@ from starpos.fix.other_focal import focal_that_fits
 from starpos.fix.solution import Status
 from starpos.identification import wide
 from starpos.identification.triangle_cache import cached
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.lens import EQUIDISTANT
 from starpos.navigation.sightings import sighting_of
 from starpos.simulation.scene import Optics
 from starpos_testing.skies.scenes import (

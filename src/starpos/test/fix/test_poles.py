@@ -81,7 +81,7 @@ def test_heading_and_attitude_change_with_the_place_as_a_fixed_camera_shows(lati
     """A level that is off by a small angle is another place, from which the camera's attitude is another."""
     phi, step = np.radians(latitude), 1e-6
     axes, link = enu_axes(phi, 0.7), rotation.from_vector(rng.normal(size=3))
-    level = Sensitivity.of(axes, link).level
+    level = Sensitivity.of(place_of(axes), link).level
     for k in range(3):
         turn = rotation.from_vector(np.eye(3)[k] * step)
         place = place_of(turn @ axes)

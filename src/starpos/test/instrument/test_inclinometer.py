@@ -58,7 +58,7 @@ def test_levelling_turns_the_level_as_the_errors_of_the_angles_do(rng):
     for _ in range(50):
         theta = rng.uniform(-0.6, 0.6, 2)
         before, error = up_of(theta), rng.normal(0, 1e-6, 2)
-        turn = rotation.from_vector(levelling_of(before, up_slope(theta)) @ error)
+        turn = rotation.from_vector(levelling_of(level_of(before)) @ up_slope(theta, before) @ error)
         up = level_of(before).T @ turn.T @ [0, 0, 1.0]
         np.testing.assert_allclose(up, up_of(theta + error), atol=1e-11)
 

@@ -12,9 +12,10 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solution import Attitude, Status
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.lens import EQUIDISTANT
 from starpos.report import folder, measures, sky_figure
 from starpos.report.night import Night, ReportedPlace, Shot, Truth
 from starpos.report.working import Workshop, worked
