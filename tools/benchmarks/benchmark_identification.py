@@ -250,14 +250,35 @@ def rows(options) -> Iterator[Row]:
         for n in (5, 6, 7)
     ]
     kinds.append(("random points", lambda c: montecarlo_fields.points(c, seed), realistic, alone))
+    together: dict[str, list[Tally]] = {name: [] for name in answers}
     for label, fields, conditions, who in kinds[3:5] if options.quick else kinds:
         what = f"identification, {label}" + ", ideal" * (conditions is ideal)
         tallies = tallied(what, fields(conditions), number, conditions, who)
-        ours = cost(tallies.pop("starpos"))
-        for name, tally in tallies.items():
-            yield Row(what, ours, name, cost(tally))
-        if not tallies:
-            yield Row(what, ours)
+        yield from compared(what, tallies)
+        if conditions is realistic and who is answers:
+            for name, tally in tallies.items():
+                together[name].append(tally)
+    whole = {name: joined(tallies) for name, tallies in together.items()}
+    yield from compared("identification, 0 to 2 false together", whole)
+
+
+def joined(tallies: list[Tally]) -> Tally:
+    """All their answers as those of one."""
+    whole = Tally()
+    for tally in tallies:
+        whole.correct, whole.wrong = whole.correct + tally.correct, whole.wrong + tally.wrong
+        whole.none, whole.cpu_ms = whole.none + tally.none, whole.cpu_ms + tally.cpu_ms
+    return whole
+
+
+def compared(what: str, tallies: dict[str, Tally]) -> Iterator[Row]:
+    """A row for each peer, or one of ours alone."""
+    ours = cost(tallies["starpos"])
+    theirs = [(name, tally) for name, tally in tallies.items() if name != "starpos"]
+    for name, tally in theirs:
+        yield Row(what, ours, name, cost(tally))
+    if not theirs:
+        yield Row(what, ours)
 
 
 def main() -> int:

@@ -5,6 +5,7 @@ The filter takes each error as its budget states it. This keeps what is needed o
 more, and how alike those next to each other are: the mean of errors that are alike is not much better than one of them.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -48,14 +49,18 @@ class Remembered:
         """What is remembered of a fix of a pose that began with `first`."""
         own = [t for t in f.terms if not t.common and t.shared != EACH_POSE]
         new = [t for t in f.terms if t.shared == EACH_POSE]
-        common = [(k, first if t.posed else f) for k, t in enumerate(f.terms) if t.common]
-        factors = [np.sqrt(f.terms[k].variance) * plane.turned(g, g.terms[k].factor)[:2] for k, g in common]
+        turn, first_turn = plane.turn(f)[:2], plane.turn(first)[:2]
+        factors = [
+            math.sqrt(t.variance) * (first_turn @ like.factor[:3] if t.posed else turn @ t.factor[:3])
+            for t, like in zip(f.terms, first.terms, strict=False)
+            if t.common
+        ]
         return cls(
             utc_unix_s=f.utc_unix_s,
             pose=pose,
             fixes=1,
             place=plane.seen(f)[:2],
-            to_rad=np.linalg.inv(plane.turned(f, f.levelling)[:2]),
+            to_rad=np.linalg.inv(turn @ f.levelling[:3]),
             shared=np.hstack(factors),
             sigma=_sigma(own),
             pose_sigma=_sigma(new),

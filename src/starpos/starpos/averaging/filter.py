@@ -61,18 +61,17 @@ class Plane:
         heading = f.heading + self.convergence(f.latitude, f.longitude) - self.heading
         return np.array([*moved, half_turn(heading)]) / UNIT
 
-    def turned(self, f: Fix, factor: np.ndarray) -> np.ndarray:
-        """The first three rows of an error factor of a fix, turned from the fix's axes into the plane's; in UNIT."""
-        turn = self.convergence(f.latitude, f.longitude)
-        c, s = np.cos(turn), np.sin(turn)
-        east, north, heading = factor[:3]
+    def turn(self, f: Fix) -> np.ndarray:
+        """What takes the first three rows of an error factor of a fix from its axes into the plane's, in UNIT: (3, 3)."""
+        angle = self.convergence(f.latitude, f.longitude)
+        c, s = np.cos(angle), np.sin(angle)
         # an error of the longitude turns the north from which the heading counts
         prime, _ = curvature_radii_m(f.latitude)
-        heading = heading - meridian_turn(f.latitude) / prime * east
-        return np.stack([c * east + s * north, c * north - s * east, heading]) / UNIT[:, None]
+        north_turns = meridian_turn(f.latitude) / prime
+        return np.array([[c, s, 0.0], [-s, c, 0.0], [-north_turns, 0.0, 1.0]]) / UNIT[:, None]
 
     def local(self, latitude: float, factor: np.ndarray) -> np.ndarray:
-        """A factor (3, m) in UNIT, as m and rad, with the heading from the north at its own place; reverses `turned`."""
+        """A factor (3, m) in UNIT, as m and rad, with the heading from the north at its own place; reverses `turn`."""
         prime, _ = curvature_radii_m(latitude)
         factor = factor * UNIT[:, None]
         return factor + np.outer([0.0, 0.0, meridian_turn(latitude) / prime], factor[0])
@@ -145,9 +144,9 @@ class PlaceFilter:
         """
         now, own = self._at(f, pose)
         shared, noise = np.zeros((3, len(now.state))), np.zeros((len(own), 3, 3))
+        turn, pose_turn = self.plane.turn(f), self.plane.turn(pose)
         for k, t in enumerate(f.terms):
-            like = pose if t.posed else f
-            factor = self.plane.turned(like, like.terms[k].factor)
+            factor = pose_turn @ pose.terms[k].factor[:3] if t.posed else turn @ t.factor[:3]
             if own[k]:
                 noise[k] = t.variance * factor @ factor.T
             else:
@@ -201,21 +200,22 @@ class PlaceFilter:
         """
         if tuple(t.name for t in f.terms) != self.names:
             raise ValueError("fixes with other error terms: they are not of one program")
-        state, sources, keys = self.state.copy(), self.sources.copy(), list(self.keys)
-        own = np.array([t.shared is None for t in f.terms])
+        keys, own = list(self.keys), np.array([t.shared is None for t in f.terms])
+        # what is left of each shared error, and the variance that it gains
+        left, gained = np.ones(len(self.state)), np.zeros((len(keys), len(self.state)))
         for k, t in enumerate(f.terms):
             if t.shared is None:
                 continue
             shared = (pose.utc_unix_s,) if t.shared == EACH_POSE else t.shared
             at, alike = self.columns[k], correlation(keys[k], shared)
-            state[at] *= alike
-            sources[:, at, :] *= alike
-            sources[:, :, at] *= alike
             walked = t.walk_s * abs(f.utc_unix_s - self.utc_unix_s) if alike else 0.0
-            sources[k, at, at] += np.eye(at.stop - at.start) * (t.variance * (1 - alike**2) + walked)
+            left[at], gained[k, at] = alike, t.variance * (1 - alike**2) + walked
             keys[k] = shared
+        sources = self.sources * (left[:, None] * left)
+        np.einsum("kii->ki", sources)[:] += gained
         later = max(self.utc_unix_s, f.utc_unix_s)
-        return replace(self, state=state, sources=sources, keys=tuple(keys), utc_unix_s=later), own
+        now = replace(self, state=self.state * left, sources=sources, keys=tuple(keys), utc_unix_s=later)
+        return now, own
 
     @property
     def place(self) -> tuple[float, float, float]:

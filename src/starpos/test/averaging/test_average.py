@@ -190,7 +190,7 @@ def dense(made):
     for k, term in enumerate(made[0].terms):
         # They are of one pose.
         like = [made[0] if term.posed else f for f in made]
-        factors = [plane.turned(f, f.terms[k].factor) * UNIT[:, None] for f in like]
+        factors = [plane.turn(f) @ f.terms[k].factor[:3] * UNIT[:, None] for f in like]
         for i, f in enumerate(made):
             for j, g in enumerate(made):
                 a, b = f.terms[k].shared, g.terms[k].shared
