@@ -2,6 +2,7 @@
 """`starpos navigate`: place, heading and velocity of a voyage from its frames and an IMU, without standing still."""
 
 import argparse
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -86,6 +87,15 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="where --velocity is not over ground but through water or air: 1 sigma of current or wind, an axis; half of "
         "it may change in an hour (0)",
     )
+    parser.add_argument(
+        "--drift-change",
+        type=options.number(1e-3, 50),
+        default=math.nan,
+        metavar="M_PER_S",
+        help="what wind or current change in ten minutes, 1 sigma an axis, where you know it: the claim is that of what is "
+        "stated, unless minutes of the record show more (of --drift-stddev a fifth; a ship's current 0.07, a drone's wind "
+        "0.3)",
+    )
     options.add_stamps(parser)
     parser.add_argument(
         "--instrument", metavar="FILE", help="instrument file (YAML) instead of the next two options"
@@ -149,6 +159,7 @@ def run(args: argparse.Namespace) -> int:
         atmosphere=options.atmosphere_of(args),
         clock_stddev_s=instrument.clock_stddev_s,
         drift_stddev=args.drift_stddev,
+        drift_change=args.drift_change,
     )
     if args.altitude_m is not None:
         vessel = replace(vessel, height_m=args.altitude_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)

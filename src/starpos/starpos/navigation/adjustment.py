@@ -14,7 +14,7 @@ from starpos.errors import FixError, VoyageError
 from starpos.navigation import sanity
 from starpos.navigation.borne_out import borne_out
 from starpos.navigation.chain import Chain, Smoothed, log_likelihood, smoothed
-from starpos.navigation.laws import MotionLaw, carried
+from starpos.navigation.laws import MotionLaw
 from starpos.navigation.links import Links, links_of
 from starpos.navigation.measures import (
     Beforehand,
@@ -95,7 +95,7 @@ class Adjustment:
 
     def _law(self, vessel: Vessel) -> MotionLaw | None:
         if self.odometry is not None:
-            return carried(vessel.drift_stddev) if vessel.drift_stddev > 0 else None
+            return vessel.carried if vessel.drift_stddev > 0 else None
         return None if vessel.parked else vessel.law
 
     @property

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of motion: how fast the speed of a vehicle can change, where nothing measures it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +75,8 @@ LAWS = {
         rest_s=1.0,
     ),
 }
+# what is said of a drift is how much it changes in so long
+CHANGE_S = 600.0
 # of a drift such a share changes in an hour
 DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
 
@@ -102,3 +104,8 @@ ANYTHING = MotionLaw(
     climb_stddev=3.0,
     rest_s=10.0,
 )
+
+
+def drifting(law: MotionLaw, change: float) -> MotionLaw:
+    """The law with a drift that changes by so much in ten minutes, 1 sigma, m/s an axis, as it walks at random."""
+    return replace(law, drift_walk=change / CHANGE_S**0.5)

@@ -6,6 +6,7 @@ import pytest
 from scipy.stats import multivariate_normal
 from voyage_calls import navigated, nees, sigma_m
 
+from starpos.errors import VoyageError
 from starpos.navigation.borne_out import independent_means
 from starpos.navigation.laws import LAWS
 from starpos_testing.voyages import made, turbulent_wind, walking_wind
@@ -71,3 +72,24 @@ def test_a_steady_wind_is_not_believed_to_stay_so():
     law = voyage.last.law
     assert law.drift_walk == pytest.approx(LAWS["drone"].drift_walk, rel=0.05)
     assert law.rest_stddev < 0.5 * LAWS["drone"].rest_stddev
+
+
+def test_a_wind_that_is_known_to_be_steady_narrows_the_claim():
+    record = made("drone", 900, 3, rate_hz=25, cadence_s=3.0)
+    usual = navigated(record, "drone", velocity=False)
+    known = navigated(record, "drone", velocity=False, drift_change=0.03)
+    assert sigma_m(known) < 0.4 * sigma_m(usual) and nees(known, record) < 16
+
+
+def test_a_wind_that_is_wrongly_said_to_be_steady_widens_the_claim_all_the_same():
+    record = made("drone", 900, 4, rate_hz=25, cadence_s=3.0, more_wind=walking_wind(0.05))
+    wrong = navigated(record, "drone", velocity=False, drift_change=0.03)
+    assert any("change" in fault for fault in wrong.faults)
+    assert sigma_m(wrong) > 5 * sigma_m(navigated(made("drone", 900, 4, rate_hz=25, cadence_s=3.0), "drone",
+                                                   velocity=False, drift_change=0.03))  # fmt: skip
+
+
+@pytest.mark.parametrize("vehicle", ["rover", "parked"])
+def test_what_stands_on_the_ground_has_no_drift_to_change(vehicle):
+    with pytest.raises(VoyageError, match="neither carries"):
+        navigated(made("parked", 30, 1, rate_hz=25), vehicle, velocity=False, drift_change=0.1)
