@@ -92,9 +92,9 @@ def define(parser: argparse.ArgumentParser) -> None:
         type=options.number(1e-3, 50),
         default=math.nan,
         metavar="M_PER_S",
-        help="what wind or current change in ten minutes, 1 sigma an axis, where you know it: the claim is that of what is "
-        "stated, unless minutes of the record show more (of --drift-stddev a fifth; a ship's current 0.07, a drone's wind "
-        "0.3)",
+        help="what wind or current change in ten minutes, 1 sigma an axis, where you know it: the claim is that of what "
+        "is stated, unless minutes of the record show more (of --drift-stddev a fifth; a ship's current 0.07, a drone's "
+        "wind 0.3)",
     )
     options.add_stamps(parser)
     parser.add_argument(
