@@ -77,9 +77,13 @@ class EarthState:
         return self.cirs_to_itrs @ np.asarray(self.astrom["bpn"]).reshape(3, 3)
 
     def to_itrs(self, v: np.ndarray) -> np.ndarray:
-        """Turn ICRS directions (N, 3) into geocentric apparent ones (N, 3) in ITRS at this date (ERFA eraAtciqz)."""
-        ra, dec = erfa.c2s(v)
-        return erfa.s2c(*erfa.atciqz(ra, dec, self.astrom)) @ self.cirs_to_itrs.T
+        """Turn ICRS directions (N, 3) into geocentric apparent ones (N, 3) in ITRS at this date.
+
+        ERFA's steps of eraAtciqz, without its angles: deflection by the Sun, aberration, bias and precession.
+        """
+        astrom = self.astrom
+        deflected = erfa.ldsun(v, astrom["eh"], astrom["em"])
+        return erfa.ab(deflected, astrom["v"], astrom["em"], astrom["bm1"]) @ self.gcrs_to_itrs.T
 
 
 def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) -> EarthState:

@@ -5,6 +5,7 @@ The residuals are formed in pixels, because the errors of the stars are known th
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -43,6 +44,11 @@ class Fitted:
     residual: np.ndarray
     keep: np.ndarray
     jitter2: float
+
+    @cached_property
+    def kept(self) -> slice | np.ndarray:
+        """Which rows go with the others: all, as is usual, without a copy of them."""
+        return slice(None) if self.keep.all() else self.keep
 
 
 def adjustment_of(

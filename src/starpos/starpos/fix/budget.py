@@ -211,14 +211,14 @@ def tilt_terms(
     rows: np.ndarray, level: Level, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
     """The sources of error of the level, A3's first; rows (n, 3): those of the factors for a small rotation of L."""
-    calibration, remounted = np.empty((3, 4)), level.a2 * mounting.remounted_rad
+    calibration, by_axes = np.empty((3, 4)), rows @ level.turns
     np.matmul(level.a2, mounting.calibration_root, out=calibration[:, :3])
     calibration[:, 3] = _turn_error(level, mounting)
     return (
         ErrorTerm(CALIBRATION, rows @ calibration, shared=ALWAYS, posed=True),
-        ErrorTerm("remounting", rows @ remounted, shared=ALWAYS, posed=True),
-        *_inclinometer_terms(rows @ (level.turns @ tilt.slope), tilt, mounting, utc_unix_s),
-        ErrorTerm("tilt response", rows @ (level.turns @ level.response), shared=ALWAYS, posed=True),
+        ErrorTerm("remounting", rows @ level.a2 * mounting.remounted_rad, shared=ALWAYS, posed=True),
+        *_inclinometer_terms(by_axes @ tilt.slope, tilt, mounting, utc_unix_s),
+        ErrorTerm("tilt response", by_axes @ level.response, shared=ALWAYS, posed=True),
     )
 
 

@@ -148,11 +148,11 @@ def solve_fix(
             f"the identified stars lie {math.sqrt(fit.jitter2):.1f} px off the best attitude: check the camera's "
             "distortion"
         )
-    keep, residual = fit.keep, fit.residual[fit.keep]
-    claimed2 = expected_extra(residual, stated[keep], share_free(keep))
-    centroids = stars.covariance_px2[keep] + ISOTROPIC * claimed2
-    same_stars = ALWAYS if stars.index is None else tuple(stars.index[keep][:MARKS].tolist())
-    errors = StarErrors.of(fit.slope[keep], centroids, catalogue_px2[keep], same_stars)
+    kept, residual = fit.kept, fit.residual[fit.kept]
+    claimed2 = expected_extra(residual, stated[kept], share_free(fit.keep))
+    centroids = stars.covariance_px2[kept] + ISOTROPIC * claimed2
+    same_stars = ALWAYS if stars.index is None else tuple(stars.index[kept][:MARKS].tolist())
+    errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
     place = place_of(fit.a4)
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
     sensitivity = Sensitivity.of(place, link_to_enu)
@@ -181,7 +181,7 @@ def solve_fix(
         link_to_enu=link_to_enu,
         terms=terms,
         levelling=sensitivity.level @ (level.turns @ axes),
-        used=np.flatnonzero(keep),
+        used=np.flatnonzero(fit.keep),
         residual_px=residual,
         residual_arcsec=math.sqrt(np.vdot(residual, residual) / residual.size) * camera.scale_arcsec,
         jitter_px=math.sqrt(fit.jitter2),
@@ -198,7 +198,7 @@ def solve_fix(
 def _bending(problem: Adjustment, fit: Fitted, errors: StarErrors, atmosphere: Atmosphere) -> np.ndarray:
     """Rotation (3,) of A4 in rad for 1 sigma of the refraction."""
     stronger = problem.predict(fit.a4, fit.scale, atmosphere.refraction(1 + STEP_REFRACTION).compiled)
-    moved = (stronger - problem.xy - fit.residual)[fit.keep]
+    moved = (stronger - problem.xy - fit.residual)[fit.kept]
     return errors.rotated(moved * (atmosphere.relative_sigma / STEP_REFRACTION))
 
 
@@ -207,6 +207,6 @@ def _rolling(
 ) -> np.ndarray:
     """Rotation (3, 2) of A4 in rad for 1 sigma of the two errors of the rows' times."""
     # in a second the sky turns about the pole, which is a column of A4
-    drift = fit.slope[fit.keep, :, :3] @ (-ROTATION_RAD_S * fit.a4[:, 2])
-    late = shutter.errors_s(problem.xy[fit.keep, 1], height)
+    drift = fit.slope[fit.kept, :, :3] @ (-ROTATION_RAD_S * fit.a4[:, 2])
+    late = shutter.errors_s(problem.xy[fit.kept, 1], height)
     return errors.rotated(drift[..., None] * late[:, None])
