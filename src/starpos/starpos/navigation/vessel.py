@@ -9,7 +9,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.navigation.imu import ImuModel
 from starpos.navigation.laws import ANYTHING, LAWS, MotionLaw
 
-PARKED = "parked"
+PARKED, ROVER = "parked", "rover"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,3 +41,8 @@ class Vessel:
     def parked(self) -> bool:
         """Whether it stands all the time."""
         return self.vehicle == PARKED
+
+    @property
+    def halts(self) -> bool:
+        """Whether it may stand on the ground now and then."""
+        return self.vehicle == ROVER
