@@ -21,7 +21,7 @@ from starpos.navigation.velocity import VelocityLog
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.units import ARCSEC
-from starpos_testing.halting import even, halting, idling, on_carriers
+from starpos_testing.halting import even, halting, idling, on_a_ferry, on_carriers
 from starpos_testing.voyages import (
     CAMERA_TO_BODY,
     INDUSTRIAL,
@@ -51,6 +51,7 @@ DRIVES = {
     "rover that halts, curving": halting(),
     "rover that halts, curving, drives running": idling(halting()),
     "rover on an even floor": even(shaking_turns=True),
+    "rover on a ferry": on_a_ferry(),
     "rover in lifts": on_carriers([0.0, 0.0, 1.0]),
     "rover on platforms": on_carriers([0.1, 0.0, 0.0]),
 }

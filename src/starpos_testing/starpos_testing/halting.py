@@ -97,7 +97,7 @@ def on_carriers(velocity, begin_s=12.0, jolt_s=2.0):
     """
 
     def drive(seconds, rng):
-        way = halting(stood_s=(40, 60))(seconds, rng)
+        way = halting(stood_s=(40, 60), sway=0.1)(seconds, rng)
         grid = _grid(seconds)
         standing = way.moving(grid) == 0
         speed, jolts, sign = 0 * grid, 0 * grid, 1.0
@@ -127,7 +127,7 @@ def on_a_ferry(speed=FERRY_SPEED):
 
 
 def idling(drive):
-    """The same ways, with the drives shaking on where the rover stands."""
+    """Ways of a drive, with its wheels shaking on where they stand."""
     return lambda seconds, rng: replace(drive(seconds, rng), moving=lambda t: 1.0 + 0 * t)
 
 
