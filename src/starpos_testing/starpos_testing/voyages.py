@@ -201,13 +201,20 @@ def made(
     velocity_sigma=0.03,
     errors=True,
     more_wind=None,
+    drive=None,
+    shaking=0.3,
 ):
     """Record a voyage; without `errors` the readings are exact, the mount as believed and the stars where they are.
 
     more_wind: of a drone, an axis, beside a steady one: `walking_wind`, `turbulent_wind`, `swinging_wind`.
+    drive: in place of the kind's way, one of `halting`, whose wheels shake the accelerometer by so many m/s2.
     """
     rng, on = np.random.default_rng(seed), float(errors)
-    displacement, angles = path_of(kind, seconds, rng, more_wind)
+    if drive is None:
+        displacement, angles = path_of(kind, seconds, rng, more_wind)
+    else:
+        way = drive(seconds, rng)
+        displacement, angles = way.displacement, way.angles
     origin, axes = ellipsoid_place(latitude_deg, longitude_deg, height_m)
 
     def place(t):
@@ -231,6 +238,9 @@ def made(
     force = half.inv().apply(np.diff(speed, axis=0) / dt - pull)
     if errors:
         gyro, force = _disturbed(gyro, force, model, dt, rng)
+        if drive is not None:
+            # it adds up to nothing, as the way is what it is
+            force += np.diff(shaking * way.moving(edges)[:, None] * rng.normal(size=(len(edges), 3)), axis=0)
     mount = Rotation.from_rotvec(np.radians(rng.normal(0, mount_deg, 3)) * on).as_matrix() @ CAMERA_TO_BODY
     log_s = np.arange(0.1, seconds, 0.1)
     ground = body(log_s).inv().apply((place(log_s + h) - place(log_s - h)) / (2 * h))

@@ -69,7 +69,8 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle",
         choices=tuple(LAWS),
-        help="parked: it stands; without --velocity the law by which its speed changes (anything that moves)",
+        help="parked: it stands; without --velocity the law by which its speed changes, and a rover's standstills as the "
+        "record shows them (anything that moves)",
     )
     parser.add_argument(
         "--mount-stddev",

@@ -29,6 +29,7 @@ from starpos.navigation.motion import BY_LAW, CONSTANTS, MEASURED, PLACE, Motion
 from starpos.navigation.odometry import Odometry
 from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.sightings import FrameUnderWay
+from starpos.navigation.standstill import FEWEST_STANDSTILLS, NOWHERE, Standstills, by_the_rest, standstills
 from starpos.navigation.start import first_motion
 from starpos.navigation.velocity import VelocityLog
 from starpos.navigation.vessel import Vessel
@@ -47,7 +48,8 @@ FARTHEST_M, MOST_ROUNDS = 2e7, 25
 LAW_CHANGE, MOST_WEIGHINGS = 1.1, 4
 # stars are seen anew where the zenith has moved by more: 2 m of refraction
 ZENITH_MOVED = 1e-3
-STANDING_SIGMA = 2e-3
+# a standstill, m/s: of each node, and of a middle one alone on trial
+STANDING_SIGMA, TRIAL_SIGMA = 2e-3, 5e-3
 # of a chi-squared of three degrees of freedom: the median, and what one in a million exceeds
 MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
 # steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8
@@ -88,9 +90,13 @@ class Adjustment:
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
         # how many times as much wind or current change as their law says
         self.weighings, self.more_drift = 0, 1.0
+        self.noise_weighed = False
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
         self.strays = 0
+        # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
+        self.standing: Standstills | None = None if self.odometry is None and vessel.halts else NOWHERE
+        self.contradicted = False
         self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
 
     def _law(self, vessel: Vessel) -> MotionLaw | None:
@@ -121,6 +127,11 @@ class Adjustment:
                 f"wind or current change {self.more_drift:.1f} times as much as the law of motion says: the claim is "
                 "widened by that"
             )
+        if self.contradicted:
+            said.append(
+                "it seems to stand now and then, but the rest of the record contradicts that: not believed; check that "
+                "the ground stays where it is, and the IMU's noise"
+            )
         return tuple(said)
 
     def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
@@ -149,7 +160,7 @@ class Adjustment:
             sigma = float(np.sqrt(variance.min()))
             progress("adjusting", min(0.95, (k + 1) / 8))
             settled = near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma)
-            if settled and not self._weighed(motion, chain, links):
+            if settled and not self._revised(motion, chain, links, stars):
                 progress("adjusting", 1.0)
                 return motion, solution, k + 1
         raise FixError(
@@ -172,19 +183,45 @@ class Adjustment:
         motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
         return stars, motion
 
+    def _revised(self, motion: Motion, chain: Chain, links: Links, stars: StarAttitudes) -> bool:
+        """Whether the motion, settled, changes what is believed of noise, law or standstills."""
+        weighed = self._weighed(motion, chain, links)
+        # standstills are judged by the law alone at first, and again by what is known in the end
+        judged = self.standing is not None and weighed
+        return weighed if judged else self._stopped(motion, chain, stars) or weighed
+
+    def _stopped(self, motion: Motion, chain: Chain, stars: StarAttitudes) -> bool:
+        """Whether it is believed to stand elsewhere than before: where it seems to, and the rest bears that out."""
+        before = len(self.standing or NOWHERE)
+        seeming = standstills(stars, self.pieces) if self.standing is None else self.standing
+        if len(seeming):
+            trial = standing_lacks(motion, seeming.middle, TRIAL_SIGMA, self.unknowns)
+            nodes = np.concatenate([chain.nodes[:, : -trial.rows.shape[1]], self._by_law(motion, trial)], 1)
+            rest = by_the_rest(trial, TRIAL_SIGMA, smoothed(replace(chain, nodes=nodes)))
+            self.contradicted |= rest.contradicted
+            enough = rest.checked.sum() >= FEWEST_STANDSTILLS and not rest.contradicted
+            seeming = seeming.but(rest.checked & enough)
+        self.standing = seeming
+        return len(seeming) != before
+
     def _weighed(self, motion: Motion, chain: Chain, links: Links) -> bool:
         """Whether the record changes how much is believed of its own noise, or of the law that stands in for velocities.
 
-        Not both: the law's errors hide those of the readings.
+        The noise only where velocities or standstills tell it: a law's errors hide it.
         """
-        self.weighings += 1
-        if self.odometry is not None:
-            if self.weighings == 1:
-                self._weigh(chain, links)
-            return self.weighings == 1
+        if (self.odometry is not None or self.standing) and not self.noise_weighed:
+            self._weigh(chain, links)
+            self.noise_weighed = True
+            return True
         stated = self._law(self.vessel)
-        if self.law is None or stated is None or self.weighings > MOST_WEIGHINGS:
+        if (
+            self.odometry is not None
+            or self.law is None
+            or stated is None
+            or self.weighings == MOST_WEIGHINGS
+        ):
             return False
+        self.weighings += 1
         law = borne_out(stated, motion)
         change = np.log([law.drift_walk / self.law.drift_walk, law.rest_stddev / self.law.rest_stddev])
         if np.abs(change).max() < np.log(LAW_CHANGE):
@@ -199,7 +236,9 @@ class Adjustment:
         while len(factors) < MOST_FACTORS and likely[-1] > max(likely) - UNLIKELY:
             factors.append(factors[-1] * FACTOR)
             density = self.model.accelerometer_noise_density * factors[-1]
-            noisy = links.noisier(density**2 - self.model.accelerometer_noise_density**2, self.pieces)
+            noisy = links.noisier(
+                self._shaken * (density**2 - self.model.accelerometer_noise_density**2), self.pieces
+            )
             likely.append(log_likelihood(replace(chain, links=noisy.whitened())) - noisy.log_determinant)
             # what is stated is believed within a factor of e, where the record says nothing
             likely[-1] -= np.log(factors[-1]) ** 2 / 2
@@ -207,6 +246,11 @@ class Adjustment:
         self.excess["forces"] = float(weight @ np.square(factors) / weight.sum())
         density = self.model.accelerometer_noise_density * np.sqrt(self.excess["forces"])
         self.model = replace(self.model, accelerometer_noise_density=density)
+
+    @property
+    def _shaken(self) -> np.ndarray:
+        """Mask (K - 1,) of the intervals in which the vehicle is not known to stand."""
+        return ~(self.standing or NOWHERE).links(len(self.nodes))
 
     def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
         """Attitudes of all frames whose stars agree, as seen under a zenith, or roughly."""
@@ -243,16 +287,28 @@ class Adjustment:
             parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
         if self.vessel.parked:
             parts.append(standing_lacks(motion, np.arange(count), STANDING_SIGMA, n))
+        rows = [part.whitened(count) for part in parts]
         if self.law is not None and self.odometry is None:
-            parts.append(law_lacks(motion, self.law))
+            stands = standing_lacks(motion, (self.standing or NOWHERE).nodes, STANDING_SIGMA, n)
+            rows.append(self._by_law(motion, stands))
         links = links_of(motion, sums, self.pieces, self.model, self.law)
+        # what shakes the accelerometer while it drives is not there where it stands
+        less = self.vessel.model.accelerometer_noise_density**2 - self.model.accelerometer_noise_density**2
+        links = links.noisier(less * ~self._shaken, self.pieces)
         chain = Chain(
             first=first_rows(motion, self.model, self.known, self.law),
-            nodes=np.concatenate([part.whitened(count) for part in parts], 1),
+            nodes=np.concatenate(rows, 1),
             links=links.whitened(),
             constants=CONSTANTS,
         )
         return chain, links
+
+    def _by_law(self, motion: Motion, stands: Lacks) -> np.ndarray:
+        """Whitened equations (K, 3, n + m + 1) of the law of motion, and in their place those of standstills."""
+        assert self.law is not None
+        rows = law_lacks(motion, self.law).whitened(len(motion))
+        rows[stands.index] = stands.whitened(len(motion))[stands.index]
+        return rows
 
     def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Lacks:
         assert self.odometry is not None

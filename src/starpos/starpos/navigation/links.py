@@ -87,10 +87,10 @@ class Links:
         """The equations as `chain.Chain` has them."""
         return np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
 
-    def noisier(self, density2: float, pieces: Pieces) -> "Links":
-        """The equations with so much more density of the force's noise, (m/s2)2/Hz."""
+    def noisier(self, density2: np.ndarray, pieces: Pieces) -> "Links":
+        """The equations with so much more density (K - 1,) of the force's noise, (m/s2)2/Hz."""
         covariance = self.covariance.copy()
-        _add_force_noise(covariance, density2, pieces.span_s[:, None, None])
+        _add_force_noise(covariance, density2[:, None, None], pieces.span_s[:, None, None])
         return Links(rows=self.rows, covariance=covariance)
 
     @property
@@ -183,8 +183,8 @@ def _noise(force: np.ndarray, pieces: Pieces, model: ImuModel, law: MotionLaw | 
     return noise
 
 
-def _add_force_noise(noise: np.ndarray, density2: float, dt: np.ndarray) -> None:
-    """Add white noise of the force, of a density in (m/s2)2/Hz, over times dt (K - 1, 1, 1)."""
+def _add_force_noise(noise: np.ndarray, density2: float | np.ndarray, dt: np.ndarray) -> None:
+    """Add white noise of the force, of a density (K - 1, 1, 1) in (m/s2)2/Hz, over times dt (K - 1, 1, 1)."""
     unit = np.eye(3) * density2
     noise[:, VELOCITY, VELOCITY] += dt * unit
     noise[:, PLACE, VELOCITY] += dt**2 / 2 * unit

@@ -11,8 +11,7 @@ from starpos.errors import VoyageError
 from starpos.navigation.imu import ImuModel
 from starpos.navigation.laws import ANYTHING, LAWS, MotionLaw, carried, drifting
 
-PARKED = "parked"
-ON_THE_GROUND = PARKED, "rover"
+PARKED, ROVER = "parked", "rover"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,10 +57,15 @@ class Vessel:
         """Whether it stands all the time."""
         return self.vehicle == PARKED
 
+    @property
+    def halts(self) -> bool:
+        """Whether it may stand on the ground now and then."""
+        return self.vehicle == ROVER
+
 
 def check_drift(vehicle: str | None, drift_stddev: float, drift_change: float) -> None:
     """Raise VoyageError if it is said how a drift changes of a vehicle that has none."""
-    if vehicle in ON_THE_GROUND and not drift_stddev and not math.isnan(drift_change):
+    if vehicle in (PARKED, ROVER) and not drift_stddev and not math.isnan(drift_change):
         raise VoyageError(
             f"drift change {drift_change:g} m/s: it is of wind or current, and neither carries a vehicle that is "
             f"'{vehicle}'"

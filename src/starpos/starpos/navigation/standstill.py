@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Standstills of a vehicle on the ground, by the record itself: attitudes, readings, and whether the rest bears them out.
+
+No single sign tells a vehicle that stands from one that rolls evenly and straight.  So it is believed where three agree.
+Its attitude stays, to the errors of the stars, as no rolling vehicle's does on real ground.  Its readings are quieter
+than while it surely moves: a vehicle whose motion is not felt is never seen to stand.  And the rest of the record,
+without that standstill, tells its velocity well enough, and it is 0.  Where one of them cannot be 0 none is believed:
+which of those that contradict each other are true nobody knows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starpos.navigation.chain import Smoothed
+from starpos.navigation.measures import Lacks, StarAttitudes
+from starpos.navigation.preintegration import Pieces
+from starpos.units import ARCSEC
+
+# it surely moves where it turns by more, rad/s, which is told by frames that are so far apart, s
+TURNING, TOLD_S = 5e-4, 1.0
+# so long it has to move before its motion is known, and so many of a hundred of these seconds may be quiet, s
+LEARNT_S, QUIET_PERCENT = 60.0, 5.0
+# of these readings' scatter a standstill has less; it is taken over so long before and after, s
+QUIETER, AROUND_S = 0.5, 1.0
+# a standstill has so many frames, and so long from the first to the last of them, s
+FEWEST_FRAMES, SHORTEST_S = 4, 8.0
+# frames that tell two axes to this, rad; variances of their attitudes are at most so many times those stated
+FINE, STEADY = 10 * ARCSEC, 2.0
+# forces add up to no more, in m/s, than their mean
+LEAP = 0.02
+# a standstill is checked where the rest leads to its velocity with less of an error, m/s an axis; what one in a thousand
+# exceeds of a chi-squared of three degrees of freedom; and so many that agree are no chance
+CHECKED, ONE_IN_1000, FEWEST_STANDSTILLS = 0.1, 16.3, 3
+# of a residual's variance such a share is left at least: less is rounding
+LEAST_LEFT = 1e-5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Standstills:
+    """J standstills: the nodes first to last (J,) of each, both included."""
+
+    first: np.ndarray
+    last: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def middle(self) -> np.ndarray:
+        """A node (J,) of each."""
+        return (self.first + self.last) // 2
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """All nodes (F,) of them."""
+        return np.concatenate([np.zeros(0, int), *map(np.arange, self.first, self.last + 1)])
+
+    def links(self, count: int) -> np.ndarray:
+        """Mask (count - 1,) of the intervals between so many nodes that lie within them."""
+        edges = np.zeros(count, int)
+        edges[self.first] += 1
+        edges[self.last] -= 1
+        return np.cumsum(edges)[:-1] > 0
+
+    def but(self, keep: np.ndarray) -> "Standstills":
+        """Some of them, by a mask (J,)."""
+        return Standstills(first=self.first[keep], last=self.last[keep])
+
+
+NOWHERE = Standstills(first=np.zeros(0, int), last=np.zeros(0, int))
+
+
+def standstills(stars: StarAttitudes, pieces: Pieces) -> Standstills:
+    """The stretches in which the vehicle seems to stand, by attitudes and readings alone."""
+    fine = np.linalg.eigvalsh(stars.covariance)[:, 1] < FINE**2
+    index, attitude = stars.index[fine], Rotation.from_matrix(stars.camera_to_itrs[fine])
+    t = np.append(0.0, np.cumsum(pieces.span_s))
+    scatter = _scatter(pieces, t)
+    moving = _turning(index, attitude, t) & np.isfinite(scatter)
+    if pieces.span_s[moving].sum() < LEARNT_S:
+        return NOWHERE
+    quiet = scatter < QUIETER * np.percentile(scatter[moving], QUIET_PERCENT)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet, [0]])))
+    found = []
+    for first, last in edges.reshape(-1, 2):
+        inside = (index >= first) & (index <= last)
+        if inside.sum() < FEWEST_FRAMES:
+            continue
+        begin, end = index[inside][[0, -1]]
+        if (
+            t[end] - t[begin] >= SHORTEST_S
+            and _steady(attitude[inside], stars.covariance[fine][inside])
+            and _level(pieces, slice(begin, end))
+        ):
+            found.append((begin, end))
+    first, last = np.array(found, int).reshape(-1, 2).T
+    return Standstills(first=first, last=last)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ByTheRest:
+    """Velocities (J, 3) at which the rest of a record arrives where the vehicle seems to stand, m/s along ITRS's axes.
+
+    covariance (J, 3, 3): of their errors.  sigma: of the standstill itself, m/s an axis.
+    """
+
+    velocity: np.ndarray
+    covariance: np.ndarray
+    sigma: float
+
+    @property
+    def checked(self) -> np.ndarray:
+        """Mask (J,) of those where a vehicle that rolls would have shown."""
+        return np.linalg.eigvalsh(self.covariance)[:, -1] < CHECKED**2
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether any of them cannot be 0, given that the others are."""
+        spread = self.covariance + self.sigma**2 * np.eye(3)
+        scaled = np.linalg.solve(spread, self.velocity[..., None])[..., 0]
+        return bool((np.einsum("ji,ji->j", self.velocity, scaled) > ONE_IN_1000).any())
+
+
+def by_the_rest(trial: Lacks, sigma: float, solution: Smoothed) -> ByTheRest:
+    """What each of the standstills would be without its own equation: trial has one of each, with which it was solved."""
+    slope, short = trial.rows[..., :-1], trial.rows[..., -1]
+    constants = np.tile(solution.constants, (len(short), 1))
+    unknowns = np.concatenate([solution.nodes[trial.index], constants], 1)
+    left = short - np.einsum("jki,ji->jk", slope, unknowns)
+    told = slope @ solution.covariance[trial.index] @ slope.transpose(0, 2, 1)
+    # the errors of the residuals: where they are nearly none, nothing but the equation itself tells the velocity
+    size, axes = np.linalg.eigh(np.eye(3) - told / sigma**2)
+    inverse = (axes / np.maximum(size, LEAST_LEFT)[:, None]) @ axes.transpose(0, 2, 1)
+    return ByTheRest(
+        velocity=-np.einsum("jik,jk->ji", inverse, left),
+        covariance=sigma**2 * (inverse - np.eye(3)),
+        sigma=sigma,
+    )
+
+
+def _scatter(pieces: Pieces, t: np.ndarray) -> np.ndarray:
+    """Scatter (K - 1,) of the forces from one reading to the next about each interval; of gaps, infinite."""
+    there = (pieces.length_s[:, 1:] > 0) & (pieces.length_s[:, :-1] > 0)
+    square = (np.diff(pieces.force, axis=1) ** 2).sum(2) * there
+    total, count = (np.append(0.0, np.cumsum(part.sum(1))) for part in (square, there))
+    middle = (t[1:] + t[:-1]) / 2
+    total, count = (
+        np.interp(middle + AROUND_S, t, part) - np.interp(middle - AROUND_S, t, part)
+        for part in (total, count)
+    )
+    whole = (count > 0) & (pieces.missing_s == 0)
+    return np.where(whole, np.sqrt(total / np.maximum(count, 1)), np.inf)
+
+
+def _turning(index: np.ndarray, attitude: Rotation, t: np.ndarray) -> np.ndarray:
+    """Mask (K - 1,) of the intervals between frames from one to the next of which it turns."""
+    if len(index) < 2:
+        return np.zeros(len(t) - 1, bool)
+    near = np.unique(np.searchsorted(t[index], np.arange(t[index[0]], t[index[-1]], TOLD_S)))
+    index, attitude = index[near], attitude[near]
+    turn = (attitude[:-1].inv() * attitude[1:]).magnitude()
+    turning = np.concatenate([[False], turn > TURNING * np.diff(t[index]), [False]])
+    return turning[np.searchsorted(index, np.arange(len(t) - 1), "right")]
+
+
+def _steady(attitude: Rotation, covariance: np.ndarray) -> bool:
+    """Whether attitudes scatter about one by no more than their errors, covariances (F, 3, 3), say."""
+    off = (attitude[len(attitude) // 2].inv() * attitude).as_rotvec()
+    weight = np.linalg.inv(covariance)
+    off = off - np.linalg.solve(weight.sum(0), np.einsum("kij,kj->i", weight, off))
+    return float(np.einsum("ki,kij,kj", off, weight, off)) < STEADY * 3 * (len(off) - 1)
+
+
+def _level(pieces: Pieces, part: slice) -> bool:
+    """Whether the forces of a part push evenly from its begin to its end."""
+    push = (pieces.force[part] * pieces.length_s[part][..., None]).sum(1)
+    span = pieces.span_s[part][:, None]
+    return bool(np.abs(np.cumsum(push - push.sum(0) / span.sum() * span, axis=0)).max() < LEAP)
