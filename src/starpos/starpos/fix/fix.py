@@ -138,8 +138,7 @@ def solve_fix(
     """
     level, refraction = mounting.level(tilt), atmosphere.refraction()
     g = level.camera
-    later_s = shutter.later_s(stars.xy[:, 1], camera.height)
-    problem = adjustment_of(stars.xy, camera, g, later(earth.to_itrs(stars.places), later_s), refraction)
+    problem = adjustment_of(stars.xy, camera, g, _seen(stars, earth, shutter, camera.height), refraction)
     catalogue_px2 = ISOTROPIC * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
     stated = stars.covariance_px2 + catalogue_px2
     fit = fitted(problem, refraction.unbend(camera.directions(*stars.xy.T) @ g.T), stated)
@@ -195,6 +194,12 @@ def solve_fix(
     )
 
 
+def _seen(stars: MatchedStars, earth: EarthState, shutter: Shutter, height: int) -> np.ndarray:
+    """Geocentric apparent directions (N, 3) of the stars in ITRS, each when its row was exposed."""
+    itrs = earth.to_itrs(stars.places)
+    return later(itrs, shutter.later_s(stars.xy[:, 1], height)) if shutter.readout_s else itrs
+
+
 def _bending(problem: Adjustment, fit: Fitted, errors: StarErrors, atmosphere: Atmosphere) -> np.ndarray:
     """Rotation (3,) of A4 in rad for 1 sigma of the refraction."""
     stronger = problem.predict(fit.a4, fit.scale, atmosphere.refraction(1 + STEP_REFRACTION).compiled)
@@ -206,6 +211,8 @@ def _rolling(
     problem: Adjustment, fit: Fitted, errors: StarErrors, shutter: Shutter, height: int
 ) -> np.ndarray:
     """Rotation (3, 2) of A4 in rad for 1 sigma of the two errors of the rows' times."""
+    if not shutter.readout_stddev_s:
+        return np.zeros((3, 2))
     # in a second the sky turns about the pole, which is a column of A4
     drift = fit.slope[fit.kept, :, :3] @ (-ROTATION_RAD_S * fit.a4[:, 2])
     late = shutter.errors_s(problem.xy[fit.kept, 1], height)
