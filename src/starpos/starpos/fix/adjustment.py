@@ -29,7 +29,7 @@ ISOTROPIC = np.eye(2)
 
 
 @at_once
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Fitted:
     """A4 (3, 3), ITRS into L, and the factor on the focal length, as N stars have it.
 
@@ -92,7 +92,7 @@ def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted
         jitter2, keep = judged(residual, stated, keep, share_free(keep))
         change = abs(jitter2 - before[1])
         settled = np.array_equal(keep, before[0]) and change <= SAME_SHARE * (jitter2 + SAME_PX2)
-    return Fitted(a4, scale, slope, residual, keep, jitter2)
+    return Fitted(a4=a4, scale=scale, slope=slope, residual=residual, keep=keep, jitter2=jitter2)
 
 
 def share_free(keep: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, 
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import Level, Mounting
+from starpos.instrument.mounting import LocalLevel, Mounting
 from starpos.units import HOUR_S
 
 ALWAYS = ("always",)
@@ -176,7 +176,7 @@ class StarErrors:
 def error_terms(
     sensitivity: Sensitivity,
     stars: StarErrors,
-    level: Level,
+    level: LocalLevel,
     tilt: Tilt,
     mounting: Mounting,
     refraction_rotation: np.ndarray,
@@ -208,7 +208,7 @@ def error_terms(
 
 
 def tilt_terms(
-    rows: np.ndarray, level: Level, tilt: Tilt, mounting: Mounting, utc_unix_s: float
+    rows: np.ndarray, level: LocalLevel, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
     """The sources of error of the level, A3's first; rows (n, 3): those of the factors for a small rotation of L."""
     calibration, by_axes = np.empty((3, 4)), rows @ level.turns
@@ -240,7 +240,7 @@ def time_terms(
     )
 
 
-def _turn_error(level: Level, mounting: Mounting) -> np.ndarray:
+def _turn_error(level: LocalLevel, mounting: Mounting) -> np.ndarray:
     """Error (3,) of L, as a small rotation about its axes, that an A3 with a large turn about the plumb line causes.
 
     To first order a turn moves the lean since the calibration sideways only, which the calibration's own term holds.

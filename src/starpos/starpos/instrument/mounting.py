@@ -19,7 +19,7 @@ LEAST_COSINE = 0.1
 
 @at_once
 @dataclass(frozen=True)
-class Level:
+class LocalLevel:
     """The local level L that a tilt shows through a mounting.
 
     up        (3,) in S, corrected by the response
@@ -78,7 +78,7 @@ class Mounting:
         """The symmetric root (3, 3) in rad of the calibration's covariance."""
         return symmetric_root(np.asarray(self.calibration_covariance, float))
 
-    def level(self, tilt: Tilt) -> Level:
+    def level(self, tilt: Tilt) -> LocalLevel:
         """The level at a tilt; InstrumentError if the response that was found is not of such a sensor.
 
         Zeros that nobody found are as wrong as the axes contradict each other.
@@ -103,7 +103,7 @@ class Mounting:
             variances[: tilt.axes] += wrong**2
             response = response_columns(theta, tilt.up, zeroed) * np.sqrt(variances)
         a2 = level_of(up)
-        return Level(up, a2, a2 @ self.a3, response)
+        return LocalLevel(up, a2, a2 @ self.a3, response)
 
     @cached_property
     def _response_root(self) -> np.ndarray:
