@@ -52,7 +52,7 @@ class Remembered:
         turn, first_turn = plane.turn(f)[:2], plane.turn(first)[:2]
         factors = [
             math.sqrt(t.variance) * (first_turn @ like.factor[:3] if t.posed else turn @ t.factor[:3])
-            for t, like in zip(f.terms, first.terms, strict=False)
+            for t, like in zip(f.terms, first.terms, strict=True)
             if t.common
         ]
         return cls(

@@ -90,12 +90,12 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--drift-change",
-        type=options.number(1e-3, 50),
+        type=options.number(0.01, 50),
         default=math.nan,
         metavar="M_PER_S",
         help="what wind or current change in ten minutes, 1 sigma an axis, where you know it: the claim is that of what "
-        "is stated, unless minutes of the record show more (of --drift-stddev a fifth; a ship's current 0.07, a drone's "
-        "wind 0.3)",
+        "is stated. Without --velocity minutes of the record may widen it (a ship's current 0.07, a drone's wind 0.3); "
+        "with --velocity it is of --drift-stddev (a fifth of it)",
     )
     options.add_stamps(parser)
     parser.add_argument(
@@ -137,6 +137,11 @@ class Seeing:
 
 def run(args: argparse.Namespace) -> int:
     args.frames = frames_among(args.frames, args.imu, args.velocity)
+    if args.velocity is not None and not args.drift_stddev and not math.isnan(args.drift_change):
+        raise VoyageError(
+            "--drift-change: a --velocity over ground drifts with nothing; give --drift-stddev if it is through water or "
+            "air"
+        )
     vertical, read, number = vertical_of(args), reader_of(args), len(args.frames)
     imu = read_imu(args.imu)
     model = ImuModel() if args.imu_model is None else read_imu_model(Path(args.imu_model))

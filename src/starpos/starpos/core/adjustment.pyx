@@ -36,13 +36,16 @@ cdef class Adjustment:
     """
 
     cdef readonly object xy, itrs, g
-    cdef readonly Air air
+    cdef Air air
     cdef const double[:, ::1] places, stars, to_level
     cdef Lens lens
     cdef double fx, fy, cx, cy, equator, e2
 
-    def __init__(self, xy, itrs, g, Lens lens, intrinsics, Air air, double equator, double e2):
+    def __init__(self, xy, itrs, g, Lens lens not None, intrinsics, Air air not None, double equator, double e2):
         self.xy, self.itrs, self.g = (np.ascontiguousarray(part, float) for part in (xy, itrs, g))
+        n = len(self.xy)
+        if self.xy.shape != (n, 2) or self.itrs.shape != (n, 3) or self.g.shape != (3, 3):
+            raise ValueError(f"stars at {self.xy.shape} px in directions {self.itrs.shape}: (N, 2) and (N, 3) are understood")
         self.places, self.stars, self.to_level = self.xy, self.itrs, self.g
         self.lens, self.air, self.equator, self.e2 = lens, air, equator, e2
         self.fx, self.fy, self.cx, self.cy = intrinsics
@@ -52,6 +55,7 @@ cdef class Adjustment:
         cdef Stance s
         cdef double[9] b
         cdef int k, i, j, turn
+        expect(local.shape[0] == self.stars.shape[0] and local.shape[1] == 3)
         s.ground[0] = s.ground[1] = s.ground[2] = 0.0
         # the diurnal aberration depends on the place that is sought
         for turn in range(2):
@@ -130,6 +134,7 @@ cdef class Adjustment:
         cdef double most
         cdef int n = self.stars.shape[0], k, i, j, turn
         cdef bint done = False
+        expect(of_stars(slope, n, P) and of_stars(covariance, n, 2) and keep.shape[0] == n)
         weighted, residual = np.zeros((n, 2, P)), np.empty((n, 2))
         cdef double[:, :, ::1] w = weighted
         cdef double[:, ::1] off = residual
@@ -168,13 +173,15 @@ cdef class Adjustment:
                     break
         return matrix(s.a4), s.scale, residual if done else None
 
-    cdef void take(self, const double[:, ::1] a4, double scale, Stance *s) noexcept:
+    cdef int take(self, const double[:, ::1] a4, double scale, Stance *s) except -1:
         cdef int i, j
+        expect(a4.shape[0] == 3 and a4.shape[1] == 3)
         for i in range(3):
             for j in range(3):
                 s.a4[3 * i + j] = a4[i, j]
         s.scale = scale
         self.carry(s)
+        return 0
 
     cdef void carry(self, Stance *s) noexcept nogil:
         """Set the velocity of the ground to that of the place."""
@@ -220,6 +227,7 @@ def gain_of(const double[:, :, ::1] slope, const double[:, :, ::1] covariance):
     cdef int n = slope.shape[0], k, i, j, side
     cdef double[P * P] normal
     cdef double[P] column
+    expect(of_stars(slope, n, P) and of_stars(covariance, n, 2))
     out, weighted = np.full((3, n, 2), np.nan), np.empty((n, 2, P))
     cdef double[:, :, ::1] gain = out, w = weighted
     for i in range(P * P):
@@ -246,6 +254,7 @@ def spread(const double[:, :, ::1] gain, const double[:, :, ::1] covariance):
     cdef double[:, ::1] to = out
     cdef double x, y
     cdef int k, i, j
+    expect(gain.shape[0] == 3 and gain.shape[2] == 2 and of_stars(covariance, gain.shape[1], 2))
     for k in range(covariance.shape[0]):
         for i in range(3):
             x = gain[i, k, 0] * covariance[k, 0, 0] + gain[i, k, 1] * covariance[k, 1, 0]
@@ -253,6 +262,18 @@ def spread(const double[:, :, ::1] gain, const double[:, :, ::1] covariance):
             for j in range(3):
                 to[i, j] += x * gain[j, k, 0] + y * gain[j, k, 1]
     return out
+
+
+cdef bint of_stars(const double[:, :, ::1] array, Py_ssize_t n, int last) noexcept:
+    """Whether an array is (n, 2, last)."""
+    return array.shape[0] == n and array.shape[1] == 2 and array.shape[2] == last
+
+
+cdef int expect(bint fits) except -1:
+    """Raise ValueError unless arrays fit to each other."""
+    if not fits:
+        raise ValueError("arrays of stars do not fit to each other: as many rows are needed in each, of the shapes stated")
+    return 0
 
 
 cdef void weigh(const double[:, ::1] slope, const double[:, ::1] covariance, double[:, ::1] out) noexcept nogil:

@@ -11,11 +11,12 @@ cdef enum:
     SWEEPS = 30
 
 
-def symmetric_root(const double[:, :] covariance):
-    """Symmetric F (n, n) with F F = covariance (n, n), which may be singular; n is at most 9.
+def symmetric_root(matrix):
+    """Symmetric F (n, n) with F F = matrix (n, n), a covariance that may be singular; n is at most 9.
 
-    There is only one such F. By Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
+    There is only one such F, so the terms of different frames agree in sign. By Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
     """
+    cdef const double[:, :] covariance = np.asarray(matrix, float)
     cdef int n = covariance.shape[0], i, j, k, sweep
     cdef double[LARGEST * LARGEST] a
     cdef double[LARGEST * LARGEST] vector

@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """How much more the residuals of stars scatter than their errors say."""
 
-from libc.math cimport exp, fabs, log
+from libc.math cimport INFINITY, exp, fabs, log
 from libc.stdlib cimport free, malloc
 
 import numpy as np
@@ -19,16 +19,17 @@ cdef enum:
 
 cdef extern from *:
     """
-    /* Take half of a residual's squared distance from n totals, and multiply n products by its determinant; one for each
-       variance that is added to its own. */
+    /* Take half of a residual's squared distance from n totals, and multiply n products by its determinant in n units; one
+       for each variance that is added to its own. */
     STARPOS_WIDE static void starpos_widen(const double *restrict residual, const double *restrict covariance,
-            const double *restrict extra, int n, double *restrict total, double *restrict product) {
+            const double *restrict extra, const double *restrict units, int n, double *restrict total,
+            double *restrict product) {
         const double x2 = residual[0] * residual[0], y2 = residual[1] * residual[1];
         const double xy = covariance[1], twice = 2 * xy * residual[0] * residual[1];
         for (int g = 0; g < n; g++) {
             const double xx = covariance[0] + extra[g], yy = covariance[3] + extra[g], determinant = xx * yy - xy * xy;
             total[g] -= 0.5 * (yy * x2 - twice + xx * y2) / determinant;
-            product[g] *= determinant;
+            product[g] *= determinant * units[g];
         }
     }
     /* Squared distances of n residuals under a variance that is added to theirs. */
@@ -46,7 +47,7 @@ cdef extern from *:
         double extra, int n, double *d2
     ) noexcept nogil
     void starpos_widen(
-        const double *residual, const double *covariance, const double *extra, int n, double *total,
+        const double *residual, const double *covariance, const double *extra, const double *units, int n, double *total,
         double *product
     ) noexcept nogil
 
@@ -65,6 +66,7 @@ def distances2(const double[:, ::1] residual, const double[:, :, ::1] covariance
     """Squared residuals (N,) of residual (N, 2) px in units of covariance (N, 2, 2) px2 plus an extra isotropic variance."""
     cdef int k
     cdef double determinant
+    fit(residual, covariance)
     out = np.empty(residual.shape[0])
     cdef double[::1] to = out
     for k in range(residual.shape[0]):
@@ -84,20 +86,24 @@ def expected_variance(
     cdef double[POINTS] extra
     cdef double[POINTS] total
     cdef double[POINTS] product
+    cdef double[POINTS] units
     cdef double step = log(most / least) / (POINTS - 1), best, density, whole = 0.0, mean = 0.0
+    fit(residual, covariance)
     for g in range(POINTS):
         extra[g], total[g], product[g] = least * exp(g * step), 0.0, 1.0
+        # of determinants: they are alike then, and their products neither too large nor too small for a number
+        units[g] = 1 / (stated + extra[g]) / (stated + extra[g])
     for k in range(n):
-        starpos_widen(&residual[k, 0], &covariance[k, 0, 0], extra, POINTS, total, product)
-        # a logarithm for several determinants, before their product is too large or too small for a number
+        starpos_widen(&residual[k, 0], &covariance[k, 0, 0], extra, units, POINTS, total, product)
+        # a logarithm for several determinants
         if k % TOGETHER == TOGETHER - 1 or k == n - 1:
             for g in range(POINTS):
                 total[g] -= 0.5 * share * log(product[g])
                 product[g] = 1.0
-    best = total[0]
+    best = -INFINITY
     for g in range(POINTS):
         # points lie evenly in the logarithm of the extra variance
-        total[g] += log(extra[g] / (stated + extra[g]))
+        total[g] += log(extra[g] / (stated + extra[g])) - share * n * log(stated + extra[g])
         best = max(best, total[g])
     for g in range(POINTS):
         density = exp(total[g] - best)
@@ -170,6 +176,9 @@ cdef double *columns_of(
 ) except NULL:
     """Set c to the residuals that are kept (N,), or to all for None; what is returned holds its numbers."""
     cdef Py_ssize_t n = residual.shape[0], k
+    fit(residual, covariance)
+    if keep is not None and keep.shape[0] != n:
+        raise ValueError(f"a mask of {keep.shape[0]} for {n} residuals")
     cdef double *room = <double *>malloc((7 * n + 1) * sizeof(double))
     if room == NULL:
         raise MemoryError
@@ -184,6 +193,14 @@ cdef double *columns_of(
             c.xx[c.n], c.xy[c.n], c.yy[c.n] = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 1, 1]
             c.n += 1
     return room
+
+
+cdef int fit(const double[:, ::1] residual, const double[:, :, ::1] covariance) except -1:
+    """Raise ValueError unless residuals are (N, 2) and covariances (N, 2, 2)."""
+    cdef Py_ssize_t n = residual.shape[0]
+    if residual.shape[1] != 2 or covariance.shape[0] != n or covariance.shape[1] != 2 or covariance.shape[2] != 2:
+        raise ValueError(f"residuals ({n}, {residual.shape[1]}) and {covariance.shape[0]} covariances: (N, 2) and (N, 2, 2)")
+    return 0
 
 
 cdef double searched(Columns *c, double share, double median_of_chi2, double least, double good) noexcept nogil:

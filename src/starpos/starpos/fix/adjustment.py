@@ -78,7 +78,7 @@ def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted
             raise FixError(
                 f"only {np.count_nonzero(keep)} of {len(keep)} identified stars agree on one attitude: no fix from them"
             )
-        covariance = stated + ISOTROPIC * jitter2
+        covariance = np.ascontiguousarray(stated + ISOTROPIC * jitter2)
         a4, scale, residual = problem.refine(
             a4, scale, slope, covariance, keep.view(np.uint8), SETTLED, MOST_STEPS
         )

@@ -161,16 +161,18 @@ class StarErrors:
 
         slope (N, 2, 4): derivatives in px of the parameters, of which the first three rotate A4.
         """
-        return cls(gain_of(slope, centroids + catalogue), centroids, catalogue, same_stars)
+        whole = np.ascontiguousarray(centroids + catalogue)
+        return cls(gain_of(np.ascontiguousarray(slope), whole), centroids, catalogue, same_stars)
 
     def rotated(self, errors_px: np.ndarray) -> np.ndarray:
         """Rotation (3, ...) of A4 in rad that errors (N, 2, ...) of the predicted places in px make."""
+        # the gain is for errors of the places seen, which are the other way round
         number = 2 * len(errors_px)
         return -self.gain.reshape(3, number) @ errors_px.reshape(number, *errors_px.shape[2:])
 
     def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """Covariance (3, 3) in rad2 of A4's rotation, from the covariances (N, 2, 2) in px2 of independent stars."""
-        return spread(self.gain, covariance)
+        return spread(self.gain, np.ascontiguousarray(covariance))
 
 
 def error_terms(

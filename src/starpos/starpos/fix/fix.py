@@ -47,7 +47,7 @@ MARKS = 20
 @at_once
 @dataclass(frozen=True)
 class MatchedStars:
-    """N identified stars.
+    """N identified stars; ValueError if the arrays do not fit to each other, FixError if a place's error is not finite.
 
     xy (N, 2) in px and covariance_px2 (N, 2, 2): where they are on the frame.
     places (N, 3): ICRS directions at the date; place_sigma (N,): their standard deviation per axis in rad.
@@ -59,6 +59,14 @@ class MatchedStars:
     places: np.ndarray
     place_sigma: np.ndarray
     index: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.xy)
+        shapes = (self.xy.shape, self.covariance_px2.shape, self.places.shape, self.place_sigma.shape)
+        if shapes != ((n, 2), (n, 2, 2), (n, 3), (n,)) or (self.index is not None and len(self.index) != n):
+            raise ValueError(f"arrays of identified stars do not fit to each other: {shapes}")
+        if not np.isfinite(self.covariance_px2).all():
+            raise FixError("the error of a star's place is not a finite number: leave that star out")
 
 
 def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:
@@ -152,6 +160,11 @@ def solve_fix(
     centroids = stars.covariance_px2[kept] + ISOTROPIC * claimed2
     same_stars = ALWAYS if stars.index is None else tuple(stars.index[kept][:MARKS].tolist())
     errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
+    if not np.isfinite(errors.gain).all() or not math.isfinite(claimed2):
+        raise FixError(
+            f"the {len(residual)} stars do not tell the attitude and how well it is known: more stars are needed, "
+            "further apart, with sound errors"
+        )
     place = place_of(fit.a4)
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
     sensitivity = Sensitivity.of(place, link_to_enu)

@@ -23,9 +23,9 @@ def judged(
     coordinates which the parameters of the fit leave free.
     """
     return sifted(
-        residual,
-        covariance,
-        keep.view(np.uint8),
+        np.ascontiguousarray(residual, float),
+        np.ascontiguousarray(covariance, float),
+        np.ascontiguousarray(keep, bool).view(np.uint8),
         share,
         MEDIAN_OF_CHI2,
         OUTLIER_SIGMA**2,
@@ -41,6 +41,7 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
     stars follow Student's t.  This is the mean of the posterior under Jeffreys' prior of the whole variance; for errors
     that are all alike it is the mean of the inverse gamma distribution.  For many stars it is the value of `judged`.
     """
+    residual, covariance = np.ascontiguousarray(residual, float), np.ascontiguousarray(covariance, float)
     # the median, which numpy's own takes longer to find than all else here
     traces = np.sort(covariance[:, 0, 0] + covariance[:, 1, 1])
     stated = float(traces[(len(traces) - 1) // 2] + traces[len(traces) // 2]) / 4
@@ -50,4 +51,4 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
 
 def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float = 0.0) -> np.ndarray:
     """Squared residuals (N,) in units of their covariance plus an extra isotropic variance (px2)."""
-    return distances2(np.ascontiguousarray(residual), np.ascontiguousarray(covariance), extra)
+    return distances2(np.ascontiguousarray(residual, float), np.ascontiguousarray(covariance, float), extra)

@@ -117,8 +117,9 @@ class Camera:
         The paper prints another third component; docs/the_paper.md#star-vectors says why it is f. NaN outside the
         picture of a fisheye. Raises InstrumentError where the distortion of a pinhole cannot be inverted.
         """
-        v = self.lens.rays(self._places(x, y))
-        if self.model == PLUMB_BOB and np.isnan(v).any():
+        places = self._places(x, y)
+        v = self.lens.rays(places)
+        if self.model == PLUMB_BOB and (np.isnan(v[..., 0]) & np.isfinite(places).all(-1)).any():
             raise InstrumentError(
                 f"distortion {self.distortion} cannot be inverted inside the frame: calibrate the camera again"
             )

@@ -76,7 +76,7 @@ class Mounting:
     @cached_property
     def calibration_root(self) -> np.ndarray:
         """The symmetric root (3, 3) in rad of the calibration's covariance."""
-        return symmetric_root(np.asarray(self.calibration_covariance, float))
+        return symmetric_root(self.calibration_covariance)
 
     def level(self, tilt: Tilt) -> LocalLevel:
         """The level at a tilt; InstrumentError if the response that was found is not of such a sensor.
@@ -107,7 +107,7 @@ class Mounting:
 
     @cached_property
     def _response_root(self) -> np.ndarray:
-        return symmetric_root(np.asarray(self.response_covariance, float))
+        return symmetric_root(self.response_covariance)
 
     @cached_property
     def _zeroed(self) -> dict[int, Zeroed]:

@@ -14,6 +14,7 @@ from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
+from starpos.fix.adjustment import share_free
 from starpos.fix.fix import sound_matches
 from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.unidentified import why_unidentified
@@ -186,7 +187,7 @@ def _fit(sighting: IdentifiedFrame, seen: np.ndarray) -> _Fit:
         before = keep
         pose = _fitted(pose, sighting, seen, keep, extra)
         residual = pose.project(seen) - sighting.xy
-        share = max(1 - 2 / keep.sum(), 1 / keep.sum())
+        share = share_free(keep)
         extra, keep = judged(residual, sighting.covariance_px2, keep, share)
         if np.array_equal(keep, before):
             break

@@ -64,8 +64,12 @@ class Vessel:
 
 
 def check_drift(vehicle: str | None, drift_stddev: float, drift_change: float) -> None:
-    """Raise VoyageError if it is said how a drift changes of a vehicle that has none."""
-    if vehicle in (PARKED, ROVER) and not drift_stddev and not math.isnan(drift_change):
+    """Raise VoyageError if it cannot be so, as of a vehicle that has no drift."""
+    if math.isnan(drift_change):
+        return
+    if not 0 < drift_change < math.inf:
+        raise VoyageError(f"drift change {drift_change:g} m/s: it must be a finite number above 0")
+    if vehicle in (PARKED, ROVER) and not drift_stddev:
         raise VoyageError(
             f"drift change {drift_change:g} m/s: it is of wind or current, and neither carries a vehicle that is "
             f"'{vehicle}'"

@@ -97,10 +97,11 @@ PARAMETERS = (
     Parameter(
         "drift_change",
         float("nan"),
-        "What wind or current change in ten minutes, 1 sigma an axis, where it is known; nan: of drift_stddev a fifth, a "
-        "ship's current 0.07, a drone's wind 0.3. Too small makes a place that claims too much: 0.1 m/s are 108 m.",
+        "What wind or current change in ten minutes, 1 sigma an axis, where it is known; nan: of drift_stddev a fifth, "
+        "or where no velocity comes a ship's current 0.07, a drone's wind 0.3. Too small makes a place that claims too "
+        "much: 0.1 m/s are 108 m.",
         unit="m/s",
-        minimum=1e-3,
+        minimum=0.01,
         maximum=50.0,
     ),
     Parameter("rate", 10.0, "Outputs a second.", unit="Hz", minimum=0.1, maximum=100.0),

@@ -210,3 +210,48 @@ def test_the_expected_scatter_is_the_mean_of_its_posterior(stars, rng):
         density = np.exp(log_density - log_density.max())
         expected = density @ extra / density.sum()
         assert expected_extra(residual, covariance, 0.9) == pytest.approx(expected, rel=2e-2)
+
+
+@pytest.mark.parametrize("scale", [1e-22, 1e-6, 1e6, 1e40])
+def test_the_expected_scatter_has_the_unit_of_its_errors(scale, rng):
+    """Products of determinants must not run over, however small or large the unit is."""
+    residual, covariance = rng.normal(0, 0.1, (30, 2)), np.tile(1e-3 * np.eye(2), (30, 1, 1))
+    plain = expected_extra(residual, covariance, 0.9)
+    assert expected_extra(residual * scale, covariance * scale**2, 0.9) == pytest.approx(plain * scale**2)
+
+
+def test_it_does_not_matter_how_arrays_lie_in_memory(rng):
+    residual, covariance, keep = (
+        rng.normal(0, 0.1, (30, 2)),
+        np.tile(1e-3 * np.eye(2), (30, 1, 1)),
+        np.arange(30) > 2,
+    )
+    extra, good = judged(residual, covariance, keep, 0.9)
+    other, same = judged(np.asfortranarray(residual), np.asfortranarray(covariance), keep.astype(int), 0.9)
+    assert other == extra and np.array_equal(same, good)
+    assert expected_extra(np.asfortranarray(residual), np.asfortranarray(covariance), 0.9) == expected_extra(
+        residual, covariance, 0.9
+    )
+
+
+def test_arrays_that_do_not_fit_to_each_other_are_refused(rng):
+    problem, a4, local = problem_of(LENSES["pinhole"], 0.3, rng, stars=8)
+    slope, covariance = problem.jacobian(a4, 1.0), np.tile(np.eye(2), (8, 1, 1))
+    keep = np.ones(8, np.uint8)
+    for call in (
+        lambda: adjustment_of(
+            problem.xy, LENSES["pinhole"], problem.g, problem.itrs[1:], Atmosphere().refraction()
+        ),
+        lambda: problem.closed_form(local[1:]),
+        lambda: problem.predict(np.eye(2), 1.0),
+        lambda: problem.refine(a4, 1.0, slope, covariance[1:], keep, 1e-11, 20),
+        lambda: problem.refine(a4, 1.0, slope, covariance, keep[1:], 1e-11, 20),
+        lambda: gain_of(slope, covariance[1:]),
+        lambda: spread(gain_of(slope, covariance), covariance[:1]),
+        lambda: judged(problem.xy, covariance[1:], keep, 0.9),
+        lambda: distance2(problem.xy, covariance[1:]),
+        lambda: expected_extra(problem.xy[:, :1], covariance, 0.9),
+        lambda: symmetric_root(np.ones((2, 3))),
+    ):
+        with pytest.raises(ValueError):
+            call()

@@ -168,6 +168,43 @@ def test_a_star_of_absurd_errors_tells_nothing_and_spoils_nothing(rng):
     assert np.sqrt(np.diag(fix.covariance)) == pytest.approx(np.sqrt(np.diag(without.covariance)), rel=0.1)
 
 
+@pytest.mark.parametrize("sigma_px", [np.inf, np.nan])
+def test_a_star_whose_error_is_no_number_is_told(sigma_px, rng):
+    field = SkyField(stars=12)
+    xy, places = field.places(STATE, rng)
+    covariance = np.tile(0.05**2 * np.eye(2), (12, 1, 1))
+    covariance[3, 0, 0] = sigma_px**2
+    with pytest.raises(FixError, match="not a finite number"):
+        field.solve(xy, places, STATE, covariance_px2=covariance)
+
+
+@pytest.mark.parametrize("sigma_px", [1e-12, 1e-3, 1e3])
+def test_a_claim_is_a_number_however_small_or_large_the_errors_are_said_to_be(sigma_px, rng):
+    field = SkyField(stars=12)
+    xy, places = field.places(STATE, rng)
+    fix = field.solve(xy, places, STATE, covariance_px2=np.tile(sigma_px**2 * np.eye(2), (12, 1, 1)))
+    assert np.isfinite(fix.covariance).all()
+
+
+def test_it_does_not_matter_how_covariances_lie_in_memory(rng):
+    field = SkyField(stars=12)
+    xy, places = field.places(STATE, rng)
+    covariance = np.tile([[0.01, 0.002], [0.002, 0.02]], (12, 1, 1))
+    usual, other = (
+        field.solve(xy, places, STATE, covariance_px2=c) for c in (covariance, np.asfortranarray(covariance))
+    )
+    assert other.latitude == usual.latitude and np.array_equal(other.covariance, usual.covariance)
+
+
+@pytest.mark.parametrize("part", ["covariance_px2", "place_sigma"])
+def test_stars_whose_arrays_do_not_fit_are_refused(part, rng):
+    field = SkyField(stars=12)
+    xy, places = field.places(STATE, rng)
+    few = {"covariance_px2": 0.01 * np.eye(2)[None], "place_sigma": np.array([1e-8])}[part]
+    with pytest.raises(ValueError, match="do not fit"):
+        field.solve(xy, places, STATE, **{part: few})
+
+
 def test_too_few_stars(rng):
     field = SkyField(stars=2)
     xy, places = field.places(STATE, rng)

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import pickle
+
 import cv2
 import numpy as np
 import pytest
@@ -85,3 +87,16 @@ def test_impossible_intrinsics_are_refused(change, words):
     good = {"width": 100, "height": 80, "fx": 900.0, "fy": 900.0, "cx": 49.5, "cy": 39.5}
     with pytest.raises(InstrumentError, match=words):
         Camera(**good | change)
+
+
+def test_a_camera_whose_lens_is_made_goes_to_other_processes(rng):
+    v = WIDE.directions(*pixels(WIDE, rng, 5))
+    again = pickle.loads(pickle.dumps(WIDE))
+    assert again == WIDE
+    np.testing.assert_array_equal(again.project(v), WIDE.project(v))
+
+
+@pytest.mark.parametrize("camera", [WIDE, PAPER])
+def test_a_pixel_that_is_no_number_has_no_direction(camera):
+    v = camera.directions([np.nan, 100.0], [50.0, 60.0])
+    assert np.isnan(v[0]).any() and np.isfinite(v[1]).all()

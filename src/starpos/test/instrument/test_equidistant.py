@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fisheyes: the model of OpenCV and ROS, beyond 90 deg off the axis too, and where a lens has no picture."""
 
+import pickle
+
 import cv2
 import numpy as np
 import pytest
@@ -117,3 +119,10 @@ def test_impossible_fisheyes_are_refused(change, words):
 def test_no_stars_are_no_error():
     assert fisheye().directions([], []).shape == (0, 3)
     assert fisheye().project(np.zeros((0, 3))).shape == (0, 2)
+
+
+def test_a_fisheye_whose_lens_is_made_goes_to_other_processes():
+    camera = fisheye(SHORT)
+    assert camera.sees([900.0], [900.0]).all()
+    again = pickle.loads(pickle.dumps(camera))
+    np.testing.assert_array_equal(again.directions([900.0], [900.0]), camera.directions([900.0], [900.0]))
