@@ -29,7 +29,14 @@ from starpos.navigation.motion import BY_LAW, CONSTANTS, MEASURED, PLACE, Motion
 from starpos.navigation.odometry import Odometry
 from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.sightings import FrameUnderWay
-from starpos.navigation.standstill import FEWEST_STANDSTILLS, NOWHERE, Standstills, by_the_rest, standstills
+from starpos.navigation.standstill import (
+    FEWEST_STANDSTILLS,
+    NOWHERE,
+    Standstills,
+    by_the_rest,
+    noise_density2,
+    standstills,
+)
 from starpos.navigation.start import first_motion
 from starpos.navigation.velocity import VelocityLog
 from starpos.navigation.vessel import Vessel
@@ -52,8 +59,9 @@ ZENITH_MOVED = 1e-3
 STANDING_SIGMA, TRIAL_SIGMA = 2e-3, 5e-3
 # of a chi-squared of three degrees of freedom: the median, and what one in a million exceeds
 MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
-# steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8
-FACTOR, MOST_FACTORS, UNLIKELY = 2**0.5, 16, 8.0
+# steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8; of e^3 by a law, since much
+# more noise would take the law's errors too, and be likely again
+FACTOR, MOST_FACTORS, UNLIKELY, UNLIKELY_BY_LAW = 2**0.5, 16, 8.0, 3.0
 
 
 class Adjustment:
@@ -87,7 +95,7 @@ class Adjustment:
             height_stddev_m=vessel.height_stddev_m,
         )
         self.model = vessel.model
-        self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0}
+        self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0, "forces at rest": 1.0}
         # how many times as much wind or current change as their law says
         self.weighings, self.more_drift = 0, 1.0
         self.noise_weighed = False
@@ -231,19 +239,21 @@ class Adjustment:
 
     def _weigh(self, chain: Chain, links: Links) -> None:
         """Raise the accelerometer's noise to what the voyage shows: of vibration some is left in sums."""
-        factors = [1.0]
-        likely = [log_likelihood(chain) - links.log_determinant]
-        while len(factors) < MOST_FACTORS and likely[-1] > max(likely) - UNLIKELY:
-            factors.append(factors[-1] * FACTOR)
-            density = self.model.accelerometer_noise_density * factors[-1]
-            noisy = links.noisier(
-                self._shaken * (density**2 - self.model.accelerometer_noise_density**2), self.pieces
-            )
+        stated2 = self.model.accelerometer_noise_density**2
+        at_rest = max(1.0, noise_density2(self.pieces, self.standing or NOWHERE) / stated2)
+        unlikely = UNLIKELY_BY_LAW if self.odometry is None else UNLIKELY
+        factors: list[float] = []
+        likely: list[float] = []
+        while len(factors) < MOST_FACTORS and (not likely or likely[-1] > max(likely) - unlikely):
+            factors.append(FACTOR ** len(factors))
+            excess = at_rest * np.where(self._shaken, factors[-1] ** 2, 1.0)
+            noisy = links.noisier((excess - 1) * stated2, self.pieces)
             likely.append(log_likelihood(replace(chain, links=noisy.whitened())) - noisy.log_determinant)
-            # what is stated is believed within a factor of e, where the record says nothing
+            # what is stated, or shown at rest, is believed within a factor of e, where the record says nothing
             likely[-1] -= np.log(factors[-1]) ** 2 / 2
         weight = np.exp(np.array(likely) - max(likely))
-        self.excess["forces"] = float(weight @ np.square(factors) / weight.sum())
+        self.excess["forces at rest"] = at_rest
+        self.excess["forces"] = at_rest * float(weight @ np.square(factors) / weight.sum())
         density = self.model.accelerometer_noise_density * np.sqrt(self.excess["forces"])
         self.model = replace(self.model, accelerometer_noise_density=density)
 
@@ -293,7 +303,8 @@ class Adjustment:
             rows.append(self._by_law(motion, stands))
         links = links_of(motion, sums, self.pieces, self.model, self.law)
         # what shakes the accelerometer while it drives is not there where it stands
-        less = self.vessel.model.accelerometer_noise_density**2 - self.model.accelerometer_noise_density**2
+        at_rest2 = self.excess["forces at rest"] * self.vessel.model.accelerometer_noise_density**2
+        less = at_rest2 - self.model.accelerometer_noise_density**2
         links = links.noisier(less * ~self._shaken, self.pieces)
         chain = Chain(
             first=first_rows(motion, self.model, self.known, self.law),

@@ -75,6 +75,8 @@ NOWHERE = Standstills(first=np.zeros(0, int), last=np.zeros(0, int))
 def standstills(stars: StarAttitudes, pieces: Pieces) -> Standstills:
     """The stretches in which the vehicle seems to stand, by attitudes and readings alone."""
     fine = np.linalg.eigvalsh(stars.covariance)[:, 1] < FINE**2
+    if fine.sum() < FEWEST_FRAMES:
+        return NOWHERE
     index, attitude = stars.index[fine], Rotation.from_matrix(stars.camera_to_itrs[fine])
     t = np.append(0.0, np.cumsum(pieces.span_s))
     scatter = _scatter(pieces, t)
@@ -140,6 +142,22 @@ def by_the_rest(trial: Lacks, sigma: float, solution: Smoothed) -> ByTheRest:
     )
 
 
+def noise_density2(pieces: Pieces, standing: Standstills) -> float:
+    """Density of the force's noise within standstills, (m/s2)2/Hz an axis, by how intervals' means scatter.
+
+    Not from reading to reading: a fan shakes those, and of that nothing adds up.  0 where there is nothing to tell it.
+    """
+    square, free = 0.0, 0
+    for begin, end in zip(standing.first, standing.last, strict=True):
+        whole = begin + np.flatnonzero(pieces.missing_s[begin:end] == 0)
+        if len(whole) > 1:
+            span = pieces.span_s[whole, None]
+            push = (pieces.force[whole] * pieces.length_s[whole][..., None]).sum(1)
+            off = push - push.sum(0) / span.sum() * span
+            square, free = square + float((off**2 / span).sum()), free + 3 * (len(whole) - 1)
+    return square / max(free, 1)
+
+
 def _scatter(pieces: Pieces, t: np.ndarray) -> np.ndarray:
     """Scatter (K - 1,) of the forces from one reading to the next about each interval; of gaps, infinite."""
     there = (pieces.length_s[:, 1:] > 0) & (pieces.length_s[:, :-1] > 0)
@@ -156,9 +174,9 @@ def _scatter(pieces: Pieces, t: np.ndarray) -> np.ndarray:
 
 def _turning(index: np.ndarray, attitude: Rotation, t: np.ndarray) -> np.ndarray:
     """Mask (K - 1,) of the intervals between frames from one to the next of which it turns."""
-    if len(index) < 2:
-        return np.zeros(len(t) - 1, bool)
     near = np.unique(np.searchsorted(t[index], np.arange(t[index[0]], t[index[-1]], TOLD_S)))
+    if len(near) < 2:
+        return np.zeros(len(t) - 1, bool)
     index, attitude = index[near], attitude[near]
     turn = (attitude[:-1].inv() * attitude[1:]).magnitude()
     turning = np.concatenate([[False], turn > TURNING * np.diff(t[index]), [False]])
