@@ -43,16 +43,6 @@ cdef class Lens:
             self.seen(&given[k, 0], &to[k, 0])
         return out.reshape(np.shape(v)[: np.ndim(v) - 1] + (2,))
 
-    def slopes(self, v):
-        """Derivatives (..., 2, 3) of `places`."""
-        cdef const double[:, ::1] given = np.ascontiguousarray(v, float).reshape(-1, 3)
-        out = np.empty((given.shape[0], 6))
-        cdef double[:, ::1] to = out
-        cdef Py_ssize_t k
-        for k in range(given.shape[0]):
-            self.seen_slopes(&given[k, 0], &to[k, 0])
-        return out.reshape(np.shape(v)[: np.ndim(v) - 1] + (2, 3))
-
     def rays(self, places):
         """Unit vectors (..., 3) that are seen at places (..., 2); NaN where none is."""
         cdef const double[:, ::1] given = np.ascontiguousarray(places, float).reshape(-1, 2)

@@ -125,10 +125,6 @@ class Camera:
             )
         return v
 
-    def slopes(self, v: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 2, 3), px, of `project` at directions v (N, 3)."""
-        return self.lens.slopes(v) * np.array([[self.fx], [self.fy]])
-
     def project(self, v: ArrayLike) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C; NaN behind a pinhole, and outside the picture of a fisheye."""
         return self.lens.places(v) * [self.fx, self.fy] + [self.cx, self.cy]

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the compiled core computes for a fix, beside plain forms of it: derivatives, directions, scatter, roots."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -143,15 +141,6 @@ def test_a_root_is_symmetric_and_its_square_is_the_covariance(size, rng):
         )
         assert np.linalg.eigvalsh(root).min() >= -1e-7 * np.abs(root).max()
     assert np.isnan(symmetric_root(np.full((size, size), np.nan))).all()
-
-
-@pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_stretches_by_its_derivatives(lens, rng):
-    camera, step = replace(LENSES[lens], cx=700.0), 1e-6
-    v = camera.directions(*rng.uniform([0, 0], [1399, 999], (50, 2)).T)
-    columns = [(camera.project(v + p) - camera.project(v - p)) / (2 * step) for p in step * np.eye(3)]
-    slope = camera.slopes(v)
-    np.testing.assert_allclose(slope, np.stack(columns, -1), rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
 def searched(residual, covariance, share, median_of_chi2):

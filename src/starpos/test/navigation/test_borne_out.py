@@ -93,3 +93,9 @@ def test_a_wind_that_is_wrongly_said_to_be_steady_widens_the_claim_all_the_same(
 def test_what_stands_on_the_ground_has_no_drift_to_change(vehicle):
     with pytest.raises(VoyageError, match="neither carries"):
         navigated(made("parked", 30, 1, rate_hz=25), vehicle, velocity=False, drift_change=0.1)
+
+
+@pytest.mark.parametrize("change", [0.0, -0.1, np.inf])
+def test_a_change_of_the_wind_that_cannot_be_is_told(change):
+    with pytest.raises(VoyageError, match="finite number above 0"):
+        navigated(made("parked", 30, 1, rate_hz=25), "drone", velocity=False, drift_change=change)
