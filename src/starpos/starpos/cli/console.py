@@ -17,6 +17,8 @@ from starpos.fix.fix import Fix
 UNREADABLE = 2
 # s between lines of progress
 LINE_EVERY_S = 5.0
+# s of work that needs no bar
+BAR_AFTER_S = 0.5
 
 
 def print_json(value: dict) -> None:
@@ -70,7 +72,7 @@ def tell_extrapolation(command: str, solved: Sequence[HasFix]) -> None:
 
 
 class ProgressBar:
-    """Progress on standard error: a bar for work of more than half a second, or lines now and then if it is no terminal.
+    """Progress on standard error: a bar for work of more than BAR_AFTER_S, or lines now and then if it is no terminal.
 
     terminal_only: no such lines, for work whose results show how far it is.
     """
@@ -84,7 +86,7 @@ class ProgressBar:
         if not sys.stderr.isatty():
             self._say(what, done)
             return
-        if time.monotonic() - self.begin < 0.5 and not self.shown:
+        if time.monotonic() - self.begin < BAR_AFTER_S and not self.shown:
             return
         self.shown = True
         filled = int(30 * min(done, 1.0))

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import zlib
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 from archives import frames, run, solve
 from cli_calls import KNOWN, WIDE
 
+from starpos.cli.console import BAR_AFTER_S
 from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
 
@@ -254,17 +256,18 @@ def test_workers_end_where_nobody_reads_on(archive):
 
 def test_a_terminal_is_shown_how_far_it_is(archive):
     ours, theirs = pty.openpty()
-    with started(archive, times=1, stderr=theirs) as (process, _, many):
-        os.close(theirs)
-        while process.stdout.read(65536):
-            pass
-        shown = b""
-        while True:
-            try:
+    with started(archive, stderr=theirs) as (process, _, many):
+        # Its answers fill the pipe: it takes as long as a bar waits, however quick the machine.
+        time.sleep(BAR_AFTER_S)
+        shown, last = b"", f"frame {len(many)} of {len(many)}".encode()
+        answers = process.stdout.fileno()
+        open_ends = {ours, answers}
+        while not (last in shown and shown.endswith(b"100 %\r\n")):
+            ready = select.select(open_ends, [], [], WAIT_S)[0]
+            assert ready, shown
+            if ours in ready:
                 shown += os.read(ours, 65536)
-            except OSError:
-                # The other end is closed.
-                break
+            if answers in ready and not os.read(answers, 65536):
+                open_ends.remove(answers)
     os.close(ours)
-    assert f"frame {len(many)} of {len(many)}".encode() in shown
-    assert shown.endswith(b"100 %\r\n")
+    os.close(theirs)
