@@ -30,9 +30,7 @@ FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglo
 CYTHON = (".pyx", ".pxd")
 # but what Cython has written
 SOURCES = [
-    f
-    for f in FILES
-    if f.suffix in (".py", ".h", *CYTHON) or (f.suffix == ".c" and not f.with_suffix(".pyx").exists())
+    f for f in FILES if f.suffix in (".py", ".h", *CYTHON) or (f.suffix == ".c" and f.parent.name != "core")
 ]
 MODULES = {p.name: p / p.name for p in PACKAGES}
 FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
