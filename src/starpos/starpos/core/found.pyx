@@ -9,6 +9,12 @@ import numpy as np
 from starpos.core.memory cimport numbers_of
 
 
+NAMES = (
+    "star", "catalogue", "blend_px", "attitude", "focal_scale", "residual_px", "mean_square_px2", "log_odds", "expected",
+    "mirrored",
+)
+
+
 cdef class Identification:
     """M matched stars and the attitude they give.
 
@@ -28,18 +34,42 @@ cdef class Identification:
         self, *, star, catalogue, blend_px, attitude, double focal_scale, double residual_px, double mean_square_px2,
         double log_odds, expected, bint mirrored,
     ):
-        self.star, self.catalogue, self.expected = (np.ascontiguousarray(row, np.intp) for row in (star, catalogue, expected))
-        self.blend_px, self.attitude = blend_px, np.ascontiguousarray(attitude, float)
+        if not len(star) == len(catalogue) == len(blend_px):
+            raise ValueError(f"{len(star)} stars, {len(catalogue)} rows and {len(blend_px)} blends are not of the same stars")
+        hold(
+            self, len(star), np.concatenate([star, catalogue, expected], dtype=np.intp, casting="unsafe"),
+            np.concatenate([np.reshape(attitude, 9), blend_px], dtype=float),
+        )
+        self.due = len(expected)
         self.focal_scale, self.residual_px, self.mean_square_px2 = focal_scale, residual_px, mean_square_px2
         self.log_odds, self.mirrored = log_odds, mirrored
 
+    @property
+    def star(self):
+        return self.rows[:self.matched]
+
+    @property
+    def catalogue(self):
+        return self.rows[self.matched:2 * self.matched]
+
+    @property
+    def expected(self):
+        return self.rows[2 * self.matched:2 * self.matched + self.due]
+
+    @property
+    def attitude(self):
+        return self.reals[:9].reshape(3, 3)
+
+    @property
+    def blend_px(self):
+        return self.reals[9:]
+
     def but(self, **changes):
         """The identification with some of its values changed."""
-        names = (
-            "star", "catalogue", "blend_px", "attitude", "focal_scale", "residual_px", "mean_square_px2", "log_odds",
-            "expected", "mirrored",
-        )
-        return Identification(**({name: getattr(self, name) for name in names} | changes))
+        return made({name: getattr(self, name) for name in NAMES} | changes)
+
+    def __reduce__(self):
+        return made, ({name: getattr(self, name) for name in NAMES},)
 
     def explains(self, int bright, int least):
         """How much of the frame it explains: three numbers.
@@ -47,16 +77,15 @@ cdef class Identification:
         How many of the frame's `bright` brightest stars are matched; how many of the brightest expected stars are, of as many
         and at least `least`; and how many these are.
         """
-        cdef int k, j, due, found = 0, seen = 0, matched = len(self.star), all_due = len(self.expected)
-        cdef const Py_ssize_t *star = <const Py_ssize_t *>numbers_of(self.star, matched * sizeof(Py_ssize_t))
-        cdef const Py_ssize_t *index = <const Py_ssize_t *>numbers_of(self.catalogue, matched * sizeof(Py_ssize_t))
-        cdef const Py_ssize_t *expected = <const Py_ssize_t *>numbers_of(self.expected, all_due * sizeof(Py_ssize_t))
-        for k in range(matched):
-            found += star[k] < bright
-        due = min(max(found, least), all_due)
+        cdef const Py_ssize_t *catalogue = self.row + self.matched
+        cdef const Py_ssize_t *expected = catalogue + self.matched
+        cdef int k, j, due, found = 0, seen = 0
+        for k in range(self.matched):
+            found += self.row[k] < bright
+        due = min(max(found, least), <int>self.due)
         for k in range(due):
-            for j in range(matched):
-                if index[j] == expected[k]:
+            for j in range(self.matched):
+                if catalogue[j] == expected[k]:
                     seen += 1
                     break
         return found, seen, due
@@ -70,7 +99,7 @@ cdef class Identification:
         above     the same of a pixel above it
         velocity  (3,): of the Earth, in units of c
         """
-        cdef const double *attitude = <const double *>numbers_of(self.attitude, 9 * sizeof(double))
+        cdef const double *attitude = self.turn
         cdef double[2][3] seen
         cdef double[3] up
         cdef double norm, flat, east, north, x, y, z
@@ -93,6 +122,19 @@ cdef class Identification:
             # at a pole, on the meridian of right ascension 0
             east, north = up[1], -up[0] * seen[0][2]
         return _full_turn(atan2(seen[0][1], seen[0][0])), atan2(seen[0][2], flat), _full_turn(atan2(east, north))
+
+
+def made(values):
+    """The Identification of these values, by their names."""
+    return Identification(**values)
+
+
+cdef int hold(Identification found, Py_ssize_t matched, rows, reals) except -1:
+    """Let it keep rows, of numpy's intp, and reals, doubles, as it names them."""
+    found.matched, found.rows, found.reals = matched, rows, reals
+    found.row = <Py_ssize_t *>numbers_of(rows, len(rows) * sizeof(Py_ssize_t))
+    found.turn = <double *>numbers_of(reals, (9 + matched) * sizeof(double))
+    return 0
 
 
 cdef double _full_turn(double angle) noexcept:

@@ -5,17 +5,23 @@ from libc.math cimport fabs, sqrt
 
 
 cdef class FrameStars:
-    cdef readonly object xy
-    cdef readonly object sigma
     cdef readonly double focal_px
     cdef readonly double area_px2
     cdef readonly int tested
-    # the same in C, the middle also with the rows flipped; the radius (rad) of a cone about it that contains the frame
-    cdef const double[:, :, ::1] pixel
-    cdef const double[::1] error
+    # `xy` and `sigma` of so many stars, one behind the other, in the array `numbers`
+    cdef int count
+    cdef object numbers
+    cdef const double *pixel
+    cdef const double *error
+    # the middle, as it is and with the rows flipped; the radius (rad) of a cone about it that contains the frame
     cdef double[2][2] centre
     cdef double[2] reach
     cdef double radius
+
+
+cdef inline const double *pixels_of(FrameStars frame, bint mirrored) noexcept nogil:
+    """Pixels (N, 2) of a frame's stars, with its rows flipped if mirrored."""
+    return frame.pixel + 2 * frame.count * mirrored
 
 
 cdef inline bint on_frame(FrameStars frame, bint mirrored, const double *pixel, double margin) noexcept nogil:

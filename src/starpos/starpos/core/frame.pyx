@@ -28,7 +28,15 @@ cdef class FrameStars:
         _hold(self, xy, sigma)
 
     def __len__(self):
-        return self.error.shape[0]
+        return self.count
+
+    @property
+    def xy(self):
+        return self.numbers[:4 * self.count].reshape(2, self.count, 2)
+
+    @property
+    def sigma(self):
+        return self.numbers[4 * self.count:]
 
     @property
     def middle(self):
@@ -40,7 +48,7 @@ cdef class FrameStars:
 
     def take(self, row):
         """The stars of these rows, in the same order."""
-        return _hold(_shape_of(self), np.ascontiguousarray(self.xy[:, row]), self.sigma[row])
+        return _hold(_shape_of(self), self.xy[:, row], self.sigma[row])
 
     def but(self, *, focal_px=None, area_px2=None, tested=None):
         """Stars as they are, with another focal length, area or number of those that decide."""
@@ -73,9 +81,18 @@ cdef void _centre(FrameStars f, double x, double y, double flipped) noexcept:
 
 cdef FrameStars _hold(FrameStars f, xy, sigma):
     """Give f these stars' pixels and errors; its size and focal length are there."""
-    f.xy, f.sigma = xy, sigma
-    f.pixel, f.error = xy, sigma
+    cdef Py_ssize_t n = len(sigma)
+    if np.shape(xy) != (2, n, 2) or np.shape(sigma) != (n,):
+        raise ValueError(f"{n} errors for pixels of shape {np.shape(xy)}: (2, {n}, 2) is expected")
+    _take(f, n, np.concatenate([np.ravel(xy), sigma], dtype=float))
     return _measured(f)
+
+
+cdef double *_take(FrameStars f, Py_ssize_t n, numbers) except NULL:
+    """Let f keep its n stars in `numbers` (5 n,); the first of these."""
+    cdef double *first = <double *>numbers_of(numbers, 5 * n * sizeof(double))
+    f.count, f.numbers, f.pixel, f.error = n, numbers, first, first + 4 * n
+    return first
 
 
 cdef FrameStars _measured(FrameStars f):
@@ -107,22 +124,19 @@ def ideal_frame(across_px, down_px, covariance, camera, double edge_px, double l
     cdef const double *y = <const double *>numbers_of(down_px, n * sizeof(double))
     cdef const double *variance = <const double *>numbers_of(covariance, 4 * n * sizeof(double))
     cdef FrameStars out = FrameStars.__new__(FrameStars)
-    pixels, errors = np.empty((2, n, 2)), np.empty(n)
-    cdef double[:, :, ::1] xy = pixels
-    cdef double[::1] error = errors
+    cdef double *xy = _take(out, n, np.empty(5 * n))
     # as a camera with square pixels sees them
     cdef double rows = max(1.0, rint(height * squeeze))
     for k in range(n):
         if not (-edge_px < x[k] < width - 1 + edge_px and -edge_px < y[k] < height - 1 + edge_px):
             return None
         across, down = x[k] - cx, (y[k] - cy) * squeeze
-        xy[0, k, 0] = xy[1, k, 0] = across
-        xy[0, k, 1], xy[1, k, 1] = down, rows - 1 - 2 * cy * squeeze - down
-        error[k] = max(sqrt((variance[4 * k] + variance[4 * k + 3]) / 2), least_sigma)
+        xy[2 * k] = xy[2 * (n + k)] = across
+        xy[2 * k + 1], xy[2 * (n + k) + 1] = down, rows - 1 - 2 * cy * squeeze - down
+        xy[4 * n + k] = max(sqrt((variance[4 * k] + variance[4 * k + 3]) / 2), least_sigma)
     _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
     out.reach[0], out.reach[1] = width / 2, rows / 2
     out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
-    out.xy, out.sigma, out.pixel, out.error = pixels, errors, xy, error
     return _measured(out)
 
 

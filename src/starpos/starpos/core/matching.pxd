@@ -34,11 +34,11 @@ cdef inline int begin(Matching *m, int detections, int stars) except -1 nogil:
     return 0
 
 
-cdef inline void order(Matching *m, const double[:, ::1] xy, int n) noexcept nogil:
-    """Sort the first n of the detections xy by x."""
+cdef inline void order(Matching *m, const double *xy, int n) noexcept nogil:
+    """Sort the first n of the detections xy (N, 2) by x."""
     cdef int i
     for i in range(n):
-        m.sorted[i].x, m.sorted[i].y, m.sorted[i].row = xy[i, 0], xy[i, 1], i
+        m.sorted[i].x, m.sorted[i].y, m.sorted[i].row = xy[2 * i], xy[2 * i + 1], i
     sort_by_x(m.sorted, n, m.sorted + n, &m.strips)
 
 

@@ -41,7 +41,7 @@ cdef void count_alike(
     FrameStars frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
 ) noexcept nogil
 cdef double weighed(
-    const double[:, ::1] xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
+    const double *xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
     const double *width, const Py_ssize_t *star, const Py_ssize_t *rank, const double *w, const Py_ssize_t *row, int many,
     Chances chances,
 ) except? -1

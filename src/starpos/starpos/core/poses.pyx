@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos.core.algebra cimport best_rotation, factored, length, median, solved, turn_by, turned
-from starpos.core.frame cimport FrameStars, direction_of, pixel_of
+from starpos.core.frame cimport FrameStars, direction_of, pixel_of, pixels_of
 from starpos.core.matching cimport Matching, match, order
 from starpos.core.sky cimport Visible
 
@@ -38,7 +38,7 @@ cdef void _slopes(const double *u, double focal, double *pixel, double *slope) n
 
 
 cdef int _fit(
-    const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
+    const double *xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
     """Fit attitude (3, 3) and focal length to pixels xy[star[k]] of directions w[near[k]], with errors sigma[k] px."""
@@ -59,7 +59,7 @@ cdef int _fit(
             _slopes(u, focal[0], pixel, slope)
             weight = 1 / (sigma[k] * sigma[k])
             for axis in range(2):
-                off = (xy[star[k], axis] - pixel[axis]) * weight
+                off = (xy[2 * star[k] + axis] - pixel[axis]) * weight
                 for i in range(4):
                     right[i] += slope[4 * axis + i] * off
                     for j in range(i + 1):
@@ -81,7 +81,7 @@ cdef int _fit(
 
 
 cdef void _fit_alone(
-    const double[:, ::1] xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
+    const double *xy, const double *w, const double *sigma, const Py_ssize_t *star, const Py_ssize_t *near,
     int n, int steps, double small_step, double *attitude, double *focal,
 ) noexcept nogil:
     """Fit as `_fit` does, from the rotation that is best with the given focal length: the result depends on no starting pose."""
@@ -91,7 +91,7 @@ cdef void _fit_alone(
     for i in range(9):
         b[i] = 0.0
     for k in range(n):
-        direction_of(xy[star[k], 0], xy[star[k], 1], focal[0], v)
+        direction_of(xy[2 * star[k]], xy[2 * star[k] + 1], focal[0], v)
         for i in range(3):
             for j in range(3):
                 b[3 * i + j] += v[i] * w[3 * near[k] + j]
@@ -110,7 +110,7 @@ def fitted(
     cdef Py_ssize_t[::1] rows = both
     cdef double[:, ::1] turned_to = out
     if n > 0:
-        _fit(xy, &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
+        _fit(&xy[0, 0], &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
     return out, focal_px
 
 
@@ -168,7 +168,7 @@ cdef void settle(
     work    room for 3 numbers a pair
     out     holds the pose to begin with; the fit begins with the frame's focal length
     """
-    cdef const double[:, ::1] xy = frame.pixel[mirrored]
+    cdef const double *xy = pixels_of(frame, mirrored)
     cdef double *sigma = work + 2 * min(n, stars.count)
     cdef int turn, i, k
     cdef bint same
@@ -195,7 +195,7 @@ cdef void settle(
 
 
 cdef void _refit(
-    FrameStars frame, const double[:, ::1] xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
+    FrameStars frame, const double *xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
     double *pixel, double *off, Settled *out,
 ) noexcept nogil:
     """Fit the pose to the pairs with errors sigma (M,); set pixels, offsets (M, 2) and residuals, with errors floored (M,)."""
@@ -209,7 +209,7 @@ cdef void _refit(
     for k in range(out.count):
         weight = 1 / (floored[k] * floored[k])
         for i in range(2):
-            off[2 * k + i] = fabs(xy[out.star[k], i] - pixel[2 * out.near[k] + i])
+            off[2 * k + i] = fabs(xy[2 * out.star[k] + i] - pixel[2 * out.near[k] + i])
             square = off[2 * k + i] * off[2 * k + i]
             whole += square
             weighted += square * weight
@@ -234,7 +234,7 @@ cdef void count_alike(
     for k in range(out.count):
         sigma[k] = length(frame.error[out.star[k]], out.spread)
         floored[k] = length(frame.error[out.star[k]], rules.floor_px)
-    _refit(frame, frame.pixel[mirrored], stars, rules, sigma, floored, pixel, work, out)
+    _refit(frame, pixels_of(frame, mirrored), stars, rules, sigma, floored, pixel, work, out)
 
 
 def log_ratio(
@@ -254,14 +254,14 @@ def log_ratio(
     cdef Py_ssize_t[::1] row = rows
     cdef int n = xy.shape[0], many = star.shape[0]
     if many == 0:
-        return weighed(xy, &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], NULL, NULL, NULL, NULL, 0, chances)
+        return weighed(&xy[0, 0], &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], NULL, NULL, NULL, NULL, 0, chances)
     return weighed(
-        xy, &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], &star[0], &rank[0], &w[0, 0], &row[0], many, chances
+        &xy[0, 0], &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], &star[0], &rank[0], &w[0, 0], &row[0], many, chances
     )
 
 
 cdef double weighed(
-    const double[:, ::1] xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
+    const double *xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
     const double *width, const Py_ssize_t *star, const Py_ssize_t *rank, const double *w, const Py_ssize_t *row, int many,
     Chances chances,
 ) except? -1:
@@ -293,7 +293,7 @@ cdef double weighed(
             for i in range(4):
                 for j in range(i + 1):
                     normal[4 * i + j] += slope[i] * slope[j] + slope[4 + i] * slope[4 + j]
-            apart2[k] = (xy[star[k], 0] - pixel[0]) ** 2 + (xy[star[k], 1] - pixel[1]) ** 2
+            apart2[k] = (xy[2 * star[k]] - pixel[0]) ** 2 + (xy[2 * star[k] + 1] - pixel[1]) ** 2
             passed = <int>rank[k]
             for j in range(k):
                 passed -= rank[k] > rank[j]
@@ -306,7 +306,7 @@ cdef double weighed(
             hits += hit[i] != NONE
         for i in range(n):
             for j in range(i):
-                if (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2 < chances.double_px * chances.double_px:
+                if (xy[2 * i] - xy[2 * j]) ** 2 + (xy[2 * i + 1] - xy[2 * j + 1]) ** 2 < chances.double_px * chances.double_px:
                     hit[i] = DOUBLED
         for e in range(ERRORS):
             # the logarithm of the largest product of the first odds; a product that gets too large or small goes into `total`

@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc, qsort
 import numpy as np
 
 from starpos.core.algebra cimport best_rotation, fetch, length, turned
-from starpos.core.frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of
+from starpos.core.frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of, pixels_of
 from starpos.core.matching cimport Matching, begin, match, order
 from starpos.core.sky cimport MOST_RUNS, Date, StarTable, runs_near
 from starpos.core.triangles cimport Candidate
@@ -46,6 +46,7 @@ cdef class BrightTable:
         cdef double[9] seen
         cdef double[9] b
         cdef double x = 0.0, y = 0.0, size2 = 0.0, away2, wanted
+        cdef const double *xy = pixels_of(frame, c.mirrored)
         cdef const double *pixel
         cdef int i, j, k, turn
         for k in range(3):
@@ -54,14 +55,14 @@ cdef class BrightTable:
             self.stars.ask(self.row[c.corner[k]], self.row[c.corner[k]], date)
         for k in range(3):
             self.stars.direction(self.row[c.corner[k]], date, &w[3 * k])
-            pixel = &frame.pixel[c.mirrored, c.star[k], 0]
+            pixel = &xy[2 * c.star[k]]
             x += pixel[0] / 3
             y += pixel[1] / 3
         wanted = _perimeter(w)
         focal[0] = frame.focal_px
         for turn in range(3):
             for k in range(3):
-                pixel = &frame.pixel[c.mirrored, c.star[k], 0]
+                pixel = &xy[2 * c.star[k]]
                 direction_of(pixel[0], pixel[1], focal[0], &seen[3 * k])
             if turn < 2:
                 focal[0] *= _perimeter(seen) / wanted
@@ -73,10 +74,10 @@ cdef class BrightTable:
         best_rotation(b, attitude)
         # a triangle's error grows with the distance from it
         for k in range(3):
-            pixel = &frame.pixel[c.mirrored, c.star[k], 0]
+            pixel = &xy[2 * c.star[k]]
             size2 += ((pixel[0] - x) ** 2 + (pixel[1] - y) ** 2) / 3
         for i in range(n):
-            pixel = &frame.pixel[c.mirrored, i, 0]
+            pixel = &xy[2 * i]
             away2 = (pixel[0] - x) ** 2 + (pixel[1] - y) ** 2
             radius[i] = match_sigma * length(frame.error[i], error_px) * sqrt(1 + away2 / max(size2, 1.0))
 
@@ -115,7 +116,7 @@ cdef class BrightTable:
             for i in range(count):
                 pixel[2 * i], pixel[2 * i + 1] = bright[i].x, bright[i].y
             begin(&m, n, count)
-            order(&m, frame.pixel[c.mirrored], n)
+            order(&m, pixels_of(frame, c.mirrored), n)
             match(&m, n, pixel, count, radius_px)
             # the sum from the brightest star down to the one where it is largest
             for i in range(n):

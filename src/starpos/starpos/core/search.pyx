@@ -8,14 +8,18 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from starpos.core.found cimport Identification
-from starpos.core.frame cimport FrameStars, on_frame
+from starpos.core.found cimport Identification, hold
+from starpos.core.frame cimport FrameStars, on_frame, pixels_of
 from starpos.core.matching cimport Matching, begin
 from starpos.core.memory cimport numbers_of
 from starpos.core.poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
 from starpos.core.screen cimport BrightTable
 from starpos.core.sky cimport Date, StarTable, Visible, date_of
 from starpos.core.triangles cimport Candidate, TriangleTable
+
+
+cdef enum:
+    MOST_STAGES = 8
 
 
 cdef struct Work:
@@ -111,12 +115,12 @@ cdef class Judge:
 
     cdef int _deciding(self):
         """How many of the frame's stars decide."""
-        return min(<int>self.frame.error.shape[0], self.frame.tested)
+        return min(self.frame.count, self.frame.tested)
 
     cdef judged(self, const double *attitude, double focal, bint mirrored, const double *radius):
         """What `identified` returns."""
         cdef Work work
-        cdef int n = self._deciding(), most = min(<int>self.frame.error.shape[0], self.rules.most_stars)
+        cdef int n = self._deciding(), most = min(self.frame.count, self.rules.most_stars)
         cdef double log_odds
         memcpy(work.end.attitude, attitude, 9 * sizeof(double))
         work.end.focal, work.stars.memory, work.m.memory, work.memory = focal, NULL, NULL, NULL
@@ -124,7 +128,7 @@ cdef class Judge:
             if not self._settled(mirrored, n, radius, &work):
                 return None
             log_odds = weighed(
-                self.frame.pixel[mirrored], &self.frame.error[0], n, self.frame.area_px2, work.end.attitude, work.end.focal,
+                pixels_of(self.frame, mirrored), self.frame.error, n, self.frame.area_px2, work.end.attitude, work.end.focal,
                 self.width, work.end.star, work.end.near, work.stars.w, work.end.near, work.end.count, self.chances,
             )
             if self.anywhere is not None:
@@ -134,7 +138,7 @@ cdef class Judge:
             # true for NaN too
             if not log_odds >= self.enough:
                 return None
-            if self.frame.error.shape[0] > n and not self._settled(mirrored, most, NULL, &work):
+            if self.frame.count > n and not self._settled(mirrored, most, NULL, &work):
                 return None
             if work.end.spread > self.rules.bent_px:
                 count_alike(
@@ -181,19 +185,16 @@ cdef class Judge:
         cdef Identification out = Identification.__new__(Identification)
         cdef const Settled *end = &work.end
         cdef int k, n = end.count, last = 2 * n
-        # one block of memory is quicker than three
-        rows, out.blend_px, out.attitude = np.empty(2 * n + work.stars.count, np.intp), np.empty(n), np.empty((3, 3))
-        cdef Py_ssize_t *row = <Py_ssize_t *>numbers_of(rows, (2 * n + work.stars.count) * sizeof(Py_ssize_t))
-        cdef double *blend = <double *>numbers_of(out.blend_px, n * sizeof(double))
-        memcpy(numbers_of(out.attitude, 9 * sizeof(double)), end.attitude, 9 * sizeof(double))
+        hold(out, n, np.empty(2 * n + work.stars.count, np.intp), np.empty(9 + n))
+        memcpy(out.turn, end.attitude, 9 * sizeof(double))
         for k in range(n):
-            row[k], row[n + k] = end.star[k], work.stars.row[end.near[k]]
-            blend[k] = work.stars.moved[end.near[k]]
+            out.row[k], out.row[n + k] = end.star[k], work.stars.row[end.near[k]]
+            out.turn[9 + k] = work.stars.moved[end.near[k]]
         for k in range(work.stars.count):
             if on_frame(self.frame, mirrored, &work.memory[2 * k], -self.rules.inside_px):
-                row[last] = work.stars.row[k]
+                out.row[last] = work.stars.row[k]
                 last += 1
-        out.star, out.catalogue, out.expected = rows[:n], rows[n:2 * n], rows[2 * n:last]
+        out.due = last - 2 * n
         out.focal_scale, out.log_odds, out.mirrored = end.focal / self.frame.focal_px, log_odds, mirrored
         out.residual_px, out.mean_square_px2 = end.rms, end.mean_square
         return out
@@ -244,7 +245,8 @@ cdef class Limits:
 cdef class Lost:
     """An iterator over what is identified of a frame lost in space, as `Finder.lost` makes it.
 
-    stages   (number of brightest stars, their error in px): triangles of these are looked up, none twice with one error.
+    stages   (number of brightest stars, their error in px), at most MOST_STAGES: triangles of these are looked up, none
+             twice with one error.
              Before the first stage the best candidate that others support is judged, of fewer stars: it mostly is right
     crowded  most of the brightest stars may be false: only candidates that two others support are judged, all of them;
              else the best candidate is judged, and of the others those that are worth a fit
@@ -254,8 +256,9 @@ cdef class Lost:
     cdef TriangleTable table
     cdef BrightTable bright
     cdef Limits limits
-    cdef object stages
-    cdef dict looked_up
+    cdef int[MOST_STAGES] stars
+    cdef double[MOST_STAGES] stage_px
+    cdef int stages, stage
     cdef bint crowded, ranked, begun
     cdef double error_px
     # Candidates of a stage; their order, where in it the search is, and its end; radii (px) of the stars that decide.
@@ -266,10 +269,14 @@ cdef class Lost:
 
     cdef int _take(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits) except -1:
         """Take what a new one searches by."""
-        cdef int most = max(limits.most_looked_at, limits.most_supported) + 1
+        cdef int most = max(limits.most_looked_at, limits.most_supported) + 1, k
         self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
-        self.stages, self.looked_up, self.crowded, self.begun = iter(stages), {}, crowded, crowded
-        self.error_px = stages[0][1]
+        self.crowded, self.begun, self.stages = crowded, crowded, len(stages)
+        if not 0 < self.stages <= MOST_STAGES:
+            raise ValueError(f"{self.stages} stages of a search: 1 to {MOST_STAGES} are possible")
+        for k in range(self.stages):
+            self.stars[k], self.stage_px[k] = stages[k]
+        self.error_px = self.stage_px[0]
         self.found = <Candidate *>malloc(most * (sizeof(Candidate) + sizeof(int)))
         self.radius = <double *>malloc((judge._deciding() + 1) * sizeof(double))
         if self.found == NULL or self.radius == NULL:
@@ -296,9 +303,9 @@ cdef class Lost:
                 self._look_first()
                 continue
             if self.at == self.count:
-                # at the end of the stages the search ends
-                stars, error_px = next(self.stages)
-                self._look_up(stars, error_px)
+                if self.stage == self.stages:
+                    raise StopIteration
+                self._look_up()
                 continue
             c = &self.found[self.order[self.at]]
             self.at += 1
@@ -309,30 +316,32 @@ cdef class Lost:
 
     cdef int _look_first(self) except -1:
         """Take the best candidate of the first few stars, if others support it."""
-        cdef int stars = min(self.limits.first_stars, <int>self.judge.frame.error.shape[0])
+        cdef int stars = min(self.limits.first_stars, self.judge.frame.count)
         self.count = self.table.best(
             self.judge.frame, 0, stars, self.error_px, self.limits.most_candidates, 1, True, self.found
         )
         self.at, self.ranked, self.order[0] = 0, True, 0
         return 0
 
-    cdef int _look_up(self, int stars, double error_px) except -1:
-        """Take the candidates of a stage."""
+    cdef int _look_up(self) except -1:
+        """Take the candidates of the next stage."""
         cdef FrameStars frame = self.judge.frame
         cdef Limits limits = self.limits
-        cdef int k, done
-        stars = min(stars, <int>frame.error.shape[0])
+        cdef double error_px = self.stage_px[self.stage]
+        cdef int k, done = 0, stars = min(self.stars[self.stage], frame.count)
         if self.crowded:
             self.count = self.table.supported(
                 frame, stars, error_px, limits.most_in_crowd, limits.most_supported, self.found
             )
         else:
-            done = self.looked_up.get(error_px, 0)
+            for k in range(self.stage):
+                if self.stage_px[k] == error_px:
+                    done = min(self.stars[k], frame.count)
             self.count = self.table.best(
                 frame, done, stars, error_px, limits.most_candidates, limits.most_looked_at, error_px > limits.loose_px,
                 self.found,
             )
-        self.looked_up[error_px] = stars
+        self.stage += 1
         self.error_px, self.at, self.ranked = error_px, 0, self.crowded
         for k in range(self.count):
             self.order[k] = k

@@ -275,14 +275,14 @@ cdef int _begin(Search *s, FrameStars frame, int stars, double error_px) except 
     cdef int a, b
     cdef double x, y, z
     s.found, s.count, s.room, s.queries = NULL, 0, 0, 0
-    s.stars = stars = min(stars, <int>frame.error.shape[0])
+    s.stars = stars = min(stars, frame.count)
     s.v = <double *>malloc((4 * stars + stars * stars + 1) * sizeof(double))
     if s.v == NULL:
         raise MemoryError
     s.error = s.v + 3 * stars
     s.side = s.error + stars
     for b in range(stars):
-        direction_of(frame.pixel[0, b, 0], frame.pixel[0, b, 1], frame.focal_px, &s.v[3 * b])
+        direction_of(frame.pixel[2 * b], frame.pixel[2 * b + 1], frame.focal_px, &s.v[3 * b])
         s.error[b] = length(error_px, frame.error[b]) / frame.focal_px
         for a in range(b):
             x, y, z = s.v[3 * a] - s.v[3 * b], s.v[3 * a + 1] - s.v[3 * b + 1], s.v[3 * a + 2] - s.v[3 * b + 2]

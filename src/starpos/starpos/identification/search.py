@@ -144,13 +144,21 @@ def identify_frame(
 def identifications(
     field: FrameStars, sky: Sky, priors: Priors, enough: float = ENOUGH
 ) -> Iterator[Identification]:
-    """Yield all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order.
-
-    Then those of stars that are spread evenly, if the brightest are not.
-    """
+    """All of `near_or_lost`, then what `_crowded_or_uneven` yields."""
     if len(field) < FEWEST_STARS:
-        return
-    yield from near_or_lost(field, sky, priors, STAGES, enough)
+        return iter(())
+    return chain(
+        near_or_lost(field, sky, priors, STAGES, enough), _crowded_or_uneven(field, sky, priors, enough)
+    )
+
+
+def _crowded_or_uneven(
+    field: FrameStars, sky: Sky, priors: Priors, enough: float
+) -> Iterator[Identification]:
+    """Yield what is identified of a frame whose brightest stars may nearly all be false, in any order.
+
+    Then that of stars that are spread evenly, if the brightest are not.
+    """
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
     rows = second_try(field)
     # each star found keeps those of its cell away: that leaves less area for the others

@@ -55,6 +55,8 @@ STEEPEST_BEND = 0.2
 # Between two skies the residuals of neighbours differ by so many px, by their errors times the first number plus the
 # second over the square root of the number of stars, and by this share of what those of distant stars do.
 MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.3
+# With a smaller mean square of all residuals no two skies are mixed.
+LEAST_MIXED_PX2 = MIXED_PX**2 * MIXED_EVERYWHERE
 # Errors of centroids (px) that nobody states.
 LEAST_ERROR_PX = 0.1
 # Of so many stars or more only this share, those that fit best, are compared.
@@ -71,7 +73,7 @@ def two_skies(
     flux (N,): of the field's stars, in any unit, brightest first.
     explained: how much of the field it explains.
     """
-    if _between_two(field, sky, found):
+    if found.mean_square_px2 >= LEAST_MIXED_PX2 and _between_two(field, sky, found):
         return True
     bright = explained.bright
     if bright - explained.explained < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
@@ -86,8 +88,6 @@ def two_skies(
 
 def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     """Whether the residuals of neighbouring stars differ as only those of two skies do."""
-    if found.mean_square_px2 < MIXED_PX**2 * MIXED_EVERYWHERE:
-        return False
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
     residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
