@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the compiled core keeps as plain memory: it takes arrays that fit only, and gives what it was given."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from starpos.core.frame import FrameStars
+from starpos.identification import Identification, search
+
+VALUES = {
+    "star": [0, 2, 5],
+    "catalogue": [700, 30, 41],
+    "blend_px": [0.0, 0.25, 0.0],
+    "attitude": np.eye(3)[[1, 2, 0]],
+    "focal_scale": 1.01,
+    "residual_px": 0.07,
+    "mean_square_px2": 0.005,
+    "log_odds": 88.0,
+    "expected": [30, 41, 700, 12],
+    "mirrored": True,
+}
+
+
+def frame(xy, sigma):
+    return FrameStars(xy=xy, sigma=sigma, middle=(0, 0), half=(50, 40), focal_px=1e3, area_px2=8e3, tested=50)
+
+
+def same(found, values):
+    return all(np.array_equal(getattr(found, name), value) for name, value in values.items())
+
+
+def test_an_identification_gives_what_it_was_given_also_from_another_process():
+    found = Identification(**VALUES)
+    assert same(found, VALUES)
+    assert same(pickle.loads(pickle.dumps(found)), VALUES)
+    assert same(found.but(star=[1, 2, 3], mirrored=False), VALUES | {"star": [1, 2, 3], "mirrored": False})
+    assert same(found, VALUES)
+
+
+def test_an_identification_of_none_has_empty_arrays():
+    none = VALUES | {"star": [], "catalogue": [], "blend_px": [], "expected": []}
+    assert same(Identification(**none), none)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"star": [0, 2]}, "^2 stars, 3 rows and 3 blends"),
+        ({"catalogue": [1, 2, 3, 4]}, "^3 stars, 4 rows and 3 blends"),
+        ({"blend_px": [0.1]}, "^3 stars, 3 rows and 1 blends"),
+        ({"attitude": np.eye(2)}, "reshape"),
+    ],
+)
+def test_arrays_of_an_identification_that_do_not_fit_are_refused(wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        Identification(**VALUES | wrong)
+
+
+def test_the_stars_of_a_frame_are_what_was_given_and_a_copy():
+    xy, sigma = np.arange(12.0).reshape(2, 3, 2), np.array([0.1, 0.2, 0.3])
+    stars = frame(xy.copy(), sigma.copy())
+    taken = stars.take(np.array([2, 0]))
+    assert len(stars) == 3
+    assert len(taken) == 2
+    assert np.array_equal(stars.xy, xy)
+    assert np.array_equal(stars.sigma, sigma)
+    assert np.array_equal(taken.xy, xy[:, [2, 0]])
+    assert np.array_equal(taken.sigma, sigma[[2, 0]])
+    assert np.array_equal(stars.but(tested=5).xy, xy)
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 2), (2, 4, 3), (1, 4, 2), (4, 2)])
+def test_pixels_that_are_not_those_of_the_errors_are_refused(shape):
+    with pytest.raises(ValueError, match="4 errors for pixels of shape"):
+        frame(np.zeros(shape), np.ones(4))
+
+
+def test_a_search_of_no_stage_or_of_too_many_is_refused(sky):
+    stars = frame(np.zeros((2, 5, 2)), np.ones(5))
+    for stages in ([], [(5, 0.3)] * 9):
+        with pytest.raises(ValueError, match=f"^{len(stages)} stages"):
+            search.near_or_lost(stars, sky, (), stages)
