@@ -206,7 +206,7 @@ cdef inline double _half_chord(const double *a, const double *b) noexcept nogil:
 cdef inline void _largest_and_smallest(const double *sine, double *angle) noexcept nogil:
     """The largest and the smallest angle (2,) of a spherical triangle by the sines (3,) of its half sides, longest first.
 
-    As `angles_of`, by sums of half sides: without a sine of them, or an arc for each.
+    As `triangles.angles`, by sums of half sides: without a sine of them, or an arc for each.
     """
     cdef double p = sine[0], q = sine[1], r = sine[2]
     cdef double p_, q_, r_

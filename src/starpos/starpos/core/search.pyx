@@ -226,28 +226,29 @@ cdef class Limits:
     loose_px                 with larger errors of the centroids a candidate counts only if another one supports it
     most_candidates          a look-up is limited to triangles for which so many candidates are expected by chance
     most_looked_at           so many candidates, the best ones, are looked at
-    most_in_crowd, most_supported  the same in a crowd of false stars
+    most_looked_up           so many triangles are looked up in a crowd of false stars, or more where it has many
+    most_in_crowd, most_supported  what most_candidates and most_looked_at are, in such a crowd
     """
 
     cdef double match_sigma, log_false, worth_a_fit, loose_px, most_candidates, most_in_crowd
-    cdef int first_stars, most_stars, most_looked_at, most_supported
+    cdef int first_stars, most_stars, most_looked_at, most_looked_up, most_supported
 
     def __init__(
         self, *, int first_stars, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
-        double most_candidates, int most_looked_at, double most_in_crowd, int most_supported,
+        double most_candidates, int most_looked_at, int most_looked_up, double most_in_crowd, int most_supported,
     ):
         self.first_stars = first_stars
         self.match_sigma, self.log_false, self.worth_a_fit, self.most_stars = match_sigma, log_false, worth_a_fit, most_stars
         self.loose_px, self.most_candidates, self.most_looked_at = loose_px, most_candidates, most_looked_at
-        self.most_in_crowd, self.most_supported = most_in_crowd, most_supported
+        self.most_looked_up, self.most_in_crowd, self.most_supported = most_looked_up, most_in_crowd, most_supported
 
 
 cdef class Lost:
     """An iterator over what is identified of a frame lost in space, as `Finder.lost` makes it.
 
     stages   (number of brightest stars, their error in px), at most MOST_STAGES: triangles of these are looked up, none
-             twice with one error.
-             Before the first stage the best candidate that others support is judged, of fewer stars: it mostly is right
+             twice with one error. Before the first stage the best candidate that others support is judged, of fewer
+             stars: it mostly is right
     crowded  most of the brightest stars may be false: only candidates that two others support are judged, all of them;
              else the best candidate is judged, and of the others those that are worth a fit
     """
@@ -331,7 +332,7 @@ cdef class Lost:
         cdef int k, done = 0, stars = min(self.stars[self.stage], frame.count)
         if self.crowded:
             self.count = self.table.supported(
-                frame, stars, error_px, limits.most_in_crowd, limits.most_supported, self.found
+                frame, stars, error_px, limits.most_looked_up, limits.most_in_crowd, limits.most_supported, self.found
             )
         else:
             for k in range(self.stage):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-# Angles of spherical triangles, the numbers that shapes are kept as, and what a look-up finds, for the other modules here.
-
-from libc.math cimport M_PI, atan2, sin, sqrt
+# The numbers that shapes of triangles are kept as, and what a look-up finds, for the other modules here.
 
 from starpos.core.frame cimport FrameStars
 
@@ -50,11 +48,13 @@ cdef struct Query:
 
 
 cdef struct Search:
-    # Of the frame's stars: directions, errors (rad), and the distance (rad) of star b from a brighter one a at [a, b].
+    # Of the frame's stars: directions, errors (rad), the distance (rad) of star b from a brighter one a at [a, b], and the
+    # angle at a, from any direction on, under which b is seen, at [a, b] too.
     int stars
     double *v
     double *error
     double *side
+    double *bearing
     Query[2 * AHEAD] waiting
     int queries
     Candidate *found
@@ -74,9 +74,9 @@ cdef class TriangleTable:
         self, FrameStars frame, int first, int last, double error_px, double most_expected, int most, bint loose, Candidate *out
     ) except -1
     cdef int supported(
-        self, FrameStars frame, int stars, double error_px, double most_expected, int most, Candidate *out
+        self, FrameStars frame, int stars, double error_px, int most_looked_up, double most_expected, int most,
+        Candidate *out
     ) except -1
-    cdef double _rarest(self, const Search *s, double most_expected) except? -1
     cdef void _measure(self, const Search *s, int a, int b, int c, Shape *out) noexcept nogil
     cdef double _expected(self, const Shape *shape) noexcept nogil
     cdef int _ask(self, Search *s, const Shape *shape) except -1 nogil
@@ -95,15 +95,6 @@ cdef inline int code_of(double value, double least, double per_unit) noexcept no
     if value < 0:
         return 0
     return <int>value if value < CODES - 1 else CODES - 1
-
-
-cdef inline void angles_of(const double *side, double *angle) noexcept nogil:
-    """The angles (3,) of a spherical triangle of sides (3,), each opposite its angle, as `triangles.angles` has them."""
-    cdef double s = (side[0] + side[1] + side[2]) / 2, whole = sin(s)
-    cdef double a = sin(max(s - side[0], 0.0)), b = sin(max(s - side[1], 0.0)), c = sin(max(s - side[2], 0.0))
-    angle[0] = 2 * atan2(sqrt(b * c), sqrt(whole * a))
-    angle[1] = 2 * atan2(sqrt(a * c), sqrt(whole * b))
-    angle[2] = 2 * atan2(sqrt(a * b), sqrt(whole * c))
 
 
 cdef inline bint is_counter_clockwise(const double *a, const double *b, const double *c) noexcept nogil:

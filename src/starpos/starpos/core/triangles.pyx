@@ -2,8 +2,8 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Look up a frame's triangles of bright stars among those of the sky, by their shape."""
 
-from libc.math cimport M_PI, asin, log, sqrt
-from libc.stdlib cimport calloc, free, malloc, realloc
+from libc.math cimport M_PI, asin, atan2, fabs, sqrt
+from libc.stdlib cimport abs, calloc, free, malloc, realloc
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from starpos.core.algebra cimport fetch, length
 from starpos.core.frame cimport FrameStars, direction_of
 
 cdef enum:
-    # Of the number of candidates that chance makes: 64 for each power of two.
-    STEPS = 4096
+    ROUNDS = 3
     # Shapes in a piece of memory that comes at once.
     LINE = 10
     # Logarithm of the size of a table that fits into a processor's cache.
@@ -94,53 +93,43 @@ cdef class TriangleTable:
             free(s.v)
 
     cdef int supported(
-        self, FrameStars frame, int stars, double error_px, double most_expected, int most, Candidate *out
+        self, FrameStars frame, int stars, double error_px, int most_looked_up, double most_expected, int most,
+        Candidate *out
     ) except -1:
         """Write candidates as `best` does, those that at least two others support, in a crowd of false stars.
 
-        Where most of these stars are false, nearly all candidates are chance, but chance supports few. Only the triangles
-        that chance matches least are looked up, until it makes so many candidates.
+        Where most of these stars are false, nearly all candidates are chance, but chance supports few. All triangles on
+        one side support each other if that side is of true stars. So a side is taken after another, with all triangles on
+        it that are on none before: first those of two stars next to each other in brightness, the faintest of them first,
+        because false stars mostly are brighter. It ends after most_looked_up triangles, or those of ROUNDS sides for each
+        star if these are more, and where chance makes so many candidates.
         """
         cdef Search s
         cdef Shape shape
-        cdef double limit
-        cdef int a, b, c
+        cdef int a, b, c, apart, looked_up = 0
+        cdef double expected = 0.0
+        s.found, s.v = NULL, NULL
         try:
             _begin(&s, frame, stars, error_px)
-            limit = self._rarest(&s, most_expected)
-            for a in range(s.stars):
-                for b in range(a + 1, s.stars):
-                    for c in range(b + 1, s.stars):
-                        self._measure(&s, a, b, c, &shape)
-                        if shape.usable and self._expected(&shape) < limit:
+            most_looked_up = max(most_looked_up, ROUNDS * s.stars * s.stars)
+            for apart in range(1, s.stars):
+                for a in range(s.stars - apart - 1, -1, -1):
+                    b = a + apart
+                    if looked_up >= most_looked_up or expected >= most_expected:
+                        break
+                    for c in range(s.stars):
+                        if not (_later(a, c, a, b) and _later(b, c, a, b)):
+                            continue
+                        self._measure(&s, min(a, c), max(a, min(b, c)), max(b, c), &shape)
+                        if shape.usable:
                             self._ask(&s, &shape)
+                            expected += self._expected(&shape)
+                            looked_up += 1
             self._answer(&s)
             return _best(&s, most, 2, False, out)
         finally:
             free(s.found)
             free(s.v)
-
-    cdef double _rarest(self, const Search *s, double most_expected) except? -1:
-        """The number of chance candidates of one triangle below which all triangles together make most_expected."""
-        cdef Shape shape
-        cdef int a, b, c, k
-        cdef double total = 0.0, one
-        cdef double *sums = <double *>calloc(STEPS, sizeof(double))
-        if sums == NULL:
-            raise MemoryError
-        for a in range(s.stars):
-            for b in range(a + 1, s.stars):
-                for c in range(b + 1, s.stars):
-                    self._measure(s, a, b, c, &shape)
-                    if shape.usable:
-                        one = self._expected(&shape)
-                        sums[max(0, min(<int>((log(one) / log(2.0) + 40) * 64), STEPS - 1))] += one
-        for k in range(STEPS):
-            total += sums[k]
-            if total >= most_expected:
-                break
-        free(sums)
-        return 2.0 ** (k / 64.0 - 40) if total >= most_expected else 1e300
 
     cdef void _measure(self, const Search *s, int a, int b, int c, Shape *out) noexcept nogil:
         """Set the sides and the tolerances of the triangle of three stars, in ascending order."""
@@ -178,9 +167,11 @@ cdef class TriangleTable:
         cdef double[3] middle
         cdef double[3] least
         cdef int i, swap, row, column, run
+        cdef bint turn = False
         cdef Query *q
         least[0], least[1], least[2] = M_PI / 3, 0.0, 0.0
-        angles_of(shape.side, angle)
+        for i in range(3):
+            turn = _angle(s, shape.star[i], shape.star[(i + 1) % 3], shape.star[(i + 2) % 3], &angle[i])
         middle[0], middle[1], middle[2] = angle[0], angle[2], max(shape.side[0], LEAST_SIDE)
         for swap in range(3):
             if swap > 0 and not angle[swap - 1] - angle[swap] < 2 * shape.tolerance[0]:
@@ -193,8 +184,7 @@ cdef class TriangleTable:
                 q.high[i] = code_of(middle[i] + shape.tolerance[i], least[i], self.codes[i])
             if swap > 0:
                 q.star[swap - 1], q.star[swap] = q.star[swap], q.star[swap - 1]
-            q.longest = middle[2]
-            q.turn = is_counter_clockwise(&s.v[3 * q.star[0]], &s.v[3 * q.star[1]], &s.v[3 * q.star[2]])
+            q.longest, q.turn = middle[2], turn ^ (swap > 0)
             for row in range(q.low[0] >> SHIFT_0, (q.high[0] >> SHIFT_0) + 1):
                 for column in range(q.low[1] >> SHIFT_1, (q.high[1] >> SHIFT_1) + 1):
                     run = (row << BITS_1 | column) << BITS_2
@@ -270,23 +260,49 @@ cdef class TriangleTable:
         return 0
 
 
+cdef inline bint _later(int x, int y, int a, int b) noexcept nogil:
+    """Whether `supported` takes the side of stars x, y after that of a, b, where a < b."""
+    cdef int apart = abs(x - y)
+    return apart > b - a or apart == b - a and min(x, y) < a
+
+
+cdef inline bint _angle(const Search *s, int a, int b, int c, double *angle) noexcept nogil:
+    """Set the angle at a of three stars; whether they are counter-clockwise, seen from within the sphere."""
+    cdef double turn = s.bearing[a * s.stars + c] - s.bearing[a * s.stars + b]
+    turn += 2 * M_PI if turn < -M_PI else 0.0
+    turn -= 2 * M_PI if turn > M_PI else 0.0
+    angle[0] = fabs(turn)
+    return turn < 0
+
+
 cdef int _begin(Search *s, FrameStars frame, int stars, double error_px) except -1:
-    """Take directions, errors and distances of a frame's brightest stars."""
+    """Take directions, errors, distances and bearings of a frame's brightest stars."""
     cdef int a, b
     cdef double x, y, z
+    cdef const double *v
+    cdef const double *w
     s.found, s.count, s.room, s.queries = NULL, 0, 0, 0
     s.stars = stars = min(stars, frame.count)
-    s.v = <double *>malloc((4 * stars + stars * stars + 1) * sizeof(double))
+    s.v = <double *>malloc((4 * stars + 2 * stars * stars + 1) * sizeof(double))
     if s.v == NULL:
         raise MemoryError
     s.error = s.v + 3 * stars
     s.side = s.error + stars
+    s.bearing = s.side + stars * stars
     for b in range(stars):
         direction_of(frame.pixel[2 * b], frame.pixel[2 * b + 1], frame.focal_px, &s.v[3 * b])
         s.error[b] = length(error_px, frame.error[b]) / frame.focal_px
         for a in range(b):
             x, y, z = s.v[3 * a] - s.v[3 * b], s.v[3 * a + 1] - s.v[3 * b + 1], s.v[3 * a + 2] - s.v[3 * b + 2]
             s.side[a * stars + b] = 2 * asin(min(1.0, 0.5 * sqrt(x * x + y * y + z * z)))
+    for a in range(stars):
+        # two directions across v, as long as each other, to the right and down
+        v = &s.v[3 * a]
+        for b in range(stars):
+            w = &s.v[3 * b]
+            x = v[2] * w[0] - v[0] * w[2]
+            y = (v[0] * v[0] + v[2] * v[2]) * w[1] - v[1] * (v[0] * w[0] + v[2] * w[2])
+            s.bearing[a * stars + b] = atan2(y, x)
     return 0
 
 

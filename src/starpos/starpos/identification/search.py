@@ -42,6 +42,7 @@ LIMITS = Limits(
     loose_px=1.0,
     most_candidates=25_000,
     most_looked_at=25,
+    most_looked_up=10_000,
     most_in_crowd=60_000,
     most_supported=40,
 )
@@ -175,9 +176,10 @@ def _crowded(
     field: FrameStars, sky: Sky, priors: Priors, enough: float, crowd: int
 ) -> Iterator[Identification]:
     """Yield what the `crowd` brightest stars of a field show if nearly all of them are false."""
-    stages = [(min(n, len(field)), error_px) for n, error_px in CROWD_STAGES]
+    # a second stage is for more stars
+    stages = CROWD_STAGES[: 1 + (len(field) > CROWD_STAGES[0][0])]
     crowded = field.but(tested=crowd)
-    yield from near_or_lost(crowded, sky, priors, list(dict.fromkeys(stages)), enough, crowded=True)
+    yield from near_or_lost(crowded, sky, priors, stages, enough, crowded=True)
 
 
 def second_try(field: FrameStars) -> np.ndarray | None:
