@@ -84,6 +84,8 @@ NEWEST_ONLY = [
             "identification/test_blind",
             "identification/test_real_frames",
             "navigation/test_bad_records",
+            "navigation/test_borne_out",
+            "navigation/test_standstill",
             "report/test_report_bag",
         )
     ),

@@ -20,6 +20,7 @@ from starpos.core.triangles cimport Candidate, TriangleTable
 
 cdef enum:
     MOST_STAGES = 8
+    LOOKS = 3
 
 
 cdef struct Work:
@@ -219,7 +220,7 @@ cdef void _release(Work *work) noexcept:
 cdef class Limits:
     """Limits of the search.
 
-    first_stars              the first look is at triangles of so many of the brightest stars
+    first_stars              LOOKS numbers: the first looks are at triangles of so many of the brightest stars
     match_sigma              stars lie within so many sigma of their places
     log_false                logarithm of the share of detections that may be false
     worth_a_fit, most_stars  log-odds of a pose that is judged, by so many of the brightest catalogue stars on the frame
@@ -231,13 +232,16 @@ cdef class Limits:
     """
 
     cdef double match_sigma, log_false, worth_a_fit, loose_px, most_candidates, most_in_crowd
-    cdef int first_stars, most_stars, most_looked_at, most_looked_up, most_supported
+    cdef int[LOOKS] first_stars
+    cdef int most_stars, most_looked_at, most_looked_up, most_supported
 
     def __init__(
-        self, *, int first_stars, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
+        self, *, first_stars, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
         double most_candidates, int most_looked_at, int most_looked_up, double most_in_crowd, int most_supported,
     ):
-        self.first_stars = first_stars
+        cdef int k
+        for k in range(LOOKS):
+            self.first_stars[k] = first_stars[k]
         self.match_sigma, self.log_false, self.worth_a_fit, self.most_stars = match_sigma, log_false, worth_a_fit, most_stars
         self.loose_px, self.most_candidates, self.most_looked_at = loose_px, most_candidates, most_looked_at
         self.most_looked_up, self.most_in_crowd, self.most_supported = most_looked_up, most_in_crowd, most_supported
@@ -247,8 +251,8 @@ cdef class Lost:
     """An iterator over what is identified of a frame lost in space, as `Finder.lost` makes it.
 
     stages   (number of brightest stars, their error in px), at most MOST_STAGES: triangles of these are looked up, none
-             twice with one error. Before the first stage the best candidate that others support is judged, of fewer
-             stars: it mostly is right
+             twice with one error. Before the first stage come looks at few stars: of each the best candidate that others
+             support is judged, which mostly is right
     crowded  most of the brightest stars may be false: only candidates that two others support are judged, all of them;
              else the best candidate is judged, and of the others those that are worth a fit
     """
@@ -259,8 +263,8 @@ cdef class Lost:
     cdef Limits limits
     cdef int[MOST_STAGES] stars
     cdef double[MOST_STAGES] stage_px
-    cdef int stages, stage
-    cdef bint crowded, ranked, begun
+    cdef int stages, stage, looks
+    cdef bint crowded, ranked
     cdef double error_px
     # Candidates of a stage; their order, where in it the search is, and its end; radii (px) of the stars that decide.
     cdef Candidate *found
@@ -272,7 +276,7 @@ cdef class Lost:
         """Take what a new one searches by."""
         cdef int most = max(limits.most_looked_at, limits.most_supported) + 1, k
         self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
-        self.crowded, self.begun, self.stages = crowded, crowded, len(stages)
+        self.crowded, self.looks, self.stages = crowded, LOOKS if crowded else 0, len(stages)
         if not 0 < self.stages <= MOST_STAGES:
             raise ValueError(f"{self.stages} stages of a search: 1 to {MOST_STAGES} are possible")
         for k in range(self.stages):
@@ -299,8 +303,7 @@ cdef class Lost:
         while True:
             if self.at == 1 and not self.ranked:
                 self._rank()
-            if self.at == self.count and not self.begun:
-                self.begun = True
+            if self.at == self.count and self.looks < LOOKS:
                 self._look_first()
                 continue
             if self.at == self.count:
@@ -316,12 +319,15 @@ cdef class Lost:
                 return identified
 
     cdef int _look_first(self) except -1:
-        """Take the best candidate of the first few stars, if others support it."""
-        cdef int stars = min(self.limits.first_stars, self.judge.frame.count)
+        """Take the best candidate of the next few stars, if others support it and it was not that of the look before."""
+        cdef int stars = min(self.limits.first_stars[self.looks], self.judge.frame.count)
+        cdef Candidate before = self.found[0]
+        cdef bint any_before = self.count > 0
         self.count = self.table.best(
             self.judge.frame, 0, stars, self.error_px, self.limits.most_candidates, 1, True, self.found
         )
-        self.at, self.ranked, self.order[0] = 0, True, 0
+        self.at = self.count if any_before and self.count > 0 and _same(&before, &self.found[0]) else 0
+        self.looks, self.ranked, self.order[0] = self.looks + 1, True, 0
         return 0
 
     cdef int _look_up(self) except -1:
@@ -383,6 +389,15 @@ cdef class Lost:
         finally:
             free(kept)
         return 0
+
+
+cdef bint _same(const Candidate *one, const Candidate *other) noexcept:
+    """Whether two candidates bring the same stars to the same detections, in whatever order."""
+    cdef int i, j, pairs = 0
+    for i in range(3):
+        for j in range(3):
+            pairs += one.star[i] == other.star[j] and one.corner[i] == other.corner[j]
+    return pairs == 3 and one.mirrored == other.mirrored
 
 
 cdef class Finder:

@@ -34,7 +34,7 @@ CROWD_STAGES = (60, 0.3), (140, 0.1)
 # the brightest: else these are spread evenly already. Half of the cells decide. Such a second try needs more evidence.
 CELLS, MOST_EVEN, SECOND_TRY = 10, 0.65, math.log(10)
 LIMITS = Limits(
-    first_stars=4,
+    first_stars=(4, 5, 7),
     match_sigma=MATCH_SIGMA,
     log_false=math.log(0.35),
     worth_a_fit=4.0,

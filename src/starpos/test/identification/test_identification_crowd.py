@@ -36,6 +36,22 @@ def test_fields_are_found_under_so_many_brighter_false_stars(crowd, sky, rng):
     assert found >= 4
 
 
+def test_fields_are_found_among_more_false_stars_as_bright_as_theirs(sky, rng):
+    found = fields = 0
+    while fields < 5:
+        attitude = random_attitude(rng)
+        xy = stars_on(sky, attitude, rng)[:20]
+        if len(xy) >= 8:
+            fields += 1
+            mixed = rng.permutation(len(xy) + 30)
+            answer = found_in(under(30, xy, rng)[mixed], sky)
+            if answer is not None:
+                assert_looks(answer, attitude)
+                assert mixed[answer.star].min() >= 30
+                found += 1
+    assert found >= 4
+
+
 def test_fields_are_found_beside_lights_that_fill_a_part_of_the_frame(sky, rng):
     """A town's windows, or an aeroplane's trail: more lights than are looked at, all of them brighter than any star."""
     found = fields = 0
