@@ -19,7 +19,7 @@ CORE = [
         depends=[*SHARED, "setup.py"],
         # else the loader takes the oldest exp, which is slow
         libraries=["m"],
-        extra_compile_args=["-O3", "-g0", "-fno-math-errno", "-fno-plt"],
+        extra_compile_args=["-O3", "-g0", "-fno-math-errno"],
     )
     for source in [*sorted(glob("starpos/core/*.pyx")), *(["starpos/core/_views.c"] if VIEWS else [])]
 ]
