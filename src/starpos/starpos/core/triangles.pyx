@@ -11,6 +11,7 @@ from starpos.core.algebra cimport fetch, length
 from starpos.core.frame cimport FrameStars, direction_of
 
 cdef enum:
+    # Sides of triangles for each star of a crowd.
     ROUNDS = 3
     # Shapes in a piece of memory that comes at once.
     LINE = 10
@@ -108,7 +109,6 @@ cdef class TriangleTable:
         cdef Shape shape
         cdef int a, b, c, apart, looked_up = 0
         cdef double expected = 0.0
-        s.found, s.v = NULL, NULL
         try:
             _begin(&s, frame, stars, error_px)
             most_looked_up = max(most_looked_up, ROUNDS * s.stars * s.stars)
